@@ -58,6 +58,13 @@ class SafetyLayer:
         largest = np.maximum(np.abs(self._lower), np.abs(self._upper))
         slack = np.maximum(1e-10 * np.minimum(max_step, self._change), 32 * np.spacing(largest))
         self._max_step, self._max_change, self._half_slack = max_step + slack / 2, self._change + slack / 2, slack / 2
+        self._passed_change = self._max_change + self._half_slack
+        # Only a quarter beyond the room to brake: the next step must compensate for it within the slack.
+        self._reach_slack = self._half_slack / 4
+        self._changes = np.broadcast_to(self._change, (2, 2, len(slack))).copy()  # NumPy is slower where it broadcasts
+        self._highest = max_step + slack
+        self._braking = (1.0 + 1e-9) * _distance(self._highest, self._change)
+        """Braking from the highest step ends within it [rad]."""
         size = len(self._names)
         self._nothing: Vector = np.full(size, np.nan)
         self._counts = np.zeros((len(KINDS), size), dtype=np.int64)
@@ -112,7 +119,7 @@ class SafetyLayer:
             self._events["missing" if desired is None else "wrong_length"] += 1
             command = self._next(self._nothing, np.zeros(len(self._names), dtype=bool), lower, upper)
         else:
-            follow = np.isfinite(wanted) & known & (not self._estopped)
+            follow = np.zeros_like(known) if self._estopped else np.isfinite(wanted) & known
             before = self._position
             command = self._next(wanted, follow, lower, upper)
             differs = command != wanted
@@ -189,28 +196,31 @@ class SafetyLayer:
 
         The command never leaves the first bounds. Where `follow`, it brakes for the second ones, and returns to them.
         """
-        slack = self._half_slack
-        position = _limited(self._position, lower[0], upper[0])
+        slack, low, high = self._half_slack, lower[0], upper[0]
+        position = _limited(self._position, low, high)
         left = position != self._position
         if left.any():
             self._step, self._target = np.where(left, 0.0, self._step), np.where(left, np.nan, self._target)
-        target = _limited(np.where(follow, wanted, position), lower[0], upper[0])
+        target = _limited(np.where(follow, wanted, position), low, high)
         ahead = target - position
         # A target that moves smoothly is expected to continue; any other is treated as a place to stop.
         target_step = target - self._target
-        smooth = np.abs(target_step - self._target_step) <= self._max_change + slack
+        smooth = np.abs(target_step - self._target_step) <= self._passed_change
         expected = np.where(smooth, target_step, 0.0)
 
         slowest = np.maximum(self._step - self._max_change, -self._max_step)
         fastest = np.minimum(self._step + self._max_change, self._max_step)
-        room = np.array((position - lower, upper - position))
-        (room_below, below), (room_above, above) = np.copysign(_reach(np.abs(room), self._change), room)
-        # Only a quarter of the slack beyond the room to brake: the next step must compensate for it within the slack.
-        within = (ahead <= np.minimum(fastest + slack, above + slack / 4)) & (
-            ahead >= np.maximum(slowest - slack, -below - slack / 4)
+        if (np.minimum(position - lower[1], upper[1] - position) < self._braking).any():
+            room = np.array((position - lower, upper - position))
+            reach = np.copysign(_reach(np.abs(room), self._changes), room)
+            room_below, below, room_above, above = reach[0, 0], reach[0, 1], reach[1, 0], reach[1, 1]
+        else:
+            room_below = below = room_above = above = self._highest
+        within = (ahead <= np.minimum(fastest + slack, above + self._reach_slack)) & (
+            ahead >= np.maximum(slowest - slack, -below - self._reach_slack)
         )
         # Arriving faster than the target moves would overshoot it; a joint already on the target follows it.
-        matched = (self._target == position) | (np.abs(ahead - expected) <= self._max_change + slack)
+        matched = (self._target == position) | (np.abs(ahead - expected) <= self._passed_change)
         passes = follow & within & matched
 
         if passes.all():
@@ -221,7 +231,7 @@ class SafetyLayer:
             step = _limited(np.where(follow, step, 0.0), slowest, fastest)
             # Last, since a position limit must hold even if rounding leaves no step that satisfies all limits.
             step = _limited(step, -room_below, room_above)
-            command = np.where(passes, target, _limited(position + step, lower[0], upper[0]))
+            command = np.where(passes, target, _limited(position + step, low, high))
         self._step = command - position
         self._position = command
         self._target = np.where(follow, target, np.nan)
@@ -243,7 +253,7 @@ class SafetyLayer:
         lower, upper = np.minimum(self._lower, before), np.maximum(self._upper, before)
         step = _limited(wanted, lower, upper) - before
         # The lead limits a joint as soon as braking for it begins.
-        leads = (np.abs(wanted - before) > room) & (_reach(np.maximum(room, 0.0), self._change) < self._max_step)
+        leads = (np.abs(wanted - before) > room) & (room < self._braking)
         reasons = np.array(
             (
                 differs & self._estopped,
@@ -280,3 +290,9 @@ def _reach(distance: Vector, change: Vector) -> Vector:
     """
     n = np.floor((np.sqrt(1.0 + 8.0 * distance / change) - 1.0) / 2.0)
     return distance / (n + 1.0) + n * change / 2.0
+
+
+def _distance(step: Vector, change: Vector) -> Vector:
+    """The way of `step` and of braking from it by `change` per tick, the inverse of `_reach`; shapes (J,)."""
+    n = np.floor(step / change)
+    return (n + 1.0) * (step - n * change / 2.0)

@@ -385,17 +385,20 @@ def test_a_gentle_way_to_a_target_keeps_its_speed_and_needs_no_intervention() ->
     assert sum(watched.layer.counters().values()) == 0
 
 
-def test_a_motion_that_runs_into_a_limit_is_braked_before_it() -> None:
+@pytest.mark.parametrize("top", [0.3, 1.0, 2.5, 4.0])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_motion_that_runs_into_a_limit_is_braked_before_it(side: int, top: float) -> None:
     watched = Watched(one_joint(), PERIOD_NS)
     watched.start(ZERO)
-    wanted, speed = 0.0, 0.0
-    for _ in range(150):
-        speed = min(speed + 0.2, 4.0)
+    wanted, speed, commands = 0.0, 0.0, []
+    while abs(wanted) < 2.5:
+        speed = min(speed + 0.2, top)
         wanted += speed * 0.01
-        command = watched.tick(np.array([wanted]))
-        if command[0] < 1.55:  # 4 rad/s stop within 0.4 rad
-            assert command[0] == wanted
-    assert command[0] == 2.0
+        commands.append(side * watched.tick(np.array([side * wanted]))[0])
+        if commands[-1] < 1.95 - top**2 / 40:  # braking takes as long at 20 rad/s2
+            assert commands[-1] == wanted
+    assert commands[-1] == 2.0
+    assert np.abs(np.diff(commands, 2)).max() <= 20.0 * watched.dt**2 * 1.001
     assert watched.layer.counters()["acceleration"] > 0
     assert watched.layer.counters()["position"] > 0
 
