@@ -63,6 +63,8 @@ STILL_RAD = 0.02
 """How far a joint that stands may move."""
 _SWITCH_S = 2e-4
 """For how long one thread may keep the others from answering [s]."""
+_START_PATIENCE_S = 0.5
+"""With replies while lines are good, in addition to their time on the wire [s]."""
 _WRITTEN_S = 1e-3
 """Real time for the emulator to take a goal in, while no tick waits for replies [s]."""
 UNSEEN_S = 0.06
@@ -176,13 +178,23 @@ class Bench:
         self._swing = self.chance.uniform(0.1, 0.35, 6), self.chance.uniform(0, 2 * np.pi, 6)
         self.ticks = self._moved = 0
 
-    def start(self, corrupt: float, drop: float, late: float) -> None:
-        """Connect both arms; from then on the lines are bad."""
+    def start(self, patience_s: float, corrupt: float, drop: float, late: float) -> None:
+        """Connect both arms; from then on the lines are bad.
+
+        Args:
+            patience_s: with replies on bad lines, in addition to their time on the wire [s].
+            corrupt: probability of each byte.
+            drop: probability of each reply.
+            late: probability of each reply.
+        """
+        # The emulators, threads of this process on a machine that may be busy, answer later than servos.
+        bus._ADAPTER_S = _START_PATIENCE_S
         logging.getLogger("ibrobot").addHandler(self.said)
         self.device.connect()
         self.core.start("teleop")
         self.tick()
         self._activate()
+        bus._ADAPTER_S = patience_s
         for emulator in (self.leader, self.follower):
             emulator.faults.corrupt, emulator.faults.drop, emulator.faults.late = corrupt, drop, late
 
@@ -417,8 +429,6 @@ def main() -> int:
     parser.add_argument("--patience", type=float, default=0.02, help="with replies, beside their time on the wire [s]")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    # The emulators, threads of this process on a machine that may be busy, answer later than servos.
-    bus._ADAPTER_S = arguments.patience
     sys.setswitchinterval(_SWITCH_S)
     clock = SteppedClock(1_700_000_000 * NS_PER_S)
     begun = time.monotonic()
@@ -430,7 +440,7 @@ def main() -> int:
         )
         config = from_document(document(folder), source=Path("faults.yaml"), sim=False)
         bench = Bench(config, leader, follower, clock, arguments.seed)
-        bench.start(arguments.corrupt, arguments.drop, arguments.late)
+        bench.start(arguments.patience, arguments.corrupt, arguments.drop, arguments.late)
         stack.callback(bench.stop)
         bench.press_space()
         drawn = incidents(bench.chance)

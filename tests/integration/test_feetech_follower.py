@@ -198,7 +198,8 @@ def test_startup_goes_slowly_to_a_pose_before_the_mode_begins(bench: Bench) -> N
     assert run.returncode == 0, err
     servo = bench.emulator.servos[1]
     assert isinstance(servo, Noting)
-    assert abs(servo.goals[-1] - (2048 + round(0.4 * RADIAN))) <= 1
+    # The mode then holds the measured position, to which a busy machine's emulator may not have brought it all the way.
+    assert abs(max(servo.goals) - (2048 + round(0.4 * RADIAN))) <= 1
     steps = [b - a for a, b in itertools.pairwise(servo.goals)]
     assert max(steps) <= 0.25 * 3.0 * TICK_S * RADIAN + 1
 

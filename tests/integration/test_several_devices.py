@@ -97,9 +97,11 @@ def test_a_key_with_two_meanings_is_refused(device: str, keys: str, twice: str) 
 )  # fmt: skip
 def test_a_key_of_takeovers_that_also_jogs_is_refused(episodes: str, message: str) -> None:
     overrides = [
-        "teleoperation={it: {type: keyboard, cartesian: false}}", "control_modes.teleop.teleop=it",
-        "control_modes.model_inference.inference={model: scripted_pick, intervene: it}", f"episodes={episodes}",
-    ]  # fmt: skip
+        "teleoperation={it: {type: keyboard, cartesian: false}}",
+        "control_modes.teleop.teleop=it",
+        "control_modes.model_inference.inference={model: scripted_pick, intervene: it}",
+        f"episodes={episodes}",
+    ]
     if not message:
         load_config(takeovers.CONFIG, sim=True, overrides=overrides)
         return
