@@ -60,9 +60,12 @@ PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis
 TWO = ("-n", "2", "--dist", "worksteal")
 """Two tests at once: in sessions so long that the others would end before them."""
 UNTYPED = (
-    "disallow_untyped_defs", "disallow_incomplete_defs", "disallow_untyped_calls", "disallow_untyped_decorators",
+    "disallow_untyped_defs",
+    "disallow_incomplete_defs",
+    "disallow_untyped_calls",
+    "disallow_untyped_decorators",
     "warn_return_any",
-)  # fmt: skip
+)
 """Tests need no annotations; what has them is checked, and so is what is in functions without."""
 IS_FIRST = "NOX_NOT_TESTED" not in os.environ
 """Whether this process started the others: those that run one session each, side by side."""

@@ -103,7 +103,7 @@ def run(folder: Path, sides: tuple[str, ...], seconds: float) -> dict[str, Any]:
                 f"hardware={{type: feetech_so101, port: {follower}, calibration: {follower}.json, {lost}}}",
                 f"teleoperation.leader={{type: so101_leader, {wiring}}}",
                 "control_modes.teleop.teleop=leader",
-            ]  # fmt: skip
+            ]
         command = [*LAUNCH, robot, "--mode", "teleop", "--headless", "--json", "--duration", str(seconds)]
         command += [word for override in overrides for word in ("--set", override)]
         ran = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)

@@ -35,9 +35,11 @@ ARCHITECTURE = (
     "--policy.n_action_steps=30", f"--policy.normalization_mapping={NORMALISED}", "--policy.device=cpu",
 )  # fmt: skip
 OPERATOR = (
-    "--set", "control_modes.learned.inference={model: act, intervene: operator}",
-    "--set", "teleoperation={operator: {type: scripted_operator}}",
-)  # fmt: skip
+    "--set",
+    "control_modes.learned.inference={model: act, intervene: operator}",
+    "--set",
+    "teleoperation={operator: {type: scripted_operator}}",
+)
 LOCKSTEP = ("--sim", "--lockstep", "--headless")
 _Z = 1.959964
 

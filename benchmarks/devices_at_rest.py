@@ -170,8 +170,9 @@ def main() -> int:
         still, moved = measure(name, arguments.minutes, arguments.seed)
         print(
             f"{name:8} {arguments.minutes:g} min at rest: the arm moved by at most {still * 1e3:.4f} mrad, "
-            f"then with the device by {moved * 1e3:.0f} mrad", flush=True,
-        )  # fmt: skip
+            f"then with the device by {moved * 1e3:.0f} mrad",
+            flush=True,
+        )
         good = good and still <= MOST_RAD and moved >= LEAST_RAD
     return 0 if good else 1
 

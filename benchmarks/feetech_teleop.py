@@ -88,8 +88,9 @@ def main() -> None:
             f"hardware={{type: feetech_so101, port: {folder}/follower, calibration: {follower_file}}}",
             f"teleoperation.leader={{type: so101_leader, port: {folder}/leader, calibration: {leader_file}, "
             "deadman: none}",
-            "control_modes.teleop.teleop=leader", f"control.rate_hz={arguments.rate}",
-        )  # fmt: skip
+            "control_modes.teleop.teleop=leader",
+            f"control.rate_hz={arguments.rate}",
+        )
         command = [*LAUNCH, "--mode", "teleop", "--headless", "--json", "--duration", str(arguments.duration)]
         command += [word for section in sections for word in ("--set", section)]
         with leader, follower:
@@ -109,8 +110,10 @@ def report(rows: NDArray[np.float64], summary: dict[str, object], arguments: arg
     moving = np.flatnonzero(np.abs(np.diff(rows[:, 2])) > 0)
     begin, end = rows[moving[0], 0] + SETTLED_S, rows[moving[-1], 0] - 0.5
     times, leader, goal, follower = rows[(rows[:, 0] > begin) & (rows[:, 0] < end)].T
-    fits = {name: sine(times, values, arguments.frequency) for name, values in
-            (("leader", leader), ("goal", goal), ("follower", follower))}  # fmt: skip
+    fits = {
+        name: sine(times, values, arguments.frequency)
+        for name, values in (("leader", leader), ("goal", goal), ("follower", follower))
+    }
     error = leader - follower
     delay = fits["follower"][1] - fits["leader"][1]
     aligned = np.interp(times - delay, times, leader) - follower

@@ -74,10 +74,12 @@ class Referee:
         self._objects = [i for i, name in enumerate(names) if name.startswith("world:")]
         still = self.model.body("base").id
         self._links = [
-            i for i in range(self.model.ngeom)
-            if i not in self._objects and self.model.geom_bodyid[i] != still
+            i
+            for i in range(self.model.ngeom)
+            if i not in self._objects
+            and self.model.geom_bodyid[i] != still
             and (self.model.geom_contype[i] or self.model.geom_conaffinity[i])
-        ]  # fmt: skip
+        ]
         self._columns = [self.model.joint(name).qposadr[0] for name in ARM_JOINTS]
 
     def clearance(self, positions: Vector) -> float:
@@ -172,9 +174,11 @@ class Figures:
         positions, velocities, accelerations = motion.sampled(0.001)
         robot = so101()
         self.beyond += bool(
-            (np.abs(velocities) > MAX_VELOCITY).any() or (np.abs(accelerations) > MAX_ACCELERATION).any()
-            or (positions < robot.lower[:5] - 1e-6).any() or (positions > robot.upper[:5] + 1e-6).any()
-        )  # fmt: skip
+            (np.abs(velocities) > MAX_VELOCITY).any()
+            or (np.abs(accelerations) > MAX_ACCELERATION).any()
+            or (positions < robot.lower[:5] - 1e-6).any()
+            or (positions > robot.upper[:5] + 1e-6).any()
+        )
         self.clearances.append(Referee(task.world).clearance(positions))
 
     def text(self, number: int, first_s: float) -> str:

@@ -120,9 +120,11 @@ def _open_box(rng: Random) -> Scene:
     depth, width, height = rng.uniform(0.14, 0.18), rng.uniform(0.14, 0.2), rng.uniform(0.08, 0.13)
     wall, half = 0.008, height / 2
     parts = {
-        "front": (-depth / 2, 0, half, wall, width, height), "back": (depth / 2, 0, half, wall, width, height),
-        "left": (0, width / 2, half, depth, wall, height), "right": (0, -width / 2, half, depth, wall, height),
-    }  # fmt: skip
+        "front": (-depth / 2, 0, half, wall, width, height),
+        "back": (depth / 2, 0, half, wall, width, height),
+        "left": (0, width / 2, half, depth, wall, height),
+        "right": (0, -width / 2, half, depth, wall, height),
+    }
     inside = np.array([x - 0.05, y - 0.05, 0.02]), np.array([x + 0.05, y + 0.05, 0.6 * height])
     side = -np.sign(y) or 1.0
     corners = np.array([[0.1, side * 0.12, 0.02], [0.3, side * 0.3, 0.1]])

@@ -42,13 +42,14 @@ def configs() -> dict[str, Any]:
     common = {
         "input_features": {STATE: state, TOP: camera, WRIST: camera},
         "output_features": {"action": PolicyFeature(FeatureType.ACTION, (6,))},
-        "device": "cpu", "pretrained_backbone_weights": None,
-    }  # fmt: skip
+        "device": "cpu",
+        "pretrained_backbone_weights": None,
+    }
     one = common | {"input_features": {STATE: state, TOP: camera}}
     return {
         "diffusion": DiffusionConfig(down_dims=(128, 256, 512), num_inference_steps=5, **common),
         "vqbet": VQBeTConfig(**one),
-    }  # fmt: skip
+    }
 
 
 def saved(config: Any, path: Path) -> Path:
@@ -99,10 +100,12 @@ def measure(policy: LeRobotPolicy, count: int, rounds: int, clock: Callable[[], 
         one_run_ms.append(timed(lambda: policy.infer_batch(batch), clock))
     single, one_run = np.median(single_ms), np.median(one_run_ms)
     return {
-        "requests": count, "single_runs_ms": round(float(single), 1), "one_run_ms": round(float(one_run), 1),
+        "requests": count,
+        "single_runs_ms": round(float(single), 1),
+        "one_run_ms": round(float(one_run), 1),
         "times_as_fast": round(float(single / one_run), 2),
         "largest_difference": float(np.abs(np.stack(together) - np.stack(alone)).max()),
-    }  # fmt: skip
+    }
 
 
 def main() -> int:

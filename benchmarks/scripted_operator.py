@@ -118,6 +118,8 @@ class ScriptedOperator(Teleop):
 def ibrobot_teleop() -> Iterator[TeleopDescriptor]:
     """The operator."""
     yield TeleopDescriptor(
-        "scripted_operator", ScriptedOperator, "takes over before a policy fails",
+        "scripted_operator",
+        ScriptedOperator,
+        "takes over before a policy fails",
         OperatorOptions,
-    )  # fmt: skip
+    )

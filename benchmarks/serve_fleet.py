@@ -128,10 +128,11 @@ class Robot:
             control_modes={"idle": ControlMode(())},
             default_control_mode="idle",
             contract=ContractConfig(
-                RATE_HZ, observations=(ObservationSpec(STATE, topic="/joint_states"),),
+                RATE_HZ,
+                observations=(ObservationSpec(STATE, topic="/joint_states"),),
                 actions=(ActionSpec("all", "/commands"),),
             ),
-        )  # fmt: skip
+        )
         self._clock, self._joints = RealClock(), joints
         self._bus = Bus(self._clock)
         policy = TwentyMilliseconds()
@@ -270,9 +271,12 @@ def _measured(answers: list[Any], busy: list[tuple[float, float]], begin_s: floa
     latencies = [latency for robot in answers for at, latency in robot["chunks"] if begin_s <= at < end_s]
     p50, p99 = np.percentile(latencies, [50, 99])
     return {
-        "load": round(worked / (end_s - begin_s), 3), "p50_ms": round(float(p50), 1), "p99_ms": round(float(p99), 1),
-        "holds": sum(begin_s <= at < end_s for robot in answers for at in robot["holds"]), "chunks": len(latencies),
-    }  # fmt: skip
+        "load": round(worked / (end_s - begin_s), 3),
+        "p50_ms": round(float(p50), 1),
+        "p99_ms": round(float(p99), 1),
+        "holds": sum(begin_s <= at < end_s for robot in answers for at in robot["holds"]),
+        "chunks": len(latencies),
+    }
 
 
 def main() -> int:

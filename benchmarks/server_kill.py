@@ -239,12 +239,15 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
     print(json.dumps(summary))
     first, last = (grown[0], grown[-1]) if grown else (resources(), resources())
     good = (
-        max(held) <= PLAN_S + STALE_S + SETTLE_S + slack_s and max(resumed) <= RESUMED_S + slack_s
-        and max(known) <= KNOWN_S + slack_s and summary["answered_twice"] == 0
+        max(held) <= PLAN_S + STALE_S + SETTLE_S + slack_s
+        and max(resumed) <= RESUMED_S + slack_s
+        and max(known) <= KNOWN_S + slack_s
+        and summary["answered_twice"] == 0
         and 0 <= stats.requests - stats.chunks - stats.failures - stats.timeouts <= 1
-        and last["threads"] <= first["threads"] and last["files"] <= first["files"] + 2
+        and last["threads"] <= first["threads"]
+        and last["files"] <= first["files"] + 2
         and last["memory_mib"] <= first["memory_mib"] + 20
-    )  # fmt: skip
+    )
     return int(not good)
 
 

@@ -240,9 +240,12 @@ class Fleet:
         p50, p99 = np.percentile(latencies, [50, 99]) / 1e6
         age = np.mean([robot.age_ns(part) for robot in self.robots]) / 1e6
         return {
-            "load": round(busy / len(part), 3), "p50_ms": round(float(p50), 1), "p99_ms": round(float(p99), 1),
-            "age_ms": round(float(age), 1), "holds": sum(at in part for robot in self.robots for at in robot.holds),
-        }  # fmt: skip
+            "load": round(busy / len(part), 3),
+            "p50_ms": round(float(p50), 1),
+            "p99_ms": round(float(p99), 1),
+            "age_ms": round(float(age), 1),
+            "holds": sum(at in part for robot in self.robots for at in robot.holds),
+        }
 
     def phases(self) -> dict[str, dict[str, Any]]:
         """Before the hiccup, from its begin until 5 s after it, and from then on."""

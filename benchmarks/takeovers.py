@@ -566,9 +566,11 @@ def measure(name: str, takeovers: int, seed: int, *, live: bool = False) -> dict
         overrides = [
             "models={wander: {type: wander}}",
             "control_modes.model_inference.inference={model: wander, intervene: it}",
-            "control_modes.teleop.teleop=it", f"teleoperation={{it: {person.device}}}",
-            f"recording={{type: mcap, root: {folder}}}", "contract.max_duration_s=100000",
-        ]  # fmt: skip
+            "control_modes.teleop.teleop=it",
+            f"teleoperation={{it: {person.device}}}",
+            f"recording={{type: mcap, root: {folder}}}",
+            "contract.max_duration_s=100000",
+        ]
         keys = person.subscribe if isinstance(person, WithKeys) else None
         config = load_config(CONFIG, overrides=overrides, sim=True)
         runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=not live, seed=seed, keys=keys)))

@@ -59,19 +59,17 @@ def test_a_good_plugin_works_beside_broken_ones(registry: Registry) -> None:
 def test_every_failure_is_reported_with_its_cause(registry: Registry) -> None:
     assert [str(failure) for failure in registry.failures] == [
         "plugin 'fake_exits' (fake-exits) failed to import: SystemExit: 3",
-        "plugin 'fake_import' (fake-import) failed to import: "
-        "ImportError: no library",
+        "plugin 'fake_import' (fake-import) failed to import: ImportError: no library",
         "plugin 'fake_misspelt' (fake-misspelt) has a wrong hook: "
         "ValueError: unknown hook 'ibrobot_hardwear', did you mean 'ibrobot_hardware'?",
-        "plugin 'fake_nothing' (fake-nothing) failed in ibrobot_policies: "
-        "TypeError: expected a Descriptor, got 'act'",
+        "plugin 'fake_nothing' (fake-nothing) failed in ibrobot_policies: TypeError: expected a Descriptor, got 'act'",
         "plugin 'fake_raising' (fake-raising) failed in ibrobot_sensors: RuntimeError: no driver",
         "plugin 'fake_twin' (fake-twin) failed in ibrobot_hardware: "
         "hardware type 'good_arm' is offered by fake-good already",
         "plugin 'fake_wrong' (fake-wrong) has a wrong hook: "
         "Plugin 'fake_wrong' for hook 'ibrobot_mode_changed': "
         "Argument(s) {'moed'} are declared in the hookimpl but can not be found in the hookspec",
-    ]  # fmt: skip
+    ]
 
 
 def test_a_missing_type_names_the_nearest_and_what_is_broken(registry: Registry) -> None:

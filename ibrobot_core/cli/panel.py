@@ -34,8 +34,10 @@ _JOINT_WIDTH = 47
 
 
 _COMMANDS = {
-    "policy": "the policy commands", "operator": "THE OPERATOR COMMANDS", "handover": "holding for the handover",
-}  # fmt: skip
+    "policy": "the policy commands",
+    "operator": "THE OPERATOR COMMANDS",
+    "handover": "holding for the handover",
+}
 
 
 class RecentLog(logging.Handler):

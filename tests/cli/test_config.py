@@ -60,11 +60,13 @@ def test_check_as_json(ibrobot: Ibrobot, robot: Path) -> None:
     ("arguments", "message"),
     [
         (["mini.yaml", "--sim"], "mini.yaml: --sim needs a simulation section, e.g. simulation: {type: mujoco}"),
-        (["mini.yaml", "--mode", "idel"],
-         "--mode idel: default_control_mode: unknown control mode 'idel', did you mean 'idle'?"),
+        (
+            ["mini.yaml", "--mode", "idel"],
+            "--mode idel: default_control_mode: unknown control mode 'idel', did you mean 'idle'?",
+        ),
         (["nowhere/x.yaml"], "nowhere/x.yaml: no such file"),
     ],
-)  # fmt: skip
+)
 def test_check_of_what_cannot_be(ibrobot: Ibrobot, robot: Path, arguments: list[str], message: str) -> None:
     ran = ibrobot("config", "check", *arguments)
 

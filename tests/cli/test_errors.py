@@ -37,12 +37,15 @@ def bugs(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (("odd", "read"), 2, "Missing argument 'FILE'; see ibrobot odd read --help"),
         (("odd", "xyzzy"), 2, "No such command 'xyzzy'; see ibrobot odd --help"),
         (("odd", "read", "no.txt"), 2, "no.txt: No such file or directory"),
-        (("odd", "take", "no.txt"), 2,
-         "Invalid value for 'FILE': 'no.txt': No such file or directory; see ibrobot odd take --help"),
+        (
+            ("odd", "take", "no.txt"),
+            2,
+            "Invalid value for 'FILE': 'no.txt': No such file or directory; see ibrobot odd take --help",
+        ),
         (("odd", "refuse"), 1, "not today"),
         (("odd", "ask"), 130, "stopped"),
     ],
-)  # fmt: skip
+)
 def test_errors_have_one_form(
     ibrobot: Ibrobot, bugs: None, arguments: tuple[str, ...], code: int, message: str
 ) -> None:

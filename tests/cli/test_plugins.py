@@ -37,8 +37,11 @@ def test_as_json_with_what_is_broken(ibrobot: Ibrobot, robot: Path, site: Site) 
         "summary": "the camera in its hand", "missing": None,
     } in listed["plugins"]  # fmt: skip
     assert {
-        "plugin": "fake_broken", "package": "fake-broken", "stage": "import", "reason": "ImportError: no library",
-    } in listed["broken"]  # fmt: skip
+        "plugin": "fake_broken",
+        "package": "fake-broken",
+        "stage": "import",
+        "reason": "ImportError: no library",
+    } in listed["broken"]
 
 
 def test_show_prints_the_options_of_every_kind_of_that_name(ibrobot: Ibrobot, robot: Path) -> None:

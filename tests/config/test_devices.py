@@ -123,8 +123,10 @@ def test_message(case: str, edited: Load) -> None:
 
 def test_devices_of_different_modes_may_share_a_port(edited: Load) -> None:
     both = "teleop: {executors: [arm_position, grip_position], teleop: {arm: left, gripper: right}}"
-    modes = [f"{group}: {{executors: [{group}_position], teleop: {{{group}: {name}}}}}"
-             for group, name in (("arm", "left"), ("gripper", "right"))]  # fmt: skip
+    modes = [
+        f"{group}: {{executors: [{group}_position], teleop: {{{group}: {name}}}}}"
+        for group, name in (("arm", "left"), ("gripper", "right"))
+    ]
     modes[1] = modes[1].replace("gripper_position", "grip_position")
     edited((both, "\n  ".join(modes)), ("/dev/b", "/dev/a"), ("mode: teleop", "mode: arm"))
 

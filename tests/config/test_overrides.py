@@ -73,11 +73,13 @@ def test_mode_overrides_the_default(load_text: Load, base: str) -> None:
         ("control.stop=[hold", "control.stop: not valid YAML: expected ',' or ']', but got '<stream end>'"),
         ("control={rate_hz: 50, rate_hz: 60}", "control.rate_hz: repeated key, first given in line 1"),
         ("hardware={type: bus, prot: a, port: b}", "hardware.prot: unknown key, did you mean 'port'?"),
-        ("control.stop=${IBROBOT_NO_SUCH}",
-         "control.stop: environment variable IBROBOT_NO_SUCH is not set; set it, or give a default: "
-         "${IBROBOT_NO_SUCH:value}"),
+        (
+            "control.stop=${IBROBOT_NO_SUCH}",
+            "control.stop: environment variable IBROBOT_NO_SUCH is not set; set it, or give a default: "
+            "${IBROBOT_NO_SUCH:value}",
+        ),
     ],
-)  # fmt: skip
+)
 def test_an_override_is_checked_like_the_file(load_text: Load, base: str, override: str, expected: str) -> None:
     with pytest.raises(ConfigError) as message:
         load_text(base, overrides=[override])

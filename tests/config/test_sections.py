@@ -128,9 +128,7 @@ def test_a_secret_of_a_section_is_not_shown(load_text: Load, base: str) -> None:
 
 def test_config_show_has_the_section_with_its_defaults(load_text: Load, base: str) -> None:
     shown = to_yaml(load_text(base + "around: {padding: 0.01}\n"))
-    assert yaml.safe_load(shown)["around"] == {
-        "table": True, "padding": 0.01, "boxes": {}, "tip": "pan", "code": "***"
-    }  # fmt: skip
+    assert yaml.safe_load(shown)["around"] == {"table": True, "padding": 0.01, "boxes": {}, "tip": "pan", "code": "***"}
 
 
 def test_json_schema_has_the_section(registry: Registry) -> None:

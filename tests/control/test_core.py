@@ -131,8 +131,9 @@ class TestGoals:
 
         goals = rig.events("goal")
         assert [(goal["executor"], goal["goal"], goal["state"]) for goal in goals] == [
-            ("arm_trajectory", "one", "executing"), ("arm_trajectory", "one", "succeeded"),
-        ]  # fmt: skip
+            ("arm_trajectory", "one", "executing"),
+            ("arm_trajectory", "one", "succeeded"),
+        ]
         np.testing.assert_allclose(rig.core.state.command[:2], [0.3, 0.2])
 
     def test_for_an_executor_that_is_not_active_are_refused(self, make_rig):

@@ -88,8 +88,9 @@ class TestFailures:
 
     def test_of_two_parts_the_failing_one_is_named(self, make_rig):
         hardware = {
-            "hand": {"type": "scripted", "joints": ["grip", "lift"]}, "base": {"type": "scripted", "joints": ["pan"]},
-        }  # fmt: skip
+            "hand": {"type": "scripted", "joints": ["grip", "lift"]},
+            "base": {"type": "scripted", "joints": ["pan"]},
+        }
         rig = make_rig({"hardware": hardware}).start()
         rig.plan([0.3, -0.2, 0.9])
         rig.tick(80)
@@ -161,12 +162,15 @@ class TestStop:
         joint = {"name": "pan", "lower": -1.0, "upper": 3.0, "max_velocity": 0.2, "max_acceleration": 2.0}
         edits = {
             "robot": {
-                "name": "slow", "joints": [joint], "groups": {"arm": ["pan"]}, "description": {"poses": {"far": [3.0]}},
+                "name": "slow",
+                "joints": [joint],
+                "groups": {"arm": ["pan"]},
+                "description": {"poses": {"far": [3.0]}},
             },
             "control": {"stop": "pose far"},
             "executors": {"one": {"type": "position", "group": "arm"}},
             "control_modes": {"stream": {"executors": ["one"]}},
-        }  # fmt: skip
+        }
         rig = make_rig(edits).start()
 
         assert 1000 <= rig.stop(1100) < 1030
@@ -230,8 +234,9 @@ class TestStop:
 
     def test_of_two_parts_the_relaxed_one_is_not_written_while_the_other_brakes(self, make_rig):
         hardware = {
-            "hand": {"type": "scripted", "joints": ["grip", "lift"]}, "base": {"type": "scripted", "joints": ["pan"]},
-        }  # fmt: skip
+            "hand": {"type": "scripted", "joints": ["grip", "lift"]},
+            "base": {"type": "scripted", "joints": ["pan"]},
+        }
         rig = make_rig({"hardware": hardware, "control": {"stop": "relax"}}).start()
         rig.plan([0.3, -0.2, 0.9])
         rig.tick(20)

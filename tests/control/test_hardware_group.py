@@ -44,9 +44,7 @@ class Part(Hardware):
     @override
     def read(self) -> JointReading:
         self._act()
-        return JointReading(
-            self.stamp_ns, self.order, self.order + 10, nan_vector(len(self.joints)), self.stale
-        )  # fmt: skip
+        return JointReading(self.stamp_ns, self.order, self.order + 10, nan_vector(len(self.joints)), self.stale)
 
     @override
     def write(self, position: Vector) -> None:

@@ -55,8 +55,9 @@ class TestWarnings:
 
     def test_of_all_parts_are_reported(self, make_rig):
         hardware = {
-            "hand": {"type": "scripted", "joints": ["grip", "lift"]}, "base": {"type": "scripted", "joints": ["pan"]},
-        }  # fmt: skip
+            "hand": {"type": "scripted", "joints": ["grip", "lift"]},
+            "base": {"type": "scripted", "joints": ["pan"]},
+        }
         rig = make_rig({"hardware": hardware}).start()
         rig.parts["hand"].conditions, rig.parts["base"].conditions = (HOT,), (WEAK,)
         rig.tick()
@@ -171,8 +172,9 @@ class TestShedding:
         rig.tick(200)
 
         assert [event["fault"] for event in rig.events("fault")] == [
-            f"{HOT.message}; this has lasted for 1 s", "torque of hardware cannot be taken off: servo 2 keeps it",
-        ]  # fmt: skip
+            f"{HOT.message}; this has lasted for 1 s",
+            "torque of hardware cannot be taken off: servo 2 keeps it",
+        ]
 
     @pytest.mark.parametrize("trouble", ["estop", "silent"])
     def test_on_the_way_an_emergency_stop_or_silence_ends_the_motion(self, make_rig, trouble):

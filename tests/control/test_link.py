@@ -71,9 +71,11 @@ class TestStates:
         assert [s.tick for s in host.read_states()] == [6]
 
     @given(
-        tick=st.integers(0, 2**62), late=st.integers(-(2**62), 2**62), success=st.sampled_from([None, True, False]),
+        tick=st.integers(0, 2**62),
+        late=st.integers(-(2**62), 2**62),
+        success=st.sampled_from([None, True, False]),
         vectors=arrays(np.float64, (4, 3), elements=FLOATS),
-    )  # fmt: skip
+    )
     def test_arrive_as_they_were_sent(self, tick, late, success, vectors):
         memory = SharedMemory(create_memory(), LAYOUT)
         sent = state(tick % 1000, success, vectors, late)
@@ -181,8 +183,10 @@ class TestPlans:
 
     @given(
         positions=st.integers(1, 40).flatmap(lambda n: arrays(np.float64, (n, 3), elements=FLOATS)),
-        mask=arrays(np.bool_, 3), start=st.integers(-(2**62), 2**62), step=st.integers(0, 2**40),
-    )  # fmt: skip
+        mask=arrays(np.bool_, 3),
+        start=st.integers(-(2**62), 2**62),
+        step=st.integers(0, 2**40),
+    )
     def test_arrive_as_they_were_sent(self, positions, mask, start, step):
         memory = SharedMemory(create_memory(), LAYOUT)
         sent = PlanRecord(3, start, step, mask, positions)

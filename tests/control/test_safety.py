@@ -89,9 +89,9 @@ def braking(step: Vector, change: Vector) -> Vector:
     return np.asarray((n + 1) * step - change * n * (n + 1) / 2)
 
 
-limits = st.tuples(
-    st.floats(-4, 3), st.floats(0.1, 6), st.floats(0.2, 20), st.floats(1, 500)
-).map(lambda t: (t[0], t[0] + t[1], t[2], t[3]))  # fmt: skip
+limits = st.tuples(st.floats(-4, 3), st.floats(0.1, 6), st.floats(0.2, 20), st.floats(1, 500)).map(
+    lambda t: (t[0], t[0] + t[1], t[2], t[3])
+)
 robots = st.lists(limits, min_size=1, max_size=3).map(lambda rows: make_robot(*rows))
 periods = st.sampled_from([2_000_000, 10_000_000, 33_333_333])
 wild = st.one_of(st.floats(allow_nan=True, allow_infinity=True), st.floats(-6, 6), st.floats(-0.1, 0.1))

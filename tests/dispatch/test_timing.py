@@ -43,9 +43,10 @@ def run(rig: Rig, latencies: list[int], ticks: int, length: int) -> list[int]:
 
 @settings(deadline=None, max_examples=40)
 @given(
-    latencies=st.lists(st.integers(0, 8), min_size=1, max_size=12), strategy=st.sampled_from(["replace", "ensemble"]),
+    latencies=st.lists(st.integers(0, 8), min_size=1, max_size=12),
+    strategy=st.sampled_from(["replace", "ensemble"]),
     parallel=st.sampled_from([1, 8]),
-)  # fmt: skip
+)
 def test_no_action_is_dropped_or_doubled_in_time(
     make_rig: type[Rig], latencies: list[int], strategy: str, parallel: int
 ) -> None:

@@ -11,17 +11,22 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted({
-    *ROOT.glob("*.md"),
-    *(ROOT / "docs").glob("*/*.md"),
-    *(ROOT / "docs").glob("*.md"),
-    *(ROOT / "plugins").glob("*/README.md"),
-} - {ROOT / f"docs/reference/{name}.md" for name in ("cli", "config", "options", "plugins")})  # fmt: skip
+PAGES = sorted(
+    {
+        *ROOT.glob("*.md"),
+        *(ROOT / "docs").glob("*/*.md"),
+        *(ROOT / "docs").glob("*.md"),
+        *(ROOT / "plugins").glob("*/README.md"),
+    }
+    - {ROOT / f"docs/reference/{name}.md" for name in ("cli", "config", "options", "plugins")}
+)
 """Written pages; the generated ones take their words from the code."""
-CODE = sorted({
-    *(ROOT / "ibrobot_core").rglob("*.py"),
-    *(path for package in (ROOT / "plugins").glob("*/ibrobot_*") for path in package.rglob("*.py")),
-})  # fmt: skip
+CODE = sorted(
+    {
+        *(ROOT / "ibrobot_core").rglob("*.py"),
+        *(path for package in (ROOT / "plugins").glob("*/ibrobot_*") for path in package.rglob("*.py")),
+    }
+)
 TESTS = sorted({*(ROOT / "tests").rglob("test_*.py"), *(ROOT / "plugins").glob("*/tests/**/test_*.py"), *CODE})
 
 OUT = {

@@ -39,7 +39,7 @@ ALLOWED = {
     "hasattr(config, 'pretrained_backbone_weights')",
     "hasattr(config, 'rtc_config')",
     "hasattr(policy, 'init_rtc_processor')",
-}  # fmt: skip
+}
 
 
 def guesses(tree: ast.AST) -> Iterator[str]:

@@ -78,9 +78,12 @@ def test_it_sees_its_unit_and_gives_radians(norm_mode: str) -> None:
     seen = policy.preprocess(converted.frame(shown))["rows"]
     arm = CALIBRATION["shoulder_lift"]
     lift = radians_to_lerobot(
-        float(shown.values["observation.state"][1]), norm_mode, range_min=arm["range_min"], range_max=arm["range_max"],
+        float(shown.values["observation.state"][1]),
+        norm_mode,
+        range_min=arm["range_min"],
+        range_max=arm["range_max"],
         inverted=True,
-    )  # fmt: skip
+    )
     assert abs(seen[-1, 1] - lift) < 1e-4
     assert abs(lift) > 2  # neither radians nor normalised twice
     assert shown.prefix is not None

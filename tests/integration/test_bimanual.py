@@ -43,11 +43,13 @@ MAX_STEP = 3.0 * 0.01 * RADIAN
 PATIENCE_S = 60.0
 # No camera is connected; a busy machine may keep the emulators, threads of this process, from answering for a while.
 OVERRIDES = (
-    "peripherals=[]", "contract={}", "control.state_timeout=20.0",
+    "peripherals=[]",
+    "contract={}",
+    "control.state_timeout=20.0",
     *(f"hardware.{side}_follower.{key}=200" for side in SIDES for key in ("lost_replies", "retries")),
     *(f"teleoperation.leader_{side}.lost_replies=5" for side in SIDES),
     "teleoperation.leader_right.deadman_key=r",
-)  # fmt: skip
+)
 
 
 def arm(folder: Path, name: str, prefix: str = "") -> Emulator:

@@ -162,9 +162,11 @@ def test_interrupted_by_the_keyboard_it_says_what_is_kept(bags: Path, tmp_path: 
     arguments = [str(bags), "--jobs", "1", "--out", str(out)]
     program = STUCK.format(said="frames (1 of 4") + PROGRAM
     with subprocess.Popen(
-        [sys.executable, "-c", program, "convert", *arguments], stderr=subprocess.PIPE, text=True,
+        [sys.executable, "-c", program, "convert", *arguments],
+        stderr=subprocess.PIPE,
+        text=True,
         start_new_session=True,
-    ) as process:  # fmt: skip
+    ) as process:
         assert process.stderr is not None
         first = process.stderr.readline()
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does
@@ -262,8 +264,10 @@ def test_a_gap_is_refused_skipped_or_held(tmp_path: Path) -> None:
     assert result.code == 1
     assert "observation.images.wrist is missing 1.000 s after the beginning" in result.err
     assert "--missing skip" in result.err
-    found = {way: run(tmp_path / "bag", "--out", tmp_path / way, "--missing", way, "--json").report for way in
-             ("skip", "hold")}  # fmt: skip
+    found = {
+        way: run(tmp_path / "bag", "--out", tmp_path / way, "--missing", way, "--json").report
+        for way in ("skip", "hold")
+    }
     assert (found["skip"]["gaps"], found["hold"]["gaps"]) == (1, 1)
     assert found["skip"]["skipped_ticks"] == found["hold"]["held_ticks"] > 10
     assert found["skip"]["frames"] == found["hold"]["frames"] - found["hold"]["held_ticks"]

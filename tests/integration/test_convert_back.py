@@ -27,10 +27,13 @@ CALIBRATION = {
     for i, joint in enumerate(JOINTS)
 }
 ROBOT: dict[str, Any] = {
-    "robot": {"name": "bench", "robot_type": "bench_follower",
-              "joints": [{"name": joint, "lower": -1.5, "upper": 1.5} for joint in JOINTS]},
+    "robot": {
+        "name": "bench",
+        "robot_type": "bench_follower",
+        "joints": [{"name": joint, "lower": -1.5, "upper": 1.5} for joint in JOINTS],
+    },
     "hardware": {"type": "bench"},
-}  # fmt: skip
+}
 
 Convert = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -94,8 +97,11 @@ def test_what_an_episode_says_of_itself_comes_back(exact: Path, convert: Convert
     assert (summary.outcome, summary.finished) == ("failure", True)
     metadata = summary.metadata
     assert (metadata["prompt"], metadata["mode"], metadata["robot"], metadata["source"]) == (
-        "sort 2", "mode 2", "bench", "exact:1",
-    )  # fmt: skip
+        "sort 2",
+        "mode 2",
+        "bench",
+        "exact:1",
+    )
     assert json.loads(metadata["config"]) == ROBOT
     assert Contract.from_canonical(json.loads(metadata["contract"])).fingerprint() == metadata["fingerprint"]
     assert metadata["fingerprint"] in (tmp_path / "back/dataset.yaml").read_text()
@@ -161,9 +167,7 @@ def test_another_episode_of_the_same_number_is_not_overwritten(exact: Path, bags
         (["--to", "bag", "--episodes", "all"], "'all' is not a number, nor two with a dash"),
     ],
 )
-def test_options_that_cannot_be_meant(
-    exact: Path, convert: Convert, tmp_path: Path, arguments: list[str], words: str
-):  # fmt: skip
+def test_options_that_cannot_be_meant(exact: Path, convert: Convert, tmp_path: Path, arguments: list[str], words: str):
     done = convert(exact, "--out", tmp_path / "out", *arguments)
     assert done.returncode == 2
     assert words in done.stderr
@@ -179,18 +183,21 @@ def test_a_foreign_dataset_is_described_by_a_robot_yaml(exact: Path, convert: Co
     assert "was not made by ibrobot, so it does not name its robot" in done.stderr
     assert not (tmp_path / "back").exists()
     robot = {
-        "robot": ROBOT["robot"] | {
+        "robot": ROBOT["robot"]
+        | {
             "joints": [each | {"max_velocity": 1, "max_acceleration": 1} for each in ROBOT["robot"]["joints"]],
             "groups": {"arm": list(JOINTS)},
         },
         "hardware": {"type": "feetech_so101", "port": "/dev/null", "calibration": "bench"},
         "executors": {"arm": {"type": "position", "group": "arm"}},
-        "control_modes": {"idle": {"executors": ["arm"]}}, "default_control_mode": "idle",
+        "control_modes": {"idle": {"executors": ["arm"]}},
+        "default_control_mode": "idle",
         "contract": {
-            "rate_hz": 30, "observations": [{"key": "observation.state", "topic": "/joint_states"}],
+            "rate_hz": 30,
+            "observations": [{"key": "observation.state", "topic": "/joint_states"}],
             "actions": [{"executor": "arm", "topic": "/commands"}],
         },
-    }  # fmt: skip
+    }
     (tmp_path / "theirs.yaml").write_text(json.dumps(robot))
     arguments = ["--config", tmp_path / "theirs.yaml", "--norm-mode", "radians"]
     done = convert(tmp_path / "theirs", "--to", "bag", "--out", tmp_path / "back", *arguments)

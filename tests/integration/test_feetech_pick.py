@@ -32,8 +32,11 @@ def test_cube_lies_in_the_bin_and_only_the_emulator_says_so(ibrobot: tuple[str, 
     launch += [word for each in PATIENT for word in ("--set", each)]
     with subprocess.Popen(
         (*emulate, "--link", str(link), "--calibration", "emulated"),
-        env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-    ) as emulator:  # fmt: skip
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as emulator:
         assert emulator.stdout is not None
         said: queue.SimpleQueue[str] = queue.SimpleQueue()
         reading = threading.Thread(target=lambda lines: deque(map(said.put, lines), maxlen=0), args=(emulator.stdout,))

@@ -33,8 +33,10 @@ def test_named_goals_are_reached_one_after_the_other(recorded: Callable[..., tup
     ran, (log,) = recorded(*PLANNING, "--goal", "home", "--goal", "rest", "--goal", "home")
     assert ran.code == 0, ran.err
     assert [line for line in ran.err.splitlines() if "goal" in line] == [
-        "I goal home reached", "I goal rest reached", "I goal home reached",
-    ]  # fmt: skip
+        "I goal home reached",
+        "I goal rest reached",
+        "I goal home reached",
+    ]
     assert log.positions[-1] == pytest.approx(np.zeros(6), abs=REACHED)
     lift = log.joint("shoulder_lift")
     middle = len(lift) // 4 + int(np.argmin(lift[len(lift) // 4 :]))

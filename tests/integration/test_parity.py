@@ -158,8 +158,10 @@ def same(one: NDArray[Any], other: NDArray[Any]) -> bool:
 
 def assert_equal(seen: Frame, converted: Frame) -> None:
     assert (seen.stamp_ns, seen.missing, list(seen.values)) == (
-        converted.stamp_ns, converted.missing, list(converted.values),
-    )  # fmt: skip
+        converted.stamp_ns,
+        converted.missing,
+        list(converted.values),
+    )
     for key, value in seen.values.items():
         assert same(value, converted.values[key]), f"{key} at {seen.stamp_ns}"
 
@@ -255,9 +257,10 @@ def test_a_whole_run_in_simulation(site: Any, tmp_path: Path, rendering: None) -
     registry = installed_plugins()
     robot = find_config("so101", registry)
     overrides = (
-        "models={keeper: {type: keeper}}", "control_modes.model_inference.inference.model=keeper",
+        "models={keeper: {type: keeper}}",
+        "control_modes.model_inference.inference.model=keeper",
         f"recording={{type: mcap, root: {tmp_path}}}",
-    )  # fmt: skip
+    )
     config = load_config(robot, overrides=overrides, mode="model_inference", sim=True)
     runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, duration_s=1.5)))
     runtime.start()

@@ -224,11 +224,13 @@ class TestFullDisk:
 
     def test_trim_and_export_leave_nothing(self, run: Run, bags: Path, tmp_path: Path):
         episode = bags / "episodes/episode_000001"
-        for number, arguments in enumerate((
-            ("trim", episode, "--to", "0.4", "-o", tmp_path / "part"),
-            ("export", episode, "/joint_states", "-o", tmp_path / "joints.csv"),
-            ("export", episode, "/top", "-o", tmp_path / "top"),
-        )):  # fmt: skip
+        for number, arguments in enumerate(
+            (
+                ("trim", episode, "--to", "0.4", "-o", tmp_path / "part"),
+                ("export", episode, "/joint_states", "-o", tmp_path / "joints.csv"),
+                ("export", episode, "/top", "-o", tmp_path / "top"),
+            )
+        ):
             done = run("episodes", *arguments, largest=100 if number else 50_000)
             assert done.code == 1
             assert f"cannot be written: {TOO_LARGE}" in done.err

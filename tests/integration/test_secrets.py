@@ -26,9 +26,12 @@ class Lab:
         self.yaml = folder / "lab.yaml"
         document = yaml.safe_load((ROOT / "configs/so101_blind.yaml").read_text(encoding="utf-8"))
         document["transport"] = {
-            "type": "zenoh", "connect": ["tcp/127.0.0.1:9"], "user": "robot1", "password": "${IBROBOT_PASSWORD}",
+            "type": "zenoh",
+            "connect": ["tcp/127.0.0.1:9"],
+            "user": "robot1",
+            "password": "${IBROBOT_PASSWORD}",
             "share": {"publish": ["/joint_states"]},
-        }  # fmt: skip
+        }
         self.yaml.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
         self.camera = folder / "camera.yaml"
         document["hardware"] = {"type": "jointlog_none"}

@@ -65,12 +65,15 @@ def test_a_leader_moves_the_arm_and_a_gamepad_its_gripper(tmp_path: Path) -> Non
     [
         ("so101_leader, port: /dev/a, calibration: none", "{}", SPACE),
         ("imu, port: /dev/a, model: bno08x", "{}", SPACE),
-        ("imu, port: /dev/a, model: bno08x, deadman_key: o", "{estop: x}",
-         "'o' is both gripper_open (keys) and deadman (it)"),
+        (
+            "imu, port: /dev/a, model: bno08x, deadman_key: o",
+            "{estop: x}",
+            "'o' is both gripper_open (keys) and deadman (it)",
+        ),
         ("imu, port: /dev/a, model: bno08x, deadman: cts", "{}", ""),
         ("imu, port: /dev/a, model: bno08x, deadman_key: z", "{}", ""),
     ],
-)  # fmt: skip
+)
 def test_a_key_with_two_meanings_is_refused(device: str, keys: str, twice: str) -> None:
     devices = f"{{it: {{type: {device}}}, keys: {{type: keyboard, cartesian: false, keys: {keys}}}}}"
     overrides = [f"teleoperation={devices}", GROUPS.format("it", "keys")]

@@ -34,10 +34,13 @@ def test_moving_a_leader_without_a_deadman_takes_the_robot(tmp_path: Path, monke
     (tmp_path / "wander.py").write_text(takeovers.WANDER)
     leader, rng = takeovers.WithLeader(tmp_path), random.Random(0)
     overrides = [
-        "models={wander: {type: wander}}", "control_modes.model_inference.inference={model: wander, intervene: it}",
-        "control_modes.teleop.teleop=it", f"teleoperation={{it: {leader.device[:-1]}, deadman: none}}}}",
-        "episodes={takeover: deadman}", "contract.max_duration_s=100",
-    ]  # fmt: skip
+        "models={wander: {type: wander}}",
+        "control_modes.model_inference.inference={model: wander, intervene: it}",
+        "control_modes.teleop.teleop=it",
+        f"teleoperation={{it: {leader.device[:-1]}, deadman: none}}}}",
+        "episodes={takeover: deadman}",
+        "contract.max_duration_s=100",
+    ]
     with made_up_site(tmp_path / "site", tmp_path, monkeypatch) as site:
         site.add("wander", "wander.py")
         config = load_config(takeovers.CONFIG, overrides=overrides, sim=True)

@@ -22,9 +22,11 @@ if TYPE_CHECKING:
     from ibrobot_testing.site import Site
 
 NEEDS = {
-    "test_distributed.py": "ibrobot_serve", "test_episode_service.py": "ibrobot_data",
-    "test_recording.py": "ibrobot_data", "test_sharing.py": "ibrobot_zenoh",
-}  # fmt: skip
+    "test_distributed.py": "ibrobot_serve",
+    "test_episode_service.py": "ibrobot_data",
+    "test_recording.py": "ibrobot_data",
+    "test_sharing.py": "ibrobot_zenoh",
+}
 collect_ignore = [name for name, package in NEEDS.items() if find_spec(package) is None]
 
 ROBOT = textwrap.dedent("""\

@@ -20,9 +20,7 @@ class Probe(Worker):
     def __init__(self, *, lockstep: bool = False, ready_after: int = 0, ready_timeout_s: float = PATIENCE_S) -> None:
         self.failures: list[tuple[str, Exception]] = []
         self.failed = threading.Event()
-        super().__init__(
-            "probe", "a probe", on_failure=self._fail, lockstep=lockstep, ready_timeout_s=ready_timeout_s
-        )  # fmt: skip
+        super().__init__("probe", "a probe", on_failure=self._fail, lockstep=lockstep, ready_timeout_s=ready_timeout_s)
         self.calls: list[str] = []
         self.ready_after = ready_after
         self.timeouts: list[float] = []

@@ -71,9 +71,10 @@ def test_a_launch_moves_nothing(run: Runtime, runs: Runs) -> None:
 
 
 @pytest.mark.parametrize(
-    "begin", [reset_after_a_stop, reset_alone, come_back_to_the_mode, connect_the_device_again],
+    "begin",
+    [reset_after_a_stop, reset_alone, come_back_to_the_mode, connect_the_device_again],
     ids=lambda f: f.__name__,
-)  # fmt: skip
+)
 def test_a_deadman_pressed_before_does_not_count_after(run: Runtime, runs: Runs, begin) -> None:
     runs.parts.MADE["lever"].deadman = True
     assert moves(run)

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 
 TWO = (
     "control_modes.teleop.teleop={arm: left, gripper: right}",
-    "teleoperation.left={type: lever}", "teleoperation.right={type: lever}",
-)  # fmt: skip
+    "teleoperation.left={type: lever}",
+    "teleoperation.right={type: lever}",
+)
 
 
 @pytest.fixture

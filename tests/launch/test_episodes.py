@@ -40,10 +40,8 @@ def test_episodes_count_up_their_seeds_and_are_announced_to_plugins(runs: Runs):
     summary = runtime.summary()
     assert (summary["episodes"], summary["successes"]) == (3, 3)
     assert [
-        event
-        for number in (1, 2, 3)
-        for event in (("started", number, "policy"), ("ended", number, "success"))
-    ] == runs.parts.EVENTS  # fmt: skip
+        event for number in (1, 2, 3) for event in (("started", number, "policy"), ("ended", number, "success"))
+    ] == runs.parts.EVENTS
     assert runs.parts.MADE["net"].seeds == (5, 6, 7)
 
 
@@ -72,8 +70,9 @@ def test_the_next_episode_waits_for_the_reset_of_an_emergency_stop(runs: Runs):
     assert runtime.session.state is not None
     assert runtime.session.state.estop
     assert [event for event in runs.parts.EVENTS if event[0] != "fault"] == [
-        ("started", 1, "policy"), ("ended", 1, "failure"),
-    ]  # fmt: skip
+        ("started", 1, "policy"),
+        ("ended", 1, "failure"),
+    ]
     runtime.session.bus.call(RESET, None)
     seconds(runtime, 0.5)
     assert len(runs.parts.EVENTS) == 3, "nor does the reset alone begin it"
@@ -102,9 +101,12 @@ def test_a_mode_switch_begins_an_episode(runs: Runs):
     runtime.switch_mode("teleop")
     runtime.stop()
     assert runs.parts.EVENTS == [
-        ("started", 1, "policy"), ("ended", 1, "unknown"), ("mode", "policy", "teleop"),
-        ("started", 2, "teleop"), ("ended", 2, "unknown"),
-    ]  # fmt: skip
+        ("started", 1, "policy"),
+        ("ended", 1, "unknown"),
+        ("mode", "policy", "teleop"),
+        ("started", 2, "teleop"),
+        ("ended", 2, "unknown"),
+    ]
 
 
 def test_an_observer_that_raises_stops_nothing(runs: Runs, site: Site, caplog: pytest.LogCaptureFixture):

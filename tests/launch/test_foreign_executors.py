@@ -20,9 +20,12 @@ def plugin(site: Site) -> None:
 @pytest.mark.parametrize("behavior", ["hold", "relax"])
 def test_setpoints_reach_a_streaming_executor_with_options_of_its_own(runs: Runs, behavior: str) -> None:
     runtime = runs.start(
-        "executors.arm_position.type=nearest", "executors.arm_position.stiffness=2.0",
-        f"contract.actions.0.safety_behavior={behavior}", mode="policy", episodes=1,
-    )  # fmt: skip
+        "executors.arm_position.type=nearest",
+        "executors.arm_position.stiffness=2.0",
+        f"contract.actions.0.safety_behavior={behavior}",
+        mode="policy",
+        episodes=1,
+    )
     before = runtime.session.measured().position[0]
     for _ in range(25):
         runtime.step()

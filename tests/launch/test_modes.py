@@ -42,8 +42,9 @@ def test_from_mode_to_mode_and_back(runs: Runs):
     assert position(runtime)[0] > pan + 0.1
     assert runtime.summary()["mode"] == "teleop"
     assert [event for event in runs.parts.EVENTS if event[0] == "mode"] == [
-        ("mode", "teleop", "plan"), ("mode", "plan", "teleop"),
-    ]  # fmt: skip
+        ("mode", "teleop", "plan"),
+        ("mode", "plan", "teleop"),
+    ]
 
 
 def test_new_parts_are_ready_before_ownership_changes_and_old_ones_go_after(

@@ -19,8 +19,11 @@ from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from numpy.typing import NDArray
 
 STATE, TOP, WRIST, SCENE = (
-    "observation.state", "observation.images.top", "observation.images.wrist", "observation.environment_state",
-)  # fmt: skip
+    "observation.state",
+    "observation.images.top",
+    "observation.images.wrist",
+    "observation.environment_state",
+)
 SIZE = len(ARM + GRIPPER)
 CHUNK = 8
 
@@ -154,13 +157,17 @@ def language_model(path: Path) -> Path:
     words.pre_tokenizer = Whitespace()
     special = ("image_token", "fake_image_token", "global_image_token", "end_of_utterance_token")
     tokenizer = PreTrainedTokenizerFast(
-        tokenizer_object=words, unk_token="<unk>", pad_token="<pad>",
+        tokenizer_object=words,
+        unk_token="<unk>",
+        pad_token="<pad>",
         extra_special_tokens=dict(zip(special, _WORDS[2:6], strict=True)),
-    )  # fmt: skip
+    )
     SmolVLMProcessor(
-        image_processor=SmolVLMImageProcessor(), tokenizer=tokenizer, video_processor=SmolVLMVideoProcessor(),
+        image_processor=SmolVLMImageProcessor(),
+        tokenizer=tokenizer,
+        video_processor=SmolVLMVideoProcessor(),
         image_seq_len=4,
-    ).save_pretrained(path)  # fmt: skip
+    ).save_pretrained(path)
     text = {
         "model_type": "llama", "hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 2, "head_dim": 8,
         "num_attention_heads": 4, "num_key_value_heads": 2, "vocab_size": len(_WORDS), "pad_token_id": 1,

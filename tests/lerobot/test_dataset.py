@@ -26,8 +26,11 @@ LOSSY = 0.15
 """Mean difference to what went into a codec, of values 0 to 1; another picture is about 0.37 away."""
 
 
-COMMANDERS = {1: [(0.0, "policy"), (0.4, "handover"), (0.5, "operator"), (1.0, "handover"), (1.2, "policy")],
-              2: [(0.0, "policy")], 3: [(0.0, "operator")]}  # fmt: skip
+COMMANDERS = {
+    1: [(0.0, "policy"), (0.4, "handover"), (0.5, "operator"), (1.0, "handover"), (1.2, "policy")],
+    2: [(0.0, "policy")],
+    3: [(0.0, "operator")],
+}
 OUTCOMES = {1: "success", 2: "failure", 3: "success"}
 
 

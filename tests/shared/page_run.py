@@ -23,9 +23,12 @@ IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()
 _START_S = 60.0
 _SMALL = ("fps=5", "width=160", "height=120")
 SO101 = (
-    "so101", "--sim", "--mode", "web",
+    "so101",
+    "--sim",
+    "--mode",
+    "web",
     *(part for camera in ("top", "wrist") for each in _SMALL for part in ("--set", f"peripherals.{camera}.{each}")),
-)  # fmt: skip
+)
 """A simulated arm whose two cameras take little of the processor."""
 _WEB = ("--web", "--set", "viewer.port=0", "--set", "viewer.browser=false")
 

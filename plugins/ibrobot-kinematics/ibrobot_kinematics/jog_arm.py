@@ -56,9 +56,11 @@ class JogArm:
             raise TeleopError(f"Cartesian jog: {error}; set {remedy} to do without it") from error
         arm = self.robot.indices(self.arm)
         self._servo = Servo(
-            model, self.robot.max_velocity[arm], self.robot.max_acceleration[arm],
+            model,
+            self.robot.max_velocity[arm],
+            self.robot.max_acceleration[arm],
             clearance=world_clearance(bus, self.arm),
-        )  # fmt: skip
+        )
 
     @property
     def tool_moves(self) -> bool:

@@ -27,8 +27,9 @@ class ServoOptions:
 
     def __attrs_post_init__(self) -> None:
         for low, high in (
-            ("lower_singularity_threshold", "hard_stop_singularity_threshold"), ("stop_distance", "slow_distance"),
-        ):  # fmt: skip
+            ("lower_singularity_threshold", "hard_stop_singularity_threshold"),
+            ("stop_distance", "slow_distance"),
+        ):
             below, above = attrs.asdict(self)[low], attrs.asdict(self)[high]
             if not below < above:
                 raise ValueError(f"{low} is {below:g}, must be below {high}, which is {above:g}")

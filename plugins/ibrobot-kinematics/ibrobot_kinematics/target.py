@@ -29,8 +29,10 @@ class Target:
 
     def __attrs_post_init__(self) -> None:
         for name, value, shape in (
-            ("position", self.position, (3,)), ("rotation", self.rotation, (3, 3)), ("axis", self.axis, (3,)),
-        ):  # fmt: skip
+            ("position", self.position, (3,)),
+            ("rotation", self.rotation, (3, 3)),
+            ("axis", self.axis, (3,)),
+        ):
             if value is not None and (np.shape(value) != shape or not np.isfinite(value).all()):
                 raise ValueError(f"{name} must be finite with shape {shape}, got {np.asarray(value).tolist()}")
         if self.rotation is not None:

@@ -35,8 +35,10 @@ _environment = threading.Lock()
 _MANUAL_EXPOSURE, _AUTO_EXPOSURE = 1, 3
 """V4L2_EXPOSURE_MANUAL, V4L2_EXPOSURE_APERTURE_PRIORITY."""
 _ROTATIONS: Mapping[int, int] = {
-    90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE,
-}  # fmt: skip
+    90: cv2.ROTATE_90_CLOCKWISE,
+    180: cv2.ROTATE_180,
+    270: cv2.ROTATE_90_COUNTERCLOCKWISE,
+}
 # OpenCV's log is silenced, because failures are raised as this package's errors.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 _SILENT = 0

@@ -9,9 +9,10 @@ import attrs
 from ibrobot_core.api import documented, option
 
 ENCODING = option(
-    "jpeg", choices=("jpeg", "raw"),
+    "jpeg",
+    choices=("jpeg", "raw"),
     help="of messages: jpeg publishes the camera's own JPEG, or else encodes once; depth is always raw",
-)  # fmt: skip
+)
 JPEG_QUALITY = option(90, ge=1, le=100, help="JPEG quality of images that the camera does not send as JPEG")
 
 

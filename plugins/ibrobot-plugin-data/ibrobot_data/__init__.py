@@ -74,7 +74,10 @@ def _records(config: RobotConfig) -> bool:
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """What records the episodes of a run with a section `recording`."""
     yield SectionDescriptor(
-        type="episodes", options=EpisodesOptions, make=_recording, without_section=_records,
+        type="episodes",
+        options=EpisodesOptions,
+        make=_recording,
+        without_section=_records,
         check_config=check_keys,
         summary="how an operator corrects a policy, and which parts of a run are kept",
-    )  # fmt: skip
+    )

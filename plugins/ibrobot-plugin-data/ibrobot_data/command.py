@@ -75,17 +75,23 @@ def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of the dataset's joints; by default radians.")
 @click.option("--calibration", metavar="NAME", help="Calibration for --norm-mode, instead of the recorded one.")
 @click.option(
-    "--missing", type=click.Choice(MISSING), default=_MISSING, show_default=True,
+    "--missing",
+    type=click.Choice(MISSING),
+    default=_MISSING,
+    show_default=True,
     help="If an observation is missing: refuse the episode, skip the tick, or hold the last value.",
-)  # fmt: skip
+)
 @click.option(
     "--outcome", "outcomes", multiple=True, type=click.Choice(OUTCOMES), help="Only this outcome; repeatable."
 )
 @click.option("--prompt", default="", metavar="TEXT", help="Task of episodes recorded without one.")
 @click.option(
-    "--only", type=click.Choice(ONLY), default="all", show_default=True,
+    "--only",
+    type=click.Choice(ONLY),
+    default="all",
+    show_default=True,
     help="Keep only the rows that the operator or the policy commanded; each stretch becomes an episode.",
-)  # fmt: skip
+)
 @click.option(
     "--context", type=click.FloatRange(min=0), default=_CONTEXT, show_default=True, metavar="S",
     help="Seconds to keep before and after an intervention, for --only interventions.",
@@ -343,9 +349,11 @@ def _print_report(report: Report) -> None:
         times, ticks = plural(len(cuts), "time"), plural(max(cuts), "tick")
         echo(f"left out where something was missing: {len(cuts)} {times}, at most {max(cuts)} {ticks} in a row")
     for what, of_each in (
-        ("missing for a time", [each.gaps for each in done]), ("stamps that jumped", [each.resets for each in done]),
-        ("lost in recording", [each.lost for each in done]), ("missing since", [each.missing for each in done]),
-    ):  # fmt: skip
+        ("missing for a time", [each.gaps for each in done]),
+        ("stamps that jumped", [each.resets for each in done]),
+        ("lost in recording", [each.lost for each in done]),
+        ("missing since", [each.missing for each in done]),
+    ):
         if counts := sum(map(Counter, of_each), Counter[str]()):
             echo(f"{what}: {', '.join(f'{name} {count}' for name, count in counts.most_common())}")
     if summary["without_prompt"]:

@@ -82,8 +82,10 @@ class Corrections(SourceWorker):
         if self._keys is None and self._options.takeover == "button" and not self._has_button():
             session.log.warning(
                 "without a terminal and a button of %s, only the service %s takes the robot from the policy; "
-                "`episodes: {takeover: deadman}` lets the deadman take it, too", self._devices, INTERVENE,
-            )  # fmt: skip
+                "`episodes: {takeover: deadman}` lets the deadman take it, too",
+                self._devices,
+                INTERVENE,
+            )
         self._publish()
 
     @override

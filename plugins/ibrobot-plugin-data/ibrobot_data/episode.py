@@ -190,11 +190,14 @@ def unexpected(error: Exception) -> str:
 
 def _described(report: EpisodeReport, summary: EpisodeSummary, request: ConversionRequest) -> EpisodeReport:
     return attrs.evolve(
-        report, finished=summary.finished, outcome=summary.outcome,
-        prompt=summary.metadata.get("prompt") or request.prompt, start_ns=summary.start_ns,
+        report,
+        finished=summary.finished,
+        outcome=summary.outcome,
+        prompt=summary.metadata.get("prompt") or request.prompt,
+        start_ns=summary.start_ns,
         lost={topic: each.dropped for topic, each in summary.topics.items() if each.dropped},
         missing={topic: each.missing for topic, each in summary.topics.items() if each.missing},
-    )  # fmt: skip
+    )
 
 
 def _write(

@@ -114,10 +114,12 @@ def read_playback(reader: EpisodeReader, contract: Contract) -> Playback:
         raise RecorderError(f"{summary.path}: its commands do not overlap in time, or are not all finite")
     commands = Track(base - base[0], np.concatenate([track.at(base) for track in tracks], axis=1))
     return Playback(
-        contract.action_joints, commands,
+        contract.action_joints,
+        commands,
         _track(found[states], first_ns + round(base[0] * NS_PER_S)) if states in found else None,
-        summary.outcome, _seed(summary.metadata),
-    )  # fmt: skip
+        summary.outcome,
+        _seed(summary.metadata),
+    )
 
 
 def _positions(message: JointState, joints: tuple[str, ...]) -> Vector:

@@ -79,9 +79,12 @@ def replay(
         options["lockstep"], playback.seed or 0, source=lambda session, mode: ReplaySource(session, mode, run)
     )
     run_robot(
-        _without_sensors(robot), request,
-        headless=options["headless"], dry_run=options["dry_run"], as_json=options["as_json"],
-    )  # fmt: skip
+        _without_sensors(robot),
+        request,
+        headless=options["headless"],
+        dry_run=options["dry_run"],
+        as_json=options["as_json"],
+    )
 
 
 def _without_sensors(robot: RobotConfig) -> RobotConfig:
@@ -130,9 +133,11 @@ def _check(contract: Contract, summary: EpisodeSummary, name: str, *, force: boo
     actions = [[(part.topic, part.type, part.joints) for part in each.action_parts] for each in (recorded, contract)]
     if force and actions[0] == actions[1]:
         return
-    remark = "its actions differ, which --force-contract does not change" if force else (
-        "CONFIG must be of the same robot; --force-contract replays where only observations differ"
-    )  # fmt: skip
+    remark = (
+        "its actions differ, which --force-contract does not change"
+        if force
+        else ("CONFIG must be of the same robot; --force-contract replays where only observations differ")
+    )
     raise ContractError(
         f"{summary.path}: was recorded with another contract than that of {name}; {remark}:\n"
         f"{contract.difference(recorded, names=(name, 'recorded'))}"

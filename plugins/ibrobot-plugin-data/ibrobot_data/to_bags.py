@@ -157,9 +157,12 @@ class _Job:
         progress: Callable[[int], None],
     ) -> int:  # fmt: skip
         metadata = {
-            "ibrobot_version": ibrobot_core.__version__, **summary.metadata, "prompt": prompt,
-            "source": self._source(summary), _DIGEST: reader.digest(),
-        }  # fmt: skip
+            "ibrobot_version": ibrobot_core.__version__,
+            **summary.metadata,
+            "prompt": prompt,
+            "source": self._source(summary),
+            _DIGEST: reader.digest(),
+        }
         self._making.parent.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(self._making, ignore_errors=True)
         recorder = _make_recorder(self._request)

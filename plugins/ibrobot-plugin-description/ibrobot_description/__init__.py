@@ -32,6 +32,9 @@ def _check(config: RobotConfig) -> Iterable[OptionFault]:
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """The section `description`, the counterpart of robot_state_publisher."""
     yield SectionDescriptor(
-        type="description", make=_publisher, without_section=_has_frames, check_config=_check,
+        type="description",
+        make=_publisher,
+        without_section=_has_frames,
+        check_config=_check,
         summary="/tf, /tf_static and /robot_description from the URDF and the mounts of sensors; has no keys",
-    )  # fmt: skip
+    )

@@ -202,8 +202,10 @@ def test_mounts_are_static_transforms_of_the_robot(load: Callable[..., RobotConf
     component.stop()
     frames = latched(session)["/tf_static"].transforms
     assert [(each.header.frame_id, each.child_frame_id) for each in frames] == [
-        ("shoulder", "tool"), ("tool", "wrist_frame"), ("wrist_frame", "wrist_optical_frame"),
-    ]  # fmt: skip
+        ("shoulder", "tool"),
+        ("tool", "wrist_frame"),
+        ("wrist_frame", "wrist_optical_frame"),
+    ]
 
 
 def test_mount_may_carry_a_mount(load: Callable[..., RobotConfig]) -> None:

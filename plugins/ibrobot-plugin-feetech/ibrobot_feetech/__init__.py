@@ -83,16 +83,20 @@ def ibrobot_guides() -> Iterable[GuideDescriptor]:
     yield _guide("ports", "Serial ports", "List the USB serial ports, and which are adapters of an SO-101.", "list_all")
     yield _guide("port", "Find an arm's port", "Unplug the arm and plug it in again to find its port.", "find")
     yield _guide(
-        "motors", "Set up motors", "Give each servo its id and 1 Mbaud, with one servo connected at a time.",
-        "set_up", "setup_questions",
-    )  # fmt: skip
+        "motors",
+        "Set up motors",
+        "Give each servo its id and 1 Mbaud, with one servo connected at a time.",
+        "set_up",
+        "setup_questions",
+    )
     yield _guide(
-        "calibration", "Calibrate an arm", "Measure the middle pose and the range of each joint, moved by hand.",
-        "calibrate", "calibration_questions",
-    )  # fmt: skip
-    yield _guide(
-        "servos", "Check an arm", "Compare the servos with their calibration.", "check", "check_questions"
-    )  # fmt: skip
+        "calibration",
+        "Calibrate an arm",
+        "Measure the middle pose and the range of each joint, moved by hand.",
+        "calibrate",
+        "calibration_questions",
+    )
+    yield _guide("servos", "Check an arm", "Compare the servos with their calibration.", "check", "check_questions")
 
 
 @hookimpl
@@ -109,9 +113,12 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Signals of the simulation that moves an emulated arm."""
     yield SensorDescriptor(
-        type="feetech_emulator", kind="simulation", options=EmulatedSignalOptions, make=_signal,
+        type="feetech_emulator",
+        kind="simulation",
+        options=EmulatedSignalOptions,
+        make=_signal,
         summary="a signal of the simulation that moves an emulated arm",
-    )  # fmt: skip
+    )
 
 
 @hookimpl

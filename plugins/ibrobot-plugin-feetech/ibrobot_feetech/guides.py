@@ -64,9 +64,10 @@ def calibrate(answers: Answered, guide: Guide) -> None:
 def check_questions() -> Sequence[Question]:
     """Port and calibration."""
     return (
-        port_question(), Question("name", "Name of the calibration", _FOLLOWER, (_FOLLOWER, _LEADER), open=True),
+        port_question(),
+        Question("name", "Name of the calibration", _FOLLOWER, (_FOLLOWER, _LEADER), open=True),
         Question("write", "Write the file's values to servos that differ", False),
-    )  # fmt: skip
+    )
 
 
 def check(answers: Answered, guide: Guide) -> None:

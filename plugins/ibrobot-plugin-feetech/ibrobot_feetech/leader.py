@@ -279,9 +279,12 @@ class LeaderTeleop(Teleop):
         low, high = self._range
         angles = self._arm.positions(np.where(self._mirrored, -1.0, 1.0) * positions).astype(np.float64)
         opened = lerobot_to_ticks(
-            (positions - self._lower) / (self._upper - self._lower) * 100, "range_0_100",
-            range_min=low, range_max=high, inverted=self._turned != self._mirrored,
-        )  # fmt: skip
+            (positions - self._lower) / (self._upper - self._lower) * 100,
+            "range_0_100",
+            range_min=low,
+            range_max=high,
+            inverted=self._turned != self._mirrored,
+        )
         pose: Vector = np.clip(np.where(self._scaled, opened, angles), low, high)
         return pose
 

@@ -44,12 +44,15 @@ def usb_ports() -> list[UsbPort]:
     links = {str(link.resolve()): str(link) for link in _BY_ID.iterdir()} if _BY_ID.is_dir() else {}
     return [
         UsbPort(
-            port.device, port.description, f"{port.vid:04x}:{port.pid:04x}", port.serial_number or "",
+            port.device,
+            port.description,
+            f"{port.vid:04x}:{port.pid:04x}",
+            port.serial_number or "",
             links.get(port.device, ""),
         )
         for port in sorted(list_ports.comports())
         if port.vid is not None
-    ]  # fmt: skip
+    ]
 
 
 def usb_port(path: str) -> UsbPort | None:

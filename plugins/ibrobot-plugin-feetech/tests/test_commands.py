@@ -335,9 +335,10 @@ def test_drift_is_reported_and_written_back(emulator, calibration_file):
 def test_a_new_servo_is_found_at_any_rate_and_gets_its_id(rate_code):
     servo = EmulatedServo(1)
     servo.set("baud_rate", rate_code)
-    with Emulator({1: servo}) as emulator, Terminal(
-        "feetech", "setup-motors", emulator.port, "--joint", "gripper"
-    ) as terminal:  # fmt: skip
+    with (
+        Emulator({1: servo}) as emulator,
+        Terminal("feetech", "setup-motors", emulator.port, "--joint", "gripper") as terminal,
+    ):
         terminal.wait_for("Connect only the servo of gripper (id 6), and power. Then press Enter")
         terminal.type("\r")
         terminal.wait_for("is id 6 at 1000000 baud")

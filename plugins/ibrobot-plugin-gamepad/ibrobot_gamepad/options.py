@@ -81,9 +81,10 @@ def _tool(layout: Layout) -> Any:
             _refuse(axis, layout.check_axis(control))
 
     return option(
-        factory=dict, help=f"{', '.join(TOOL_AXES)} -> axis (`-` reverses it, `none`), where not the default",
+        factory=dict,
+        help=f"{', '.join(TOOL_AXES)} -> axis (`-` reverses it, `none`), where not the default",
         validator=check,
-    )  # fmt: skip
+    )
 
 
 def _buttons(layout: Layout) -> Any:
@@ -97,9 +98,10 @@ def _buttons(layout: Layout) -> Any:
             raise ValueError("deadman: must have a button: the robot moves only while it is held")
 
     return option(
-        factory=dict, help=f"function -> button or `none`, where not the default; functions: {', '.join(FUNCTIONS)}",
+        factory=dict,
+        help=f"function -> button or `none`, where not the default; functions: {', '.join(FUNCTIONS)}",
         validator=check,
-    )  # fmt: skip
+    )
 
 
 def _poses(layout: Layout) -> Any:
@@ -141,9 +143,10 @@ class GamepadOptions(JogOptions):
 
     start: str = option("joints", choices=("joints", "tool"), help="what the sticks move initially")
     via: str = option(
-        "auto", choices=("auto", "hid", "sdl"),
+        "auto",
+        choices=("auto", "hid", "sdl"),
         help="how to read the pad: its own reports (hid), SDL's mapping database (sdl), or the first that knows it",
-    )  # fmt: skip
+    )
     joints: Mapping[str, str] = _joints(PAD)
     tool: Mapping[str, str] = _tool(PAD)
     buttons: Mapping[str, str] = _buttons(PAD)

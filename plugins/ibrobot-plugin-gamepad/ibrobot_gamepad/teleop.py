@@ -87,9 +87,7 @@ class JogTeleop(Teleop):
         self._finder = Finder(self._kind, self._via)
         self._look(self._finder)
         if self._device is None:
-            self._ctx.log.warning(
-                "%s: no %s is plugged in; the robot holds until one is", self._ctx.name, self._kind
-            )  # fmt: skip
+            self._ctx.log.warning("%s: no %s is plugged in; the robot holds until one is", self._ctx.name, self._kind)
 
     @override
     def activate(self, measured: JointReading) -> None:

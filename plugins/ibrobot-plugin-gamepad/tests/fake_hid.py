@@ -130,9 +130,12 @@ def _sony(buttons: Iterable[str], hat: tuple[int, int]) -> list[int]:
 
 
 def dualsense(
-    *buttons: str, left: tuple[float, float] = (0, 0), right: tuple[float, float] = (0, 0),
-    triggers: tuple[float, float] = (0, 0), hat: tuple[int, int] = (0, 0),
-) -> bytes:  # fmt: skip
+    *buttons: str,
+    left: tuple[float, float] = (0, 0),
+    right: tuple[float, float] = (0, 0),
+    triggers: tuple[float, float] = (0, 0),
+    hat: tuple[int, int] = (0, 0),
+) -> bytes:
     """A DualSense's USB report 0x01."""
     sticks = [stick_byte(left[0]), stick_byte(-left[1]), stick_byte(right[0]), stick_byte(-right[1])]
     part = [*sticks, *(round(255 * each) for each in triggers), 7, *_sony(buttons, hat)]

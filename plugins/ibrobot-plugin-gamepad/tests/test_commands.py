@@ -69,8 +69,10 @@ def test_test_shows_what_changes(hidapi: FakeHidapi):
     hidapi.plug(Replaying(*DUALSENSE, reports=deque(reports)))
     assert run("test", "--seconds", "0.2").splitlines() == [
         "Pad (054c:0ce6, DualSense): move its axes, press its buttons",
-        "at rest", "left_x +1.00  south", "dpad_y -1.00",
-    ]  # fmt: skip
+        "at rest",
+        "left_x +1.00  south",
+        "dpad_y -1.00",
+    ]
 
 
 def test_test_of_a_device_that_is_not_there(hidapi: FakeHidapi):

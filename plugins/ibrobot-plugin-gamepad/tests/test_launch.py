@@ -172,9 +172,11 @@ def test_unplugs_in_motion_hold_until_the_deadman_is_pressed_again(start: Start,
 def bimanual(hidapi: FakeHidapi) -> Iterator[tuple[Run, queue.SimpleQueue[str]]]:
     """Two simulated arms: a pad moves the left one, the keyboard the right one."""
     overrides = [
-        "peripherals=[]", "contract={}", "teleoperation.pad={type: gamepad, via: hid, gripper: left_gripper}",
+        "peripherals=[]",
+        "contract={}",
+        "teleoperation.pad={type: gamepad, via: hid, gripper: left_gripper}",
         "control_modes.both={executors: [left_position, right_position], teleop: {left: pad, right: keyboard_right}}",
-    ]  # fmt: skip
+    ]
     registry, typed = installed_plugins(), queue.SimpleQueue[str]()
     config = load_config(CONFIG.parent / "bi_so101.yaml", sim=True, mode="both", overrides=overrides, registry=registry)
     runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, keys=lambda: typed)))

@@ -159,7 +159,9 @@ def test_the_descriptor_has_the_events_with_a_button():
     pad, mouse = ibrobot_teleop()
     assert pad.events(GamepadOptions()) == ("start", "success", "failure", "discard", "intervention")
     assert pad.events(GamepadOptions(buttons={"start": "none", "discard": "none"})) == (
-        "success", "failure", "intervention",
-    )  # fmt: skip
+        "success",
+        "failure",
+        "intervention",
+    )
     assert mouse.events(SpaceMouseOptions()) == ()
     assert mouse.events(SpaceMouseOptions(buttons={"start": "button3"})) == ("start",)

@@ -173,9 +173,11 @@ def test_whatever_comes_is_a_state_within_bounds_or_nothing(model: Model, report
 
 
 @given(
-    st.sampled_from([-1.0, 0.0, 1.0]), st.floats(-1, 1), st.floats(0, 1),
+    st.sampled_from([-1.0, 0.0, 1.0]),
+    st.floats(-1, 1),
+    st.floats(0, 1),
     st.sets(st.sampled_from(["south", "east", "west", "north", "start", "guide", "right_stick"])),
-)  # fmt: skip
+)
 def test_a_dualsense_report_comes_back_as_it_was_made(x: float, y: float, pulled: float, buttons: set[str]):
     state = read(parse_dualsense, dualsense(*buttons, left=(x, y), triggers=(pulled, 0)))
     assert state.buttons == buttons

@@ -143,9 +143,12 @@ def rig(hidapi: FakeHidapi) -> Rig:
 
 
 STICKS = {
-    "shoulder_pan": {"left": (1, 0)}, "shoulder_lift": {"left": (0, 1)}, "elbow_flex": {"right": (0, 1)},
-    "wrist_flex": {"hat": (0, 1)}, "wrist_roll": {"right": (1, 0)},
-}  # fmt: skip
+    "shoulder_pan": {"left": (1, 0)},
+    "shoulder_lift": {"left": (0, 1)},
+    "elbow_flex": {"right": (0, 1)},
+    "wrist_flex": {"hat": (0, 1)},
+    "wrist_roll": {"right": (1, 0)},
+}
 
 
 @pytest.mark.parametrize(("joint", "controls"), STICKS.items(), ids=STICKS)
@@ -278,9 +281,12 @@ def test_buttons_ask_for_episodes_and_takeover_once_a_press(rig: Rig, event: str
 
 def test_buttons_can_be_given_other_functions(hidapi: FakeHidapi):
     options = GamepadOptions(
-        cartesian=False, via="hid", joints={"shoulder_pan": "-right_y", "elbow_flex": "none"},
-        buttons={"deadman": "right_trigger", "gripper_close": "none", "estop": "guide"}, poses={"rest": "east"},
-    )  # fmt: skip
+        cartesian=False,
+        via="hid",
+        joints={"shoulder_pan": "-right_y", "elbow_flex": "none"},
+        buttons={"deadman": "right_trigger", "gripper_close": "none", "estop": "guide"},
+        poses={"rest": "east"},
+    )
     rig = Rig(hidapi, options)
     held = (0.0, 1.0)
     rig.tick(dualsense(triggers=held))
@@ -376,8 +382,9 @@ def test_the_named_pad_is_taken(hidapi: FakeHidapi):
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
-@given(st.lists(st.binary(max_size=80) | st.binary(min_size=63, max_size=63).map(lambda rest: b"\x01" + rest),
-                max_size=30))  # fmt: skip
+@given(
+    st.lists(st.binary(max_size=80) | st.binary(min_size=63, max_size=63).map(lambda rest: b"\x01" + rest), max_size=30)
+)
 def test_garbage_moves_nothing_and_raises_nothing(hidapi: FakeHidapi, reports: list[bytes]):
     """Reports of the right shape but random may press any button, so the deadman is one that they cannot reach."""
     hidapi.bus.clear()

@@ -43,10 +43,11 @@ class ImuOptions:
         None, unit="baud", gt=0, help="baud rate; None: that of a new device, 115200 or 9600 (witmotion)"
     )
     tool: Mapping[str, str] = option(
-        factory=dict, validator=_check_tool,
+        factory=dict,
+        validator=_check_tool,
         help="axis of the tool (x, y, z, roll, pitch, yaw) -> tilt that moves it (roll, pitch, yaw; `-` reverses it; "
         "none), where not the default",
-    )  # fmt: skip
+    )
     speed: float = option(0.1, unit="m/s", gt=0, help="speed of the tool at full tilt")
     turn_speed: float = option(0.8, unit="rad/s", gt=0, help="speed of turning the tool at full tilt")
     dead_zone: float = option(0.1, unit="rad", ge=0, help="tilt below which the tool rests")

@@ -86,9 +86,7 @@ NUMBERS = ",0,0,0,0,0,0\n"
 HEADER = header(JOINTS)
 BAD = {
     "no joint": ("time_s,\n", "1: the header begins with 'time_s', must be time_s,JOINT,…"),
-    "joint twice": (
-        HEADER.replace("elbow_flex", "gripper"), "1: joint 'gripper' has 2 columns, must have one"
-    ),
+    "joint twice": (HEADER.replace("elbow_flex", "gripper"), "1: joint 'gripper' has 2 columns, must have one"),
     "no rows": (HEADER, "1: has no row after the header"),
     "short row": (HEADER + "0" + NUMBERS + "1,0,0\n", "3: 3 values, must be 7 as in the header"),
     "blank row": (HEADER + "0" + NUMBERS + "\n" + "1" + NUMBERS, "3: 1 values, must be 7 as in the header"),
@@ -97,7 +95,7 @@ BAD = {
     "time not finite": (HEADER + "inf" + NUMBERS, "2: time_s is inf, must be finite"),
     "time stands": (HEADER + "1" + NUMBERS + "1" + NUMBERS, "3: time_s is 1.0, must be greater than 1.0"),
     "time runs back": (HEADER + "2" + NUMBERS + "1" + NUMBERS, "3: time_s is 1.0, must be greater than 2.0"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD.keys())

@@ -60,9 +60,11 @@ def ibrobot_readers() -> Iterable[ReaderDescriptor]:
 def ibrobot_policies() -> Iterable[PolicyDescriptor]:
     """The policy that runs LeRobot checkpoints."""
     yield PolicyDescriptor(
-        type="lerobot", options=LeRobotPolicyOptions, make=_policy,
+        type="lerobot",
+        options=LeRobotPolicyOptions,
+        make=_policy,
         summary="a LeRobot checkpoint: ACT, Diffusion, VQ-BeT, SmolVLA, pi0, …",
-    )  # fmt: skip
+    )
 
 
 def _datasets() -> click.Command:

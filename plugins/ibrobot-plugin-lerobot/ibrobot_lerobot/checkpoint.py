@@ -152,9 +152,7 @@ def read_checkpoint(path: Path, base_models: Collection[str] = ()) -> Checkpoint
     n_obs_steps = whole(file, "n_obs_steps", config.get("n_obs_steps", 1), MAX_HISTORY)
     note = _note_path(path)
     trained_on = read_json(note.parent, note.name) if note is not None else {}
-    return Checkpoint(
-        path, kind, config, inputs, action_size, chunk_size, n_obs_steps, processors, trained_on, note
-    )  # fmt: skip
+    return Checkpoint(path, kind, config, inputs, action_size, chunk_size, n_obs_steps, processors, trained_on, note)
 
 
 def rename_map(path: Path, step: Mapping[str, Any]) -> dict[str, str]:

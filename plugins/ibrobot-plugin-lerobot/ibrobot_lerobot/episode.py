@@ -94,9 +94,12 @@ class EpisodeWriter:
         """
         number = self._tasks.setdefault(task, len(self._tasks))
         row: dict[str, Any] = {
-            "timestamp": self.frames / self._form.fps, "frame_index": self.frames, "episode_index": 0,
-            "index": self.frames, "task_index": number,
-        }  # fmt: skip
+            "timestamp": self.frames / self._form.fps,
+            "frame_index": self.frames,
+            "episode_index": 0,
+            "index": self.frames,
+            "task_index": number,
+        }
         for key, track in self._tracks.items():
             track.add(values[key])
         for key, (encode, stats) in self._pictures.items():
@@ -184,9 +187,12 @@ def counter_stats(frames: int, fps: int, begin: int, episode: int, task_numbers:
     """Statistics of the columns that the writer generates."""
     index = np.arange(frames)
     found = {
-        "timestamp": index / fps, "frame_index": index, "episode_index": np.full(frames, episode),
-        "index": index + begin, "task_index": task_numbers,
-    }  # fmt: skip
+        "timestamp": index / fps,
+        "frame_index": index,
+        "episode_index": np.full(frames, episode),
+        "index": index + begin,
+        "task_index": task_numbers,
+    }
     return {key: vector_stats(values[:, None]) for key, values in found.items()}
 
 

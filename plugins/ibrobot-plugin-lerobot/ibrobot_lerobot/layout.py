@@ -150,8 +150,10 @@ def task_table(tasks: list[str]) -> pa.Table:
             {"name": "task_index", "field_name": "task_index", **number, "metadata": None},
             {"name": "task", "field_name": "task", **text, "metadata": None},
         ],
-        "attributes": {}, "creator": {"library": "pyarrow", "version": pa.__version__}, "pandas_version": "2.2.0",
-    }  # fmt: skip
+        "attributes": {},
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.2.0",
+    }
     schema = pa.schema({"task_index": pa.int64(), "task": pa.string()}, {"pandas": json.dumps(described)})
     return table_of([{"task_index": number, "task": task} for number, task in enumerate(tasks)], schema)
 

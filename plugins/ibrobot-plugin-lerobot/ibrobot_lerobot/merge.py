@@ -249,9 +249,11 @@ class _Merge:
 
     def _write_meta(self, metadata: Mapping[str, Any]) -> None:
         info = self._info | {
-            "total_episodes": self._episode, "total_frames": self._frame, "total_tasks": len(self._tasks),
+            "total_episodes": self._episode,
+            "total_frames": self._frame,
+            "total_tasks": len(self._tasks),
             "splits": {"train": f"0:{self._episode}"},
-        }  # fmt: skip
+        }
         pq.write_table(layout.task_table(list(self._tasks)), self._target / layout.TASKS)
         layout.write_json(self._target / layout.STATS, plain(self._stats()))
         if self._pictures:

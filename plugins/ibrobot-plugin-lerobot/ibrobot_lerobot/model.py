@@ -82,8 +82,10 @@ class PolicyModel:
         if self._autocast is not None and not np.isfinite(action).all():
             self._log.warning(
                 "%s: %s overflows %s for zero inputs; bfloat16 and float32 have a larger range",
-                self._checkpoint.path, self._checkpoint.type, self._autocast,
-            )  # fmt: skip
+                self._checkpoint.path,
+                self._checkpoint.type,
+                self._autocast,
+            )
 
     def predict(self, batch: Sequence[Tensors]) -> list[NDArray[np.float32]]:
         """Compute the chunks of requests whose tensors have equal names and shapes; each has shape (1, N, A).
@@ -108,7 +110,7 @@ class PolicyModel:
             self._log.info(
                 "%s draws random numbers that cannot be assigned to requests, so requests run one by one",
                 self._checkpoint.type,
-            )  # fmt: skip
+            )
             return self.predict(batch)
         if len(batch) == 1 and "prefix" not in batch[0]:
             self._draws = draws.made

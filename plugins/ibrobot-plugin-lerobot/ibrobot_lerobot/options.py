@@ -37,9 +37,10 @@ class LeRobotPolicyOptions:
     path: Path = option(help="folder of the checkpoint: config.json, processors and, for inference, model.safetensors")
     device: str = option("auto", choices=("auto", "cuda", "mps", "cpu"), help="auto: a GPU if available, else the CPU")
     dtype: str = option(
-        "auto", choices=("auto", "float32", "bfloat16", "float16"),
+        "auto",
+        choices=("auto", "float32", "bfloat16", "float16"),
         help="precision of the computation; auto: the checkpoint's",
-    )  # fmt: skip
+    )
     compile: bool = option(False, help="use torch.compile: slow to load, faster inference")
     threads: int | None = option(
         None, ge=1, help="CPU threads of torch; by default one fewer than the cores, at least 1"

@@ -41,9 +41,11 @@ class LeRobotSteps:
             config = PreTrainedConfig.from_pretrained(checkpoint.path)
             config.pretrained_path = checkpoint.path  # the file may have another path
             self._pre, self._post = make_pre_post_processors(
-                config, pretrained_path=str(checkpoint.path), preprocessor_overrides=overrides[PREPROCESSOR],
+                config,
+                pretrained_path=str(checkpoint.path),
+                preprocessor_overrides=overrides[PREPROCESSOR],
                 postprocessor_overrides=overrides[POSTPROCESSOR],
-            )  # fmt: skip
+            )
         except Exception as error:
             raise PolicyError(f"{checkpoint.path}: LeRobot cannot create its processors: {error}") from error
 

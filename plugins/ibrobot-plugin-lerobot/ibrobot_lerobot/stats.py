@@ -26,9 +26,12 @@ def vector_stats(values: NDArray[Any]) -> Stats:
     """Statistics of vectors, shape (N, D), N >= 1: each of shape (D,)."""
     values = values.astype(np.float64)
     stats = {
-        "min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0),
+        "min": values.min(0),
+        "max": values.max(0),
+        "mean": values.mean(0),
+        "std": values.std(0),
         "count": np.array([len(values)]),
-    }  # fmt: skip
+    }
     return stats | dict(zip(QUANTILES, np.quantile(values, list(QUANTILES.values()), axis=0), strict=True))
 
 
@@ -117,9 +120,12 @@ class DepthStats:
         """The counts as JSON values, for `join`."""
         (bins,) = self._histogram[0].nonzero()
         return {
-            "pictures": self._pictures, "moments": self._moments.tolist(), "range": self._range.tolist(),
-            "bins": bins.tolist(), "histogram": self._histogram[0, bins].tolist(),
-        }  # fmt: skip
+            "pictures": self._pictures,
+            "moments": self._moments.tolist(),
+            "range": self._range.tolist(),
+            "bins": bins.tolist(),
+            "histogram": self._histogram[0, bins].tolist(),
+        }
 
     def join(self, state: Mapping[str, Any]) -> None:
         """Add the counts of another object."""

@@ -61,10 +61,13 @@ def _encoder(codec: str, options: LeRobotOptions) -> Encoder:
     preset = options.preset or (_SVT_PRESET if codec == "libsvtav1" else "")
     settings = {"g": str(options.gop)} | ({"preset": preset} if preset else {})
     described: dict[str, Any] = {
-        "video.g": options.gop, "video.crf": options.crf,
+        "video.g": options.gop,
+        "video.crf": options.crf,
         "video.preset": int(preset) if preset.isdigit() else preset or None,
-        "video.fast_decode": 0, "video.video_backend": "pyav", "video.extra_options": {},
-    }  # fmt: skip
+        "video.fast_decode": 0,
+        "video.video_backend": "pyav",
+        "video.extra_options": {},
+    }
     if codec == "libsvtav1":
         settings |= {"crf": str(options.crf), "svtav1-params": f"fast-decode=0:lp={options.threads}"}
         return Encoder(codec, settings, described)

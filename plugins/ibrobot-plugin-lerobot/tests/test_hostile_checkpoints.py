@@ -17,9 +17,12 @@ from .hostile import ATTACKS, POST, PRE, pickled_weights
 from .test_checkpoint import frame, make, step, write
 
 TYPES: dict[str, dict[str, Any]] = {
-    "act": {}, "diffusion": {"horizon": 16, "n_obs_steps": 2}, "vqbet": {"action_chunk_size": 5},
-    "smolvla": {"vlm_model_name": "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"}, "pi0": {},
-}  # fmt: skip
+    "act": {},
+    "diffusion": {"horizon": 16, "n_obs_steps": 2},
+    "vqbet": {"action_chunk_size": 5},
+    "smolvla": {"vlm_model_name": "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"},
+    "pi0": {},
+}
 """Policies without steps that only LeRobot runs, so that the robot's side needs no torch."""
 
 

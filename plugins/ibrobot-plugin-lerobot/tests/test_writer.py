@@ -56,10 +56,11 @@ def test_videos_keep_step_with_their_rows(tmp_path: Path, options: dict[str, Any
 
 def test_pictures_in_tables_are_exact(tmp_path: Path) -> None:
     features = {
-        "observation.images.top": CAMERA, "observation.images.grey": Feature("image", (32, 64, 1)),
+        "observation.images.top": CAMERA,
+        "observation.images.grey": Feature("image", (32, 64, 1)),
         "observation.images.depth": Feature("uint16", (4, 6, 1)),
         "observation.images.far": Feature("float32", (5, 3, 1)),
-    }  # fmt: skip
+    }
     root = write(tmp_path / "set", features, (3,), videos=False)
     info = json.loads((root / "meta/info.json").read_text())["features"]
     assert {key: info[key]["dtype"] for key in features} == dict.fromkeys(features, "image")
@@ -103,8 +104,9 @@ def test_statistics_are_those_of_the_frames(tmp_path: Path) -> None:
 def test_tasks_are_numbered_as_they_come(tmp_path: Path) -> None:
     root = write(tmp_path / "set", {"observation.state": STATE}, (2, 2, 2))
     assert pq.read_table(root / "meta/tasks.parquet").to_pylist() == [
-        {"task_index": 0, "task": "task 0"}, {"task_index": 1, "task": "task 1"},
-    ]  # fmt: skip
+        {"task_index": 0, "task": "task 0"},
+        {"task_index": 1, "task": "task 1"},
+    ]
     assert [row["task_index"] for row in rows(root)] == [0, 0, 1, 1, 0, 0]
     described = json.loads(pq.read_schema(root / "meta/tasks.parquet").metadata[b"pandas"])
     assert described["index_columns"] == ["task"]

@@ -100,9 +100,12 @@ class BagFile:
         size = self.size
         with _whole_records(self._output):
             self._writer.add_message(
-                self._channels[item.topic], item.received_ns, cast(bytes, item.data), item.published_ns,
+                self._channels[item.topic],
+                item.received_ns,
+                cast(bytes, item.data),
+                item.published_ns,
                 self.counts[item.topic] + 1,
-            )  # fmt: skip
+            )
         self.counts[item.topic] += 1
         self.counted.add(item.received_ns)
         if self.size != size:

@@ -130,9 +130,12 @@ def information(
 
 def _topic(topic: Topic) -> dict[str, Any]:
     return {
-        "name": topic.name, "type": topic.type, "serialization_format": "cdr",
-        "offered_qos_profiles": offered_qos(topic.latched), "type_description_hash": topic.type_hash(),
-    }  # fmt: skip
+        "name": topic.name,
+        "type": topic.type,
+        "serialization_format": "cdr",
+        "offered_qos_profiles": offered_qos(topic.latched),
+        "type_description_hash": topic.type_hash(),
+    }
 
 
 def quoted(custom: Mapping[str, str]) -> dict[str, str]:

@@ -133,9 +133,7 @@ class McapSource(Source):
 
     def _raw(self, channel: Channel, entry: Entry) -> Raw:
         # Copy, because a view would keep the whole chunk in memory.
-        return Raw(
-            channel.topic, self.types[channel.topic], bytes(entry.data), entry.received_ns, entry.published_ns
-        )  # fmt: skip
+        return Raw(channel.topic, self.types[channel.topic], bytes(entry.data), entry.received_ns, entry.published_ns)
 
     @override
     def close(self) -> None:

@@ -233,8 +233,10 @@ def test_a_foreign_bag_is_trimmed_with_the_definitions_that_it_brings(tmp_path, 
     store.register(get_types_from_msg("bool data\nuint8 more\n", "std_msgs/msg/Bool"))
     kind = store.types
     with RosbagsWriter(tmp_path / "bag", version=9, storage_plugin=storage) as writer:
-        topics = {type_: writer.add_connection(f"/{type_[:4]}", type_, typestore=store) for type_ in (
-            "lamp_msgs/msg/Lamp", "std_msgs/msg/Bool")}  # fmt: skip
+        topics = {
+            type_: writer.add_connection(f"/{type_[:4]}", type_, typestore=store)
+            for type_ in ("lamp_msgs/msg/Lamp", "std_msgs/msg/Bool")
+        }
         for index in range(20):
             lamp = kind["lamp_msgs/msg/Lamp"](kind["builtin_interfaces/msg/Time"](index, 2), ["a"])
             both = (lamp, kind["std_msgs/msg/Bool"](True, index))

@@ -227,8 +227,9 @@ def test_foreign_bags_are_read(tmp_path, storage, compression):
             writer.write(foreign, stamp(index), store.serialize_cdr(lamp, "lamp_msgs/msg/Lamp"))
     kept = summary(tmp_path / "bag")
     assert {topic: (t.type, t.count) for topic, t in kept.topics.items()} == {
-        JOINTS: (JointState.ros_type, 20), "/lamp": ("lamp_msgs/msg/Lamp", 20),
-    }  # fmt: skip
+        JOINTS: (JointState.ros_type, 20),
+        "/lamp": ("lamp_msgs/msg/Lamp", 20),
+    }
     assert (kept.finished, kept.start_ns, kept.end_ns) == (True, stamp(0), stamp(19))
     assert (dict(kept.metadata), kept.outcome) == ({"place": "lab"}, "unknown")
     assert [r.message for r in read(tmp_path / "bag", {JOINTS})] == [joints(i) for i in range(20)]

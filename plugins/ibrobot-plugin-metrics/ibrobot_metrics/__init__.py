@@ -22,6 +22,8 @@ def _port(options: MetricsOptions, session: Session) -> Component:
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """What is on `/diagnostics`, for Prometheus."""
     yield SectionDescriptor(
-        type="metrics", options=MetricsOptions, make=_port,
+        type="metrics",
+        options=MetricsOptions,
+        make=_port,
         summary="counts in Prometheus' text format, over HTTP on this machine",
-    )  # fmt: skip
+    )

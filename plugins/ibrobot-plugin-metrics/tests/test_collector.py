@@ -19,9 +19,10 @@ HOSTILE = 'a"} 1\nibrobot_forged{x="\\'
 
 
 @given(
-    st.dictionaries(TEXTS, st.floats(), min_size=1, max_size=5), st.booleans(),
+    st.dictionaries(TEXTS, st.floats(), min_size=1, max_size=5),
+    st.booleans(),
     TEXTS.filter(lambda text: "\r" not in text),
-)  # fmt: skip
+)
 def test_parser_reads_back_any_label_and_any_number(values: dict[str, float], counter: bool, about: str) -> None:
     families = Families({})
     for label, value in values.items():

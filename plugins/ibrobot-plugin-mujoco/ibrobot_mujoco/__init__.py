@@ -93,9 +93,12 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
 def ibrobot_policies() -> Iterable[PolicyDescriptor]:
     """A scripted expert."""
     yield PolicyDescriptor(
-        type="scripted_pick", options=ScriptedPickOptions, make=_scripted_pick, check_options=check_pick,
+        type="scripted_pick",
+        options=ScriptedPickOptions,
+        make=_scripted_pick,
+        check_options=check_pick,
         summary="picks the cube and puts it into the bin, by inverse kinematics and the scene's ground truth",
-    )  # fmt: skip
+    )
 
 
 def _decoder() -> Callable[[CompressedImage], Image | None]:

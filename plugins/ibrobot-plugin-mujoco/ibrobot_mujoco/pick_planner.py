@@ -28,11 +28,13 @@ class Scene:
     def parse(cls, values: Vector) -> Scene:
         """Parse an observation, shape (SCENE_SIZE,)."""
         w, x, y, z = values[3:7] / np.linalg.norm(values[3:7])
-        axes = np.array([
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ])  # fmt: skip
+        axes = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
         return cls(values[:3], axes, values[7:])
 
 
@@ -96,8 +98,10 @@ def _heading(scene: Scene) -> float:
 
 def _down(heading: float) -> Vector:
     """Axes of a tip that points straight down and whose jaws close along `heading` [rad], shape (3, 3)."""
-    return np.array([
-        [np.cos(heading), np.sin(heading), 0.0],
-        [np.sin(heading), -np.cos(heading), 0.0],
-        [0.0, 0.0, -1.0],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [np.cos(heading), np.sin(heading), 0.0],
+            [np.sin(heading), -np.cos(heading), 0.0],
+            [0.0, 0.0, -1.0],
+        ]
+    )

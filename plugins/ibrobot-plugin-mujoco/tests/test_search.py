@@ -35,9 +35,12 @@ def test_full_poses_of_packaged_arms_are_reached(name: str):
     for q in anywhere(model, 40, 0):
         tip = model.forward(q)
         found = solve(
-            model, Target(tip.position, rotation=tip.rotation), middle(model),
-            position_tolerance=1e-5, rotation_tolerance=1e-4,
-        )  # fmt: skip
+            model,
+            Target(tip.position, rotation=tip.rotation),
+            middle(model),
+            position_tolerance=1e-5,
+            rotation_tolerance=1e-4,
+        )
         reached = model.forward(found)
         np.testing.assert_allclose(reached.position, tip.position, atol=1e-5)
         assert np.linalg.norm(log(reached.rotation.T @ tip.rotation)) < 1e-4

@@ -51,13 +51,19 @@ def _rrt_connect(options: Any, ctx: Context) -> Planner:
 def ibrobot_planners() -> Iterable[PlannerDescriptor]:
     """The planners `joint` and `rrt_connect`."""
     yield PlannerDescriptor(
-        type="joint", options=JointPlannerOptions, make=_joint, tool_goals=False,
+        type="joint",
+        options=JointPlannerOptions,
+        make=_joint,
+        tool_goals=False,
         summary="straight line in joint space, time-optimal within velocity, acceleration and jerk limits",
-    )  # fmt: skip
+    )
     yield PlannerDescriptor(
-        type="rrt_connect", options=RrtConnectOptions, make=_rrt_connect, check=find_engines,
+        type="rrt_connect",
+        options=RrtConnectOptions,
+        make=_rrt_connect,
+        check=find_engines,
         summary="around obstacles, to joint positions or poses of the tool, checked against padding after timing",
-    )  # fmt: skip
+    )
 
 
 def _source(session: Session, mode: ControlMode) -> SourceWorker:
@@ -88,13 +94,18 @@ def _gripper(options: Any, ctx: Context) -> Executor:
 def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
     """The executors `trajectory` and `gripper`."""
     yield ExecutorDescriptor(
-        type="trajectory", options=TrajectoryOptions, make=_trajectory,
+        type="trajectory",
+        options=TrajectoryOptions,
+        make=_trajectory,
         summary="follows joint trajectories, with path and goal tolerances",
-    )  # fmt: skip
+    )
     yield ExecutorDescriptor(
-        type="gripper", options=GripperOptions, make=_gripper, goals="position",
+        type="gripper",
+        options=GripperOptions,
+        make=_gripper,
+        goals="position",
         summary="opens or closes a gripper; a stall counts as grasped",
-    )  # fmt: skip
+    )
 
 
 def _world(options: WorldOptions, session: Session) -> Component:
@@ -134,7 +145,7 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
     )  # fmt: skip
     yield SectionDescriptor(
         type="tasks", make=_tasks, summary="services of a run that perform tasks, with a mode with a planner"
-    )  # fmt: skip
+    )
 
 
 def _description() -> click.Command:

@@ -42,9 +42,10 @@ def with_hulls(arm: Arm, unchecked: Collection[Pair]) -> Arm:
             link for q in free for link in {name for each in coarse.contacts(q) for name in (each.first, each.second)}
         )
         vain = [
-            (number, link) for link, number in touching.items()
+            (number, link)
+            for link, number in touching.items()
             if number > _VAIN_SHARE * len(free) and len(hulls[link]) < len(of_links[link])
-        ]  # fmt: skip
+        ]
         if not vain:
             return attrs.evolve(arm, hulls=few)
         # The link that touches most is at fault; the others may be good without it.

@@ -74,9 +74,12 @@ class Plan:
 @click.option("--from", "start", required=True, metavar="START", help="A pose, or joint=rad,… (others at 0).")
 @click.option("--goal", required=True, metavar="GOAL", help="A pose, joint=rad,…, or xyz=X,Y,Z with axis, rpy or quat.")
 @click.option(
-    "--speed", type=click.FloatRange(0, 1, min_open=True), default=1.0, show_default=True,
+    "--speed",
+    type=click.FloatRange(0, 1, min_open=True),
+    default=1.0,
+    show_default=True,
     help="Fraction of the velocity limits.",
-)  # fmt: skip
+)
 @click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Also draw the plan: .png, .svg or .pdf.")
 @run_options("config", "sim", "seed", "mode", "overrides", "as_json")
 def plan(start: str, goal: str, speed: float, plot: Path | None, config: str | None, **options: Any) -> None:
@@ -122,8 +125,11 @@ def _loaded(config: str | None, options: dict[str, Any]) -> tuple[RobotConfig, C
     registry = installed_plugins()
     loaded = load_config(
         find_config(config, registry),
-        overrides=options["overrides"], mode=options["mode"], sim=options["sim"], registry=registry,
-    )  # fmt: skip
+        overrides=options["overrides"],
+        mode=options["mode"],
+        sim=options["sim"],
+        registry=registry,
+    )
     planning = [name for name, mode in loaded.control_modes.items() if mode.planner is not None]
     name = loaded.default_control_mode
     if name not in planning:
@@ -192,9 +198,12 @@ def _planned(
     limits = robot.max_velocity[robot.indices(joints)]
     peaks = np.abs(found.velocities).max(axis=0)
     facts |= {
-        "success": True, "code": PlanCode.SUCCESS.name, "message": "",
+        "success": True,
+        "code": PlanCode.SUCCESS.name,
+        "message": "",
         "goal_joints": dict(zip(joints, found.positions[-1].tolist(), strict=True)),
-        "position_error_m": result.position_error, "orientation_error_rad": result.orientation_error,
+        "position_error_m": result.position_error,
+        "orientation_error_rad": result.orientation_error,
         "length_rad": float(np.linalg.norm(np.diff(found.positions, axis=0), axis=1).sum()),
         "tool_path_m": None if found.tool is None else float(np.linalg.norm(np.diff(found.tool, axis=0), axis=1).sum()),
         "duration_s": float(found.times[-1]),
@@ -204,7 +213,7 @@ def _planned(
             for name, peak, limit in zip(joints, peaks, limits, strict=True)
         },
         "planning_time_s": elapsed_s,
-    }  # fmt: skip
+    }
     return found
 
 
@@ -224,9 +233,10 @@ def _session(config: RobotConfig, seed: int) -> Iterator[Session]:
 def _sampled(trajectory: JointTrajectory, robot: Robot, start: Vector) -> Plan:
     points = trajectory.points
     fields = [
-        np.array([point.positions for point in points]), np.array([point.velocities for point in points]),
+        np.array([point.positions for point in points]),
+        np.array([point.velocities for point in points]),
         np.array([point.accelerations for point in points]),
-    ]  # fmt: skip
+    ]
     stamps = np.array([point.time_from_start_ns for point in points], dtype=np.int64)
     spline = Spline(stamps, *(each if each.size else None for each in fields))  # type: ignore[arg-type]
     times = np.append(np.arange(0.0, seconds(spline.end_ns), _STEP_S), seconds(spline.end_ns))

@@ -75,11 +75,13 @@ class Motion:
         h = np.diff(self.times)[at][:, None]
         u = (times - self.times[at])[:, None] / h
         c0, c1, c2, c3, c4, c5 = self._quintics[:, at]
-        return np.stack([
-            c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5)))),
-            (c1 + u * (2 * c2 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h,
-            (2 * c2 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / (h * h),
-        ])  # fmt: skip
+        return np.stack(
+            [
+                c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5)))),
+                (c1 + u * (2 * c2 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h,
+                (2 * c2 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / (h * h),
+            ]
+        )
 
     def positions_within(self, step: float) -> Vector:
         """Positions of the quintic at most `step` [s] apart, shape (M, J), all points among them."""

@@ -207,8 +207,11 @@ def test_world(robot: SimpleNamespace, tmp_path: Path):
     add.update_planning_scene()
     objects = add.planning_scene["objects"]
     assert {name: each["shape"] for name, each in objects.items()} == {
-        "table": "box", "ball": "sphere", "can": "cylinder", "part": "mesh",
-    }  # fmt: skip
+        "table": "box",
+        "ball": "sphere",
+        "can": "cylinder",
+        "part": "mesh",
+    }
     assert abs(objects["can"]["pose"]["orientation"]["x"]) == pytest.approx(1.0)
     add.add_collision_box("ball", (0.02, 0.02, 0.02), position=(0.25, 0.1, 0.1))
     add.move_collision("ball", (0.0, 0.0, 0.55), (0, 0, 0, 1))
@@ -264,7 +267,7 @@ WRONG: list[tuple[Callable[[MoveIt2], Any], type[Exception], str]] = [
     (lambda arm: arm.set_path_orientation_constraint(DOWN), NotSupported, "constraints are not supported"),
     (lambda arm: arm.reset_controller([0.0]), NotSupported, "joints do not jump"),
     (lambda arm: arm.set_workspace_parameters((0, 0, 0), (1, 1, 1)), NotSupported, "the workspace is bounded"),
-]  # fmt: skip
+]
 
 
 def test_wrong_calls(robot: SimpleNamespace):
@@ -422,10 +425,12 @@ def test_servo_of_a_robot_without_the_mode_is_not_enabled(caplog: pytest.LogCapt
 
 SERVO = {
     "__init__": "node frame_id namespace linear_speed angular_speed enable_at_init callback_group",
-    "__call__": "linear angular", "servo": "linear angular enable_if_disabled",
+    "__call__": "linear angular",
+    "servo": "linear angular enable_if_disabled",
     "servo_jog": "joint_names velocities enable_if_disabled",
-    "enable": "wait_for_server_timeout_sec sync", "disable": "wait_for_server_timeout_sec sync",
-}  # fmt: skip
+    "enable": "wait_for_server_timeout_sec sync",
+    "disable": "wait_for_server_timeout_sec sync",
+}
 """Method of pymoveit2's MoveIt2Servo (June 2026) -> its parameters."""
 
 

@@ -297,8 +297,9 @@ def test_cloud_with_the_name_of_an_object_is_refused(tmp_path: Path):
     both = options("objects: {a: {shape: plane}}\nclouds: {a: {topic: /p}}")
     (fault,) = descriptor.check_options(both, make_robot(tmp_path), ())
     assert (fault.option, fault.message) == (
-        ("clouds", "a"), "there is an object 'a' already; clouds need names of their own",
-    )  # fmt: skip
+        ("clouds", "a"),
+        "there is an object 'a' already; clouds need names of their own",
+    )
 
 
 def test_planes_hide_what_is_below_them():

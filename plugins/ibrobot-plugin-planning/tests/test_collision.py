@@ -118,12 +118,14 @@ OBJECTS = (
     '<geom name="o3" type="sphere" pos="0 -.2 .25" size=".06"/>'
     '<geom name="o4" type="capsule" pos="0 .22 .3" size=".02 .05"/>'
 )
-WORLD = World({
-    "o1": WorldObject(Box((0.1, 0.08, 0.06)), Pose(Vector3(0.2, 0, 0.2))),
-    "o2": WorldObject(Cylinder(0.03, 0.2), Pose(Vector3(-0.15, 0.1, 0.15))),
-    "o3": WorldObject(Sphere(0.06), Pose(Vector3(0, -0.2, 0.25))),
-    "o4": WorldObject(Capsule(0.02, 0.1), Pose(Vector3(0, 0.22, 0.3))),
-})  # fmt: skip
+WORLD = World(
+    {
+        "o1": WorldObject(Box((0.1, 0.08, 0.06)), Pose(Vector3(0.2, 0, 0.2))),
+        "o2": WorldObject(Cylinder(0.03, 0.2), Pose(Vector3(-0.15, 0.1, 0.15))),
+        "o3": WorldObject(Sphere(0.06), Pose(Vector3(0, -0.2, 0.25))),
+        "o4": WorldObject(Capsule(0.02, 0.1), Pose(Vector3(0, 0.22, 0.3))),
+    }
+)
 
 
 @pytest.mark.skipif(
@@ -183,18 +185,21 @@ def test_unknown_names_are_refused(arm):
         (lambda: Collisions(arm, World(), ARM, {"knee": 0.0}), "no joint 'knee'", PlanCode.INVALID_GROUP_NAME),
         (
             lambda: Collisions(arm, World({"a": WorldObject(Sphere(0.1), link="foot")}), ARM),
-            "no link 'foot'; the links are: world, base, turret", PlanCode.INVALID_LINK_NAME,
+            "no link 'foot'; the links are: world, base, turret",
+            PlanCode.INVALID_LINK_NAME,
         ),
         (
             lambda: Collisions(arm, World({"a": WorldObject(Sphere(0.1), may_touch={"table"})}), ARM),
-            "object 'a' may touch 'table', which is neither a link nor an object", PlanCode.INVALID_LINK_NAME,
+            "object 'a' may touch 'table', which is neither a link nor an object",
+            PlanCode.INVALID_LINK_NAME,
         ),
         (
             lambda: Collisions(arm, World({"hand": WorldObject(Sphere(0.1))}), ARM),
-            "an object has the name of link 'hand'", PlanCode.INVALID_OBJECT_NAME,
+            "an object has the name of link 'hand'",
+            PlanCode.INVALID_OBJECT_NAME,
         ),
         (lambda: arm.link_pose("foot", np.zeros(6)), "no link 'foot'", PlanCode.INVALID_LINK_NAME),
-    ):  # fmt: skip
+    ):
         with pytest.raises(PlanningError, match=message) as caught:
             make()
         assert caught.value.code is code
@@ -204,8 +209,10 @@ def test_models_that_cannot_be_used_are_refused(tmp_path):
     broken = tmp_path / "broken.xml"
     broken.write_text("<mujoco><worldbody><body></worldbody></mujoco>")
     bare = tmp_path / "bare.xml"
-    bare.write_text('<mujoco><worldbody><body><joint name="a" range="-1 1"/><inertial pos="0 0 0" mass="1" '
-                    'diaginertia="1 1 1"/></body></worldbody></mujoco>')  # fmt: skip
+    bare.write_text(
+        '<mujoco><worldbody><body><joint name="a" range="-1 1"/><inertial pos="0 0 0" mass="1" '
+        'diaginertia="1 1 1"/></body></worldbody></mujoco>'
+    )
     for path, joints, message in (
         (tmp_path / "none.xml", ("a",), "none.xml cannot be loaded"),
         (broken, ("a",), "broken.xml cannot be loaded"),

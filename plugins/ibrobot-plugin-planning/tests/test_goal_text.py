@@ -116,12 +116,14 @@ def test_text_that_makes_no_sense(robot, goal: str, message: str):
         (JointGoal(("pan", "pan"), np.zeros(2)), 1.0, "goal has 2 joints and 2 positions, each joint once"),
         (JointGoal(("tilt",), np.zeros(1)), 1.0, f"no joint 'tilt'; the joints are: {NAMES}"),
         (
-            JointGoal(("pan",), np.array([math.nan])), 1.0, "goal of joint pan is nan, must be an angle in radians",
+            JointGoal(("pan",), np.array([math.nan])),
+            1.0,
+            "goal of joint pan is nan, must be an angle in radians",
         ),
         ("up", 0.0, "velocity_scaling is 0.0, must be above 0 and at most 1"),
         ("up", math.nan, "velocity_scaling is nan, must be above 0 and at most 1"),
     ],
-)  # fmt: skip
+)
 def test_value_that_makes_no_sense(robot, goal, scaling: float, message: str):
     with pytest.raises(PlanningError) as failure:
         target(goal, robot, scaling)

@@ -192,9 +192,11 @@ def test_stop_slows_down_and_holds() -> None:
     assert jaw.setpoint == pytest.approx(before - 2.0**2 / (2 * 40), abs=0.012)
     assert jaw.velocity == 0
     assert [(s.goal_id, s.state) for s in jaw.statuses()] == [
-        ("close", GoalState.EXECUTING), ("close", GoalState.CANCELED),
-        ("stop", GoalState.EXECUTING), ("stop", GoalState.SUCCEEDED),
-    ]  # fmt: skip
+        ("close", GoalState.EXECUTING),
+        ("close", GoalState.CANCELED),
+        ("stop", GoalState.EXECUTING),
+        ("stop", GoalState.SUCCEEDED),
+    ]
 
 
 def test_deactivation_ends_the_goal() -> None:

@@ -161,9 +161,7 @@ def test_some_of_the_joints_can_be_planned_in_another_order():
 
 
 REFUSED = {
-    "above the limit": (
-        request([0, 0, 0], {"a": 2.5}), "goal of joint a is 2.5 rad, must be within -2.0 .. 2.0 rad"
-    ),
+    "above the limit": (request([0, 0, 0], {"a": 2.5}), "goal of joint a is 2.5 rad, must be within -2.0 .. 2.0 rad"),
     "not a number": (request([0, 0, 0], {"b": math.nan}), "goal of joint b is nan rad, must be within -1.0 .. 3.0 rad"),
     "infinite": (request([0, 0, 0], {"b": math.inf}), "goal of joint b is inf rad, must be within -1.0 .. 3.0 rad"),
     "no such joint": (request([0, 0, 0], {"elbow": 0.0}), "no joint 'elbow'; the joints are: a, b, c"),
@@ -171,11 +169,10 @@ REFUSED = {
         PlanRequest(("a",), np.zeros(1), JointGoal(("b",), np.zeros(1))),
         "goal names joint 'b', which is not planned: a",
     ),
-    "joint twice": (
-        PlanRequest(("a",), np.zeros(1), JointGoal(("a", "a"), np.zeros(2))), "goal names joint 'a' twice"
-    ),
+    "joint twice": (PlanRequest(("a",), np.zeros(1), JointGoal(("a", "a"), np.zeros(2))), "goal names joint 'a' twice"),
     "planned joint unknown": (
-        PlanRequest(("x",), np.zeros(1), JointGoal(("a",), np.zeros(1))), "no joint 'x'; the joints are: a, b, c"
+        PlanRequest(("x",), np.zeros(1), JointGoal(("a",), np.zeros(1))),
+        "no joint 'x'; the joints are: a, b, c",
     ),
     "positions missing": (
         PlanRequest(("a",), np.zeros(1), JointGoal(("a",), np.zeros(2))),
@@ -187,13 +184,14 @@ REFUSED = {
     ),
     "start not a number": (request([0, math.nan, 0], {"a": 1.0}), "start of joint b is nan, must be finite"),
     "speed above all": (
-        request([0, 0, 0], {"a": 1.0}, velocity_scaling=1.5), "velocity_scaling is 1.5, must be above 0 and at most 1"
+        request([0, 0, 0], {"a": 1.0}, velocity_scaling=1.5),
+        "velocity_scaling is 1.5, must be above 0 and at most 1",
     ),
     "no acceleration": (
         request([0, 0, 0], {"a": 1.0}, acceleration_scaling=0.0),
         "acceleration_scaling is 0.0, must be above 0 and at most 1",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("asked", "message"), REFUSED.values(), ids=REFUSED.keys())

@@ -250,7 +250,9 @@ def test_end_of_the_run_ends_a_service_that_waits(run):
     [
         (GO_TO, "xyz=1", PlanningError, "goal 'xyz=1': xyz takes 3 numbers, got 1"),
         (
-            GO_TO, "xyz=0.2,0,0.1 pan=1", PlanningError,
+            GO_TO,
+            "xyz=0.2,0,0.1 pan=1",
+            PlanningError,
             "goal 'xyz=0.2,0,0.1 pan=1': pan moves the tool, and cannot be given beside its position",
         ),
         (RESULT, 99, PlanningError, "no goal 99; /planning/go_to answers with the number of a goal"),
@@ -258,7 +260,7 @@ def test_end_of_the_run_ends_a_service_that_waits(run):
         (MOVE_TO_CONFIGURATION, "up", ConfigError, "the request: expected a mapping, got 'up'"),
         (MOVE_TO_POSE, MoveToPose(Pose()), NotSupported, "this service waits for the motion: "),
     ],
-)  # fmt: skip
+)
 def test_wrong_request_is_an_error(run, service: str, request_: object, error: type[Exception], expected: str):
     runtime = run()
     runtime.step()

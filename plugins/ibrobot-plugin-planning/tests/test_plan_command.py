@@ -42,8 +42,11 @@ def planned(yaml: Path, *arguments: str) -> dict[str, Any]:
 def test_joint_goal_around_an_obstacle(yaml: Path):
     found = planned(yaml, "--from", "left", "--goal", "right", "--set", WORLD)
     assert (found["kind"], found["planner"], found["success"], found["code"]) == (
-        "named pose", "rrt_connect", True, "SUCCESS",
-    )  # fmt: skip
+        "named pose",
+        "rrt_connect",
+        True,
+        "SUCCESS",
+    )
     assert found["goal_joints"]["pan"] == pytest.approx(-1.0)
     assert found["length_rad"] > 2.0
     assert found["duration_s"] > 0.5

@@ -200,9 +200,11 @@ def test_straight_lines_end_where_something_is_in_the_way(planner):
     begin = tip(planner, LEFT)[:3, 3]
     through = PositionGoal(Vector3(begin[0], -begin[1], begin[2]))
     refused(
-        planner, ask(LinearGoal((through,))), PlanCode.PLANNING_FAILED,
+        planner,
+        ask(LinearGoal((through,))),
+        PlanCode.PLANNING_FAILED,
         r"the tool can follow \d\d % of the straight path, 100 % asked: \w+ .* wall",
-    )  # fmt: skip
+    )
     result = planner.plan(ask(LinearGoal((through,), least_fraction=0.1)))
     assert 0.1 < result.fraction < 0.5
     assert end(planner, result)[1, 3] > 0.015

@@ -58,8 +58,10 @@ def test_new_goal_blends_with_the_motion_under_way(run, mode: str):
     replaced = step(runtime, 1)
     result = runtime.session.bus.call(RESULT, first)
     assert (result.outcome, result.code, result.message) == (
-        "CANCELLED", PlanCode.PREEMPTED, "replaced by goal pan=1.6,lift=0.4",
-    )  # fmt: skip
+        "CANCELLED",
+        PlanCode.PREEMPTED,
+        "replaced by goal pan=1.6,lift=0.4",
+    )
     commands += replaced
     assert finish(runtime, second, commands).success
     assert_within_limits(runtime, commands)
@@ -70,9 +72,11 @@ def test_new_goal_blends_with_the_motion_under_way(run, mode: str):
 
 @pytest.mark.parametrize(
     ("refuse", "told"),
-    [(":brake:", "the arm stops before its next motion: braking was refused: too fast"),
-     ("2:arm", "the next motion of arm began after a stop: too fast")],
-)  # fmt: skip
+    [
+        (":brake:", "the arm stops before its next motion: braking was refused: too fast"),
+        ("2:arm", "the next motion of arm began after a stop: too fast"),
+    ],
+)
 def test_refused_blend_is_reported_and_the_motion_begins_after_a_stop(
     run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, refuse: str, told: str
 ):
@@ -161,8 +165,9 @@ def test_obstacle_that_appears_stops_the_arm_before_it(run):
     runtime.session.bus.call("/world/add", f"{{name: crate, object: {box}}}")
     result = finish(runtime, number, commands)
     assert (result.outcome, result.code.name) == (
-        "EXECUTION_FAILED", "MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE",
-    )  # fmt: skip
+        "EXECUTION_FAILED",
+        "MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE",
+    )
     assert result.message.startswith("stopped before an obstacle: ")
     assert "crate" in result.message
     assert_within_limits(runtime, commands)

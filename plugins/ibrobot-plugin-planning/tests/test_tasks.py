@@ -159,8 +159,10 @@ def test_feedback_per_step(run):
     perform(runtime, steps("{name: rest, wait: {seconds: 0.1}}", "wait: {seconds: 0.1}", more="name: two waits"))
     messages = [json.loads(item.message.data) for item in seen.drain() if isinstance(item.message, String)]
     assert [(m["task"], m["step"], m["steps"], m["state"]) for m in messages] == [
-        ("two waits", 1, 2, "executing"), ("two waits", 2, 2, "executing"), ("two waits", 2, 2, "succeeded"),
-    ]  # fmt: skip
+        ("two waits", 1, 2, "executing"),
+        ("two waits", 2, 2, "executing"),
+        ("two waits", 2, 2, "succeeded"),
+    ]
     assert (messages[0]["kind"], messages[0]["name"]) == ("wait", "rest")
 
 
@@ -269,9 +271,11 @@ def test_policy_is_recorded_as_an_episode(run, tmp_path, until: str, outcome: st
 def test_look_reports_objects_and_waits_for_images(run):
     runtime = run()
     text = steps(
-        "look: {object: cube}", "look: {camera: eye}", "look: {object: cube, near: post, within: 0.5}",
+        "look: {object: cube}",
+        "look: {camera: eye}",
+        "look: {object: cube, near: post, within: 0.5}",
         "look: {object: cube, near: ball, within: 0.1}",
-    )  # fmt: skip
+    )
     result = perform(runtime, text)
     assert result.steps[0].facts == {"position_m": [0.2, 0.05, 0.06]}
     assert result.steps[1].facts["topic"] == "/camera/eye/image_raw"

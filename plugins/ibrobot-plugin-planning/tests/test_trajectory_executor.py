@@ -316,8 +316,10 @@ def test_trajectory_takes_over_at_a_time_of_the_running_one() -> None:
         assert arm.at(time_s) == pytest.approx(alone.at(time_s), abs=1e-9)
     arm.at(1.02)
     assert [(each.goal_id, each.state) for each in arm.statuses()] == [
-        ("first", GoalState.CANCELED), ("second", GoalState.EXECUTING), ("second", GoalState.SUCCEEDED),
-    ]  # fmt: skip
+        ("first", GoalState.CANCELED),
+        ("second", GoalState.EXECUTING),
+        ("second", GoalState.SUCCEEDED),
+    ]
 
 
 def _rest_to_rest(s: float) -> tuple[float, float, float]:
@@ -344,9 +346,12 @@ def test_stop_drops_a_trajectory_that_waits_to_take_over() -> None:
     arm.go({"stop": True}, "stop")
     arm.at(1.5)
     assert [(each.goal_id, each.state) for each in arm.statuses()] == [
-        ("first", GoalState.EXECUTING), ("second", GoalState.CANCELED), ("first", GoalState.CANCELED),
-        ("stop", GoalState.EXECUTING), ("stop", GoalState.SUCCEEDED),
-    ]  # fmt: skip
+        ("first", GoalState.EXECUTING),
+        ("second", GoalState.CANCELED),
+        ("first", GoalState.CANCELED),
+        ("stop", GoalState.EXECUTING),
+        ("stop", GoalState.SUCCEEDED),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -388,9 +393,11 @@ def test_stop_slows_down_along_the_trajectory() -> None:
     assert 0.5 < path[-1, 0] < 0.9
     assert (np.diff(path[:, 0]) >= 0).all()
     assert [(each.goal_id, each.state) for each in arm.statuses()] == [
-        ("goal", GoalState.EXECUTING), ("goal", GoalState.CANCELED),
-        ("stop", GoalState.EXECUTING), ("stop", GoalState.SUCCEEDED),
-    ]  # fmt: skip
+        ("goal", GoalState.EXECUTING),
+        ("goal", GoalState.CANCELED),
+        ("stop", GoalState.EXECUTING),
+        ("stop", GoalState.SUCCEEDED),
+    ]
 
 
 def test_stop_at_rest_succeeds_at_once() -> None:

@@ -45,7 +45,7 @@ MALFORMED = {
         lambda: WorldObject(Sphere(0.1), Pose(orientation=Quaternion(0, 0, 0, 0))),
         "a quaternion of length 0, must be 1",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("make", "message"), MALFORMED.values(), ids=MALFORMED)
@@ -67,7 +67,7 @@ REFUSED = {
         "'can' is attached to 'hand' already",
     ),
     "object that is not attached": (lambda: WORLD.detach("can", Pose()), "object 'can' is not attached"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("change", "message"), REFUSED.values(), ids=REFUSED)

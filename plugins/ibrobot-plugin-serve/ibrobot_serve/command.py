@@ -52,17 +52,25 @@ _PANEL_PERIOD_S = 0.5
 @click.option("--type", "type_", help="Plugin of the policy in MODEL_DIR, e.g. lerobot.")
 @click.option("--name", help="Name of the model for robots; by default its name in CONFIG, or the folder's.")
 @click.option(
-    "--set", "overrides", multiple=True, metavar="PATH=VALUE",
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="PATH=VALUE",
     help="Override a key of CONFIG, e.g. control.rate_hz=50, or an option of the policy in MODEL_DIR, e.g. device=cpu.",
-)  # fmt: skip
+)
 @click.option(
-    "--listen", multiple=True, metavar="ENDPOINT",
+    "--listen",
+    multiple=True,
+    metavar="ENDPOINT",
     help="Address for robots, in place of the transport's connect; with MODEL_DIR, by default this machine.",
-)  # fmt: skip
+)
 @click.option(
-    "--transport", "transport_options", multiple=True, metavar="OPTION=VALUE",
+    "--transport",
+    "transport_options",
+    multiple=True,
+    metavar="OPTION=VALUE",
     help="Option of the transport, e.g. users=users.txt.",
-)  # fmt: skip
+)
 @click.option("--batch", type=click.IntRange(min=1), default=8, show_default=True, help="Maximum requests per batch.")
 @click.option("--queue", type=click.IntRange(min=1), default=64, show_default=True, help="Maximum waiting requests.")
 @click.option(
@@ -74,9 +82,11 @@ _PANEL_PERIOD_S = 0.5
     help="A model that works on one batch for longer hangs: requests fail, and the server restarts.",
 )  # fmt: skip
 @click.option(
-    "--metrics-port", type=click.IntRange(0, 65535), metavar="PORT",
+    "--metrics-port",
+    type=click.IntRange(0, 65535),
+    metavar="PORT",
     help="Port of 127.0.0.1 for /metrics (Prometheus), /healthz and /readyz; 0: any free port.",
-)  # fmt: skip
+)
 @click.option(
     "--drain", type=click.FloatRange(min=0), default=10.0, show_default=True, metavar="S",
     help="How long to wait for pending requests at the end.",

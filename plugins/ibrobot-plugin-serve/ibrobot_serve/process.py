@@ -54,9 +54,12 @@ class ProcessEngine(Engine):
     ) -> None:  # fmt: skip
         super().__init__("process", seed)
         self._order = {
-            "document": config.complete, "source": str(config.source), "sim": config.simulated, "model": model,
+            "document": config.complete,
+            "source": str(config.source),
+            "sim": config.simulated,
+            "model": model,
             "seed": seed,
-        }  # fmt: skip
+        }
         self._fingerprint = fingerprint
         self._accept_new_weights = accept_new_weights
         self._log = logging.getLogger("ibrobot.inference")

@@ -302,9 +302,11 @@ class WireEncoder:
         """
         jpegs = _jpegs(message.tensors, self._codec) if self._codec is not None else {}
         key = (
-            message.robot, message.fingerprint, message.text,
+            message.robot,
+            message.fingerprint,
+            message.text,
             *[(name, array.dtype, array.shape) for name, array in message.tensors.items()],
-        )  # fmt: skip
+        )
         layout = self._layouts.get(key) if not jpegs else None
         if layout is None:
             layout = _lay_out(message, jpegs, self._limits)

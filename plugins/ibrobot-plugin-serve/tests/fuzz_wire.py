@@ -228,9 +228,12 @@ def main() -> int:
     if arguments.connections:
         robot, grown = fuzz_connections(arguments.connections, arguments.seed)
         summary = {
-            "garbage_connections": arguments.connections, "growth_mib": round(grown, 1), "robot_served": robot.served,
-            "robot_slowest_ms": round(robot.slowest_s * 1e3, 1), "robot_wrong": robot.wrong[:3],
-        }  # fmt: skip
+            "garbage_connections": arguments.connections,
+            "growth_mib": round(grown, 1),
+            "robot_served": robot.served,
+            "robot_slowest_ms": round(robot.slowest_s * 1e3, 1),
+            "robot_wrong": robot.wrong[:3],
+        }
         wrong = wrong or bool(robot.wrong) or grown > GROWTH_MIB
         print(json.dumps(summary))
     return int(wrong)

@@ -260,12 +260,14 @@ class Halves(PictureCodec):
 
 
 PICTURES = WireMessage(
-    WireKind.REQUEST, 1,
+    WireKind.REQUEST,
+    1,
     {
-        "top": np.arange(48, dtype=np.uint8).reshape(4, 4, 3), "mask": np.ones((4, 4, 1), np.uint8),
+        "top": np.arange(48, dtype=np.uint8).reshape(4, 4, 3),
+        "mask": np.ones((4, 4, 1), np.uint8),
         "normalised": np.ones((4, 4, 3), np.float32),
     },
-)  # fmt: skip
+)
 
 
 def test_pictures_travel_as_their_codec_says_and_all_else_as_it_is():

@@ -49,9 +49,12 @@ def _has_model(config: RobotConfig) -> bool:
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """The teleop `twist`, the counterpart of MoveIt Servo."""
     yield TeleopDescriptor(
-        type="twist", options=TwistOptions, make=_twist, check_options=_check_twist,
+        type="twist",
+        options=TwistOptions,
+        make=_twist,
+        check_options=_check_twist,
         summary="moves the tool along a topic of twists, as MoveIt Servo does",
-    )  # fmt: skip
+    )
 
 
 @hookimpl

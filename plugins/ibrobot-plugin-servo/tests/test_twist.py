@@ -63,8 +63,9 @@ def robot_of(model: Path) -> Robot:
     return attrs.evolve(make_robot(), joints=joints, groups=groups, description=Description(mjcf=model, tip="tool"))
 
 
-def twist(linear: tuple[float, ...] = (0.0, 0.0, 0.1), angular: tuple[float, ...] = (0.0, 0.0, 0.0),
-          frame: str = "") -> TwistStamped:  # fmt: skip
+def twist(
+    linear: tuple[float, ...] = (0.0, 0.0, 0.1), angular: tuple[float, ...] = (0.0, 0.0, 0.0), frame: str = ""
+) -> TwistStamped:
     return TwistStamped(Header(0, frame), Twist(Vector3(*linear), Vector3(*angular)))
 
 

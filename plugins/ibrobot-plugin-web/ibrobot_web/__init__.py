@@ -45,9 +45,12 @@ def ibrobot_viewers() -> Iterable[ViewerDescriptor]:
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """Jog from the page."""
     yield TeleopDescriptor(
-        type="web", options=WebTeleopOptions, make=_teleop, devices=lambda options: {"type": "the page of the run"},
+        type="web",
+        options=WebTeleopOptions,
+        make=_teleop,
+        devices=lambda options: {"type": "the page of the run"},
         summary="joint and tool jog from the page of the viewer web, while a button is held",
-    )  # fmt: skip
+    )
 
 
 def _ui() -> click.Command:

@@ -193,7 +193,7 @@ class Playback:
             return []
         moving = {each.topic for each in things if each.topic} & {
             name for name, known in self.summary.topics.items() if known.count
-        }  # fmt: skip
+        }
         if not moving:
             return []
         tracks = {topic: self._track(topic) for topic in moving}

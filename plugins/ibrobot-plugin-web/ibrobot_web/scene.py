@@ -125,8 +125,11 @@ def _root_link(urdf: str | None) -> str | None:
     links = [each.attributes.get("name") for each in elements if each.tag == "link"]
     children = {
         inner.attributes.get("link")
-        for each in elements if each.tag == "joint" for inner in each.children if inner.tag == "child"
-    }  # fmt: skip
+        for each in elements
+        if each.tag == "joint"
+        for inner in each.children
+        if inner.tag == "child"
+    }
     return next((link for link in links if link not in children), None)
 
 
@@ -148,10 +151,13 @@ def _body(model: Any, body: int, geoms: list[int], meshes: list[int]) -> dict[st
                 "pos": model.jnt_pos[joint].tolist(), "ref": float(model.qpos0[model.jnt_qposadr[joint]]),
             })  # fmt: skip
     return {
-        "name": model.body(body).name, "parent": int(model.body_parentid[body]) if body else -1,
-        "pos": model.body_pos[body].tolist(), "quat": model.body_quat[body].tolist(), "joints": joints,
+        "name": model.body(body).name,
+        "parent": int(model.body_parentid[body]) if body else -1,
+        "pos": model.body_pos[body].tolist(),
+        "quat": model.body_quat[body].tolist(),
+        "joints": joints,
         "geoms": [_geom(model, geom, meshes) for geom in geoms],
-    }  # fmt: skip
+    }
 
 
 def _geom(model: Any, geom: int, meshes: list[int]) -> dict[str, Any]:
@@ -159,9 +165,12 @@ def _geom(model: Any, geom: int, meshes: list[int]) -> dict[str, Any]:
     material = int(model.geom_matid[geom])
     rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
     found: dict[str, Any] = {
-        "type": _SHAPES[kind], "size": model.geom_size[geom].tolist(), "pos": model.geom_pos[geom].tolist(),
-        "quat": model.geom_quat[geom].tolist(), "rgba": [round(float(value), 4) for value in rgba],
-    }  # fmt: skip
+        "type": _SHAPES[kind],
+        "size": model.geom_size[geom].tolist(),
+        "pos": model.geom_pos[geom].tolist(),
+        "quat": model.geom_quat[geom].tolist(),
+        "rgba": [round(float(value), 4) for value in rgba],
+    }
     if kind == _MESH:
         found["mesh"] = meshes.index(int(model.geom_dataid[geom]))
     return found

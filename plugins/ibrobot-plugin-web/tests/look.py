@@ -327,9 +327,12 @@ def ready(chromium: Any, address: str) -> Any:
 
 
 PARTS = {
-    "empty": look_at_empty, "filled": look_at_filled, "run": look_at_run, "policy": look_at_policy,
+    "empty": look_at_empty,
+    "filled": look_at_filled,
+    "run": look_at_run,
+    "policy": look_at_policy,
     "training": look_at_training,
-}  # fmt: skip
+}
 
 
 @contextlib.contextmanager

@@ -183,9 +183,10 @@ def test_objects_around_the_robot_are_shown_where_they_are() -> None:
 def test_objects_of_a_simulated_scene_are_where_the_simulation_has_them() -> None:
     here = Pose(Vector3(1, 2, 3), Quaternion(0, 0, 0, 1))
     things = (
-        SceneObject("table", "plane", (), here), SceneObject("bin", "box", (0.2, 0.4, 0.6), here),
+        SceneObject("table", "plane", (), here),
+        SceneObject("bin", "box", (0.2, 0.4, 0.6), here),
         SceneObject("cube", "box", (0.2, 0.2, 0.2), here, "/simulation/scene", 2),
-    )  # fmt: skip
+    )
     session = make_session()
     make: Any = None
     descriptor = HardwareDescriptor("sim", make=make, summary="", scene=lambda options, robot: things)

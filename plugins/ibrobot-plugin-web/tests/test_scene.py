@@ -42,9 +42,7 @@ def test_meshes_are_few_triangles(tmp_path: Path) -> None:
     grid = np.linspace(0, 0.1, 60)
     points = [(x, y, 0.02 * np.sin(60 * x)) for x in grid for y in grid]
     vertices = " ".join(f"{value:.5f}" for point in points for value in point)
-    faces = " ".join(
-        f"{i} {i + 1} {i + 60} {i + 1} {i + 61} {i + 60}" for i in range(60 * 59) if i % 60 < 59
-    )  # fmt: skip
+    faces = " ".join(f"{i} {i + 1} {i + 60} {i + 1} {i + 61} {i + 60}" for i in range(60 * 59) if i % 60 < 59)
     text = (
         f'<mujoco><asset><mesh name="m" inertia="shell" vertex="{vertices}" face="{faces}"/></asset><worldbody>'
         '<body name="b"><joint name="j"/><geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
@@ -101,10 +99,12 @@ def test_cameras_of_the_robot_yaml_are_where_their_mounts_say(tmp_path: Path) ->
     np.testing.assert_allclose(down["pos"], [0.0, 0.1, 0.1], atol=1e-6)
     for camera, direction, up in ((ahead, [1, 0, 0], [0, 0, 1]), (down, [0, 0, -1], [0, 1, 0])):
         w, x, y, z = camera["quat"]
-        turn = np.array([
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ])  # fmt: skip
+        turn = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
         np.testing.assert_allclose(turn @ [0, 0, -1], direction, atol=1e-4)
         np.testing.assert_allclose(turn @ [0, 1, 0], up, atol=1e-4)

@@ -52,11 +52,14 @@ def test_nothing_is_served_without_a_session_and_watching_changes_nothing(tmp_pa
 @pytest.mark.parametrize(
     ("body", "error"),
     [
-        (b"[]", "must be a JSON object"), (b"{", "must be JSON"), (b"[" * 100_000, "must be JSON"),
-        (b"{}", "no job None"), (b'{"number": "1"}', "no job 1"),
+        (b"[]", "must be a JSON object"),
+        (b"{", "must be JSON"),
+        (b"[" * 100_000, "must be JSON"),
+        (b"{}", "no job None"),
+        (b'{"number": "1"}', "no job 1"),
     ],
     ids=lambda value: str(value)[:12],
-)  # fmt: skip
+)
 def test_malformed_requests_are_refused(tmp_path: Path, body: bytes, error: str) -> None:
     async def test(server: UiServer) -> None:
         async with server.client.post(
@@ -120,7 +123,7 @@ def test_a_job_is_cancelled_as_by_ctrl_c_and_then_at_once(tmp_path: Path) -> Non
     stubborn = (
         "import signal, time\nsignal.signal(signal.SIGINT, lambda *_: print('not yet', flush=True))\n"
         "print('ready', flush=True)\nwhile True: time.sleep(1)"
-    )  # fmt: skip
+    )
 
     async def test(server: UiServer) -> None:
         number = server.ui.jobs.start("run", "Run", [stubborn], program=PYTHON).number

@@ -15,16 +15,22 @@ from ibrobot_web.ui.server import LARGEST_REQUEST, VIEWS, routes_of
 from ui_server import UiServer, run_ui
 
 FOREIGN = (
-    {"Origin": "http://evil.example"}, {"Origin": "null"}, {"Host": "evil.example"}, {"Sec-Fetch-Site": "cross-site"},
+    {"Origin": "http://evil.example"},
+    {"Origin": "null"},
+    {"Host": "evil.example"},
+    {"Sec-Fetch-Site": "cross-site"},
     {"Sec-Fetch-Site": "same-site"},
-)  # fmt: skip
+)
 FILES = ("episodes", "convert", "datasets", "training")
 """Views whose requests name files."""
 WRONG: tuple[Any, ...] = (
-    {}, {"path": 3, "paths": 3, "out": 3, "dataset": 3}, {"path": None, "paths": [None]}, {"path": {"a": []}},
+    {},
+    {"path": 3, "paths": 3, "out": 3, "dataset": 3},
+    {"path": None, "paths": [None]},
+    {"path": {"a": []}},
     {"path": "a\0b", "paths": ["a\0b"], "out": "a\0b", "dataset": "\0", "robot": "\0", "checkpoint": "\0"},
     {"path": "a" * 100_000, "paths": ["a" * 100_000], "out": "b" * 5000, "dataset": "c" * 5000},
-)  # fmt: skip
+)
 OUTSIDE = ("..", "../x", "/etc/passwd", "/", "a/../../b", "//etc")
 
 

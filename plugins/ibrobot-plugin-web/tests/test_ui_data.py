@@ -64,11 +64,14 @@ def test_comments_on_the_first_entries_stay_with_them() -> None:
 @pytest.mark.parametrize(
     ("text", "model", "error"),
     [
-        ("models: {a: {type: x}}", "a", "is of another type"), ("models: [", "", "is not YAML"),
-        ("models: 3", "", "models must be a mapping"), ("models:\ncontrol_modes: {}", "", "models is empty"),
-        ("a: 1", "x}: {y", "use letters, digits and _"), ("models: {a: {type: lerobot}}", "a", "has no path"),
+        ("models: {a: {type: x}}", "a", "is of another type"),
+        ("models: [", "", "is not YAML"),
+        ("models: 3", "", "models must be a mapping"),
+        ("models:\ncontrol_modes: {}", "", "models is empty"),
+        ("a: 1", "x}: {y", "use letters, digits and _"),
+        ("models: {a: {type: lerobot}}", "a", "has no path"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_edited_is_said(text: str, model: str, error: str) -> None:
     with pytest.raises(IbrobotError, match=error):
         with_model(text, "/p", model=model)
@@ -102,10 +105,11 @@ def test_nothing_outside_the_opened_folders_is_read_or_written(ui: Ui, tmp_path:
     inside = "training/checkpoints/000010/pretrained_model"
     shutil.copytree(ui.folders.first / inside, tmp_path / "outside")
     for facts in (
-        {"robot": "so101_blind", "checkpoint": "../outside"}, {"robot": "../x.yaml", "checkpoint": inside},
+        {"robot": "so101_blind", "checkpoint": "../outside"},
+        {"robot": "../x.yaml", "checkpoint": inside},
         {"robot": "so101_blind", "checkpoint": inside, "target": "../x.yaml"},
         {"robot": "so101_blind", "checkpoint": inside, "target": "/etc/x.yaml"},
-    ):  # fmt: skip
+    ):
         with pytest.raises(IbrobotError, match="outside the opened folders"):
             training.preview(ui, facts)
         with pytest.raises(IbrobotError, match="outside the opened folders"):
@@ -161,11 +165,12 @@ def test_the_loss_of_a_training_is_plotted(ui: Ui) -> None:
     facts: dict[str, Any] = {}
     said = []
     for line in events(
-        {"event": "begin", "steps": 10}, {"event": "progress", "step": 1, "steps": 10, "loss": 0.7, "seconds": 300.0},
+        {"event": "begin", "steps": 10},
+        {"event": "progress", "step": 1, "steps": 10, "loss": 0.7, "seconds": 300.0},
         {"event": "progress", "step": 4, "steps": 10, "loss": 0.5, "seconds": 360.0},
         {"event": "progress", "step": 9, "steps": 10, "loss": 0.4, "seconds": 460.0},
         {"event": "report", "checkpoint": "training/checkpoints/000010/pretrained_model"},
-    ):  # fmt: skip
+    ):
         facts |= read(line) or {}
         said.append(facts["text"])
     assert said[1:4] == [

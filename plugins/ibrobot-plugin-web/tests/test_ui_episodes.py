@@ -30,9 +30,7 @@ def episode(tmp_path: Path) -> Path:
 
     (tmp_path / "arm.xml").write_text(MODEL)
     config = {"robot": {"description": {"mjcf": "arm.xml", "tip": "tool"}}}
-    return make_episode(
-        tmp_path / "pick/episodes/episode_000001", prompt="pick", robot="arm", config=config
-    )  # fmt: skip
+    return make_episode(tmp_path / "pick/episodes/episode_000001", prompt="pick", robot="arm", config=config)
 
 
 @pytest.fixture
@@ -88,9 +86,10 @@ def test_objects_of_the_simulated_scene_are_where_they_were(opened: Playback, tm
 
 def test_a_model_outside_the_opened_folders_is_not_read(episode: Path, tmp_path: Path) -> None:
     other = {
-        "/etc/hostname": "outside the opened", "package://yaml/../../../../etc/hostname": "out of its package",
+        "/etc/hostname": "outside the opened",
+        "package://yaml/../../../../etc/hostname": "out of its package",
         "../a.xml": "outside the opened",
-    }  # fmt: skip
+    }
 
     async def test(server: UiServer) -> None:
         scene = await server.get("episodes/scene", path=str(episode))
@@ -117,7 +116,7 @@ def run_here(ui: Ui, *arguments: str) -> str:
 
 def test_episodes_are_judged_trimmed_deleted_and_restored(
     episode: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
+) -> None:
     async def test(server: UiServer) -> None:
         async def row() -> Any:
             (found,) = (await server.get("episodes/list"))["episodes"]

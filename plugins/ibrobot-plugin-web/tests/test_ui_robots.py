@@ -56,8 +56,11 @@ def test_problems_are_those_of_config_check(folder: Path) -> None:
         found = await server.get("robots/check", robot="wrong.yaml", sim="false")
         ran = subprocess.run(
             [*IBROBOT, "config", "check", "wrong.yaml", "--json"],
-            cwd=folder, capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         assert found["problems"] == json.loads(ran.stdout)
         assert {(each["line"], each["path"]) for each in found["problems"]} >= {(5, "robot.joints.pan.uper")}
         for outside in ("../x.yaml", "/etc/passwd"):
@@ -139,9 +142,12 @@ def test_the_progress_of_a_session_is_read_from_its_status_lines(folder: Path) -
 
     line = "mode web | episodes 1, successes 1 | recording “a, saved 1 of 2”, 3 s, 17 s left, saved 1 of 4"
     assert read_status(line) == {
-        "saved": 1, "progress": 0.25,
+        "saved": 1,
+        "progress": 0.25,
         "text": "recording “a, saved 1 of 2”, 3 s, 17 s left · 1 of 4 episodes saved",
-    }  # fmt: skip
+    }
     assert read_status("recorded   2 of 4 episodes into episodes/pick") == {
-        "saved": 2, "progress": 0.5, "text": "2 of 4 episodes saved",
-    }  # fmt: skip
+        "saved": 2,
+        "progress": 0.5,
+        "text": "2 of 4 episodes saved",
+    }

@@ -53,14 +53,16 @@ class WebxrOptions:
     """Options of `type: webxr`; the joints' own limits bound every speed."""
 
     host: str = option(
-        "127.0.0.1", validator=_check_host,
+        "127.0.0.1",
+        validator=_check_host,
         help="address to listen on: 127.0.0.1 for this machine alone, 0.0.0.0 for the network",
-    )  # fmt: skip
+    )
     port: int = option(8443, ge=0, le=65535, help="port of the page; 0: any free one")
     names: tuple[str, ...] = option(
-        (), validator=_check_names,
+        (),
+        validator=_check_names,
         help="names and addresses under which browsers reach this machine; empty: its host name and address",
-    )  # fmt: skip
+    )
     certificate: Path | None = option(
         None, help="certificate of this machine, made by `ibrobot certs`; without one, the page makes its own"
     )
@@ -71,9 +73,12 @@ class WebxrOptions:
     gripper: str = option("gripper", help="group of joints that the trigger moves, or none; all others move the tool")
     scale: float = option(1.0, gt=0, le=10, help="distance of the tool for each metre of the hand")
     facing: float = option(
-        0.0, unit="rad", ge=-7, le=7,
+        0.0,
+        unit="rad",
+        ge=-7,
+        le=7,
         help="direction in which the operator looks, from the robot's x axis to the left; 3.14: towards the robot",
-    )  # fmt: skip
+    )
     turn: bool = option(True, help="whether the tool turns with the hand")
     tool_speed: float = option(0.5, unit="m/s", gt=0, le=1, help="highest speed of the tool")
     turn_speed: float = option(2.0, unit="rad/s", gt=0, le=6, help="highest speed of turning the tool")

@@ -27,9 +27,11 @@ from ibrobot_webxr.messages import LONGEST, Claim, Hands, Press, Shown, Stop, de
 from ibrobot_webxr.options import HANDS, WebxrOptions
 
 _KINDS = {
-    "html": "text/html; charset=utf-8", "css": "text/css; charset=utf-8", "js": "text/javascript; charset=utf-8",
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
     "svg": "image/svg+xml",
-}  # fmt: skip
+}
 _START_S = 10.0
 _STATE_S = 0.1
 """Period of the states sent to pages [s]."""

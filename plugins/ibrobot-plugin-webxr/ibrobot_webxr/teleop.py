@@ -290,9 +290,7 @@ class _Tool:
             heading = tip.rotation[:, 0]
             turn = turn - (turn @ heading) * heading
         way, turn = _shortened(way, _LEAD_M), _shortened(turn, _LEAD_RAD)
-        self._origin = TipPose(
-            tip.position + way - self.motion.moved, turned.T @ exp(turn) @ tip.rotation
-        )  # fmt: skip
+        self._origin = TipPose(tip.position + way - self.motion.moved, turned.T @ exp(turn) @ tip.rotation)
         if np.linalg.norm(way) > _ARRIVED[0] or np.linalg.norm(turn) > _ARRIVED[1]:
             linear = _approach(way, options.follow_time, options.tool_speed, _BRAKING)
             angular = _approach(turn, options.follow_time, options.turn_speed, _TURN_BRAKING)

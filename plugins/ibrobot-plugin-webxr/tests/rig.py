@@ -91,9 +91,7 @@ class Rig:
         if not self.tracked:
             return {}
         position = tuple(self.at.tolist()) if self.has_position else None
-        return {
-            self.side: HandPose(self.orientation, position, self.clutch, self.trigger, self.open, self.move)
-        }  # fmt: skip
+        return {self.side: HandPose(self.orientation, position, self.clutch, self.trigger, self.open, self.move)}
 
     def tick(self, count: int = 1) -> TeleopCommand:
         """Let time pass; the robot follows its setpoints."""

@@ -109,8 +109,9 @@ def test_the_page_offers_its_own_certificate_for_phones_to_install(
 def test_requests_without_the_token_are_refused(page: PageServer, browser: Browser):
     status, text, _ = browser.get("/")
     assert (status, text) == (
-        401, "scan the QR code in the terminal of the robot, or open the address below it\n",
-    )  # fmt: skip
+        401,
+        "scan the QR code in the terminal of the robot, or open the address below it\n",
+    )
     assert browser.get("/main.js")[0] == 401
     with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
         browser.connect()
@@ -303,14 +304,16 @@ GARBAGE = {
     json.dumps(hands(right=hand(clutch=True, position=[0, 1]))): "hands.right.position: must be a list of 3 numbers",
     json.dumps(hands(right=hand(position=[0, 1e9, 0]))): "hands.right.position: must be a number from -100 to 100",
     json.dumps(hands(right=hand(orientation=[0, 0, 0, 0]))): "hands.right.orientation: must be a unit quaternion",
-    json.dumps(hands(right=hand(orientation=[0, 0, 0, 3]))):
-        "hands.right.orientation: must be a number from -1.01 to 1.01",
+    json.dumps(
+        hands(right=hand(orientation=[0, 0, 0, 3]))
+    ): "hands.right.orientation: must be a number from -1.01 to 1.01",
     json.dumps(hands(right=hand(gripper=2))): "hands.right.gripper: must be a number from 0 to 1",
     json.dumps(hands(right=hand(open="yes"))): "hands.right.open: must be a number from -1 to 1",
     json.dumps(hands(right=hand(move=[0, 0, True]))): "hands.right.move: must be a number from -1 to 1",
-    json.dumps(hands(right=hand(jump=1))):
-        "hands.right: unknown keys; must have clutch, gripper, move, open, orientation, position",
-}  # fmt: skip
+    json.dumps(
+        hands(right=hand(jump=1))
+    ): "hands.right: unknown keys; must have clutch, gripper, move, open, orientation, position",
+}
 
 
 def test_garbage_is_refused_by_a_message_each_and_moves_nothing(

@@ -64,8 +64,9 @@ def test_requests_pass_with_certificates(lab: Path):
         assert robot.request("echo", b"hello", WAIT_S) == b"hello"
     peers = peer_rows(make_session())
     assert sorted((kind, name) for _, kind, _, name in peers if kind == "client") == [
-        ("client", "robot1"), ("client", "robot2"),
-    ]  # fmt: skip
+        ("client", "robot1"),
+        ("client", "robot2"),
+    ]
     assert {address for _, kind, address, _ in peers if kind == "router"} == {endpoint}
     for end in (*robots, server):
         end.close()

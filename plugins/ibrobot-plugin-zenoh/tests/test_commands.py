@@ -150,8 +150,10 @@ def test_pub_of_another_type_is_refused(robot: ZenohTransport, endpoint: str):
 def test_ctrl_c_ends_it_cleanly(command: list[str], robot: ZenohTransport, endpoint: str):
     with subprocess.Popen(
         [*ibrobot_command(PATIENT), "topic", *command, "--endpoint", endpoint],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    ) as process:  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
         assert process.stdout is not None
         assert process.stdout.readline()
         process.send_signal(signal.SIGINT)

@@ -186,8 +186,10 @@ def test_a_ros_2_node_of_another_make_hears_and_is_heard():
     script = Path(__file__).with_name("ros_peer.py")
     with subprocess.Popen(
         [sys.executable, str(script), endpoint.rpartition(":")[2]],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    ) as peer:  # fmt: skip
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as peer:
         assert peer.stdout is not None
         try:
             assert peer.stdout.readline().split() == ["/lab/chatter", "/reply"]

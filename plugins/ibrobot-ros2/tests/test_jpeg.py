@@ -37,9 +37,7 @@ def file(strip_tables: bool = False, padding: bytes = b"") -> np.ndarray:
     return np.frombuffer(kept + jpeg[at:-2] + padding + jpeg[-2:], np.uint8)
 
 
-@given(
-    st.integers(1, 40), st.integers(1, 40), st.sampled_from(["rgb8", "bgr8", "mono8"]), st.integers(0, 5)
-)  # fmt: skip
+@given(st.integers(1, 40), st.integers(1, 40), st.sampled_from(["rgb8", "bgr8", "mono8"]), st.integers(0, 5))
 def test_encoding_size_and_stamp_are_kept(height: int, width: int, encoding: str, padding: int) -> None:
     given = picture(height, width, encoding, padding)
     found = from_jpeg(to_jpeg(given, 95))

@@ -37,9 +37,12 @@ class Terminal:
         try:
             self._process = subprocess.Popen(
                 [*ibrobot_command(_START.format(before=before)), *arguments],
-                stdin=slave, stdout=slave, stderr=slave, start_new_session=True,
+                stdin=slave,
+                stdout=slave,
+                stderr=slave,
+                start_new_session=True,
                 env={**os.environ, "TERM": "xterm", "COLUMNS": str(columns), "LINES": "40", **(environment or {})},
-            )  # fmt: skip
+            )
         finally:
             os.close(slave)
         self.screen = ""

@@ -61,7 +61,7 @@ def test_right_descriptors_pass(descriptor: Descriptor[Any]) -> None:
         (wrong(FOLLOWS, options=NoOptions), "must derive from StreamOptions"),
         (wrong(FOLLOWS, options=NoOptions, streams=False, goals="pose"), "goals is 'pose'"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_member_is_found(descriptor: Descriptor[Any], what: str) -> None:
     with pytest.raises(AssertionError, match=what):
         check_descriptor(descriptor, NoOptions())

@@ -67,9 +67,7 @@ def nod(config: str | None, joint: str, **options: Any) -> None:
     path = find_config(config, installed_plugins())
     robot = load_config(path, overrides=run_overrides(options), mode=options["mode"], sim=options["sim"])
     request = LaunchRequest(options["lockstep"], source=lambda session, mode: Nod(session, mode, joint))
-    run_robot(
-        robot, request, headless=options["headless"], dry_run=options["dry_run"], as_json=options["as_json"]
-    )  # fmt: skip
+    run_robot(robot, request, headless=options["headless"], dry_run=options["dry_run"], as_json=options["as_json"])
 
 
 @hookimpl

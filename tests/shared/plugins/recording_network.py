@@ -56,7 +56,10 @@ def make(options, ctx):
 @hookimpl
 def ibrobot_transports():
     yield TransportDescriptor(
-        "network", make, "a network", NetworkOptions,
+        "network",
+        make,
+        "a network",
+        NetworkOptions,
         used=lambda options: options.share != Share(),
         components=lambda options, session, link: components(options.share, session, link),
-    )  # fmt: skip
+    )

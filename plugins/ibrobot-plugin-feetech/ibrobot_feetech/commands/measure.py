@@ -133,9 +133,12 @@ class Measurement:
             return _rows(self._measured, ranges)
 
         self._guide.wait(
-            "Move each joint in the table to both ends.", flag="--range-seconds", columns=_COLUMNS, rows=rows,
+            "Move each joint in the table to both ends.",
+            flag="--range-seconds",
+            columns=_COLUMNS,
+            rows=rows,
             seconds=self._answers.range_seconds,
-        )  # fmt: skip
+        )
 
     def _is_inverted(self, joint: Joint) -> bool:
         """Whether radians decrease as ticks increase."""

@@ -48,9 +48,10 @@ def map_controls(config: str | None, device: str, wait: float) -> None:
         echo(f"{found.name} ({found.id}): let go of all controls")
         learner = _Learner(open_device, wait)
         joints = {
-            name: f"Move what moves {name} towards its upper limit" for name in robot.joint_names
+            name: f"Move what moves {name} towards its upper limit"
+            for name in robot.joint_names
             if name not in robot.groups.get("gripper", ())
-        }  # fmt: skip
+        }
         learned = {
             "joints": learner.axes(joints),
             "tool": learner.axes({axis: f"Move what moves the tool {_WAYS[axis]} ({axis})" for axis in TOOL_AXES}),

@@ -42,8 +42,11 @@ class Kind:
 def dualsense_features() -> dict[int, bytes]:
     """What hid-playstation reads of a DualSense over USB: calibration, address, firmware."""
     calibration = struct.pack("<B17h", 5, 0, 0, 0, 8192, -8192, 8192, -8192, 8192, -8192, 540, 540, *[8192, -8192] * 3)
-    return {0x05: calibration.ljust(41, b"\0"), 0x09: bytes([9, 1, 2, 3, 4, 5, 6]).ljust(20, b"\0"),
-            0x20: bytes([0x20]).ljust(64, b"\0")}  # fmt: skip
+    return {
+        0x05: calibration.ljust(41, b"\0"),
+        0x09: bytes([9, 1, 2, 3, 4, 5, 6]).ljust(20, b"\0"),
+        0x20: bytes([0x20]).ljust(64, b"\0"),
+    }
 
 
 def dualshock_features() -> dict[int, bytes]:

@@ -59,12 +59,15 @@ def list_episodes(path: Path, as_json: bool) -> None:
             table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "prompt")
         for row in rows:
             table.add_row(
-                _shown(Path(str(row["path"])), path), str(row["date"])[0 if wide else 5 :], f"{row['duration_s']:.1f}",
-                str(row["messages"]), str(row["dropped"]),
+                _shown(Path(str(row["path"])), path),
+                str(row["date"])[0 if wide else 5 :],
+                f"{row['duration_s']:.1f}",
+                str(row["messages"]),
+                str(row["dropped"]),
                 str(row["outcome"]) if row["finished"] else styled("unfinished", "red"),
                 told_size(int(str(row["bytes"]))),
                 *([str(row["prompt"])] if prompts else []),
-            )  # fmt: skip
+            )
         console.print(table)
     for problem in problems:
         echo(f"unreadable: {problem}", err=True)

@@ -145,9 +145,12 @@ class MoveIt2(CollisionObjects):
             self._motions.ask("/move_action", {"goals": self._taken_goals(), **self._scalings()})
 
     def move_to_configuration(
-        self, joint_positions: Sequence[float], joint_names: Sequence[str] | None = None, tolerance: float = 0.001,
+        self,
+        joint_positions: Sequence[float],
+        joint_names: Sequence[str] | None = None,
+        tolerance: float = 0.001,
         weight: float = 1.0,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Plan and move to joint positions [rad]; returns at once.
 
         Raises:
@@ -260,9 +263,12 @@ class MoveIt2(CollisionObjects):
         self._goals[-1] |= {"quaternion": numbers(quat_xyzw, "xyzw"), "orientation_tolerance": float(least)}
 
     def set_joint_goal(
-        self, joint_positions: Sequence[float], joint_names: Sequence[str] | None = None, tolerance: float = 0.001,
+        self,
+        joint_positions: Sequence[float],
+        joint_names: Sequence[str] | None = None,
+        tolerance: float = 0.001,
         weight: float = 1.0,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Set joint positions of the next goal [rad]; without names, of the first joints of the arm."""
         positions = positions_of(joint_positions, joint_names or self.joint_names)
         self._goals[-1] |= {"joints": positions, "joint_tolerance": float(tolerance)}
@@ -390,9 +396,11 @@ class MoveIt2(CollisionObjects):
 
     def _straight(self, least_fraction: float, start: Mapping[str, float]) -> JointTrajectory | None:
         request = {
-            "waypoints": self._taken_goals(), "least_fraction": max(least_fraction, _LEAST), "start": start,
+            "waypoints": self._taken_goals(),
+            "least_fraction": max(least_fraction, _LEAST),
+            "start": start,
             **self._scalings(),
-        }  # fmt: skip
+        }
         return self._trajectory(self._node.call("/compute_cartesian_path", request))
 
     def _trajectory(self, answer: Mapping[str, Any]) -> JointTrajectory | None:

@@ -82,9 +82,12 @@ def run(file: str, config: str | None, **options: Any) -> None:
     robot = load_config(path, overrides=(*changes, *section), mode=mode, sim=sim, registry=registry)
     request = LaunchRequest(options["lockstep"], options["seed"], by_operator=robot.recording is not None)
     run_robot(
-        robot, request, headless=options["headless"], as_json=options["as_json"],
+        robot,
+        request,
+        headless=options["headless"],
+        as_json=options["as_json"],
         make_hooks=lambda runtime: TaskHooks(runtime, read),
-    )  # fmt: skip
+    )
 
 
 def _read(file: str, parameters: tuple[str, ...]) -> TaskFile:

@@ -81,9 +81,12 @@ class Drive:
     def _facts(self, driver: Driver) -> dict[str, Any]:
         operator = self.operator
         return {
-            "page": driver.number, "role": driver.role, "operating": driver is operator,
-            "operator": operator.name if operator is not None else "", "pages": len(self._drivers),
-        }  # fmt: skip
+            "page": driver.number,
+            "role": driver.role,
+            "operating": driver is operator,
+            "operator": operator.name if operator is not None else "",
+            "pages": len(self._drivers),
+        }
 
     async def serve(self, socket: web.WebSocketResponse, role: Role, name: str) -> None:
         """Handle the commands of a page until it is gone."""

@@ -160,9 +160,7 @@ class Guard:
         while len(self._sessions) > _SESSIONS:
             self._sessions.popitem(last=False)
         response = web.Response(status=303, headers={"Location": "/"})
-        response.set_cookie(
-            self._cookie, session.key, httponly=True, samesite="Strict", secure=self._secure, path="/"
-        )  # fmt: skip
+        response.set_cookie(self._cookie, session.key, httponly=True, samesite="Strict", secure=self._secure, path="/")
         return response
 
     def _unknown(self, request: web.Request) -> web.StreamResponse:

@@ -12,9 +12,11 @@ from ibrobot_web.ui.job_runner import Reader
 from ibrobot_web.ui.recordings import find_recordings, paths_of
 
 _CHOICES = {
-    "only": ("all", "interventions", "policy"), "missing": ("skip", "hold", "refuse"), "norm_mode": NORM_MODES,
+    "only": ("all", "interventions", "policy"),
+    "missing": ("skip", "hold", "refuse"),
+    "norm_mode": NORM_MODES,
     "outcome": ("", "success", "failure", "unknown"),
-}  # fmt: skip
+}
 
 
 def listing(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -97,10 +99,13 @@ def parse_event(line: str) -> Mapping[str, Any]:
 def told(report: Mapping[str, Any]) -> str:
     """The result of a conversion in a line."""
     counts = {
-        "left out": report["failed"], "passed over": report["passed_over"], "ticks skipped": report["skipped_ticks"],
-        "ticks held": report["held_ticks"], "messages lost in recording": report["lost_messages"],
+        "left out": report["failed"],
+        "passed over": report["passed_over"],
+        "ticks skipped": report["skipped_ticks"],
+        "ticks held": report["held_ticks"],
+        "messages lost in recording": report["lost_messages"],
         "without a task": report["without_prompt"],
-    }  # fmt: skip
+    }
     others = "".join(f", {name} {count}" for name, count in counts.items() if count)
     size = report["size_bytes"] / 1e6
     episodes = f"{report['episodes']} episode{'' if report['episodes'] == 1 else 's'}"

@@ -159,11 +159,13 @@ def listing(ui: Ui, facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The guides of all plugins, with their questions."""
     return [
         {
-            "name": guide.name, "title": guide.title, "summary": guide.summary,
+            "name": guide.name,
+            "title": guide.title,
+            "summary": guide.summary,
             "questions": [attrs.asdict(question) for question in guide.questions()],
         }
         for guide in installed_plugins().guides
-    ]  # fmt: skip
+    ]
 
 
 def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:

@@ -29,9 +29,11 @@ def place(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
     while not existing.exists():
         existing = existing.parent
     return {
-        "folder": ui.folders.name(folder), "episodes": len(episodes), "free_bytes": shutil.disk_usage(existing).free,
+        "folder": ui.folders.name(folder),
+        "episodes": len(episodes),
+        "free_bytes": shutil.disk_usage(existing).free,
         "episode_bytes": round(sum(sizes) / len(sizes)) if sizes else None,
-    }  # fmt: skip
+    }
 
 
 def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
@@ -67,8 +69,10 @@ def read_status(line: str) -> Mapping[str, Any] | None:
     if (status := _STATUS.search(line)) is not None:
         saved, count = int(status["saved"]), int(status["count"])
         return {
-            "saved": saved, "progress": saved / count, "text": f"{status['state']} · {saved} of {count} episodes saved"
-        }  # fmt: skip
+            "saved": saved,
+            "progress": saved / count,
+            "text": f"{status['state']} · {saved} of {count} episodes saved",
+        }
     if (summary := _SUMMARY.match(line)) is not None:
         saved, count = int(summary["saved"]), int(summary["count"])
         return {"saved": saved, "progress": saved / count, "text": f"{saved} of {count} episodes saved"}

@@ -174,9 +174,11 @@ def run_arguments(ui: Ui, facts: Mapping[str, Any]) -> list[str]:
     """The arguments of a run: robot, body, mode and page."""
     mode = text(facts, "mode", "")
     return [
-        robot_of(ui, facts), *(["--sim"] if flag(facts, "sim") else []), *([f"--mode={mode}"] if mode else []),
+        robot_of(ui, facts),
+        *(["--sim"] if flag(facts, "sim") else []),
+        *([f"--mode={mode}"] if mode else []),
         *ui.run_options,
-    ]  # fmt: skip
+    ]
 
 
 def _title(robot: str, facts: Mapping[str, Any]) -> str:

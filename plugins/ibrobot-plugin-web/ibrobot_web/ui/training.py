@@ -35,9 +35,10 @@ def listing(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
     if not missing and find_spec("lerobot") is None:
         missing = _INSTALL
     return {
-        "missing": missing, "datasets": [ui.folders.name(path) for path in find_recordings(ui.folders.paths).datasets],
+        "missing": missing,
+        "datasets": [ui.folders.name(path) for path in find_recordings(ui.folders.paths).datasets],
         "checkpoints": [_row(ui, path) for path in _checkpoints(ui)],
-    }  # fmt: skip
+    }
 
 
 def _checkpoints(ui: Ui) -> Iterator[Path]:
@@ -174,5 +175,8 @@ def _problems(content: str, target: Path) -> list[str]:
 
 
 ROUTES: dict[str, Handler] = {
-    "GET /list": listing, "POST /start": start, "GET /preview": preview, "POST /apply": apply,
-}  # fmt: skip
+    "GET /list": listing,
+    "POST /start": start,
+    "GET /preview": preview,
+    "POST /apply": apply,
+}
