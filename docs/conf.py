@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
 from pathlib import Path
 
+from docutils.nodes import Element
 from sphinx.application import Sphinx
+from sphinx.util import logging
 
 from ibrobot_core import __version__
 
@@ -31,6 +34,7 @@ html_css_files = ["wide.css"]
 
 default_role = "code"  # `--sim` in a docstring is code, not a title with a dash
 autodoc_member_order = "bysource"
+python_maximum_signature_line_length = 140
 autodoc_default_options = {"members": True, "show-inheritance": True}
 # Names of other projects, of type parameters, and of what has no page of its own.
 nitpick_ignore = [("py:class", "ibrobot_core.interfaces.planner.Goal")]  # a type alias, which autodoc leaves out
@@ -55,10 +59,36 @@ def _types_beside_names(app: Sphinx, what: str, name: str, obj: object, options:
     lines[:] = "\n".join(lines).split("\n")
 
 
+def _require_docstring(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Warn of a constant without a docstring, for which autodoc shows that of its type."""
+    borrowed = inspect.getdoc(type(obj)) or ""
+    if what in ("attribute", "data") and lines and borrowed.startswith(lines[0].strip() or "\n"):
+        logging.getLogger(__name__).warning("%s has no docstring", name)
+
+
+def _readable_defaults(
+    app: Sphinx, what: str, name: str, obj: object, options: object, signature: str | None, returns: str | None
+) -> tuple[str, str | None] | None:
+    """Shorten defaults that are no Python, which also keep Sphinx from linking the types."""
+    if signature is None:
+        return None
+    signature = re.sub(r"<function [\w.]*<lambda>>|\bNOTHING\b", "...", signature)
+    return re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", signature), returns
+
+
+def _drop_plain_bases(app: Sphinx, domain: str, kind: str, content: Element) -> None:
+    """Drop the line on bases from a class that has none of note."""
+    if content.children and content[0].astext() in ("Bases: object", "Bases: ABC", "Bases: Generic"):
+        content.pop(0)
+
+
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
+    app.connect("autodoc-process-docstring", _require_docstring, priority=300)
     app.connect("autodoc-process-docstring", _keep_colons, priority=400)
     app.connect("autodoc-process-docstring", _types_beside_names, priority=600)
+    app.connect("autodoc-process-signature", _readable_defaults)
+    app.connect("object-description-transform", _drop_plain_bases)
 
 
 # An annotation such as `type[Any]` is taken for an attribute of that name, of which there are several.

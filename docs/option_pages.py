@@ -23,7 +23,7 @@ def config_page() -> Iterator[str]:
     yield "[options of that plugin](options.md).\n"
     yield "`${NAME:default}` is replaced from the environment, `~` by the home directory, and `package://PACKAGE/path`"
     yield "by where that Python package is.\n"
-    yield "| section | | |"
+    yield "| section | | contents |"
     yield "|---|---|---|"
     for name, field in SECTIONS.items():
         required = "required" if field.default is attrs.NOTHING else ""
@@ -91,7 +91,7 @@ def _class_tables(kind: type[Any]) -> Iterator[str]:
 
 
 def _table(kind: type[Any], *, links: bool = True) -> Iterator[str]:
-    yield "| key | type | unit | default | allowed | |"
+    yield "| key | type | unit | default | allowed | meaning |"
     yield "|---|---|---|---|---|---|"
     for each in described(kind):
         inner = [(path, found) for path, found in _classes(each.name, fields(kind)[each.name].type) if links]

@@ -19,7 +19,10 @@ from ibrobot_core.units import TICKS_PER_TURN
 
 VERSION = 2
 """Version of the companion file. Version 1 had no `zero_at`; 0 rad was at the pose."""
-ZERO_AT_POSE, ZERO_AT_RANGE = "pose", "range"
+ZERO_AT_POSE = "pose"
+"""0 rad is the pose that was set by hand at calibration."""
+ZERO_AT_RANGE = "range"
+"""0 rad is the middle of each joint's calibrated range."""
 ZERO_AT: Mapping[str, str] = {
     ZERO_AT_POSE: "the pose that was set by hand at calibration (tick 2048)",
     ZERO_AT_RANGE: "the middle of each joint's calibrated range, as in LeRobot",
@@ -28,6 +31,7 @@ ZERO_AT: Mapping[str, str] = {
 MAX_HOMING_OFFSET = 2047
 """Greatest homing offset that a servo can store (sign and 11 bits)."""
 MIDDLE_TICK = TICKS_PER_TURN // 2
+"""Middle of a servo's turn [ticks]."""
 _LAST = TICKS_PER_TURN - 1
 
 

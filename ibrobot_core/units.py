@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 NS_PER_S = 1_000_000_000
+"""Nanoseconds per second."""
 
 
 def ns(seconds: float) -> int:
@@ -66,8 +67,8 @@ def ticks_to_lerobot[T: (float, NDArray[Any])](
 ) -> T:
     """Servo ticks -> LeRobot's units, as its `MotorsBus` (0.6) normalises them.
 
-    - `range_m100_100`: `range_min`..`range_max` -> -100..100, clipped; negated if inverted.
-    - `range_0_100` (the gripper): -> 0..100, clipped; subtracted from 100 if inverted.
+    - `range_m100_100`: `range_min` to `range_max` -> -100 to 100, clipped; negated if inverted.
+    - `range_0_100` (the gripper): -> 0 to 100, clipped; subtracted from 100 if inverted.
     - `degrees`: from the middle of the range, `360 / 4095` degrees a tick, neither clipped nor inverted.
 
     Args:

@@ -66,7 +66,10 @@ def check(
 @config.command()
 @config_options
 def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None) -> None:
-    """Print CONFIG as a run would use it, with all defaults filled in, as a YAML that loads again."""
+    """Print CONFIG as a run would use it, as YAML.
+
+    All defaults are filled in, and the YAML loads again.
+    """
     from ibrobot_core.config import find_config, load_config
     from ibrobot_core.config.missing import describe
     from ibrobot_core.config.show import to_yaml
@@ -79,7 +82,10 @@ def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | 
 
 @config.command()
 def schema() -> None:
-    """Print a JSON Schema of robot YAMLs for editors, with the options of every installed plugin."""
+    """Print a JSON Schema of robot YAMLs, for editors.
+
+    It has the options of every installed plugin.
+    """
     from ibrobot_core.config.jsonschema import json_schema
 
     echo(json.dumps(json_schema(installed_plugins()), indent=2))

@@ -41,7 +41,10 @@ def plugins(ctx: click.Context, as_json: bool) -> None:
 @click.argument("type_", metavar="TYPE")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of {kind, type, …, options: […]}.")
 def show(type_: str, as_json: bool) -> None:
-    """Print the options of TYPE, for every kind that has a type of this name."""
+    """Print the options of TYPE.
+
+    If several kinds have a type of this name, it prints the options of each.
+    """
     from ibrobot_core.config.describe import described
 
     registry = installed_plugins()

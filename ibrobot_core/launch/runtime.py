@@ -15,6 +15,7 @@ from ibrobot_core.launch.session import Session
 from ibrobot_core.units import ns
 
 SET_MODE = "/set_mode"
+"""Service that switches the control mode."""
 RESET = "/reset"
 ESTOP = "/estop"
 _GLANCE_S, _GLANCES = 0.1, 100

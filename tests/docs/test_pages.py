@@ -258,6 +258,24 @@ def test_every_table_of_options_names_options_that_exist() -> None:
     assert [(option, place) for option, place in named if option not in known] == []
 
 
+def _groups(group: click.Group, context: click.Context) -> Iterator[click.Context]:
+    yield context
+    for name in group.list_commands(context):
+        inner = group.get_command(context, name)
+        if isinstance(inner, click.Group):
+            yield from _groups(inner, click.Context(inner, parent=context, info_name=name, terminal_width=80))
+
+
+def test_summaries_of_commands_fit_into_a_line_of_the_terminal() -> None:
+    listed = [
+        f"{context.command_path}: {line.strip()}"
+        for context in _groups(cli, click.Context(cli, info_name="ibrobot", terminal_width=80, **cli.context_settings))
+        for line in context.get_help().splitlines()
+    ]
+    assert len(listed) > 100
+    assert [line for line in listed if line.endswith("...") and "[" not in line] == []
+
+
 def test_readme_names_every_command() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     (table,) = re.findall(r"^## Commands$(.*?)^## ", text, re.MULTILINE | re.DOTALL)

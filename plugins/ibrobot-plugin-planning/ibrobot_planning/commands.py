@@ -22,7 +22,9 @@ def description() -> None:
     "--output", type=click.Path(dir_okay=False, path_type=Path), help="The file; without it, standard output."
 )
 def srdf(config: str, samples: int, seed: int, output: Path | None) -> None:
-    """Write an SRDF of the robot in CONFIG: groups, poses, and links whose collisions need no check.
+    """Write an SRDF of the robot in CONFIG.
+
+    It has groups, poses, and links whose collisions need no check.
 
     Two links need no check if one joint connects them, or if they touch in nearly all or in none of the random
     configurations, as in MoveIt's setup assistant. Links have the names of the URDF or, without a URDF, of the MJCF.

@@ -15,7 +15,10 @@ from ibrobot_core.api import Screen, echo, styled
 @click.command("list")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def list_cameras(as_json: bool) -> None:
-    """List the cameras of this machine: path, stable id, name, and formats, sizes and rates."""
+    """List the cameras of this machine.
+
+    It shows path, stable id, name, and formats, sizes and rates of each.
+    """
     found = v4l2.cameras()
     if as_json:
         echo(json.dumps([attrs.asdict(camera) for camera in found], indent=2))

@@ -25,7 +25,10 @@ _WAIT_S = 10.0
 )
 @click.option("--seconds", type=click.FloatRange(min=0), default=1.0, show_default=True, help="How long to measure.")
 def snapshot(source: str, output: Path | None, seconds: float) -> None:
-    """Save an image of each camera of SOURCE, and print its size, encoding and measured rate."""
+    """Save an image of each camera of SOURCE.
+
+    It prints its size, encoding and measured rate.
+    """
     from ibrobot_camera.commands.sources import opened, pixels
 
     output = output or Path("camera.png")

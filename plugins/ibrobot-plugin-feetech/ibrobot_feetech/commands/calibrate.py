@@ -61,7 +61,9 @@ def calibrate(
     zero_at: str, prefix: str, check_signs: bool, middle_now: bool, range_seconds: float | None, accept_ranges: bool,
     yes: bool,
 ) -> None:  # fmt: skip
-    """Calibrate an arm: its middle pose, then the range of each joint, moved by hand.
+    """Calibrate an arm, moving its joints by hand.
+
+    Put it in its middle pose, then move each joint to both ends of its range.
 
     Nothing is written to the servos or to disk before everything is measured.
     """

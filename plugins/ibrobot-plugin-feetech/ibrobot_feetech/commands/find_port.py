@@ -14,7 +14,7 @@ from ibrobot_feetech.usb import UsbPort, usb_ports
 @click.command()
 @click.option("--list", "only_list", is_flag=True, help="Only list the ports.")
 def find_port(only_list: bool) -> None:
-    """Find the port of an arm by unplugging its USB cable and plugging it in again."""
+    """Find the port of an arm by unplugging its USB cable."""
     guide = TerminalGuide()
     before = list_ports(guide)
     if not only_list:

@@ -31,7 +31,10 @@ def import_calibration(
     file: str, name: str | None, zero_at: str | None, port: str | None, arm: str | None, robot: str | None,
     prefix: str, yes: bool,
 ) -> None:  # fmt: skip
-    """Import the calibration FILE, a path or a name, and set where its 0 rad is. Does not access any servo."""
+    """Import a calibration, and set where its 0 rad is.
+
+    FILE is a path or a name. The command does not access any servo.
+    """
     path = calibration_path(name or file)
     found = load_calibration(file, [joint.name for joint in joints_of(robot, name)], zero_at=zero_at)
     if path.exists() and not yes and not agree(f"{path} exists already. Overwrite it?", flag="--yes"):

@@ -36,7 +36,10 @@ _UNITS = {
 @click.option("--once", is_flag=True, help="Print one reading, then exit.")
 @click.option("--json", "as_json", is_flag=True, help="Print one line of JSON per reading.")
 def monitor(port: str | None, robot: str | None, period: float, once: bool, as_json: bool) -> None:
-    """Show position, speed, load, temperature, voltage, current and errors of every servo. Ctrl-C ends it."""
+    """Show the state of every servo.
+
+    It shows position, speed, load, temperature, voltage, current and errors. Ctrl-C ends it.
+    """
     joints = joints_of(robot)
     with opened(port, joints=by_servo(joints)) as bus:
         reader = SyncReader(bus, [joint.servo for joint in joints], "present_position", "present_current")

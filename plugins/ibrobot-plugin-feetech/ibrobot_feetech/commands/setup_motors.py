@@ -28,7 +28,10 @@ _RATE = 1_000_000
 )
 @click.option("--yes", is_flag=True, help="The servo is connected: do not ask; needs exactly one --joint.")
 def setup_motors(port: str | None, names: tuple[str, ...], robot: str | None, baud: tuple[int, ...], yes: bool) -> None:
-    """Set each servo's id and 1 Mbaud, with only one servo connected at a time, beginning with the last joint."""
+    """Set the id and the baud rate of each servo, one by one.
+
+    Only one servo is connected at a time, beginning with the last joint. The baud rate becomes 1 Mbaud.
+    """
     if yes and len(names) != 1:
         raise click.UsageError("--yes needs exactly one --joint, because only one servo may be connected")
     set_up_motors(TerminalGuide(), port, names, robot=robot, rates=baud, yes=yes)

@@ -15,7 +15,10 @@ _VIA = {"hid": "its own reports", "sdl": "SDL"}
 @click.command("list")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def list_devices(as_json: bool) -> None:
-    """List gamepads and SpaceMice: name, id for the option `device`, model, and how they are read."""
+    """List gamepads and SpaceMice.
+
+    It shows name, id for the option `device`, model, and how each is read.
+    """
     found = find_all()
     if as_json:
         rows = [

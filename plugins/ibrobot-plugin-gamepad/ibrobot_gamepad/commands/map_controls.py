@@ -37,7 +37,9 @@ _Find = Callable[[Controls, Controls], str | None]
 @device_option
 @click.option("--wait", type=click.FloatRange(min=0), default=5.0, show_default=True, help="Time for each control [s].")
 def map_controls(config: str | None, device: str, wait: float) -> None:
-    """Learn the controls of a device, and print them as YAML for the section `teleoperation`.
+    """Learn the controls of a device, and print them as YAML.
+
+    The YAML is for the section `teleoperation`.
 
     CONFIG is a robot YAML as for `ibrobot launch`; it names the joints. The command asks for one control after another:
     press it, or move it to its end, then let go. A function whose control you do not touch in time keeps its default.

@@ -10,5 +10,8 @@ from ibrobot_gamepad.permissions import udev_rules
 
 @click.command()
 def udev() -> None:
-    """Print the udev rule that lets the user logged in at this machine open gamepads and SpaceMice."""
+    """Print the udev rule that lets users open devices.
+
+    It covers gamepads and SpaceMice, for the user logged in at this machine.
+    """
     echo(udev_rules())

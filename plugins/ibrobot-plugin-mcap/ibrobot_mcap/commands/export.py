@@ -26,7 +26,10 @@ _TO_RGB = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, 3), "bgra8":
 )
 @wrong_input()
 def export(episode: Path, topic: str, output: Path) -> None:
-    """Export a TOPIC of an EPISODE: numbers and texts to a CSV file, images to PNG files with their stamps."""
+    """Export a TOPIC of an EPISODE to CSV or PNG files.
+
+    Numbers and texts become a CSV file, images PNG files and a CSV file of their stamps.
+    """
     from ibrobot_mcap.commands.found import opened
 
     with opened(episode) as reader:

@@ -21,7 +21,10 @@ _LONG = 200
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, with all metadata.")
 @wrong_input()
 def info(episode: Path, as_json: bool) -> None:
-    """Show the topics, counts, losses and metadata of an EPISODE, which may be unfinished."""
+    """Show topics, counts, losses and metadata of an EPISODE.
+
+    The episode may be unfinished.
+    """
     from ibrobot_mcap.commands.found import date_of, duration_s, size_of, summary_of, told_size
 
     summary = summary_of(episode)

@@ -20,7 +20,10 @@ _WIDE = 100
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @wrong_input()
 def list_episodes(path: Path, as_json: bool) -> None:
-    """List the episodes in PATH: a folder of datasets (by default `episodes`), a dataset, or an episode."""
+    """List the episodes in PATH.
+
+    PATH is a folder of datasets (by default `episodes`), a dataset, or an episode.
+    """
     from ibrobot_mcap.commands.found import date_of, duration_s, episodes_in, size_of, summary_of, told_size
 
     rows = []

@@ -20,7 +20,10 @@ _THUMBNAILS = 8
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="A .png file; by default NAME.png.")
 @wrong_input()
 def plot(episode: Path, output: Path | None) -> None:
-    """Plot an EPISODE: joints and actions over time, rates and gaps of every topic, and some images."""
+    """Plot an EPISODE.
+
+    It shows joints and actions over time, rates and gaps of every topic, and some images.
+    """
     try:
         import matplotlib as mpl
     except ImportError:

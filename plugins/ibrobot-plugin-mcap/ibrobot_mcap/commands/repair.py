@@ -13,11 +13,11 @@ from ibrobot_core.api import EpisodeSummary, RecorderError, echo, wrong_input
 @click.argument("path", type=click.Path(path_type=Path))
 @wrong_input()
 def repair(path: Path) -> None:
-    """Repair unfinished or incomplete episodes in PATH: write index and metadata.yaml for the readable part.
+    """Repair unfinished or incomplete episodes in PATH.
 
-    The episode records the missing messages, and `verify` reports them. The outcome becomes unknown, since the end
-    may be missing: look at the episode, and set it with `mark`. The original is removed only after the new episode has
-    been read back and has all its messages.
+    It writes index and metadata.yaml for the readable part. The episode records the missing messages, and `verify`
+    reports them. The outcome becomes unknown, since the end may be missing: look at the episode, and set it with
+    `mark`. The original is removed only after the new episode has been read back and has all its messages.
     """
     from ibrobot_mcap import rewrite
     from ibrobot_mcap.commands.found import duration_s, episodes_in

@@ -18,7 +18,9 @@ from ibrobot_core.api import Declined, RecorderError, echo, wrong_input
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @wrong_input()
 def trash_command(path: Path, restore: str | None, empty: bool, yes: bool, as_json: bool) -> None:
-    """List what PATH holds in its trash: deleted episodes, and the originals of trimmed ones; newest last.
+    """List, restore or delete episodes in the trash of PATH.
+
+    The trash has deleted episodes and the originals of trimmed ones; newest last.
 
     PATH is a folder of datasets (by default `episodes`), a dataset, or the folder of its episodes.
     """

@@ -17,10 +17,10 @@ from ibrobot_core.api import echo, wrong_input
 @click.option("--in-place", is_flag=True, help="Replace EPISODE; the original moves to .trash beside it.")
 @wrong_input()
 def trim(episode: Path, begin_s: float, end_s: float | None, output: Path | None, in_place: bool) -> None:
-    """Copy a part of an EPISODE to a new one, in seconds from its first message.
+    """Copy a part of an EPISODE to a new one.
 
-    The last message of a latched topic before this part is kept, because a late subscriber would have received it.
-    After --in-place, `ibrobot episodes trash --restore` puts the original back.
+    Times are in seconds from its first message. The last message of a latched topic before this part is kept, because a
+    late subscriber would have received it. After --in-place, `ibrobot episodes trash --restore` puts the original back.
     """
     from ibrobot_mcap import trash
     from ibrobot_mcap.commands.found import duration_s, opened

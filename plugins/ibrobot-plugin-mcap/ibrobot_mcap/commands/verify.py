@@ -14,7 +14,9 @@ from ibrobot_core.api import echo, wrong_input
 @click.option("--gap", type=click.FloatRange(min=1), default=5.0, show_default=True, help="Longest pause, in periods.")
 @wrong_input()
 def verify(path: Path, gap: float) -> None:
-    """Read every message of the episodes in PATH and print problems; exits with 1 if there are any.
+    """Check every message of the episodes in PATH.
+
+    Prints problems, and exits with 1 if there are any.
 
     Problems are: unfinished episodes, messages that cannot be decoded, counts that differ from metadata.yaml, lost
     messages, topics of the contract without messages, header stamps that decrease, pauses in a topic longer than --gap
