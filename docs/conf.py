@@ -16,6 +16,7 @@ from ibrobot_core import __version__
 sys.path.insert(0, str(Path(__file__).parent))
 
 import generate
+from option_pages import flags_as_code
 
 generate.write(Path(__file__).parent / "reference")
 
@@ -35,6 +36,7 @@ html_css_files = ["wide.css"]
 default_role = "code"  # `--sim` in a docstring is code, not a title with a dash
 autodoc_member_order = "bysource"
 python_maximum_signature_line_length = 140
+python_use_unqualified_type_names = True
 autodoc_default_options = {"members": True, "show-inheritance": True}
 # Names of other projects, of type parameters, and of what has no page of its own.
 nitpick_ignore = [("py:class", "ibrobot_core.interfaces.planner.Goal")]  # a type alias, which autodoc leaves out
@@ -48,21 +50,26 @@ def _keep_colons(app: Sphinx, what: str, name: str, obj: object, options: object
 
 
 def _types_beside_names(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
-    """Show the type of an attribute beside its name, where Napoleon adds it as a field below the text."""
+    """Show the type of an attribute beside its name, where Napoleon adds it as a field below the text.
+
+    Flags such as --sim in the help texts of options become code.
+    """
     attribute = 0
     for number, line in enumerate(lines):
         if line.startswith(".. attribute::"):
             attribute = number
         elif attribute and re.match(r" {3}:type: ", line):
-            lines[attribute] += f"\n{line}"
+            lines[attribute] += "\n" + re.sub(r"\b(collections\.abc|pathlib)\.", "", line)
             lines[number] = ""
+        elif attribute:
+            lines[number] = flags_as_code(line)
     lines[:] = "\n".join(lines).split("\n")
 
 
 def _require_docstring(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
     """Warn of a constant without a docstring, for which autodoc shows that of its type."""
-    borrowed = inspect.getdoc(type(obj)) or ""
-    if what in ("attribute", "data") and lines and borrowed.startswith(lines[0].strip() or "\n"):
+    borrowed = [inspect.cleandoc(each.__doc__) for each in (obj, type(obj)) if isinstance(each.__doc__, str)]
+    if what in ("attribute", "data") and lines and any(text.startswith(lines[0]) for text in borrowed):
         logging.getLogger(__name__).warning("%s has no docstring", name)
 
 

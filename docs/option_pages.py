@@ -28,7 +28,7 @@ def config_page() -> Iterator[str]:
     for name, field in SECTIONS.items():
         required = "required" if field.default is attrs.NOTHING else ""
         target = next((f"[`{name}`](#{_anchor(kind)})" for _, kind in _classes(name, field.type)), f"`{name}`")
-        yield f"| {target} | {required} | {_text(field.metadata['help'])} |"
+        yield f"| {target} | {required} | {flags_as_code(field.metadata['help'])} |"
     registry = installed_plugins()
     for name in registry.types("section"):
         yield f"| [`{name}`](#{_options_anchor('section', name)}) | | {registry.find('section', name).summary} |"
@@ -102,14 +102,14 @@ def _table(kind: type[Any], *, links: bool = True) -> Iterator[str]:
             each.unit,
             _default(each.default),
             each.allowed,
-            _text(each.help) + keys,
+            flags_as_code(each.help) + keys,
         )
         yield _row(cells)
     yield ""
 
 
-def _text(help_text: str) -> str:
-    """A help text with its flags, e.g. --sim, as code; otherwise they get a dash for their two hyphens."""
+def flags_as_code(help_text: str) -> str:
+    """A text with its flags, e.g. --sim, as code; otherwise they get a dash for their two hyphens."""
     return re.sub(r"`[^`]*`|(?<!\S)--\w[\w-]*", lambda found: f"`{found[0].strip('`')}`", help_text)
 
 

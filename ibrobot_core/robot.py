@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ibrobot_core.options import documented, option
 
 Vector = NDArray[np.float64]
+"""Floats, e.g. one for each joint: shape (J,)."""
 
 LAG_S = 0.1
 """How long after its setpoint a servo may be at a place [s]; ADR 0016 has what was measured."""

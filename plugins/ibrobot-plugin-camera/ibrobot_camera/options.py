@@ -57,7 +57,7 @@ class RealSenseOptions:
     stream: str = option("color", choices=("color", "depth"), help="depth: 16UC1 [mm], aligned to the colour images")
     width: int = option(640, unit="px", gt=0, help="image width")
     height: int = option(480, unit="px", gt=0, help="image height")
-    fps: float = option(30.0, unit="Hz", gt=0, help="pictures a second")
+    fps: float = option(30.0, unit="Hz", gt=0, help="images per second")
     encoding: str = ENCODING
     jpeg_quality: int = JPEG_QUALITY
     frame_id: str = option("", help="frame id of the messages; NAME_optical_frame if empty")
