@@ -172,6 +172,7 @@ class _Live:
         self._thread.join(_CLOSE_S)
 
     def _run(self, capture: Capture) -> None:
+        warned = False
         try:
             while not self._ended.is_set():
                 picture = capture.read()
@@ -182,6 +183,12 @@ class _Live:
                         return
                     capture = found
                     continue
+                if capture.lacks_stamps and not warned:
+                    warned = True
+                    self._ctx.log.warning(
+                        "camera %s: its driver gives no time stamps; images get the time at which they arrive",
+                        self._ctx.name,
+                    )
                 with self._changed:
                     self._newest = picture
                     self._changed.notify()

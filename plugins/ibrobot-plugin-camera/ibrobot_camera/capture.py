@@ -91,8 +91,8 @@ class Capture:
             raise
         self.fps = float(self._capture.get(cv2.CAP_PROP_FPS))
         """Images per second, as reported by the source [Hz]; 0 if unknown."""
-        self.driver_stamps = False
-        """Whether the last image has the driver's stamp."""
+        self.lacks_stamps = False
+        """Whether this is a V4L2 device whose last image has no plausible stamp, but that of its arrival."""
 
     def read(self) -> Picture | None:
         """The next image; None at the end of a file, or if the source is lost."""
@@ -228,9 +228,9 @@ class Capture:
         if self._device.kind == "v4l2":
             stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
             if now_ns - NS_PER_S < stamp_ns <= now_ns:
-                self.driver_stamps = True
+                self.lacks_stamps = False
                 return stamp_ns
-        self.driver_stamps = False
+            self.lacks_stamps = True
         return now_ns
 
     def _error(self, what: str) -> SensorError:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from ibrobot_camera import camera as camera_module
 from ibrobot_camera import capture as capture_module
 from ibrobot_camera.capture import Capture
 from ibrobot_camera.device import Device
 from ibrobot_camera.options import OpenCvOptions
 from ibrobot_camera.v4l2 import Mode
+from ibrobot_testing.contexts import host_context
 
-from ibrobot_core.api import CompressedImage
+from ibrobot_core.api import CompressedImage, RealClock, SensorError
 
 
 class Scripted:
@@ -60,6 +63,44 @@ class TestPictures:
         pictures: list[np.ndarray | None] = [None] * 100
         assert self.capture(monkeypatch, pictures).read() is None
         assert pictures
+
+    @pytest.mark.parametrize(("age_ms", "is_stamp"), [(100.0, True), (None, False), (-1000.0, False), (2000.0, False)])
+    def test_plausible_stamps_of_the_driver_are_kept(
+        self, monkeypatch: pytest.MonkeyPatch, age_ms: float | None, is_stamp: bool
+    ) -> None:
+        source = self.capture(monkeypatch, [np.zeros((3, 4, 3), np.uint8)])
+        begun_ns = time.monotonic_ns()
+        stamp_ms = 0.0 if age_ms is None else begun_ns / 1e6 - age_ms
+        source._capture.set(cv2.CAP_PROP_POS_MSEC, stamp_ms)
+        picture = source.read()
+        assert picture is not None
+        assert (picture.taken_ns == round(stamp_ms * 1e6)) == is_stamp == (not source.lacks_stamps)
+        assert is_stamp or begun_ns <= picture.taken_ns <= time.monotonic_ns()
+
+    def test_a_driver_without_stamps_is_reported_once(
+        self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        devices = [Scripted([np.zeros((3, 4, 3), np.uint8)] * 3)]
+
+        def open_once(self: Capture) -> Scripted:
+            if not devices:
+                raise SensorError("unplugged")
+            return devices.pop()
+
+        monkeypatch.setattr(capture_module.Capture, "_open", open_once)
+        monkeypatch.setattr(camera_module, "find_device", lambda device, name: Device("v4l2", "/dev/video7"))
+        options = OpenCvOptions(device=7, strict=False, reconnect_timeout=0.0)
+        camera = camera_module.OpenCvCamera(options, host_context("top", clock=RealClock()))
+        camera.open()
+
+        def read_on() -> None:
+            while True:
+                camera.read(10.0)
+
+        with pytest.raises(SensorError, match="did not return"):
+            read_on()
+        camera.close()
+        assert caplog.text.count("camera top: its driver gives no time stamps") == 1
 
     def test_z16_bytes_become_depths(self, monkeypatch: pytest.MonkeyPatch) -> None:
         depth = np.arange(12, dtype=np.uint16).reshape(3, 4)

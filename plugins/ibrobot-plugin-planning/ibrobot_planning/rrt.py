@@ -180,15 +180,6 @@ class RrtConnectPlanner(Planner):
         return start
 
 
-@attrs.frozen(eq=False)
-class _Goal:
-    """One alternative."""
-
-    number: int
-    candidates: list[Candidate]
-    """Of all joints."""
-
-
 @attrs.define(eq=False)
 class _Plan:
     """One request in progress."""

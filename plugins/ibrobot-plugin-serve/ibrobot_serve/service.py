@@ -76,7 +76,6 @@ class RobotCounts:
     """Answered with an error; includes `expired` ones."""
     expired: int = 0
     """Not begun, because the deadline had passed."""
-    heard_ns: int = 0
     latencies_ms: deque[float] = attrs.field(factory=lambda: deque(maxlen=_LATENCIES_KEPT))
 
     def summary(self) -> dict[str, Any]:
