@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
+
+RUN_KEYS: Mapping[str, str] = {
+    "esc": "emergency stop", "tab": "start and end of an episode", **{f"f{i}": "mode switch" for i in range(1, 10)},
+    "f10": "reset", "f11": "end of an episode", "f12": "end of an episode",
+}  # fmt: skip
+"""Key -> its meaning in every run; devices and sections may only use it for the same."""
 
 
 class RunHooks:

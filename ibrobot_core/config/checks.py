@@ -22,6 +22,7 @@ from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TeleopDescriptor, TransportDescriptor
 from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Joint, Robot
+from ibrobot_core.run_hooks import RUN_KEYS
 from ibrobot_core.units import radians
 
 _SLACK = 0.01
@@ -158,9 +159,16 @@ class Checks:
     def _options(self, robot: Robot) -> None:
         """Run the plugins' checks of their options for this robot."""
         for part in self.sections.all():
+            keys: dict[str, str] = {}
             for seen, joints in self._seen_by(part, robot):
                 for fault in part.descriptor.check_options(part.component.options, seen, joints):
                     self.document.add((*part.key, *fault.option), fault.message)
+                if isinstance(part.descriptor, TeleopDescriptor):
+                    keys |= part.descriptor.keys(part.component.options, seen)
+            for key, does in keys.items():
+                if does != (always := RUN_KEYS.get(key, does)):
+                    message = f"key {key!r} is both {does} and, in every run, {always}; give the device another key"
+                    self.document.add(part.key, message)
 
     def _seen_by(self, part: ParsedComponent[Any], robot: Robot) -> list[tuple[Robot, tuple[str, ...]]]:
         """The robot as a component sees it, with its joints; a device sees the groups that it moves in the modes."""

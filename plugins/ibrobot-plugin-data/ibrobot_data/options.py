@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import OptionFault, TeleopDescriptor, documented, installed_plugins, option
+from ibrobot_core.api import RUN_KEYS, OptionFault, TeleopDescriptor, documented, installed_plugins, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import RobotConfig
@@ -69,6 +69,9 @@ def check_keys(config: RobotConfig) -> Iterator[OptionFault]:
         if modes and options.highlight_key == options.takeover_key:
             message = f"{options.highlight_key!r} is the takeover_key, too; give one of them another key"
             yield OptionFault(("episodes", "highlight_key"), message)
+    for option_, (key, _) in keys.items():
+        if key in RUN_KEYS:
+            yield OptionFault(("episodes", option_), f"{key!r} is {RUN_KEYS[key]} in every run; give another key")
     for mode in modes:
         assert mode.inference is not None
         for group, name in mode.inference.devices.items():

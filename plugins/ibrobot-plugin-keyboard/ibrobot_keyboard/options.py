@@ -3,20 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import attrs
 
 from ibrobot_core.api import documented, option
-
-RESERVED = ("q", "esc", "tab", *(f"f{n}" for n in range(1, 13)))
-"""Keys that belong to `ibrobot launch`: quit, emergency stop, modes, reset."""
-
-
-def _check_keys(instance: Any, attribute: attrs.Attribute[Any], keys: Mapping[str, str]) -> None:
-    for action, key in keys.items():
-        if key in RESERVED:
-            raise ValueError(f"{action}: key {key!r} is reserved by ibrobot; reserved keys are {', '.join(RESERVED)}")
 
 
 @documented
@@ -32,4 +22,4 @@ class KeyboardOptions:
     )
     cartesian: bool = option(True, help="whether Cartesian jog is available; it needs robot.description.mjcf")
     gripper: str = option("gripper", help="joint group that the gripper keys move")
-    keys: Mapping[str, str] = option(factory=dict, help="action -> key, instead of the default", validator=_check_keys)
+    keys: Mapping[str, str] = option(factory=dict, help="action -> key, instead of the default")

@@ -239,7 +239,7 @@ def test_the_emergency_key_asks_for_a_stop_once_and_ends_all_motion():
 
 def test_keys_of_the_runtime_and_unknown_ones_do_nothing():
     rig = TeleopRig()
-    for key in ("q", "esc", "tab", "f1", "f10", "ü", "m"):
+    for key in ("esc", "tab", "f1", "f10", "ü", "m"):
         assert rig.tick(key) == TeleopCommand(None)
 
 
@@ -269,13 +269,6 @@ def test_keys_that_make_no_sense_are_refused(keys, message):
     with pytest.raises(TeleopError) as refused:
         TeleopRig(options=KeyboardOptions(cartesian=False, keys=keys))
     assert str(refused.value).startswith(message)
-
-
-def test_keys_of_the_runtime_cannot_be_given_away():
-    with pytest.raises(
-        ValueError, match=r"estop: key 'q' is reserved by ibrobot; reserved keys are q, esc, tab, f1, .*f12$"
-    ):
-        KeyboardOptions(keys={"estop": "q"})
 
 
 def test_more_joints_than_keys_need_keys_of_their_own():
