@@ -167,8 +167,8 @@ class Checks:
                     keys |= part.descriptor.keys(part.component.options, seen)
             for key, does in keys.items():
                 if does != (always := RUN_KEYS.get(key, does)):
-                    message = f"key {key!r} is both {does} and, in every run, {always}; give the device another key"
-                    self.document.add(part.key, message)
+                    message = f"key {key!r} is both {does} and, in every run, {always}; choose another key"
+                    self.document.add(_place_of(key, part.key, self.document.get(*part.key)), message)
 
     def _seen_by(self, part: ParsedComponent[Any], robot: Robot) -> list[tuple[Robot, tuple[str, ...]]]:
         """The robot as a component sees it, with its joints; a device sees the groups that it moves in the modes."""
@@ -370,3 +370,12 @@ class Checks:
 def streams(part: ParsedComponent[Any]) -> bool:
     """Whether an executor follows setpoints, not goals."""
     return isinstance(part.descriptor, ExecutorDescriptor) and part.descriptor.streams
+
+
+def _place_of(value: str, at: Key, node: Any) -> Key:
+    """The key in the mapping at `at` that has `value`; `at` itself if none has, e.g. for a default."""
+    for name, inner in node.items() if isinstance(node, Mapping) else ():
+        place = (*at, name)
+        if inner == value or (found := _place_of(value, place, inner)) != place:
+            return place if inner == value else found
+    return at

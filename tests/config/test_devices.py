@@ -55,10 +55,10 @@ CASES = {
         f"{MODE}.teleop.gripper: key 'space' is both emergency stop (right) and deadman (left); give one of them "
         "another key"),
     "key of the run": ([("/dev/b", "/dev/b, deadman: f1, stop: tab")],
-        "robot.yaml:32: teleoperation.right: key 'f1' is both deadman and, in every run, mode switch; give the device "
+        "robot.yaml:32: teleoperation.right.deadman: key 'f1' is both deadman and, in every run, mode switch; choose "
         "another key\n"
-        "robot.yaml:32: teleoperation.right: key 'tab' is both emergency stop and, in every run, start and end of an "
-        "episode; give the device another key"),
+        "robot.yaml:32: teleoperation.right.stop: key 'tab' is both emergency stop and, in every run, start and end of "
+        "an episode; choose another key"),
     "two sources": ([("gripper: right}}", "gripper: right}, planner: {type: straight}}")],
         f"{MODE}.planner: teleop already drives this mode; make a mode for each"),
     "goals": ([("[arm_position, grip_position], teleop", "[arm_trajectory, grip_position], teleop")],
