@@ -22,8 +22,8 @@ nox.needs_version = ">=2026.8.10"
 nox.options.default_venv_backend = "uv"
 nox.options.reuse_venv = "yes"
 # `nox` alone runs sessions side by side, one more than there are cores since tests wait too, and prints each one's
-# output when it ends. They start in the order of this file: the longest come first, so that none is left alone at the
-# end. A named session prints as it runs. `-j` says otherwise.
+# output when it ends. They start in the order of this file: the longest come first, then those that wait most, and last
+# those that keep the cores busy together. A named session prints as it runs. `-j` says otherwise.
 nox.options.allow_parallel = True
 nox.options.parallel = 1 if sys.argv[1:] else (os.cpu_count() or 1) + 1
 # The many processes that tests start would otherwise compile what they import, each for itself.
@@ -206,6 +206,36 @@ def lerobot(session: nox.Session) -> None:
 
 
 @nox.session
+def wheels(session: nox.Session) -> None:
+    """Whether everything, with all extras, installs from wheels on each platform; what is installed runs by itself."""
+    projects = [str(folder / "pyproject.toml") for folder in LOCAL.values()]
+    options = ("--quiet", "--all-extras", "-c", "constraints.txt", "--only-binary", ":all:", "--python-version", "3.12")
+    for platform in PLATFORMS:
+        session.run("uv", "pip", "compile", *options, "--python-platform", platform, "-o", os.devnull, *projects)
+    folder = Path(session.create_tmp()).absolute()
+    session.run("uv", "build", "--quiet", "--all-packages", "--wheel", "--out-dir", str(folder / "dist"))
+    for page in ("README.md", "plugins/ibrobot-plugin-feetech/README.md"):
+        requirement, *commands = installation(page)
+        environment = folder / requirement
+        session.run("uv", "venv", "--quiet", "--clear", str(environment))
+        wheels = ("--find-links", str(folder / "dist"), "-c", "constraints.txt")
+        session.run("uv", "pip", "install", "--quiet", "--python", str(environment), *wheels, requirement)
+        with session.chdir(folder):  # away from this repository
+            for command in commands:
+                program, *arguments = shlex.split(command, comments=True)
+                session.run(str(environment / "bin" / program), *arguments, external=True)
+
+
+@nox.session
+@nox.parametrize("name", PLUGINS, ids=PLUGINS)
+def plugin(session: nox.Session, name: str) -> None:
+    """A plugin's tests with that plugin and core alone; those in a browser run in `integration`."""
+    install(session, name)
+    system_libraries(session)
+    session.run(*PYTEST, str(FOLDERS[name] / "tests"), *session.posargs)
+
+
+@nox.session
 def core(session: nox.Session) -> None:
     """Core's tests with no plugin installed."""
     install(session)
@@ -256,36 +286,6 @@ def types(session: nox.Session) -> None:
     bases = {"MYPYPATH": ":".join((*shared, *map(str, FOLDERS.values()), str(folder)))}
     given = (f"--config-file={folder / 'pyproject.toml'}", "--explicit-package-bases")
     session.run("mypy", *given, *typed, *tests, env=bases)
-
-
-@nox.session
-def wheels(session: nox.Session) -> None:
-    """Whether everything, with all extras, installs from wheels on each platform; what is installed runs by itself."""
-    projects = [str(folder / "pyproject.toml") for folder in LOCAL.values()]
-    options = ("--quiet", "--all-extras", "-c", "constraints.txt", "--only-binary", ":all:", "--python-version", "3.12")
-    for platform in PLATFORMS:
-        session.run("uv", "pip", "compile", *options, "--python-platform", platform, "-o", os.devnull, *projects)
-    folder = Path(session.create_tmp()).absolute()
-    session.run("uv", "build", "--quiet", "--all-packages", "--wheel", "--out-dir", str(folder / "dist"))
-    for page in ("README.md", "plugins/ibrobot-plugin-feetech/README.md"):
-        requirement, *commands = installation(page)
-        environment = folder / requirement
-        session.run("uv", "venv", "--quiet", "--clear", str(environment))
-        wheels = ("--find-links", str(folder / "dist"), "-c", "constraints.txt")
-        session.run("uv", "pip", "install", "--quiet", "--python", str(environment), *wheels, requirement)
-        with session.chdir(folder):  # away from this repository
-            for command in commands:
-                program, *arguments = shlex.split(command, comments=True)
-                session.run(str(environment / "bin" / program), *arguments, external=True)
-
-
-@nox.session
-@nox.parametrize("name", PLUGINS, ids=PLUGINS)
-def plugin(session: nox.Session, name: str) -> None:
-    """A plugin's tests with that plugin and core alone; those in a browser run in `integration`."""
-    install(session, name)
-    system_libraries(session)
-    session.run(*PYTEST, str(FOLDERS[name] / "tests"), *session.posargs)
 
 
 @nox.session
