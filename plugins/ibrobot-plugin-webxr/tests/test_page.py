@@ -241,7 +241,7 @@ def test_the_page_shows_cameras_and_who_has_control(arm: Arm, server: PageServer
 
     arm.wait(comes)
     shown.wait_for()
-    assert tab.locator("figcaption").text_content() == "wrist"
+    tab.locator("figcaption", has_text="wrist").wait_for()
     bus.publish("/robot_status", RobotStatus(Header(0), "so101", "phone", faults=("<b>a fault</b>",)))
     tab.get_by_text("<b>a fault</b>").wait_for()
     tab.close()

@@ -33,6 +33,7 @@ function onState(next) {
   const moves = arms.some(([, { engaged }]) => engaged);
   $("clutch").classList.toggle("moves", moves);
   $("message").textContent = failure || reason(next, arms);
+  nameCameras();
   for (const button of document.querySelectorAll("[data-event], #clutch, #stick, #open, #close")) button.disabled = next.control !== "you";
 }
 
@@ -53,6 +54,13 @@ function onLink({ open, silent, rate, roundTrip }) {
   if (!open || silent) controls.release();
 }
 
+// The first image of a camera may come before the state that names it.
+function nameCameras() {
+  figures.forEach(({ children: [image, caption] }, camera) => {
+    caption.textContent = image.alt = state?.cameras[camera] ?? "";
+  });
+}
+
 function onImage(camera, blob, shown) {
   if (!figures[camera]) {
     const figure = document.createElement("figure");
@@ -60,9 +68,8 @@ function onImage(camera, blob, shown) {
     figures[camera] = figure;
     $("cameras").replaceChildren(...figures.filter(Boolean));
   }
-  const name = state?.cameras[camera] ?? "";
-  const [image, caption] = figures[camera].children;
-  caption.textContent = image.alt = name;
+  nameCameras();
+  const [image] = figures[camera].children;
   if (headset.session && !headset.isPhone) {
     createImageBitmap(blob).then((bitmap) => headset.screens.show(camera, bitmap)).finally(shown);
     return;
