@@ -1,4 +1,4 @@
-"""Hooks for a command's own keys and status rows, beside those of the run and its mode."""
+"""The keys of every run, and hooks for the keys and status rows that a command adds to them."""
 
 from __future__ import annotations
 
