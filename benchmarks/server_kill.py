@@ -166,6 +166,7 @@ def kill_once(
     stats, engine = session.acting.dispatch, session.acting.engine
     chunks = stats.chunks
     until(lambda: stats.chunks > chunks, PATIENCE_S, "a chunk")
+    until(lambda: motion.moved_ns().size > 0, PATIENCE_S, "the arm moves")
     until(lambda: stats.requests > stats.chunks + stats.failures + stats.timeouts, PATIENCE_S, "a request in flight")
     time.sleep(0.02)
     killed_ns = session.clock.now_ns()

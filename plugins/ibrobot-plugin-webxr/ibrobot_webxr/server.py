@@ -331,11 +331,15 @@ class PageServer:
     async def _tell_until_end(self) -> None:
         """Send the state to all pages, until the end."""
         while not self._ending.is_set():
+            began_s = time.monotonic()
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._ending.wait(), _STATE_S)
             now_s = time.monotonic()
-            if self._control is not None and now_s - self._control.heard_s > _SILENT_S:
-                self._release(self._control)
+            if self._control is not None:
+                # While this thread pauses, a page that has just opened does not learn that it may send.
+                self._control.heard_s += max(0.0, now_s - began_s - _STATE_S)
+                if now_s - self._control.heard_s > _SILENT_S:
+                    self._release(self._control)
             if self._images is not None and not self._pages:
                 self._images.refresh()  # so that a page that opens has no old image
             if self._status is not None and (received := self._status.get()) is not None:

@@ -258,6 +258,15 @@ def test_a_silent_page_loses_control(
     assert browser.state(control="you")
 
 
+def test_a_page_that_opens_while_the_host_pauses_keeps_control(
+    page: PageServer, browser: Browser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ibrobot_webxr.server._SILENT_S", 0.5)
+    browser.log_in().connect()
+    page._loop.call_soon_threadsafe(time.sleep, 0.8)
+    assert browser.state()["control"] == "you"
+
+
 def test_the_stop_reaches_the_run_in_any_mode(ctx: Context, page: PageServer, browser: Browser):
     assert ctx.bus is not None
     stopped: list[object] = []
