@@ -56,7 +56,7 @@ EXTRAS = {
 PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-apple-darwin")
 """Where everything must install without a compiler: PCs, robots' own computers (e.g. Jetson), and Macs."""
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
-PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0", "-rs")
+PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0", "-rfEs")
 TWO = ("-n", "2", "--dist", "worksteal")
 """Two tests at once: in sessions so long that the others would end before them."""
 UNTYPED = (
