@@ -41,6 +41,7 @@ from ibrobot_serve.remote import RemoteEngine
 from ibrobot_serve.service import InferenceService
 from ibrobot_serve.wire import WireKind, WireMessage, encode
 from ibrobot_testing import host_context
+from ibrobot_testing.ports import free_port
 from made_up import plugin
 
 from ibrobot_core.config import load_config
@@ -157,14 +158,6 @@ def started(*arguments: str) -> Iterator[int]:
 def security_options(certificates: Path | None) -> tuple[str, ...]:
     """The arguments that tell a process of its certificates."""
     return ("--certificates", str(certificates)) if certificates else ()
-
-
-def free_port() -> int:
-    """A port of this machine that nobody listens on."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port: int = free.getsockname()[1]
-        return port
 
 
 def receive(connection: socket.socket, buffer: memoryview) -> int:

@@ -18,7 +18,6 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import socket
 import subprocess
 import sys
 import threading
@@ -32,6 +31,7 @@ from ibrobot_serve.remote import RemoteEngine
 from ibrobot_serve.service import InferenceService, ServiceOptions
 from ibrobot_testing import host_context, make_robot
 from ibrobot_testing.fakes import FakePolicy
+from ibrobot_testing.ports import free_port
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import RealClock
@@ -240,9 +240,7 @@ def fleet(
     count: int, seconds: float, watermark: str, *, hiccup_s: float = 0.0, batch: int = 1, with_greedy: bool = False
 ) -> dict[str, dict[str, Any]]:
     """One round, before the hiccup and after it."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     server = started("--serve", endpoint, "--batch", batch)
     asking = [
         started(

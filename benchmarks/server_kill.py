@@ -14,7 +14,6 @@ import argparse
 import json
 import logging
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -24,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ibrobot_testing.ports import free_port
 from made_up import plugin
 
 from ibrobot_core.config import load_config
@@ -193,9 +193,7 @@ def resources() -> dict[str, int]:
 
 def run(kills: int, slack_s: float, folder: Path) -> int:
     """Print what came of it as JSON; 1 when it is not as it must be."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
     (folder / "mini.yaml").write_text(ROBOT.replace("PORT", str(port)))
     mine = [entry for found in distributions(path=[str(folder)]) for entry in found.entry_points]

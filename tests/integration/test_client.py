@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from ibrobot_planning.client import GripperInterface, MoveIt2, rclpy
 from ibrobot_planning.client import robots as ibrobot_robots
 from ibrobot_planning.client.rclpy import Node, ReentrantCallbackGroup
 from ibrobot_testing import host_context
+from ibrobot_testing.ports import free_port
 
 from ibrobot_core.api import (
     Int8,
@@ -33,9 +33,7 @@ robot = ibrobot_robots.so101
 
 
 def free_endpoint() -> str:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{found.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ import os
 import re
 import select
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -21,6 +20,7 @@ import pytest
 from ibrobot_serve.remote import RemoteEngine
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
+from ibrobot_testing.ports import free_port
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Transport
@@ -40,9 +40,7 @@ PATIENT = ("--set", "control_modes.model_inference.inference.request_timeout=60"
 
 def free_endpoint() -> str:
     """An address of this machine that nobody listens on."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture
@@ -131,7 +129,7 @@ def test_a_server_whose_model_hangs_starts_again(
     ibrobot: tuple[str, ...], endpoint: str, connect: Callable[..., Transport], site: Site, tmp_path: Path
 ):
     site.add("hangs-once", "hangs_once.py")
-    port = free_endpoint().split(":")[1]
+    port = free_port()
     command = [*ibrobot, "serve", str(tmp_path), "--type", "hangs_once", "--name", "net", "--listen", endpoint]
     process = subprocess.Popen(
         [*command, "--hang-timeout", "0.5", "--metrics-port", str(port)],

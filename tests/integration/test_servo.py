@@ -6,10 +6,11 @@ import json
 import subprocess
 import time
 from pathlib import Path
-from socket import create_connection, socket
+from socket import create_connection
 
 import pytest
 import yaml
+from ibrobot_testing.ports import free_port
 
 pytestmark = pytest.mark.integration
 
@@ -19,9 +20,7 @@ TWIST = "{header: {frame_id: base_link}, twist: {linear: {z: 0.1}}}"
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 def listens(endpoint: str) -> bool:

@@ -31,6 +31,7 @@ from ibrobot_serve.service import InferenceService
 from ibrobot_serve.wire import WireDecoder, WireEncoder, WireKind, WireMessage, service_name
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy, FakeTransport
+from ibrobot_testing.ports import free_port
 
 from ibrobot_core.api import (
     Handler,
@@ -173,9 +174,7 @@ def fuzz_frames(count: int, seed: int) -> tuple[Counter[str], Robot, float]:
 def fuzz_connections(count: int, seed: int) -> tuple[Robot, float]:
     """Open connections that send garbage to a listening server; the robot, and the growth [MiB]."""
     descriptor = installed_plugins().find("transport", "zenoh")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = free.getsockname()
+    address = ("127.0.0.1", free_port())
     endpoint = f"tcp/127.0.0.1:{address[1]}"
     server = descriptor.make(descriptor.options(mode="router", listen=(endpoint,)), host_context())
     service = InferenceService(Adds(), server, "adds")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import socket
 import threading
 from collections.abc import Callable
 from typing import Any
 
 from ibrobot_testing import host_context
+from ibrobot_testing.ports import free_port
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
@@ -24,9 +24,7 @@ made: list[ZenohTransport] = []
 
 def free_endpoint(protocol: str = "tcp") -> str:
     """An endpoint of this machine that nobody listens on."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return f"{protocol}/127.0.0.1:{found.getsockname()[1]}"
+    return f"{protocol}/127.0.0.1:{free_port()}"
 
 
 def router(endpoint: str, **options: Any) -> ZenohTransport:
