@@ -46,7 +46,7 @@ OVERRIDES = (
     "peripherals=[]",
     "contract={}",
     "control.state_timeout=20.0",
-    *(f"hardware.{side}_follower.{key}=200" for side in SIDES for key in ("lost_replies", "retries")),
+    *(f"hardware.{side}_follower.{key}=1000" for side in SIDES for key in ("lost_replies", "retries")),
     *(f"teleoperation.leader_{side}.lost_replies=5" for side in SIDES),
     "teleoperation.leader_right.deadman_key=r",
 )

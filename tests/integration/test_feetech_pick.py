@@ -21,7 +21,7 @@ PATIENCE_S = 60.0
 
 
 # What a busy machine may cost: replies that come late, and time.
-PATIENT = ("hardware.lost_replies=200", "hardware.retries=200", "control.state_timeout=20.0")
+PATIENT = ("hardware.lost_replies=1000", "hardware.retries=200", "control.state_timeout=20.0")
 
 
 def test_cube_lies_in_the_bin_and_only_the_emulator_says_so(ibrobot: tuple[str, ...], tmp_path: Path) -> None:

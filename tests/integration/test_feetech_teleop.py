@@ -143,7 +143,7 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
             f"teleoperation.leader={{type: so101_leader, port: {tmp_path}/leader, calibration: {leader_file}}}",
             "control_modes.teleop.teleop=leader",
             # A busy machine may keep the emulator, a thread of this process, from answering for a while.
-            "hardware.lost_replies=200",
+            "hardware.lost_replies=1000",
             "hardware.retries=200",
             "teleoperation.leader.lost_replies=5",
             "control.state_timeout=20.0",

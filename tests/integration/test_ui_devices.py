@@ -57,7 +57,7 @@ def test_an_arm_is_calibrated_on_the_page(tmp_path: Path, monkeypatch: pytest.Mo
     from ibrobot_feetech.emulator import Emulator
 
     # A busy machine may keep the emulator, a thread of this process, from answering for a while.
-    monkeypatch.setattr("ibrobot_feetech.bus._ADAPTER_S", 0.5)
+    monkeypatch.setattr("ibrobot_feetech.bus._ADAPTER_S", 3.0)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
 
     async def test(server: UiServer) -> None:

@@ -139,6 +139,17 @@ def test_a_stall_needs_the_speed_to_stay_low_without_a_break() -> None:
     assert jaw.statuses()[0].result["stalled"] is True
 
 
+def test_a_pause_of_the_control_loop_is_no_stall() -> None:
+    jaw = Jaw(start=1.0, velocity=2.0, stall_time=0.5)
+    jaw.close(0.5)
+    for _ in range(3):
+        jaw.now_ns += 700_000_000
+        jaw.run(0.01)
+    assert jaw.statuses() == [GoalStatus("close", GoalState.EXECUTING)]
+    jaw.run(1.0)
+    assert jaw.statuses()[0].result["reached_goal"] is True
+
+
 def test_max_effort_ends_the_squeezing_also_after_the_goal() -> None:
     jaw = Jaw(start=1.0, effort=0.1, velocity=2.0, stall_time=0.2)
     jaw.close(0.0, max_effort=0.8)

@@ -31,10 +31,10 @@ _SHARE = 0.99
 @attrs.define
 class _Running:
     goal_id: str
-    moved_ns: int
-    """When the gripper last moved [ns]."""
     stops: bool = False
     """Whether it only slows down."""
+    still_ns: int = 0
+    """Time since the gripper last moved [ns], in which it had setpoints."""
 
 
 class GripperExecutor(Executor):
@@ -63,6 +63,8 @@ class GripperExecutor(Executor):
         self._fastest = min(options.velocity, joint.max_velocity) * period_s
         self._change = _SHARE * joint.max_acceleration * period_s**2
         self._stall_ns = ns(options.stall_time)
+        # A tick that comes later was missed: it had no setpoint, and a gripper that stood meanwhile has not stalled.
+        self._longest_ns = 2 * ctx.period_ns
         self._setpoint = self._target = math.nan
         self._step = 0.0
         """The last step of the setpoint [rad]."""
@@ -98,7 +100,7 @@ class GripperExecutor(Executor):
         if math.isnan(self._setpoint):
             raise GoalRejected("the executor is not active")
         if goal == {"stop": True}:
-            self._begin(_Running(goal_id, measured.stamp_ns, stops=True), self._setpoint + self._braking_distance())
+            self._begin(_Running(goal_id, stops=True), self._setpoint + self._braking_distance())
             return
         unknown = [key for key in goal if key not in {"position", "max_effort"}]
         if unknown:
@@ -113,7 +115,7 @@ class GripperExecutor(Executor):
             raise GoalRejected(f"max_effort is {max_effort:.6g} Nm; it must be at least 0")
         if max_effort > 0 and not np.isfinite(measured.effort[0]):
             raise GoalRejected(f"max_effort cannot be kept: {self.joints[0]} has no measured effort; leave it out")
-        self._begin(_Running(goal_id, measured.stamp_ns), position)
+        self._begin(_Running(goal_id), position)
         self._max_effort = max_effort
 
     def _begin(self, goal: _Running, target: float) -> None:
@@ -132,9 +134,10 @@ class GripperExecutor(Executor):
             squeezes = self._max_effort > 0 and abs(measured.effort[0]) >= self._max_effort
             self._step = 0.0 if squeezes else self._next_step()
             self._setpoint += self._step
+        passed_ns = min(measured.stamp_ns - self._stamp_ns, self._longest_ns)
         self._stamp_ns = measured.stamp_ns
         if self._running is not None:
-            self._judge(self._running, measured)
+            self._judge(self._running, measured, passed_ns)
         return np.array([self._setpoint])
 
     @override
@@ -155,18 +158,18 @@ class GripperExecutor(Executor):
         most = min(abs(gap) / (ticks + 1) + ticks * self._change / 2, self._fastest)
         return min(max(math.copysign(most, gap), self._step - self._change), self._step + self._change)
 
-    def _judge(self, running: _Running, measured: JointReading) -> None:
+    def _judge(self, running: _Running, measured: JointReading, passed_ns: int) -> None:
         """End the goal if it is reached or the gripper has stalled."""
         if running.stops:
             if self._setpoint == self._target or self._step == 0:
                 self._end(GoalState.SUCCEEDED, "", self._result(measured))
             return
         # Written so that a NaN speed counts as moving: a stall must be measured.
-        if not abs(measured.velocity[0]) < self._options.stall_velocity:
-            running.moved_ns = measured.stamp_ns
+        moves = not abs(measured.velocity[0]) < self._options.stall_velocity
+        running.still_ns = 0 if moves else running.still_ns + passed_ns
         if abs(measured.position[0] - self._target) <= self._options.goal_tolerance:
             self._end(GoalState.SUCCEEDED, "", self._result(measured, reached_goal=True))
-        elif measured.stamp_ns - running.moved_ns >= self._stall_ns:
+        elif running.still_ns >= self._stall_ns:
             result = self._result(measured, stalled=True)
             why = f"stalled at {measured.position[0]:.4g} rad on the way to {self._target:.6g}"
             if self._options.allow_stalling:
