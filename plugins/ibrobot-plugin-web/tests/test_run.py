@@ -64,7 +64,8 @@ def test_the_arm_holds_soon_after_the_operator_is_gone(address: str, end: str) -
                 middle = operator.states[-1]["position"][0] < 0
                 speed = 0.6 if middle else -0.6
                 motion = {"shoulder_pan": speed, "wrist_roll": speed}
-                while not moved_until_ns(watcher):  # again on a busy machine, where a press can end at once
+                await operator.jog(0.5, next(PRESSES), joints=motion)
+                while not moved_until_ns(watcher):  # on a busy machine, a press can end before it moves anything
                     await operator.jog(0.5, next(PRESSES), joints=motion)
                 if end == "release":
                     await operator.call("release")
