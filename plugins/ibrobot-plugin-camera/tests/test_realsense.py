@@ -6,7 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar, override
+from typing import Any, override
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from ibrobot_camera.librealsense import load_library
 from ibrobot_camera.options import RealSenseOptions
 from ibrobot_camera.realsense import RealSenseCamera
 from ibrobot_ros2.jpeg import from_jpeg
-from ibrobot_testing import LeakCheck, SensorSuite, host_context
+from ibrobot_testing import SensorSuite, host_context
 
 from ibrobot_core.api import (
     CameraInfo,
@@ -119,13 +119,18 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(realsense, "_LOST_S", PATIENCE_S)
 
 
-@pytest.fixture
-def library() -> Any:
+@pytest.fixture(scope="module")
+def library() -> Iterator[Any]:
     """Intel's library; tests with it are skipped where it, or a system library that it needs, is missing."""
     try:
-        return load_library()
+        library = load_library()
     except MissingDependency as missing:
         pytest.skip(str(missing))
+    # While there is a context, libusb keeps the socket by which it hears of devices: no test opens it.
+    context = library.context()
+    context.query_devices()
+    yield library
+    del context
 
 
 @pytest.fixture(params=[0.001])
@@ -141,8 +146,6 @@ def soft(library: Any, request: pytest.FixtureRequest, monkeypatch: pytest.Monke
 
 class TestConformance(SensorSuite):
     timeout_s = PATIENCE_S
-
-    leak_check: ClassVar[LeakCheck] = LeakCheck(allow={"file": "libusb keeps the socket by which it hears of devices"})
 
     @pytest.fixture(autouse=True)
     def _soft(self, soft: SoftwareCamera) -> None:
