@@ -257,7 +257,7 @@ def test_what_is_not_there_is_reported(endpoint: str, said: str):
         ("robot1/ca.pem", "robot1/certificate.pem", "robot2/key.pem", "robot2/key.pem: is not the key of"),
         ("ca.key", "robot1/certificate.pem", "robot1/key.pem", "ca.key: is not a certificate in PEM"),
         ("ca.pem", "robot1/certificate.pem", "ca.pem", "are not a certificate and key in PEM"),
-        ("ca.pem", "robot9/certificate.pem", "robot1/key.pem", "robot9/certificate.pem: cannot be read: No such file"),
+        ("ca.pem", "nobody/certificate.pem", "robot1/key.pem", "nobody/certificate.pem: cannot be read: No such file"),
     ],
 )
 @pytest.mark.parametrize("mode", ["client", "router"])
