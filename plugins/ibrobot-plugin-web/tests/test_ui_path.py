@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,6 +18,18 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
     pytest.mark.skipif(("hardware", "mujoco") not in installed_plugins().entries, reason="needs ibrobot-plugin-mujoco"),
 ]
+
+
+@contextmanager
+def held(page: Any, address: str) -> Iterator[None]:
+    """Answer no requests to an address meanwhile."""
+    waiting: list[Any] = []
+    holds = True
+    page.route(address, lambda route: waiting.append(route) if holds else route.continue_())
+    yield
+    holds = False
+    for route in waiting:
+        route.continue_()
 
 
 def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
@@ -31,7 +46,15 @@ def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
         page.on("console", lambda line: errors.extend([f"{line.text} {line.location}"] * (line.type == "error")))
         page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
         page.goto(address)
+        page.get_by_text("No problems found.").wait_for(timeout=60_000)
+        with held(page, "**/api/robots/check?*"):
+            page.get_by_label("Robot", exact=True).select_option("my_arm.yaml")
+            assert page.get_by_role("button", name="Launch").is_disabled()
         record(page)
+        with held(page, "**/api/convert/list"):
+            page.get_by_role("link", name="Convert", exact=True).click()
+            assert page.get_by_role("button", name="Convert", exact=True).is_disabled()
+        page.go_back()
         convert(page)
         browser.close()
     assert not errors

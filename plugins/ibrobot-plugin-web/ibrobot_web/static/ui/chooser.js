@@ -38,6 +38,8 @@ export class Chooser {
   choose(facts) {
     Object.assign(choice, facts);
     sessionStorage.setItem(KEY, JSON.stringify(choice));
+    this.found = null;
+    this.changed(null);
     this.check();
   }
 

@@ -26,7 +26,7 @@ export class View {
     this.only = select("convert-only", ONLY);
     this.missing = select("convert-missing", MISSING);
     this.unit = select("convert-unit", UNITS);
-    this.begin = h("button", { class: "primary", disabled: !this.ui.drives }, "Convert");
+    this.begin = h("button", { class: "primary", disabled: true }, "Convert");
     const form = h("form", { class: "card" }, this.groups, h("div", { class: "fields gap" },
       h("label", { for: "convert-out" }, "Dataset"), h("div", {}, this.out, this.known),
       h("label", { for: "convert-append" }, "Add to it"), h("div", {}, this.append, " if it exists"),

@@ -42,7 +42,7 @@ export class View {
 
   found(found) {
     this.begin.disabled = !this.chooser.ready || !this.ui.drives;
-    if (found.dataset && this.dataset.value === "default") { this.dataset.value = found.dataset; this.place(); }
+    if (found?.dataset && this.dataset.value === "default") { this.dataset.value = found.dataset; this.place(); }
   }
 
   // Where episodes go, and for how many the disk has room.
