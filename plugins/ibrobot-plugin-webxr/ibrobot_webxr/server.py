@@ -284,15 +284,15 @@ class PageServer:
                     self._control = page
             case Shown(camera):
                 self._next_image(page, camera)
-            case _ if page is not self._control:
-                pass  # it watches; its state says so
             case Hands():
-                late_s = page.delays.late_s(message.time_s, page.heard_s)
-                self.exchange.put(message, late_s)
-                # The page measures the round trip by it, and notices a network that is gone.
+                if page is self._control:
+                    self.exchange.put(message, page.delays.late_s(message.time_s, page.heard_s))
+                # The page measures the round trip by it, and notices a network that is gone. It may have sent this
+                # before it learned that it has lost control.
                 await page.socket.send_str(f'{{"type":"echo","n":{message.number}}}')
             case Press(event):
-                self.exchange.press(event)
+                if page is self._control:
+                    self.exchange.press(event)
 
     async def _stop(self) -> None:
         """Stop the robot, in any mode."""

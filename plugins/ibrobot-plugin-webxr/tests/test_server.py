@@ -225,8 +225,8 @@ def test_a_second_page_only_watches(ctx: Context, teleop: WebxrTeleop, page: Pag
     with Browser(page.address) as second:
         second.log_in().connect()
         assert second.state()["control"] == "other"
-        second.send(hands(1, right=hand()))
-        second.send(hands(2, right=hand(clutch=True)))
+        second.send_hands(1, right=hand())  # answered, so that the page does not take the network for gone
+        second.send_hands(2, right=hand(clutch=True))
         second.send({"type": "press", "event": "start"})
         second.send({"type": "claim"})
         assert second.state()["control"] == "other"

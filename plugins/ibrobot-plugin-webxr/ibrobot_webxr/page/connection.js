@@ -39,7 +39,8 @@ export class Connection {
       const now = performance.now();
       this.roundTrips = [...this.roundTrips.slice(-59), now - this.sentAt.get(message.n)];
       this.answers = [...this.answers.slice(-59), now];
-      this.sentAt.delete(message.n);
+      // Answers come in order: one that did not come before this one never will.
+      for (const n of this.sentAt.keys()) if (n <= message.n) this.sentAt.delete(n);
     } else if (message.type === "state") {
       this.inControl = message.control === "you";
       this.onState(message);

@@ -86,6 +86,7 @@ async function run(start) {
   failure = "";
   try {
     await start();
+    connection.send({ type: "claim" }); // a start can last longer than a silent page keeps control
     $("controls").hidden = Boolean(headset.session) && !headset.isPhone;
     await navigator.wakeLock?.request("screen").catch(() => {});
   } catch (error) {
