@@ -165,8 +165,13 @@ def test_controllers_of_a_headset_move_the_arm(arm: Arm, server: PageServer, tab
     arm.wait(lambda: far(arm, BENT) and arm.position[5] < 0, push)
     tab.evaluate("emulated.right.tracked = false")
     arm.wait(lambda: not arm.moves)
-    tab.evaluate("emulated.right.pressed = [4]; emulated.left.pressed = [5]")
-    arm.wait(lambda: set(arm.events) == {"intervention", "start"})
+
+    def buttons() -> None:
+        tab.evaluate("emulated.right.pressed = []; emulated.left.pressed = []")
+        tab.wait_for_timeout(200)
+        tab.evaluate("emulated.right.pressed = [4]; emulated.left.pressed = [5]")
+
+    arm.wait(lambda: set(arm.events) == {"intervention", "start"}, buttons)
     tab.evaluate("emulated.left.pressed = [3]")
     arm.wait(lambda: arm.stopped)
 
