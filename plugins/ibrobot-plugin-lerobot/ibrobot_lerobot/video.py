@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from queue import Full, Queue
@@ -91,11 +93,35 @@ def _opens(encoder: Encoder) -> str | None:
         context.width, context.height, context.pix_fmt = 256, 256, PIXEL_FORMAT
         context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
         context.options = encoder.options
+        with _same_priority():
+            context.open()
         context.encode(av.VideoFrame(256, 256, PIXEL_FORMAT))
         context.encode(None)
     except (av.error.FFmpegError, ValueError) as error:
         return str(error)
     return None
+
+
+@contextmanager
+def _same_priority() -> Iterator[None]:
+    """Keep the scheduling of this thread, and give it to the threads started meanwhile.
+
+    As root, libsvtav1 sets SCHED_FIFO 99 for the thread that opens it. Its own threads, and later threads and processes
+    of this one, inherit it: they would take precedence over the control loop of a robot.
+    """
+    if sys.platform != "linux":
+        yield
+        return
+    policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
+    before = set(os.listdir("/proc/self/task"))
+    try:
+        yield
+    finally:
+        started = set(os.listdir("/proc/self/task")) - before
+        for thread in (threading.get_native_id(), *map(int, started)):
+            with suppress(ProcessLookupError):  # it has ended
+                if os.sched_getscheduler(thread) == os.SCHED_FIFO:
+                    os.sched_setscheduler(thread, policy, param)
 
 
 class VideoTrack:
@@ -178,6 +204,8 @@ class VideoTrack:
     def _run(self) -> None:
         try:
             with self._container:
+                with _same_priority():
+                    self._stream.codec_context.open()
                 while (frame := self._queue.get()) is not None:
                     if self._failure is not None:
                         self._stream.encode(None)  # without a flush, the encoder prints warnings to stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -157,6 +158,17 @@ def test_auto_takes_the_first_gpu_encoder_that_opens(monkeypatch: pytest.MonkeyP
     assert choose_encoder(LeRobotOptions(codec="auto")).codec == "hevc_nvenc"
     monkeypatch.setattr("ibrobot_lerobot.video._opens", lambda encoder: "no device")
     assert choose_encoder(LeRobotOptions(codec="auto")).codec == "libsvtav1"
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="libsvtav1 raises priorities as root only")
+def test_encoding_takes_no_priority_over_the_control_loop(tmp_path: Path) -> None:
+    writer = LeRobotDatasetWriter(LeRobotOptions())
+    writer.create(tmp_path / "set", 30.0, {"observation.images.top": CAMERA}, {})
+    for number in range(12):  # more than can wait, so that the encoder is open
+        writer.add_frame({"observation.images.top": picture(number)}, "task")
+    assert os.SCHED_FIFO not in {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")}
+    writer.save_episode()
+    writer.finalize()
 
 
 def test_a_full_disk_is_reported_and_no_thread_waits(tmp_path: Path) -> None:
