@@ -134,7 +134,7 @@ class _Tree:
     def __init__(self, roots: Vector, weights: Vector) -> None:
         self.size = len(roots)
         self._weights = weights
-        self._nodes = np.empty((max(_FIRST_NODES, 2 * self.size), roots.shape[1]))
+        self._nodes = np.zeros((max(_FIRST_NODES, 2 * self.size), roots.shape[1]))
         self._nodes[: self.size] = roots
         self._weighted = self._nodes * weights
         self._parents = [-1] * self.size

@@ -69,6 +69,13 @@ def test_equal_seeds_give_equal_paths():
     np.testing.assert_array_equal(found(seed=3), found(seed=3))
 
 
+def test_what_the_memory_held_before_does_not_matter(monkeypatch):
+    expected = found()
+    signaling_nan = np.array(0x7FF0_0000_0000_0001, np.uint64).view(np.float64)
+    monkeypatch.setattr(np, "empty", lambda shape, dtype=float: np.full(shape, signaling_nan, dtype))
+    np.testing.assert_array_equal(found(), expected)
+
+
 def test_a_free_line_is_the_path():
     assert len(found(walls=Walls(()))) == 2
 
