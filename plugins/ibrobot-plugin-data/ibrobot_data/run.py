@@ -308,10 +308,23 @@ def _run_in_processes(
             "run the same command again, with fewer --jobs if needed"
         ) from None
     except KeyboardInterrupt:
-        end_processes(multiprocessing.active_children())
+        _end_pool(pool)
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _end_pool(pool: ProcessPoolExecutor) -> None:
+    """End a pool, and its processes at once.
+
+    The pool may start another process while one ends, and a terminated one may keep a lock that others wait for. So
+    processes are terminated until the pool has ended.
+    """
+    ending = threading.Thread(target=pool.shutdown, kwargs={"cancel_futures": True}, daemon=True)
+    ending.start()
+    while ending.is_alive():
+        end_processes(multiprocessing.active_children())
+        ending.join(_POLL_S)
 
 
 def end_processes(processes: Sequence[BaseProcess]) -> None:
