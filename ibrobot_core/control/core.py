@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -26,7 +27,9 @@ from ibrobot_core.units import ns
 EMERGENCY_STOP = "emergency stop"
 """The fault raised by `/estop`."""
 _FIRST_READINGS = 10
-"""Attempts to get a new reading at the start, since single replies may be lost."""
+"""Attempts to get a new reading, since single replies may be lost."""
+_FIRST_READING_S = 2.0
+"""How long at least a start waits for the first reading: the computer may be busy with starting the rest."""
 _POSE_SPEED = 0.25
 """Speed of motions to a start or stop pose, as a fraction of the velocity limits."""
 _POSE_TIMEOUT_S = 10.0
@@ -102,7 +105,7 @@ class ControlCore:
             self._hardware.require_relax()
         self._hardware.connect()
         try:
-            self._measured = self._first_reading()
+            self._measured = self._first_reading(_FIRST_READING_S)
             self._safety.activate(self._measured.position)
         except HardwareError:
             self._hardware.undo_connect()
@@ -247,13 +250,13 @@ class ControlCore:
         """Release the hardware."""
         self._hardware.disconnect()
 
-    def _first_reading(self) -> JointReading:
-        for _ in range(_FIRST_READINGS):
-            measured = self._hardware.read()
-            if not measured.stale:
-                break
-        else:
-            raise HardwareError("the joints do not answer yet")
+    def _first_reading(self, patience_s: float = 0.0) -> JointReading:
+        deadline_s = time.monotonic() + patience_s
+        readings = 1
+        while (measured := self._hardware.read()).stale:
+            if readings >= _FIRST_READINGS and time.monotonic() >= deadline_s:
+                raise HardwareError("the joints do not answer yet")
+            readings += 1
         self._answered_ns = measured.stamp_ns
         return measured
 

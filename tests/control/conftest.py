@@ -71,8 +71,9 @@ class ScriptedHardware(FakeHardware):
     def read(self) -> JointReading:
         if self.silent:
             raise HardwareError("the bus is silent")
-        if self.stale and self._last is not None:
-            return attrs.evolve(self._last, stamp_ns=self._ctx.clock.now_ns(), stale=True)
+        if self.stale:
+            last = self._last or super().read()
+            return attrs.evolve(last, stamp_ns=self._ctx.clock.now_ns(), stale=True)
         self._last = super().read()
         return self._last
 
