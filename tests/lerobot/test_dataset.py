@@ -184,9 +184,9 @@ def test_act_trains_on_it(bags: Path, tmp_path: Path) -> None:
         f"--dataset.root={tmp_path / 'set'}", "--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false",
         "--policy.pretrained_backbone_weights=null", "--policy.dim_model=32", "--policy.n_heads=2",
         "--policy.dim_feedforward=64", "--policy.n_encoder_layers=1", "--policy.n_vae_encoder_layers=1",
-        "--policy.chunk_size=10", "--policy.n_action_steps=10", "--steps=20", "--batch_size=2", "--num_workers=0",
-        "--log_freq=5", "--save_freq=20", f"--output_dir={tmp_path / 'out'}",
+        "--policy.chunk_size=10", "--policy.n_action_steps=10", "--steps=5", "--batch_size=2", "--num_workers=0",
+        "--log_freq=5", "--save_freq=5", f"--output_dir={tmp_path / 'out'}",
     ]  # fmt: skip
     found = subprocess.run(command, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stderr[-3000:]
-    assert (tmp_path / "out/checkpoints/000020/pretrained_model/model.safetensors").is_file()
+    assert (tmp_path / "out/checkpoints/000005/pretrained_model/model.safetensors").is_file()
