@@ -257,6 +257,7 @@ class ControlCore:
             if readings >= _FIRST_READINGS and time.monotonic() >= deadline_s:
                 raise HardwareError("the joints do not answer yet")
             readings += 1
+            time.sleep(0.001)  # hardware that reads in a thread of its own is stale at once
         self._answered_ns = measured.stamp_ns
         return measured
 

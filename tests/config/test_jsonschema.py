@@ -16,9 +16,11 @@ INFERENCE = ("control_modes", "policy", "inference")
 
 @pytest.fixture
 def validator(registry: Registry) -> jsonschema.Draft202012Validator:
-    schema = json_schema(registry)
-    jsonschema.Draft202012Validator.check_schema(schema)
-    return jsonschema.Draft202012Validator(schema)
+    return jsonschema.Draft202012Validator(json_schema(registry))
+
+
+def test_it_is_a_json_schema(registry: Registry) -> None:
+    jsonschema.Draft202012Validator.check_schema(json_schema(registry))
 
 
 def test_a_good_file_is_valid(validator: jsonschema.Draft202012Validator, base: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ibrobot_core.control import core
 from ibrobot_core.control.link import PlanRecord
 from ibrobot_core.errors import ConfigError, HardwareError, NotSupported
 
@@ -27,14 +28,14 @@ class TestStart:
         with pytest.raises(HardwareError, match="joint lift is measured at nan"):
             rig.core.start("stream")
 
-    def test_refuses_an_invalid_reading(self, make_rig):
+    def test_joints_that_never_answer_are_an_error(self, make_rig, monkeypatch):
+        monkeypatch.setattr(core, "_FIRST_READING_S", 0.0)
         rig = make_rig({})
-        rig.hardware.connect()
-        rig.hardware.read()
         rig.hardware.stale = True
 
         with pytest.raises(HardwareError, match="do not answer"):
             rig.core.start("stream")
+        assert not rig.hardware.torque
 
     def test_refuses_to_promise_torque_off_on_hardware_without_it(self, make_rig):
         rig = make_rig({"hardware": {"type": "stiff"}, "control": {"stop": "relax"}})
