@@ -27,9 +27,9 @@ from ibrobot_core.units import ns
 EMERGENCY_STOP = "emergency stop"
 """The fault raised by `/estop`."""
 _FIRST_READINGS = 10
-"""Attempts to get a new reading, since single replies may be lost."""
+"""Least number of attempts to get a new reading, since single replies may be lost."""
 _FIRST_READING_S = 2.0
-"""How long at least a start waits for the first reading: the computer may be busy with starting the rest."""
+"""How long a start tries: the computer may be busy with starting the rest."""
 _POSE_SPEED = 0.25
 """Speed of motions to a start or stop pose, as a fraction of the velocity limits."""
 _POSE_TIMEOUT_S = 10.0
