@@ -24,6 +24,8 @@ class OptionFault:
     option: tuple[str | int, ...]
     """The option, or an item in it: `("inverted", 1)` is the second item of `inverted`."""
     message: str
+    model: str = ""
+    """The model of `robot.description` that the component needs and the robot lacks, e.g. `mjcf`."""
 
 
 def did_you_mean(word: str, known: Sequence[str], what: str) -> str:

@@ -34,7 +34,7 @@ def check(
 ) -> None:
     """Report all faults of CONFIG; exit with 2 if there are any."""
     from ibrobot_core.config import find_config, load_config
-    from ibrobot_core.config.missing import unavailable_modes
+    from ibrobot_core.config.missing import absent_models, unavailable_modes
     from ibrobot_core.launch.absence import absent_sensors, describe_absent
     from ibrobot_core.launch.models import check_models
 
@@ -56,6 +56,8 @@ def check(
     echo(f"{path}: ok ({found.robot.name}, {len(found.robot.joints)} joints, {body})")
     echo(f"modes: {', '.join(found.control_modes)}; starts in {found.default_control_mode}")
     for line in unavailable_modes(found.unavailable):
+        echo(f"note: {line}")
+    for line in absent_models(found.absent_models):
         echo(f"note: {line}")
     if absent := describe_absent(absent_sensors(found, installed_plugins())):
         echo(f"note: runs start without {absent}")

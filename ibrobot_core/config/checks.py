@@ -8,6 +8,7 @@ from typing import Any
 
 import attrs
 
+from ibrobot_core.config.missing import Missing
 from ibrobot_core.config.models import READERS, DescriptionModel, Limits, ModelError
 from ibrobot_core.config.schema import (
     ControlConfig,
@@ -20,6 +21,7 @@ from ibrobot_core.config.schema import (
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document, Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TeleopDescriptor, TransportDescriptor
+from ibrobot_core.options import OptionFault
 from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Joint, Robot
 from ibrobot_core.run_hooks import RUN_KEYS
@@ -162,13 +164,21 @@ class Checks:
             keys: dict[str, str] = {}
             for seen, joints in self._seen_by(part, robot):
                 for fault in part.descriptor.check_options(part.component.options, seen, joints):
-                    self.document.add((*part.key, *fault.option), fault.message)
+                    self._fault(part.key, fault)
                 if isinstance(part.descriptor, TeleopDescriptor):
                     keys |= part.descriptor.keys(part.component.options, seen)
             for key, does in keys.items():
                 if does != (always := RUN_KEYS.get(key, does)):
                     message = f"key {key!r} is both {does} and, in every run, {always}; choose another key"
                     self.document.add(_place_of(key, part.key, self.document.get(*part.key)), message)
+
+    def _fault(self, key: Key, fault: OptionFault) -> None:
+        """Report a fault of a component; one that needs a model that is not installed counts as missing itself."""
+        absent = self.sections.absent_models.get(fault.model)
+        if absent is None:
+            self.document.add((*key, *fault.option), fault.message)
+        else:
+            self.sections.missing.append(Missing(key, (*key, *fault.option), absent))
 
     def _seen_by(self, part: ParsedComponent[Any], robot: Robot) -> list[tuple[Robot, tuple[str, ...]]]:
         """The robot as a component sees it, with its joints; a device sees the groups that it moves in the modes."""

@@ -30,6 +30,14 @@ def expand(text: str) -> str:
     return str(Path(expanded).expanduser()) if expanded.startswith("~/") else expanded
 
 
+def missing_package(text: str) -> str | None:
+    """The package to install for a path `package://PACKAGE/path`; None if it is installed, or for any other path."""
+    if not text.startswith("package://"):
+        return None
+    package = text.removeprefix("package://").partition("/")[0]
+    return package.replace("_", "-") if package.isidentifier() and find_spec(package) is None else None
+
+
 def resolve_path(text: str, base: Path) -> Path:
     """Resolve a path from a config: `package://PACKAGE/path` in an installed package, a relative path from `base`.
 

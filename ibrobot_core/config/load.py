@@ -128,8 +128,8 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
     check_known(document)
     simulated = document.get("simulation", "default_control_mode") if sections.simulated else None
     entered = simulated or sections.plain.get("default_control_mode")
-    unavailable = split(document, sections.plain, sections.missing, entered, everything=communicates)
     Checks(document, sections, communicates).run()
+    unavailable = split(document, sections.plain, sections.missing, entered, everything=communicates)
     contract_checks = ContractChecks(document, sections)
     contract = contract_checks.run()
     document.raise_problems()
@@ -175,7 +175,8 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         simulated=sections.simulated,
         closed_ends=_closed_ends(robot, sections),
         unavailable=unavailable,
-        missing=tuple(each.error for each in sections.missing),
+        missing=(*(each.error for each in sections.missing), *sections.absent_models.values()),
+        absent_models=sections.absent_models,
         source=source,
         document=shown,
         complete=document.root,

@@ -67,6 +67,18 @@ def unavailable_modes(unavailable: Mapping[str, str]) -> list[str]:
     ]
 
 
+def absent_models(absent: Mapping[str, PluginNotInstalled]) -> list[str]:
+    """One line per package that is not installed and contains models of `robot.description`."""
+    by_package: dict[str, list[str]] = {}
+    for model, error in absent.items():
+        by_package.setdefault(error.package, []).append(model)
+    return [
+        f"joint limits are not compared with robot.description.{' and '.join(models)}, whose package is not installed: "
+        f"pip install {package}"
+        for package, models in by_package.items()
+    ]
+
+
 def describe(errors: Iterable[PluginNotInstalled]) -> str:
     """The missing plugins with one command that installs them all, and broken plugins with the reason."""
     found = list(dict.fromkeys(errors))

@@ -505,6 +505,8 @@ class RobotConfig:
     """Name -> section defined by a plugin, for those in the file."""
     simulated: bool = not_a_key(False)
     """Whether this run uses `simulation` instead of `hardware`."""
+    absent_models: Mapping[str, PluginNotInstalled] = not_a_key(factory=dict, repr=False, eq=False)
+    """Model of `robot.description` -> the package that contains it and is not installed."""
     unavailable: Mapping[str, str] = not_a_key(factory=dict, repr=False, eq=False)
     """Mode -> why it is unavailable, and what to install."""
     missing: tuple[PluginNotInstalled, ...] = not_a_key((), repr=False, eq=False)

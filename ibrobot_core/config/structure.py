@@ -12,6 +12,7 @@ import attrs
 
 from ibrobot_core.config import schema
 from ibrobot_core.config.convert import Converter, Faults, error_message, unknown_key
+from ibrobot_core.config.expand import missing_package
 from ibrobot_core.config.missing import Missing
 from ibrobot_core.config.secrets import note
 from ibrobot_core.config.yaml_nodes import Document, Key
@@ -20,6 +21,8 @@ from ibrobot_core.errors import PluginError, PluginNotInstalled
 from ibrobot_core.options import fields
 from ibrobot_core.plugins import Registry, example_type
 
+MODELS = ("mjcf", "urdf", "srdf")
+"""The keys of `robot.description` that name files."""
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -56,6 +59,8 @@ class ParsedSections:
     """The sections of plugins."""
     missing: list[Missing] = attrs.field(factory=list)
     """Components without an installed plugin."""
+    absent_models: dict[str, PluginNotInstalled] = attrs.field(factory=dict)
+    """Model of `robot.description` -> the package that contains it and is not installed."""
 
     def active(self) -> Iterator[ParsedComponent[Any]]:
         """The components that a run opens when it starts."""
@@ -155,8 +160,25 @@ class SectionParser:
             elif (entry := self.registry.entries.get(("section", name))) is not None:
                 reason = f"{entry.package} adds a section of this name, which is one of ibrobot's own"
                 faults.add((name,), f"{reason}: rename it there, or pip uninstall {entry.package}")
-        sections.plain = _Outline(self.base).arguments(known, self.document.root, faults)
+        sections.plain = _Outline(self.base).arguments(known, self._with_installed_models(sections), faults)
         self._report((), faults)
+
+    def _with_installed_models(self, sections: ParsedSections) -> Mapping[str, Any]:
+        """The document without the models whose package is not installed; only what needs these is affected."""
+        root: Mapping[str, Any] = self.document.root
+        at: Key = ("robot", "description")
+        described = self.document.get(*at)
+        for model in MODELS if isinstance(described, Mapping) else ():
+            path = described.get(model)
+            if isinstance(path, str) and (package := missing_package(path)) is not None:
+                reason = (
+                    f"robot.description.{model}: {path} is in a package that is not installed: pip install {package}"
+                )
+                sections.absent_models[model] = PluginNotInstalled("model", model, package, reason)
+        if not sections.absent_models:
+            return root
+        kept = {name: value for name, value in described.items() if name not in sections.absent_models}
+        return {**root, "robot": {**root["robot"], "description": kept}}
 
     def _plugin_section(self, sections: ParsedSections, name: str, value: Any, faults: Faults) -> None:
         """Parse a section defined by a plugin."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.component import Component, Worker, error_line, error_text, exit_code
-from ibrobot_core.config.missing import unavailable_modes
+from ibrobot_core.config.missing import absent_models, unavailable_modes
 from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, PluginError
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_components
@@ -61,7 +61,8 @@ class Runtime:
         session = self.session
         if self.plan.without:
             session.log.warning("running without %s", self.plan.without)
-        for line in unavailable_modes(session.config.unavailable):
+        config = session.config
+        for line in (*absent_models(config.absent_models), *unavailable_modes(config.unavailable)):
             session.log.warning("%s", line)
         try:
             for component in self.plan.components:

@@ -9,14 +9,6 @@ import pytest
 NAME = "a name is not empty and has no slash, control character or space at its ends"
 # The fault, the replaced text of the base YAML, its replacement, and the whole error.
 CASES = {
-    "package_missing": (
-        "    poses:",
-        "    urdf: package://no_such_robot/arm.urdf\n    poses:",
-        (
-            "robot.yaml:11: robot.description.urdf: the Python package 'no_such_robot' is not installed: pip "
-            "install no-such-robot"
-        ),
-    ),
     "package_file_missing": (
         "    poses:",
         "    urdf: package://ibrobot_core/arm.urdf\n    poses:",

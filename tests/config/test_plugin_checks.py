@@ -53,6 +53,40 @@ def checking(registry: Registry) -> None:
     registry.entries["teleop", "stick"] = Entry("teleop", stick, "fake", "ibrobot-plugin-fake", "1.0")
 
 
+ABSENT = "package://no_such_robot/arm.xml is in a package that is not installed: pip install no-such-robot"
+
+
+def _needs_model(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    if robot.description.mjcf is None:
+        yield OptionFault((), "a wand needs robot.description.mjcf: set it", "mjcf")
+
+
+@pytest.fixture
+def with_absent_model(base: str, registry: Registry) -> str:
+    """A robot whose model is in a package that is not installed, with a device in mode `tool` that needs the model."""
+    wand = TeleopDescriptor("wand", never_made, "a wand", StickOptions, check_options=_needs_model)
+    registry.entries["teleop", "wand"] = Entry("teleop", wand, "fake", "ibrobot-plugin-fake", "1.0")
+    text = base.replace("    poses:", "    mjcf: package://no_such_robot/arm.xml\n    poses:", 1)
+    text = text.replace("teleoperation:", "teleoperation:\n  tool: {type: wand}", 1)
+    return text.replace("control_modes:", "control_modes:\n  tool: {executors: [arm_position], teleop: tool}", 1)
+
+
+def test_model_that_is_not_installed_makes_only_the_modes_that_need_it_unavailable(
+    with_absent_model: str, load_text: Load
+) -> None:
+    config = load_text(with_absent_model)
+    reason = f"robot.description.mjcf: {ABSENT}"
+    assert {model: str(error) for model, error in config.absent_models.items()} == {"mjcf": reason}
+    assert config.unavailable == {"tool": reason}
+    assert config.robot.description.mjcf is None
+    assert next(str(error) for error in config.missing if error.type == "mjcf") == reason
+
+
+def test_model_that_the_entered_mode_needs_must_be_installed(with_absent_model: str, load_text: Load) -> None:
+    message = faults(load_text, with_absent_model, mode="tool")
+    assert message == f"robot.yaml:33: teleoperation.tool: robot.description.mjcf: {ABSENT}"
+
+
 def faults(load_text: Load, text: str, **options: Any) -> str:
     with pytest.raises(ConfigError) as message:
         load_text(text, **options)

@@ -107,7 +107,7 @@ def check_mapping(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> 
     """Each joint has an axis, each control one meaning in each mode, and the tool a model."""
     gripper, arm = _parts(options, robot)
     if options.cartesian and robot.description.mjcf is None:
-        yield OptionFault(("cartesian",), "tool jog needs robot.description.mjcf: set it, or cartesian: false")
+        yield OptionFault(("cartesian",), "tool jog needs robot.description.mjcf: set it, or cartesian: false", "mjcf")
     if options.start == "tool" and not options.cartesian:
         yield OptionFault(("start",), "the tool cannot be jogged with cartesian: false: must be joints")
     poses = tuple(robot.description.poses)

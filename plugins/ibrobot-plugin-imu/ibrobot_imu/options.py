@@ -103,7 +103,7 @@ def check_imu(options: ImuOptions, robot: Robot, joints: tuple[str, ...]) -> Ite
         message = f"unknown group {options.gripper!r}{did_you_mean(options.gripper, groups, 'known')}"
         yield OptionFault(("gripper",), message)
     if robot.description.mjcf is None:
-        yield OptionFault((), "tilting moves a tool, which needs robot.description.mjcf: set it")
+        yield OptionFault((), "tilting moves a tool, which needs robot.description.mjcf: set it", "mjcf")
     arms = {robot.description.arm_of(name) for name in robot.joint_names}
     if len(arms) > 1:
         message = "the robot has several arms: give the device one in the mode, e.g. teleop: {left: DEVICE}"

@@ -131,7 +131,9 @@ def keys_of(options: KeyboardOptions, robot: Robot) -> Mapping[str, str]:
 def check_keys(options: KeyboardOptions, robot: Robot) -> Iterator[OptionFault]:
     """Check that each joint has keys, that each key has one action, and that Cartesian jog has a model."""
     if options.cartesian and robot.description.mjcf is None:
-        yield OptionFault(("cartesian",), "Cartesian jog needs robot.description.mjcf: set it, or cartesian: false")
+        yield OptionFault(
+            ("cartesian",), "Cartesian jog needs robot.description.mjcf: set it, or cartesian: false", "mjcf"
+        )
     try:
         keymap_of(options, robot)
     except TeleopError as error:

@@ -153,7 +153,7 @@ def check_world(options: MujocoOptions, robot: Robot, joints: tuple[str, ...]) -
     """Check that the robot has an MJCF, and that the pose and joints in the options exist."""
     poses = list(robot.description.poses)
     if robot.description.mjcf is None:
-        yield OptionFault((), f"robot {robot.name!r} has no MJCF to simulate: set robot.description.mjcf")
+        yield OptionFault((), f"robot {robot.name!r} has no MJCF to simulate: set robot.description.mjcf", "mjcf")
     elif robot.description.mjcf.is_file():  # core has reported a missing one
         yield from _unusable(options, robot)
     if options.start_pose not in poses:

@@ -62,8 +62,14 @@ def ibrobot_planners() -> Iterable[PlannerDescriptor]:
         options=RrtConnectOptions,
         make=_rrt_connect,
         check=find_engines,
+        check_options=_needs_model,
         summary="around obstacles, to joint positions or poses of the tool, checked against padding after timing",
     )
+
+
+def _needs_model(options: RrtConnectOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    if robot.description.mjcf is None:
+        yield OptionFault((), "planning around obstacles needs robot.description.mjcf: set it", "mjcf")
 
 
 def _source(session: Session, mode: ControlMode) -> SourceWorker:

@@ -26,7 +26,7 @@ def _pose(options: ToolPoseOptions | None, session: Session) -> Component:
 
 def _check_twist(options: TwistOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
     if robot.description.mjcf is None:
-        yield OptionFault(("topic",), "twists move a tool, which needs robot.description.mjcf: set it")
+        yield OptionFault(("topic",), "twists move a tool, which needs robot.description.mjcf: set it", "mjcf")
     if len({robot.description.arm_of(name) for name in robot.joint_names}) > 1:
         message = "the robot has several arms: give the device one in the mode, e.g. teleop: {left: DEVICE}"
         yield OptionFault((), message)
@@ -36,7 +36,7 @@ def _check_twist(options: TwistOptions, robot: Robot, joints: tuple[str, ...]) -
 
 def _check_pose(options: ToolPoseOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
     if robot.description.mjcf is None:
-        yield OptionFault((), "the pose of the tool needs robot.description.mjcf: set it")
+        yield OptionFault((), "the pose of the tool needs robot.description.mjcf: set it", "mjcf")
     if robot.description.arms:
         yield OptionFault((), "publishes the pose of one tool, but the robot has several arms: leave the section out")
 

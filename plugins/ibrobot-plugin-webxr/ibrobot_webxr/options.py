@@ -110,7 +110,7 @@ class WebxrOptions:
 def check_robot(options: WebxrOptions, robot: Robot) -> Iterator[OptionFault]:
     """The robot has a model and the gripper, and the certificate exists."""
     if robot.description.mjcf is None:
-        yield OptionFault((), "a hand moves the tool, which needs robot.description.mjcf: set it")
+        yield OptionFault((), "a hand moves the tool, which needs robot.description.mjcf: set it", "mjcf")
     if options.gripper not in (NONE, *robot.groups):
         known = did_you_mean(options.gripper, (*robot.groups, NONE), "the groups are")
         yield OptionFault(("gripper",), f"unknown group {options.gripper!r}{known}; `{NONE}` if nothing grips")
