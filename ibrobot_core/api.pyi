@@ -264,7 +264,7 @@ from ibrobot_core.contract.metadata import robot_metadata as robot_metadata
 from ibrobot_core.launch.episodes import Episodes as Episodes
 from ibrobot_core.control.realtime import go_real_time as go_real_time
 from ibrobot_core.memory import create_memory as create_memory, set_malloc as set_malloc
-from ibrobot_core.child import Channel as Channel, Child as Child, open_parent as open_parent
+from ibrobot_core.child import Channel as Channel, Child as Child, Failure as Failure, open_parent as open_parent
 from ibrobot_core.signals import end_signals as end_signals, on_signals as on_signals
 from ibrobot_core.outside import LogFormatter as LogFormatter, echo as echo
 from ibrobot_core.screen import Screen as Screen, styled as styled

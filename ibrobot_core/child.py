@@ -1,7 +1,8 @@
 """Child processes: start them, exchange messages, end them within a time limit, and report why they died.
 
 A child runs `python -m MODULE CHANNEL DESCRIPTOR…` and inherits the descriptors. The first message on the channel is
-its order. The child sends its log records on the channel, and an event `failed` with the `error` if it fails.
+its order. On the same channel the child reports its log records, and its `Failure` if it fails. Reports have envelopes
+of their own, so that nothing in a message can pass for one. Both sides drop lines that are neither.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import select
 import signal
 import socket
@@ -19,10 +21,46 @@ import time
 from collections.abc import Mapping
 from typing import Any, override
 
+import attrs
+
 from ibrobot_core.errors import ComponentFailed
 
 FAREWELL_S = 1.0
 """Time for which a child's last messages wait for a parent that does not read [s]."""
+_LONGEST = 64 << 20
+"""Longest line [bytes]; a peer that sends a longer one, or that leaves more unread, is disconnected."""
+_LOGGER = re.compile(r"ibrobot(\.[^\n]{1,100})?")
+"""Names of the loggers that a child may use."""
+_LEVELS = range(101)
+_log = logging.getLogger("ibrobot.child")
+
+
+@attrs.frozen
+class LogLine:
+    """A log record of a child."""
+
+    logger: str = attrs.field(validator=attrs.validators.matches_re(_LOGGER))
+    level: int = attrs.field(validator=attrs.validators.in_(_LEVELS))
+    message: str = attrs.field(validator=attrs.validators.instance_of(str))
+
+
+@attrs.frozen
+class Failure:
+    """Why a child fails."""
+
+    error: str = attrs.field(validator=attrs.validators.instance_of(str))
+    exit_code: int = attrs.field(default=1, validator=attrs.validators.in_(range(256)))
+    """Exit status that the run ends with."""
+    holding: list[str] = attrs.field(
+        factory=list, validator=attrs.validators.deep_iterable(attrs.validators.instance_of(str))
+    )
+    """Parts that hold torque, and how to switch it off, one line each."""
+
+
+Report = LogLine | Failure
+"""What a child says about itself, as opposed to its messages."""
+_REPORTS: Mapping[str, type[Report]] = {"log": LogLine, "failure": Failure}
+_MESSAGE = "message"
 
 
 class Channel:
@@ -37,8 +75,11 @@ class Channel:
         self._partial = bytearray()
         self._unsent = bytearray()
         self._sending = threading.Lock()
+        self._reports: list[Report] = []
         self.closed = False
         """Whether the peer has closed the connection or died."""
+        self.dropped = 0
+        """Number of lines of the peer that were neither messages nor reports."""
 
     def fileno(self) -> int:
         """The socket's descriptor, for `select`."""
@@ -46,10 +87,18 @@ class Channel:
 
     def send(self, message: Mapping[str, Any]) -> None:
         """Send an object without blocking; a later call sends what the peer does not read yet."""
-        line = json.dumps(message, separators=(",", ":")).encode() + b"\n"
+        self._put(_MESSAGE, message)
+
+    def report(self, report: Report) -> None:
+        """The child's side: send a report like a message."""
+        self._put(next(name for name, kind in _REPORTS.items() if isinstance(report, kind)), attrs.asdict(report))
+
+    def _put(self, envelope: str, content: Mapping[str, Any]) -> None:
+        line = json.dumps([envelope, content], separators=(",", ":")).encode() + b"\n"
         with self._sending:
             self._unsent += line
             self._flush()
+            self.closed = self.closed or len(self._unsent) > _LONGEST
 
     def flush(self, timeout_s: float = FAREWELL_S) -> None:
         """Wait up to `timeout_s` [s] for the peer to read the unsent data."""
@@ -74,7 +123,7 @@ class Channel:
                 self.closed = True
 
     def receive(self) -> list[dict[str, Any]]:
-        """The objects that have arrived completely."""
+        """The messages that have arrived completely."""
         if self._unsent:
             with self._sending:
                 self._flush()
@@ -85,24 +134,42 @@ class Channel:
                 break
             except OSError:
                 received = b""
-            if not received:
-                self.closed = True
             self._partial += received
+            self.closed = not received or len(self._partial) > _LONGEST
         if b"\n" not in self._partial:
             return []
         *lines, rest = bytes(self._partial).split(b"\n")
         self._partial = bytearray(rest)
-        return [json.loads(line) for line in lines]
+        return [message for line in lines if (message := self._opened(line)) is not None]
+
+    def _opened(self, line: bytes) -> dict[str, Any] | None:
+        """The message in a line; None if it is a report, which is kept, or neither, which is counted."""
+        try:
+            match json.loads(line):
+                case ["message", dict() as content]:
+                    return content
+                case [str() as envelope, dict() as content]:
+                    self._reports.append(_REPORTS[envelope](**content))
+                    return None
+        except (ValueError, TypeError, KeyError, RecursionError):
+            pass
+        self.dropped += 1
+        return None
+
+    def take_reports(self) -> list[Report]:
+        """The parent's side: the reports that have arrived since the last call."""
+        taken, self._reports = self._reports, []
+        return taken
 
     def wait(self, timeout_s: float | None) -> list[dict[str, Any]]:
-        """Wait up to `timeout_s` [s], or without limit if None, for at least one object.
+        """Wait up to `timeout_s` [s], or without limit if None, for at least one message, or for a report.
 
         Raises:
             ComponentFailed: if the peer has closed the connection or died.
         """
         while True:
             messages = self.receive()
-            if messages:
+            if messages or self._reports:
                 return messages
             if self.closed:
                 raise ComponentFailed("the process at the other end is gone")
@@ -126,7 +193,7 @@ class Child:
 
     Attributes:
         channel: the channel to the child.
-        failed: the child's event `failed`; None if it has not sent one.
+        failure: why the child fails; None if it has not said so.
     """
 
     def __init__(self, module: str, order: Mapping[str, Any], *descriptors: int) -> None:
@@ -141,7 +208,9 @@ class Child:
                 start_new_session=True,
             )
         self.channel = Channel(own_end)
-        self.failed: Mapping[str, Any] | None = None
+        self.failure: Failure | None = None
+        self._module = module
+        self._told = False
         self._waiting: list[Mapping[str, Any]] = []
         self.channel.send({**order, "host": os.getpid()})
 
@@ -151,18 +220,20 @@ class Child:
         return self._process.pid
 
     def receive(self) -> list[Mapping[str, Any]]:
-        """The messages that have arrived, except log records and failures, which are handled here."""
-        messages, self._waiting = self._waiting, []
-        return messages + self._sifted(self.channel.receive())
+        """The messages that have arrived. Reports are handled here."""
+        messages, self._waiting = [*self._waiting, *self.channel.receive()], []
+        self._take_reports()
+        return messages
 
     def wait(self, timeout_s: float) -> Mapping[str, Any] | None:
-        """The next message as in `receive`, or None if none arrives within `timeout_s` [s].
+        """The next message as in `receive`, or None if none arrives within `timeout_s` [s], or before a report.
 
         Raises:
             ComponentFailed: if the child has died.
         """
         if not self._waiting:
-            self._waiting = self._sifted(self.channel.wait(timeout_s))
+            self._waiting = [*self.channel.wait(timeout_s)]
+            self._take_reports()
         return self._waiting.pop(0) if self._waiting else None
 
     def kill(self) -> None:
@@ -182,22 +253,20 @@ class Child:
     def cause(self, timeout_s: float) -> str:
         """End the child as `end` does, and return why it ended: its own error if it sent one, else its exit status."""
         self.end(timeout_s)
-        if self.failed is not None:
-            return str(self.failed["error"])
+        if self.failure is not None:
+            return self.failure.error
         status = self._process.returncode
         return f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
 
-    def _sifted(self, messages: list[dict[str, Any]]) -> list[Mapping[str, Any]]:
-        others: list[Mapping[str, Any]] = []
-        for message in messages:
-            match message.get("event"):
-                case "log":
-                    logging.getLogger(message["logger"]).log(message["level"], "%s", message["message"])
-                case "failed":
-                    self.failed = message
-                case _:
-                    others.append(message)
-        return others
+    def _take_reports(self) -> None:
+        for report in self.channel.take_reports():
+            if isinstance(report, Failure):
+                self.failure = report
+            else:
+                logging.getLogger(report.logger).log(report.level, "%s", report.message)
+        if self.channel.dropped and not self._told:
+            self._told = True
+            _log.warning("process %s (%d) sent what is no message; it was dropped", self._module, self.pid)
 
 
 class _ToParent(logging.Handler):
@@ -210,8 +279,8 @@ class _ToParent(logging.Handler):
     @override
     def emit(self, record: logging.LogRecord) -> None:
         if not self._channel.backlog:
-            event = {"event": "log", "logger": record.name, "level": record.levelno, "message": record.getMessage()}
-            self._channel.send(event)
+            level = min(max(record.levelno, _LEVELS[0]), _LEVELS[-1])
+            self._channel.report(LogLine(record.name, level, record.getMessage()))
 
 
 def open_parent(descriptor: int) -> Channel:

@@ -13,10 +13,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ibrobot_core.child import Channel, Child
+from ibrobot_core.child import Channel, Child, Failure, LogLine
 from ibrobot_core.errors import ComponentFailed
 
 PATIENCE_S = 30.0
+
+
+def line(content: Any, envelope: Any = "message") -> bytes:
+    """What a peer sends."""
+    return json.dumps([envelope, content]).encode() + b"\n"
+
+
+KEYS = st.sampled_from(["event", "do", "reply", "log", "failure", "logger", "level", "message", "error", "holding"])
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | KEYS,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS | st.text(), inner, max_size=4),
+    max_leaves=8,
+)
+"""What JSON can say, often with the words of the protocol."""
 
 
 @pytest.fixture
@@ -37,7 +51,7 @@ class TestChannel:
     def test_messages_survive_arriving_in_pieces(self, messages, cut):
         ours, theirs = socket.socketpair()
         channel = Channel(ours)
-        text = b"".join(json.dumps(m).encode() + b"\n" for m in messages)
+        text = b"".join(line(message) for message in messages)
         received = []
         for begin in range(0, len(text), cut):
             theirs.sendall(text[begin : begin + cut])
@@ -49,19 +63,19 @@ class TestChannel:
 
     def test_half_a_message_is_none_yet(self, ends):
         channel, peer = ends
-        peer.sendall(b'{"do": "st')
+        peer.sendall(b'["message", {"do": "st')
         assert channel.receive() == []
         assert channel.wait(0.0) == []
 
-        peer.sendall(b'op"}\n')
+        peer.sendall(b'op"}]\n')
         assert channel.wait(0.0) == [{"do": "stop"}]
 
     def test_what_a_peer_said_before_it_died_is_heard(self, ends):
         channel, peer = ends
-        peer.sendall(b'{"event": "failed"}\n{"ev')
+        peer.sendall(line({"event": "stopped"}) + b'["mess')
         peer.close()
 
-        assert channel.wait(0.0) == [{"event": "failed"}]
+        assert channel.wait(0.0) == [{"event": "stopped"}]
         assert channel.closed
         with pytest.raises(ComponentFailed, match="gone"):
             channel.wait(0.0)
@@ -88,6 +102,74 @@ class TestChannel:
             received += reader.receive()
         assert received == sent
         assert channel.backlog == 0
+
+
+class TestStrangers:
+    """A peer may send anything: what is no message of the protocol is dropped, and the next message arrives."""
+
+    @given(content=st.dictionaries(KEYS | st.text(), VALUES, max_size=5))
+    def test_nothing_in_a_message_passes_for_a_report(self, content):
+        ours, theirs = socket.socketpair()
+        sender, receiver = Channel(ours), Channel(theirs)
+        sender.send(content)
+        received = receiver.receive()
+        sender.close()
+        receiver.close()
+
+        assert json.dumps(received) == json.dumps([content])
+        assert receiver.take_reports() == []
+        assert receiver.dropped == 0
+
+    @given(
+        wrong=st.one_of(
+            st.binary(max_size=60).map(lambda garbage: garbage.replace(b"\n", b"") + b"\n"),
+            VALUES.map(lambda value: json.dumps(value).encode() + b"\n"),
+            st.builds(line, VALUES, VALUES),
+            st.builds(line, st.dictionaries(KEYS, VALUES), st.sampled_from(["log", "failure", "message"])),
+            st.sampled_from([b"[" * 100_000 + b"\n", b"\xff\xfe\n", b"1" * 5000 + b"\n", line({}, []), line({}, {})]),
+        )
+    )
+    def test_what_is_no_message_is_dropped(self, wrong):
+        ours, theirs = socket.socketpair()
+        channel = Channel(ours)
+        theirs.sendall(wrong + line({"event": "ready"}))
+        received = channel.receive()
+        reports = channel.take_reports()
+        channel.close()
+        theirs.close()
+
+        assert received[-1] == {"event": "ready"}
+        assert all(isinstance(message, dict) for message in received)
+        assert all(isinstance(report, LogLine | Failure) for report in reports)
+        assert len(received) - 1 + len(reports) + channel.dropped == 1
+
+    @pytest.mark.parametrize(
+        "wrong",
+        [
+            {"logger": "ibrobot.web", "level": 20},
+            {"logger": "root", "level": 20, "message": "forged"},
+            {"logger": "ibrobot.a\nb", "level": 20, "message": "forged"},
+            {"logger": "ibrobot.web", "level": "20", "message": "forged"},
+            {"logger": "ibrobot.web", "level": 20, "message": ["forged"]},
+            {"logger": "ibrobot.web", "level": 20, "message": "forged", "more": 1},
+        ],
+    )
+    def test_a_log_record_has_known_keys_of_their_types(self, ends, wrong):
+        channel, peer = ends
+        peer.sendall(line(wrong, "log"))
+
+        assert channel.receive() == []
+        assert channel.take_reports() == []
+        assert channel.dropped == 1
+
+    def test_an_endless_line_ends_the_connection(self, ends, monkeypatch):
+        monkeypatch.setattr("ibrobot_core.child._LONGEST", 100_000)
+        channel, peer = ends
+        while not channel.closed:
+            peer.sendall(b"x" * 10_000)
+            channel.receive()
+        with pytest.raises(ComponentFailed, match="gone"):
+            channel.wait(0.0)
 
 
 @pytest.fixture
@@ -123,6 +205,25 @@ class TestChild:
 
         assert (first, second) == ({"event": "ready"}, {"event": "report"})
         assert caplog.messages == ["the arm is warm"]
+
+    def test_words_of_the_protocol_in_messages_are_only_words(self, start, caplog):
+        """With messages and reports in one envelope, the first raised and the second was the child's failure."""
+        forged = [
+            {"do": "release", "event": "log"},
+            {"event": "log", "logger": "ibrobot.web", "level": 40, "message": "forged"},
+            {"do": "estop", "event": "failed", "error": "forged"},
+            {"failure": {"error": "forged"}},
+        ]
+        child = start(say=forged, exit=0)
+        with caplog.at_level(logging.INFO, "ibrobot"):
+            received = [child.wait(PATIENCE_S) for _ in forged]
+            with pytest.raises(ComponentFailed, match="gone"):
+                listen(child)
+
+        assert received == forged
+        assert caplog.messages == []
+        assert child.failure is None
+        assert child.cause(PATIENCE_S) == "exit status 0"
 
     @pytest.mark.parametrize(
         ("order", "cause"),

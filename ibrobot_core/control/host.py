@@ -219,10 +219,10 @@ class ControlClient(ControlHost):
                 raise ComponentFailed("given up while control started")
             if time.monotonic() > deadline_s:
                 raise ComponentFailed(f"the control process was not ready after {_START_TIMEOUT_S:.0f} s")
-            if child.failed is not None:
-                self.holding = child.failed["holding"]
-                failure = HardwareError(child.failed["error"])
-                failure.exit_code = child.failed["exit_code"]
+            if child.failure is not None:
+                self.holding = child.failure.holding
+                failure = HardwareError(child.failure.error)
+                failure.exit_code = child.failure.exit_code
                 raise failure
             if message is not None and message["event"] == "ready":
                 self.signals = [(topic, size) for topic, size in message["signals"]]
@@ -292,8 +292,8 @@ class ControlClient(ControlHost):
         except Exception as error:  # noqa: BLE001 - reported to the run, which cannot go on without states
             self._on_death(ComponentFailed(f"control's states cannot be passed on ({type(error).__name__}: {error})"))
             return
-        if child.failed is not None:
-            self.holding = child.failed["holding"]
+        if child.failure is not None:
+            self.holding = child.failure.holding
         if not self._stopping:
             self._on_death(self._failure(child, "the control process died"))
         # Wake waiting callers only afterwards, so that the cause is reported and not its consequence.

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.child import FAREWELL_S, Channel, open_parent
+from ibrobot_core.child import FAREWELL_S, Channel, Failure, open_parent
 from ibrobot_core.clock import RealClock
 from ibrobot_core.component import error_text, exit_code
 from ibrobot_core.config import from_document
@@ -141,8 +141,7 @@ def main(parent: int, memory: int, wake: int) -> int:
         if core is not None:
             core.abandon()
         holding = core.holding() if core is not None else []
-        failed = {"event": "failed", "error": error_text(error), "exit_code": exit_code(error), "holding": holding}
-        channel.send(failed)
+        channel.report(Failure(error_text(error), exit_code(error), holding))
         return 1
     finally:
         if core is not None:

@@ -6,7 +6,7 @@ import logging
 import os
 import sys
 
-from ibrobot_core.child import FAREWELL_S, open_parent
+from ibrobot_core.child import FAREWELL_S, Failure, open_parent
 
 channel = open_parent(int(sys.argv[1]))
 order = channel.wait(None)[0]
@@ -15,7 +15,7 @@ if text := order.get("log"):
 for message in order.get("say", ()):
     channel.send(message)
 if error := order.get("fail"):
-    channel.send({"event": "failed", "error": error})
+    channel.report(Failure(error))
 channel.flush(FAREWELL_S)
 if number := order.get("signal"):
     os.kill(os.getpid(), number)

@@ -168,8 +168,8 @@ class WebViewer(Viewer):
                 message = child.wait(_POLL_S)
             except ComponentFailed:
                 raise IbrobotError(child.cause(_END_S)) from None
-            if child.failed is not None:
-                raise IbrobotError(str(child.failed["error"]))
+            if child.failure is not None:
+                raise IbrobotError(child.failure.error)
             if message is not None and message["event"] == "ready":
                 return message
         raise ComponentFailed(f"the page's server was not ready after {_START_S:g} s")

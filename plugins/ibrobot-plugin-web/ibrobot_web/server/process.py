@@ -24,7 +24,7 @@ from typing import Any
 
 from aiohttp import web
 
-from ibrobot_core.api import Channel, IbrobotError, open_parent
+from ibrobot_core.api import Channel, Failure, IbrobotError, open_parent
 from ibrobot_web.link import FIRST_PICTURE, STATUS, receive_frame
 from ibrobot_web.pictures import as_jpeg
 from ibrobot_web.server.app import make_app
@@ -155,7 +155,7 @@ def main() -> None:
     try:
         asyncio.run(serve(channel, stream, order))
     except IbrobotError as error:
-        channel.send({"event": "failed", "error": str(error)})
+        channel.report(Failure(str(error)))
         channel.flush()
 
 

@@ -107,7 +107,7 @@ class Devices:
         """Take the messages of a guide until it ends."""
         child = work.child
         done = False
-        while not work.cancelled and not done and child.failed is None:
+        while not work.cancelled and not done and child.failure is None:
             try:
                 message = child.wait(_POLL_S)
             except ComponentFailed:

@@ -2,7 +2,7 @@
 
 Its order has the guide's `name` and the `answers` to its questions. It sends the server `say`, `show`, `picture`,
 and requests `{"ask": N, "kind": "confirm" | "wait", "text": …}` with `rows` while one waits; the server replies
-`{"reply": N, "ok": …}`. It ends with `done` or `failed`, or when the server closes the channel.
+`{"reply": N, "ok": …}`. It ends with `done` or a `Failure`, or when the server closes the channel.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, override
 
-from ibrobot_core.api import Channel, Guide, IbrobotError, error_text, installed_plugins, open_parent
+from ibrobot_core.api import Channel, Failure, Guide, IbrobotError, error_text, installed_plugins, open_parent
 
 _POLL_S = 0.03
 _ROWS_S = 0.1
@@ -95,10 +95,10 @@ def main() -> None:
         guide = next(each for each in installed_plugins().guides if each.name == order["name"])
         guide.run(order["answers"], PageGuide(channel))
     except IbrobotError as error:
-        channel.send({"event": "failed", "error": str(error) or type(error).__name__})
+        channel.report(Failure(str(error) or type(error).__name__))
     except Exception as error:
         logging.getLogger("ibrobot.ui").exception("the guide %s failed", order["name"])
-        channel.send({"event": "failed", "error": error_text(error)})
+        channel.report(Failure(error_text(error)))
     else:
         channel.send({"event": "done"})
     channel.flush()
