@@ -158,6 +158,7 @@ from ibrobot_core.messages import (
     Vector3 as Vector3,
 )
 from ibrobot_core.robot import Description as Description, Joint as Joint, Robot as Robot, Vector as Vector
+from ibrobot_core.deadman import Deadman as Deadman
 from ibrobot_core.clock import Clock as Clock, RealClock as RealClock, SteppedClock as SteppedClock
 from ibrobot_core.bus import Bus as Bus, Received as Received, Subscription as Subscription
 from ibrobot_core.component import (

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Literal
 
 import attrs
 
+from ibrobot_core.deadman import Deadman
 from ibrobot_core.interfaces.hardware import JointReading
 
 OperatorEvent = Literal["start", "success", "failure", "discard", "intervention"]
@@ -30,6 +32,11 @@ class TeleopCommand:
 
 class Teleop(ABC):
     """A device that commands joint positions. Its first positions after `activate` must be those of the robot."""
+
+    @cached_property
+    def deadman(self) -> Deadman:
+        """The device's deadman, to which it reports; it moves the robot only while this allows it."""
+        return Deadman()
 
     @abstractmethod
     def connect(self) -> None:
