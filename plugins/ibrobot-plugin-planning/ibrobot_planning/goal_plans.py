@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 
 import attrs
 import numpy as np
@@ -24,13 +25,12 @@ from ibrobot_core.api import (
     PositionGoal,
     Session,
     Vector,
+    ns,
 )
+from ibrobot_planning.completion import check_size, completed
 from ibrobot_planning.execution import ExecutorGoal
 from ibrobot_planning.goal_text import Target
 from ibrobot_planning.poses import named_pose
-
-_START_RAD = 0.01
-"""Allowed distance between the start of a trajectory and the robot, that of MoveIt."""
 
 
 class GoalPlans:
@@ -83,9 +83,9 @@ class GoalPlans:
         executors = {name: self._session.config.executors[name] for name in self._mode.executors}
         found: dict[str, Goal | float | JointTrajectory] = {}
         if (trajectory := target.trajectory) is not None:
-            wanted = set(trajectory.joint_names)
+            wanted = sorted(trajectory.joint_names)
             arms = [
-                name for name, each in executors.items() if each.goals == "trajectory" and set(each.joints) == wanted
+                name for name, each in executors.items() if each.goals == "trajectory" and sorted(each.joints) == wanted
             ]
             if not arms:
                 raise PlanningError(
@@ -159,20 +159,34 @@ class GoalPlans:
             if isinstance(goal, float):
                 goals[name] = goal
                 continue
+            others = dict(zip(robot.joint_names, start.tolist(), strict=True))
             if isinstance(goal, JointTrajectory):
-                self._check_begin(goal, start)
-                goals[name] = goal
+                check_size(goal)
+                goals[name] = self._checked(goal, start, others)
                 continue
             joints = self._session.config.executors[name].joints
-            others = dict(zip(robot.joint_names, start.tolist(), strict=True))
             planned = self.planned(
                 PlanRequest(
                     joints, start[robot.indices(joints)], goal,
                     target.velocity_scaling, target.acceleration_scaling, others,
                 )
             )  # fmt: skip
-            goals[name] = planned.trajectory
+            goals[name] = self._checked(planned.trajectory, start, others)
         return goals, planned
+
+    def _checked(self, trajectory: JointTrajectory, start: Vector, others: Mapping[str, float]) -> JointTrajectory:
+        """A trajectory in full, within the limits and free in the present world, whoever made it.
+
+        Raises:
+            PlanningError: if it is not.
+        """
+        robot, config = self._session.config.robot, self._session.config
+        whole = completed(
+            trajectory, start[robot.indices(trajectory.joint_names)], robot, ns(1.0 / config.control.rate_hz)
+        )
+        if touched := self.planner.blocked(whole, others):
+            raise PlanningError(f"the trajectory is not free: {touched}", PlanCode.INVALID_MOTION_PLAN)
+        return whole
 
     def planned(self, request: PlanRequest) -> PlanResult:
         """Plan by the mode's planner, one request at a time.
@@ -182,26 +196,3 @@ class GoalPlans:
         """
         with self._lock:
             return self.planner.plan(request)
-
-    def _check_begin(self, trajectory: JointTrajectory, start: Vector) -> None:
-        """Check that a trajectory begins where the robot is.
-
-        Raises:
-            PlanningError: if it does not.
-        """
-        first = trajectory.points[0].positions
-        present = start[self._session.config.robot.indices(trajectory.joint_names)]
-        if first.shape != present.shape:
-            raise PlanningError(
-                f"point 0 of the trajectory has {first.size} positions for {present.size} joints",
-                PlanCode.INVALID_MOTION_PLAN,
-            )
-        away = np.abs(first - present)
-        # Written so that NaN fails it.
-        if not away.max() <= _START_RAD:
-            joint = int(away.argmax())
-            raise PlanningError(
-                f"the trajectory begins with {trajectory.joint_names[joint]} at {first[joint]:.4f} rad, the robot is at"
-                f" {present[joint]:.4f} rad; at most {_START_RAD} rad may lie between them",
-                PlanCode.START_STATE_INVALID,
-            )

@@ -123,7 +123,7 @@ class RrtConnectPlanner(Planner):
         checks = self._collisions(world, trajectory.joint_names, others)
         made = motion_of(trajectory)
         if made is None:
-            return ""
+            return "nothing is known of a trajectory without velocities and accelerations"
         positions = made.sampled(_CHECK_S)[0][round(seconds(from_ns) / _CHECK_S) :: _WATCH_STRIDE]
         # What touches already may get away.
         leaving = _outwards(checks, positions) or 0 if len(positions) else 0

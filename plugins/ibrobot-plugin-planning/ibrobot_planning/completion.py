@@ -1,0 +1,285 @@
+"""Trajectories in full: from where the robot stands, with velocities and accelerations, and within the limits.
+
+Whoever made a trajectory, executors follow its points by quintics of positions, velocities and accelerations. What the
+points leave out is computed here, so that the motion that is checked is the motion that the robot makes:
+
+- Positions alone: the cubic spline with continuous accelerations, at rest at both ends.
+- Positions and velocities: the cubic between two points. Where the acceleration jumps from one cubic to the next, two
+  more points close by limit the change to a fraction of a control period.
+- A first point that is not quite where the robot stands: a short motion from rest to rest leads there.
+"""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.api import JointTrajectory, PlanCode, PlanningError, Robot, Vector, ns, seconds
+from ibrobot_planning.blend import motion_of, trajectory_of
+from ibrobot_planning.timing import Motion
+
+START_RAD = 0.01
+"""Allowed distance between the start of a trajectory and the robot, that of MoveIt."""
+MOST_POINTS = 2000
+"""Points of a given trajectory, at most: the control process reads them between two ticks."""
+LONGEST_S = 300.0
+"""Duration of a given trajectory, at most."""
+_SAME_RAD = 1e-6
+"""A start this near to the robot needs no motion to it."""
+_STILL = 1e-6
+"""Velocities [rad/s] that count as rest."""
+_MORE = 1.01
+"""Allowed excess of the limits of velocity and acceleration, for rounding."""
+_BEYOND_RAD = 1e-5
+"""Allowed excess of positions, for rounding."""
+_JUMP = 1e-3
+"""Jumps of the acceleration, as a share of its limit, that need no further points."""
+_QUINTIC_SPEED, _QUINTIC_RATE = 1.875, 5.7736
+"""Peaks of a quintic from rest to rest, over the way in unit time."""
+
+
+@attrs.frozen(eq=False)
+class _Points:
+    """Points of a trajectory: N points of J joints."""
+
+    times_ns: NDArray[np.int64]
+    """Strictly increasing from 0, shape (N,)."""
+    positions: Vector
+    """[rad], shape (N, J)."""
+    velocities: Vector | None
+    """[rad/s], shape (N, J)."""
+    accelerations: Vector | None
+    """[rad/s^2], shape (N, J)."""
+
+
+def check_size(trajectory: JointTrajectory) -> None:
+    """Refuse a given trajectory that costs too much to check and to send.
+
+    Raises:
+        PlanningError: with too many points, or too long a duration.
+    """
+    if len(trajectory.points) > MOST_POINTS:
+        raise _invalid(f"the trajectory has {len(trajectory.points)} points; at most {MOST_POINTS} are accepted")
+    last_ns = trajectory.points[-1].time_from_start_ns if trajectory.points else 0
+    if last_ns > ns(LONGEST_S):
+        raise _invalid(f"the trajectory takes {seconds(last_ns):g} s; at most {LONGEST_S:g} s are accepted")
+
+
+def completed(trajectory: JointTrajectory, start: Vector, robot: Robot, period_ns: int) -> JointTrajectory:
+    """The motion of a robot that follows a trajectory from rest, with velocities and accelerations in all points.
+
+    Args:
+        trajectory: of joints of the robot, from rest to rest.
+        start: where these joints are commanded [rad], shape (J,).
+        robot: the robot.
+        period_ns: control period.
+
+    Returns:
+        The trajectory itself if nothing is missing.
+
+    Raises:
+        PlanningError: if a number is missing or not finite, if the trajectory does not begin where the robot stands or
+            does not end at rest, or exceeds a limit.
+    """
+    names = trajectory.joint_names
+    order = robot.indices(names)
+    points = _from_robot(_points(trajectory), start, robot, order, names, period_ns)
+    made = motion_of(trajectory)
+    if made is None or not _is_whole(made, start):
+        made = _smooth(points, robot.max_acceleration[order], period_ns)
+        trajectory = trajectory_of(made, names, trajectory.header.stamp_ns)
+    _check_limits(made, robot, order, names, seconds(period_ns))
+    return trajectory
+
+
+def _is_whole(made: Motion, start: Vector) -> bool:
+    """Whether a motion begins exactly at the robot, at rest and without an acceleration."""
+    begins = made.times[0] == 0 and np.abs(made.positions[0] - start).max() <= _SAME_RAD
+    return bool(begins and not made.velocities[0].any() and not made.accelerations[0].any())
+
+
+def _points(trajectory: JointTrajectory) -> _Points:
+    """The points as arrays, after a check of their numbers."""
+    points, names = trajectory.points, trajectory.joint_names
+    if not points:
+        raise _invalid("the trajectory has no points; it needs two, or one after time 0")
+    if any(point.effort.size for point in points):
+        raise _invalid("the trajectory has efforts; only positions, velocities and accelerations are followed")
+    times = [point.time_from_start_ns for point in points]
+    for number, time in enumerate(times):
+        if time < 0 or (number and time <= times[number - 1]):
+            raise _invalid(f"point {number} of the trajectory is at {time} ns; times must increase from 0 on")
+    if times[-1] == 0:
+        raise _invalid("the last point of the trajectory is at time 0, which leaves no time to reach it")
+    positions = _field([point.positions for point in points], "positions", len(names))
+    if positions is None:
+        raise _invalid("the points of the trajectory have no positions; every point needs them")
+    velocities = _field([point.velocities for point in points], "velocities", len(names))
+    accelerations = _field([point.accelerations for point in points], "accelerations", len(names))
+    if accelerations is not None and velocities is None:
+        raise _invalid("the trajectory has accelerations but no velocities; give both, or positions alone")
+    if velocities is not None:
+        for number in (0, -1) if times[0] == 0 else (-1,):
+            if np.abs(velocities[number]).max() > _STILL:
+                joint = int(np.abs(velocities[number]).argmax())
+                where = "ends" if number else "begins"
+                raise _invalid(
+                    f"the trajectory {where} with {names[joint]} at {velocities[number, joint]:.6g} rad/s; it must"
+                    f" {where[:-1]} at rest"
+                )
+    return _Points(np.array(times, dtype=np.int64), positions, velocities, accelerations)
+
+
+def _field(rows: list[Vector], name: str, number: int) -> Vector | None:
+    """One field of all points, shape (N, J); None if no point has it."""
+    if not any(row.size for row in rows):
+        return None
+    for index, row in enumerate(rows):
+        if row.shape != (number,):
+            raise _invalid(f"point {index} of the trajectory has {row.size} {name} for {number} joints")
+        if not np.isfinite(row).all():
+            raise _invalid(f"point {index} of the trajectory has {name} that are not finite")
+    return np.array(rows)
+
+
+def _from_robot(
+    points: _Points, start: Vector, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...], period_ns: int
+) -> _Points:
+    """The points, begun where the robot stands.
+
+    Raises:
+        PlanningError: if they begin elsewhere.
+    """
+    away = np.abs(points.positions[0] - start)
+    # Written so that NaN fails it.
+    if not away.max() <= START_RAD:
+        joint = int(away.argmax())
+        raise PlanningError(
+            f"the trajectory begins with {names[joint]} at {points.positions[0, joint]:.4f} rad, the robot is at"
+            f" {start[joint]:.4f} rad; at most {START_RAD} rad may lie between them",
+            PlanCode.START_STATE_INVALID,
+        )
+    if points.times_ns[0] == 0 and away.max() <= _SAME_RAD:
+        return attrs.evolve(points, positions=np.vstack([start, points.positions[1:]]))
+    later_ns = 0
+    velocities = points.velocities
+    if points.times_ns[0] == 0:
+        fastest, strongest = robot.max_velocity[order], robot.max_acceleration[order]
+        lead_s = max(
+            float((_QUINTIC_SPEED * away / fastest).max()), float(np.sqrt(_QUINTIC_RATE * away / strongest).max())
+        )
+        later_ns = max(ns(_MORE * lead_s), 2 * period_ns)
+        if velocities is None:  # the way to the first point ends at rest, and is no part of the spline
+            velocities = _spline_velocities(points.times_ns, points.positions)
+    rest = np.zeros((1, len(start)))
+    return _Points(
+        np.concatenate([[0], points.times_ns + later_ns]),
+        np.vstack([start, points.positions]),
+        None if velocities is None else np.vstack([rest, velocities]),
+        None if points.accelerations is None else np.vstack([rest, points.accelerations]),
+    )
+
+
+def _spline_velocities(times_ns: NDArray[np.int64], positions: Vector) -> Vector:
+    """Velocities [rad/s], shape (N, J), of the cubic spline through the points whose acceleration is continuous."""
+    h = (np.diff(times_ns) / ns(1.0))[:, None]
+    slopes = np.diff(positions, axis=0) / h
+    velocities = np.zeros_like(positions)
+    # h[i] v[i-1] + 2 (h[i-1] + h[i]) v[i] + h[i-1] v[i+1] = 3 (h[i] s[i-1] + h[i-1] s[i]), solved from both ends.
+    factors, rests = np.zeros(len(positions)), np.zeros_like(positions)
+    for i in range(1, len(positions) - 1):
+        before, after = float(h[i - 1, 0]), float(h[i, 0])
+        pivot = 2 * (before + after) - after * factors[i - 1]
+        factors[i] = before / pivot
+        rests[i] = (3 * (after * slopes[i - 1] + before * slopes[i]) - after * rests[i - 1]) / pivot
+    for i in range(len(positions) - 2, 0, -1):
+        velocities[i] = rests[i] - factors[i] * velocities[i + 1]
+    return velocities
+
+
+def _smooth(points: _Points, max_acceleration: Vector, period_ns: int) -> Motion:
+    """The points as one motion whose acceleration does not jump; it begins and ends without any."""
+    velocities = points.velocities
+    if velocities is None:
+        velocities = _spline_velocities(points.times_ns, points.positions)
+    left, right = _accelerations(points, velocities)
+    none = np.zeros((1, points.positions.shape[1]))
+    before, after = np.concatenate([none, right]), np.concatenate([left, none])
+    means = (before + after) / 2
+    means[[0, -1]] = 0.0
+    jumps = (np.abs(after - before) > _JUMP * max_acceleration).any(axis=1)
+    lengths = np.diff(points.times_ns)
+    near_ns = np.minimum(lengths, period_ns) // 4
+    rows = [(points.times_ns, points.positions, velocities, means)]
+    for piece, at_ns in ((jumps[:-1], near_ns), (jumps[1:], lengths - near_ns)):
+        chosen = np.flatnonzero(piece & (near_ns > 0))
+        rows.append(_at(points, velocities, left, right, chosen, at_ns[chosen]))
+    times, *values = (np.concatenate(columns) for columns in zip(*rows, strict=True))
+    kept = np.argsort(times, kind="stable")
+    return Motion(times[kept] / ns(1.0), *(column[kept] for column in values))
+
+
+def _accelerations(points: _Points, velocities: Vector) -> tuple[Vector, Vector]:
+    """Accelerations at the begin and at the end of each piece between points [rad/s^2], both shape (N - 1, J)."""
+    if points.accelerations is not None:
+        return points.accelerations[:-1], points.accelerations[1:]
+    h = (np.diff(points.times_ns) / ns(1.0))[:, None]
+    slopes = np.diff(points.positions, axis=0) / h
+    v0, v1 = velocities[:-1], velocities[1:]
+    return (6 * slopes - 4 * v0 - 2 * v1) / h, (2 * v0 + 4 * v1 - 6 * slopes) / h
+
+
+def _at(
+    points: _Points, velocities: Vector, left: Vector, right: Vector, pieces: NDArray[np.intp], at_ns: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Vector, Vector, Vector]:
+    """Times, positions, velocities and accelerations at a time [ns] within each of some pieces, as quintics have it."""
+    h = (np.diff(points.times_ns)[pieces] / ns(1.0))[:, None]
+    u = (at_ns / ns(1.0))[:, None] / h
+    p0, way = points.positions[pieces], points.positions[pieces + 1] - points.positions[pieces]
+    v0, v1, a0, a1 = (
+        velocities[pieces] * h, velocities[pieces + 1] * h, left[pieces] * h * h, right[pieces] * h * h,
+    )  # fmt: skip
+    c3 = 10 * way - 6 * v0 - 4 * v1 - 1.5 * a0 + 0.5 * a1
+    c4 = -15 * way + 8 * v0 + 7 * v1 + 1.5 * a0 - a1
+    c5 = 6 * way - 3 * v0 - 3 * v1 - 0.5 * a0 + 0.5 * a1
+    return (
+        points.times_ns[pieces] + at_ns,
+        p0 + u * (v0 + u * (a0 / 2 + u * (c3 + u * (c4 + u * c5)))),
+        (v0 + u * (a0 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h,
+        (a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / (h * h),
+    )
+
+
+def _check_limits(made: Motion, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...], period_s: float) -> None:
+    """Check positions, speeds and changes of speed as the safety layer sees them: by setpoints a control period apart.
+
+    Raises:
+        PlanningError: for the joint that exceeds a limit most.
+    """
+    step = period_s / 2  # setpoints may fall anywhere between the points
+    inner = made.sampled(step)[0]
+    rest = np.repeat(inner[-1:], 3, axis=0)
+    positions = np.concatenate([inner[:1], inner[:1], inner, rest])
+    # A motion may begin outside the positions, and lead inwards.
+    lower, upper = np.minimum(robot.lower[order], inner[0]), np.maximum(robot.upper[order], inner[0])
+    speeds = np.abs(np.diff(positions, axis=0)) / step
+    changes = np.abs(positions[4:] - 2 * positions[2:-2] + positions[:-4]) / period_s**2
+    for what, unit, values, limits in (
+        ("position", "rad", np.maximum(positions - upper, lower - positions), np.full(len(order), _BEYOND_RAD)),
+        ("velocity", "rad/s", speeds, _MORE * robot.max_velocity[order]),
+        ("acceleration", "rad/s²", changes, _MORE * robot.max_acceleration[order]),
+    ):
+        # Written so that NaN fails it.
+        if not (values <= limits).all():
+            worst, joint = np.unravel_index(int((values / limits).argmax()), values.shape)
+            peak, limit = values[worst, joint], limits[joint] / _MORE
+            said = f"a {what} of {peak:.4g} {unit}; its limit is {limit:.4g} {unit}"
+            if what == "position":
+                said = f"a position {peak:.4g} rad outside its limits"
+            at = min(max(float(worst) - 1, 0) * step, made.duration)
+            raise _invalid(f"the trajectory gives {names[int(joint)]} near {at:.3f} s {said}")
+
+
+def _invalid(message: str) -> PlanningError:
+    return PlanningError(message, PlanCode.INVALID_MOTION_PLAN)
