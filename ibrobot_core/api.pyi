@@ -105,6 +105,7 @@ from ibrobot_core.errors import (
     GoalRejected as GoalRejected,
     HardwareError as HardwareError,
     IbrobotError as IbrobotError,
+    InUse as InUse,
     MissingDependency as MissingDependency,
     NotSupported as NotSupported,
     PlanCode as PlanCode,
@@ -268,6 +269,7 @@ from ibrobot_core.memory import create_memory as create_memory, set_malloc as se
 from ibrobot_core.child import Channel as Channel, Child as Child, Failure as Failure, open_parent as open_parent
 from ibrobot_core.signals import end_signals as end_signals, on_signals as on_signals
 from ibrobot_core.outside import LogFormatter as LogFormatter, echo as echo
+from ibrobot_core.ownership import Ownership as Ownership
 from ibrobot_core.screen import Screen as Screen, styled as styled
 from ibrobot_core.terminal import KeyReader as KeyReader
 

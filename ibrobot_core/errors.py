@@ -188,6 +188,10 @@ class DatasetError(IbrobotError):
     """A dataset cannot be written or read, e.g. because the shapes of frames differ."""
 
 
+class InUse(IbrobotError):
+    """An episode or a dataset has another owner, e.g. because it is being recorded."""
+
+
 class GoalRejected(IbrobotError):
     """An executor refuses a goal, e.g. because the times of a trajectory do not increase."""
 
@@ -218,12 +222,12 @@ _OF_THE_MACHINE = frozenset(
 def wrong_input() -> Iterator[None]:
     """A context and decorator with which errors make a command exit with 2, because the user gave invalid input.
 
-    Errors of the machine, such as a full disk, and of components that died keep their exit code.
+    Errors of the machine, such as a full disk, of what others use, and of components that died keep their exit code.
     """
     try:
         yield
     except IbrobotError as error:
-        if not (isinstance(error, DiskFull | ComponentFailed | Declined) or _is_of_the_machine(error)):
+        if not (isinstance(error, DiskFull | InUse | ComponentFailed | Declined) or _is_of_the_machine(error)):
             error.exit_code = ConfigError.exit_code
         raise
 

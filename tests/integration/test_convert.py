@@ -25,6 +25,7 @@ from recordings import CONTRACT, JOINTS, SIZE, START_NS, numbered, record
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from ibrobot_core.api import Ownership
 from ibrobot_core.messages import (
     Float64MultiArray,
     Header,
@@ -478,3 +479,17 @@ def test_only_episodes_of_an_outcome(tmp_path: Path) -> None:
     assert not found[:-1].any()
     result = run(tmp_path / "bags", "--out", tmp_path / "all", "--success")
     assert "cannot be determined: the episode's outcome is unknown" in result.err
+
+
+def test_an_episode_that_is_being_recorded_is_left_out_and_names_its_owner(bags: Path, tmp_path: Path) -> None:
+    shutil.copytree(bags, tmp_path / "bags")
+    with Ownership(tmp_path / "bags/episode_000002", "is being recorded"):
+        result = run(tmp_path / "bags", "--out", tmp_path / "set")
+    assert result.code == 1
+    left_out = (
+        f"left out episode_000002: {tmp_path / 'bags/episode_000002'}: is being recorded by process {os.getpid()};"
+    )
+    assert left_out in result.err
+    assert set(rows(tmp_path / "set")["episode_index"]) == {0, 1, 2}
+    again = run(tmp_path / "bags", "--out", tmp_path / "set", "--append", "--json")
+    assert (again.report["episodes"], again.report["passed_over"]) == (1, 3), again.err

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import threading
 from typing import TYPE_CHECKING
 
+import attrs
 import pytest
 import yaml
+from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_service import DISCARD, START, STATUS, STOP, EpisodeService
 
-from ibrobot_core.errors import DiskFull, NotSupported, RecorderError
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import DiskFull, InUse, NotSupported, RecorderError
+from ibrobot_core.ownership import Ownership
 
 if TYPE_CHECKING:
     from ibrobot_core.launch.runtime import Runtime
@@ -163,3 +168,56 @@ def test_buttons_of_a_device_are_passed_to_what_records_episodes(run: Runtime, r
     ticks(run, 3)
     events = run.session.operator_events
     assert [events.get_nowait(), events.get_nowait(), events.empty()] == ["start", "discard", True]
+
+
+def test_an_episode_belongs_to_its_recorder_until_it_has_ended(run: Runtime, runs: Runs):
+    bus, root = run.session.bus, runs.folder / "kept" / "pick" / "episodes"
+    bus.call(START, "pick")
+    ticks(run, 2)
+    with pytest.raises(InUse, match="episode_000001: is being recorded by process"):
+        Ownership(root / "episode_000001", "is being trimmed", wait_s=0.0)
+    bus.call(STOP, "success")
+    ticks(run, 2)
+    Ownership(root / "episode_000001", "is being trimmed", wait_s=0.0).close()
+    bus.call(START, "pick")
+    ticks(run, 2)
+    run.stop()
+    assert [path.name for path in sorted(root.iterdir())] == ["episode_000001", "episode_000002"], "no lock is left"
+
+
+def test_two_runs_that_record_into_one_dataset_lose_no_episode(run: Runtime, runs: Runs):
+    bus, root = run.session.bus, runs.folder / "kept" / "pick" / "episodes"
+    root.mkdir(parents=True)
+    with Ownership(root / "episode_000001", "is being recorded"):  # another run began, and has not written anything yet
+        bus.call(START, "pick")
+        ticks(run, 2)
+        bus.call(STOP, "success")
+        ticks(run, 2)
+    assert folders(runs) == ["episode_000002"]
+    run.stop()
+    service = run.session.episodes
+    assert isinstance(service, EpisodeService)
+    assert (service.saved, service.failure) == (1, None)
+
+
+def test_the_first_episodes_of_two_runs_agree_on_one_contract(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(runs.folder)
+    config = runs.start(RECORDING, mode="teleop", by_operator=True).session.config
+    contract = Contract.from_config(config)
+    other = attrs.evolve(contract, rate_hz=contract.rate_hz / 2)
+    ready, refused = threading.Barrier(2), list[str]()
+
+    def join(mine: Contract) -> None:
+        ready.wait()
+        try:
+            EpisodeDataset(runs.folder / "new").join(mine, "mini", "")
+        except RecorderError as error:
+            refused.append(str(error))
+
+    threads = [threading.Thread(target=join, args=(each,)) for each in (contract, other)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    (message,) = refused
+    assert "its episodes have another contract" in message

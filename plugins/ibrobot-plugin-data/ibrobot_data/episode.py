@@ -9,6 +9,7 @@ import os
 import shutil
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from ibrobot_core.api import (
     IbrobotError,
     JointCalibration,
     JointUnits,
+    Ownership,
     RealClock,
     RecorderError,
     Robot,
@@ -152,11 +154,20 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
     """
     making = job.unit.with_name(f"{job.unit.name}.making")
     shutil.rmtree(making, ignore_errors=True)
-    reader: EpisodeReader | None = None
     report = EpisodeReport(job.source)
+    with ExitStack() as stack:
+        return _convert(job, making, report, progress, stack)
+
+
+def _convert(
+    job: Job, making: Path, report: EpisodeReport, progress: Callable[[int], None], stack: ExitStack
+) -> EpisodeReport:
     try:
+        if EpisodeAddress.of(job.episode).number is None:
+            stack.enter_context(Ownership(job.episode, "is being converted", shared=True))
         key = unit_key(job)
         reader = installed_plugins().open_episode(job.episode)
+        stack.callback(reader.close)
         summary = reader.summary()
         report = attrs.evolve(_described(report, summary, job.request), identity=identity(reader, summary))
         unit = _write(job, key, reader, summary, report, making, progress)
@@ -171,9 +182,6 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
     except Exception as error:  # noqa: BLE001 - a fault in a plugin must not cost the other episodes
         shutil.rmtree(making, ignore_errors=True)
         return attrs.evolve(report, error=unexpected(error))
-    finally:
-        if reader is not None:
-            reader.close()
     return unit.report
 
 

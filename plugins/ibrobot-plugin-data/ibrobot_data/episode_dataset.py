@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
 import yaml
 
-from ibrobot_core.api import Contract, RecorderError
+from ibrobot_core.api import Contract, Ownership, RecorderError
+
+_WAIT_S = 10.0
+"""Others change `dataset.yaml` within milliseconds."""
 
 
 class EpisodeDataset:
@@ -33,7 +38,8 @@ class EpisodeDataset:
 
     @prompt.setter
     def prompt(self, prompt: str) -> None:
-        self._write({**self._read(), "prompt": prompt})
+        with self._owned():
+            self._write({**self._read(), "prompt": prompt})
 
     def join(self, contract: Contract, robot: str, robot_type: str) -> None:
         """Check that the dataset has this contract, and create `dataset.yaml` for the first episode.
@@ -47,10 +53,13 @@ class EpisodeDataset:
             RecorderError: if the dataset has another contract, or the file cannot be written.
         """
         self.check(contract)
-        known = self._read()
-        if "fingerprint" not in known:
-            facts = {"name": self._folder.name, "robot": robot, "robot_type": robot_type}
-            self._write({**facts, "fingerprint": contract.fingerprint(), "contract": contract.canonical(), **known})
+        if "fingerprint" in self._read():
+            return
+        facts = {"name": self._folder.name, "robot": robot, "robot_type": robot_type}
+        with self._owned():
+            self.check(contract)  # another run may have been the first
+            described = {**facts, "fingerprint": contract.fingerprint(), "contract": contract.canonical()}
+            self._write(described | self._read())
 
     def check(self, contract: Contract) -> None:
         """Check that the dataset has this contract, or no episodes.
@@ -80,6 +89,17 @@ class EpisodeDataset:
                 f"recording.root: {self._folder} cannot be written: {folder}: {error.strerror}; choose another root"
             ) from None
 
+    @contextmanager
+    def _owned(self) -> Iterator[None]:
+        """Change `dataset.yaml` alone."""
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            owned = Ownership(self._file, "is being changed", file=self._folder / ".dataset.lock", wait_s=_WAIT_S)
+        except OSError as error:
+            raise RecorderError(f"{self._file}: cannot be written: {error.strerror}") from None
+        with owned:
+            yield
+
     def _read(self) -> dict[str, Any]:
         try:
             document = yaml.safe_load(self._file.read_text(encoding="utf-8"))
@@ -94,7 +114,6 @@ class EpisodeDataset:
     def _write(self, facts: dict[str, Any]) -> None:
         staged = self._file.with_suffix(".yaml.new")
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
             staged.write_text(yaml.safe_dump(facts, sort_keys=False, allow_unicode=True), encoding="utf-8")
             staged.replace(self._file)
         except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from uuid import NAMESPACE_OID, uuid4, uuid5
 
@@ -11,6 +12,8 @@ import ibrobot_core
 from ibrobot_core.api import (
     Contract,
     EpisodeStart,
+    InUse,
+    Ownership,
     RecorderError,
     RecordingConfig,
     RobotConfig,
@@ -28,12 +31,33 @@ def episode_folder(dataset: Path, number: int) -> Path:
     return dataset / "episodes" / f"{_PREFIX}{number:06d}"
 
 
+def take_next_folder(recording: RecordingConfig) -> Ownership:
+    """Take the folder of the dataset's next episode, which does not exist yet, for as long as it is recorded.
+
+    Raises:
+        RecorderError: if no folder can be created there.
+    """
+    root = recording.folder / "episodes"
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        number = _next_number(root)
+        while True:
+            with suppress(InUse):  # another run records into this dataset, too
+                taken = Ownership(episode_folder(root.parent, number), "is being recorded", wait_s=0.0)
+                if not taken.path.exists():
+                    return taken
+                taken.close()
+            number += 1
+    except OSError as error:
+        raise RecorderError(f"recording.root: {root} cannot be created: {error.strerror}") from None
+
+
 def episode_start(
-    config: RobotConfig, recording: RecordingConfig, topics: Mapping[str, str], *, mode: str, seed: int, stamp_ns: int,
-    lockstep: bool, prompt: str = "", plugins: Mapping[str, str] | None = None,
+    config: RobotConfig, recording: RecordingConfig, topics: Mapping[str, str], directory: Path, *, mode: str,
+    seed: int, stamp_ns: int, lockstep: bool, prompt: str = "", plugins: Mapping[str, str] | None = None,
     policy: Mapping[str, str] | None = None,
 ) -> EpisodeStart:  # fmt: skip
-    """The start of the dataset's next episode.
+    """The start of an episode.
 
     Args:
         config: the robot.
@@ -41,6 +65,7 @@ def episode_start(
         topics: topic -> message type for every topic on the bus. For `topics: contract` the episode has all topics of
             the contract, including those not published yet, and who commands; otherwise it has the requested ones of
             these topics, and more may follow (`any_topic`).
+        directory: the folder of the episode.
         mode: the control mode.
         seed: the seed of the scene.
         stamp_ns: start of the episode [ns].
@@ -50,15 +75,10 @@ def episode_start(
         policy: the acting policy and its weights; None without a policy.
 
     Raises:
-        RecorderError: if the folder cannot be created, or the dataset has another contract.
+        RecorderError: if the dataset has another contract.
     """
     contract = Contract.from_config(config)
-    root = recording.folder / "episodes"
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecorderError(f"recording.root: {root} cannot be created: {error.strerror}") from None
-    EpisodeDataset(root.parent).join(contract, config.robot.name, config.robot.robot_type)
+    EpisodeDataset(recording.folder).join(contract, config.robot.name, config.robot.robot_type)
     metadata = {
         "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode, "prompt": prompt,
         "contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint(),
@@ -73,7 +93,6 @@ def episode_start(
         kept = {**contract.topics, **({COMMANDER: String.ros_type} if COMMANDER in topics else {})}
     else:
         kept = {topic: type_ for topic, type_ in topics.items() if is_kept(topic, recording, contract)}
-    directory = episode_folder(root.parent, _next_number(root))
     return EpisodeStart(directory, stamp_ns, kept, metadata, any_topic=recording.topics != "contract")
 
 

@@ -106,12 +106,12 @@ class PartialRecording(RecordingWorker):
         since_ns = recent[0].received_ns if recent else now_ns
         self._end_ns = None
         try:
-            start = self._start_of(number, prompt, since_ns)
+            start, owned = self._start_of(number, prompt, since_ns)
         except RecorderError as error:
             self._fail(error)
             return
         latched = [item for item in self.session.bus.latched().values() if item.received_ns < since_ns]
-        self._open_episode(start, latched, self._incoming.lost.copy())
+        self._open_episode(start, owned, latched, self._incoming.lost.copy())
         for item in recent:
             super()._write(item, item.received_ns)
 

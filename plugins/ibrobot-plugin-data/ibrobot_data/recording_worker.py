@@ -17,6 +17,7 @@ from ibrobot_core.api import (
     EpisodeEnd,
     EpisodeStart,
     Message,
+    Ownership,
     Received,
     Recorder,
     RecorderError,
@@ -27,7 +28,7 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_data.episode_service import EpisodeService
-from ibrobot_data.episode_start import episode_start, is_kept
+from ibrobot_data.episode_start import episode_start, is_kept, take_next_folder
 
 _DEPTH = 4096
 """Length of the queue to the recorder, in messages."""
@@ -67,6 +68,8 @@ class RecordingWorker(SessionWorker):
         self._pending_lock = threading.Lock()
         """Held while an action is stamped and queued, and while actions and messages are taken, to keep their order."""
         self._open = False
+        self._owned: Ownership | None = None
+        """The folder of the open episode."""
         self._seen: dict[str, deque[int]] = {}
         """Topic -> times of the last messages [ns]."""
         self._newest: dict[str, Message] = {}
@@ -91,6 +94,7 @@ class RecordingWorker(SessionWorker):
         self.on_end.callback(self._incoming.close)
         self.service.serve()
         self.on_end.callback(self.service.unserve)
+        self.on_end.callback(self._give_up)
         self.on_end.callback(self._did, self._recorder.close)
         self.on_end.callback(self.work, 0.0)
 
@@ -103,13 +107,13 @@ class RecordingWorker(SessionWorker):
         session = self.session
         self.failure = None
         with self._pending_lock:
-            start = self._start_of(number, prompt, session.bus.snapshot_ns())
+            start, owned = self._start_of(number, prompt, session.bus.snapshot_ns())
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
-            begin = partial(self._open_episode, start, latched, self._incoming.lost.copy())
+            begin = partial(self._open_episode, start, owned, latched, self._incoming.lost.copy())
             self._pending.append((start.stamp_ns, begin))
 
-    def _start_of(self, number: int, prompt: str, stamp_ns: int) -> EpisodeStart:
-        """The start of the dataset's next episode, which is of episode `number` of the run.
+    def _start_of(self, number: int, prompt: str, stamp_ns: int) -> tuple[EpisodeStart, Ownership]:
+        """The start of the dataset's next episode, which is of episode `number` of the run, and its folder.
 
         Raises:
             RecorderError: if it cannot be recorded in its dataset.
@@ -117,11 +121,18 @@ class RecordingWorker(SessionWorker):
         session = self.session
         self._sizes = {}
         topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
-        return episode_start(
-            session.config, self._config, topics, mode=session.mode, seed=session.request.seed + number - 1,
-            stamp_ns=stamp_ns, lockstep=session.request.lockstep, prompt=prompt, plugins=session.registry.versions(),
-            policy=session.acting.described() if session.acting is not None else None,
-        )  # fmt: skip
+        owned = take_next_folder(self._config)
+        try:
+            start = episode_start(
+                session.config, self._config, topics, owned.path, mode=session.mode,
+                seed=session.request.seed + number - 1, stamp_ns=stamp_ns, lockstep=session.request.lockstep,
+                prompt=prompt, plugins=session.registry.versions(),
+                policy=session.acting.described() if session.acting is not None else None,
+            )  # fmt: skip
+        except BaseException:
+            owned.close()
+            raise
+        return start, owned
 
     def _later(self, act: Callable[[], None]) -> None:
         """Let the thread of the recorder do something between the messages received until now and the next ones."""
@@ -204,11 +215,17 @@ class RecordingWorker(SessionWorker):
             self._newest[item.topic] = item.message
             self._seen.setdefault(item.topic, deque(maxlen=_RATE_WINDOW)).append(item.received_ns)
 
-    def _open_episode(self, start: EpisodeStart, latched: Iterable[Received], lost: Mapping[str, int]) -> None:
+    def _open_episode(
+        self, start: EpisodeStart, owned: Ownership, latched: Iterable[Received], lost: Mapping[str, int]
+    ) -> None:
         """Open an episode; `latched` and `lost` are the latched messages and the lost ones counted when it began."""
         self.failure = None
         self._lost = lost
+        self._give_up()
+        self._owned = owned
         self._open = self._did(partial(self._recorder.begin, start))
+        if not self._open:
+            self._give_up()
         for item in latched:
             self._write(item, start.stamp_ns)
 
@@ -227,7 +244,15 @@ class RecordingWorker(SessionWorker):
         self._open = False
         # Counted now, since messages that were queued when the episode ended may have been lost later.
         dropped = {topic: n for topic, n in self.lost().items() if self._keeps(topic)}
-        return self._did(partial(self._recorder.end, attrs.evolve(end, dropped=dropped)))
+        whole = self._did(partial(self._recorder.end, attrs.evolve(end, dropped=dropped)))
+        self._give_up()
+        return whole
+
+    def _give_up(self) -> None:
+        """Leave the folder of the last episode to others."""
+        if self._owned is not None:
+            self._owned.close()
+            self._owned = None
 
     def _write(self, item: Received, received_ns: int) -> None:
         if not self._open or not self._keeps(item.topic):

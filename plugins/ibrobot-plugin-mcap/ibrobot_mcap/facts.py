@@ -75,6 +75,16 @@ def parse_facts(text: str, path: Path) -> Facts:
         raise RecorderError(f"{path}: is not metadata of a rosbag2: {error}") from error
 
 
+def custom_beside(file: Path) -> Mapping[str, str]:
+    """`custom_data` in the `metadata.yaml` that lists a file, where the outcome can have been set by hand; or empty.
+
+    Raises:
+        RecorderError: if it cannot be read.
+    """
+    facts = read_facts(file.with_name(METADATA))
+    return facts.custom if facts is not None and file.name in facts.files else {}
+
+
 def set_custom(directory: Path, values: Mapping[str, str]) -> None:
     """Set keys of `custom_data` in the `metadata.yaml` of a bag, without changing anything else.
 

@@ -25,7 +25,7 @@ from ibrobot_core.api import (
 )
 from ibrobot_mcap.compressed import Expanded, MessageCompressed
 from ibrobot_mcap.damage import reading
-from ibrobot_mcap.facts import Facts, parse_facts, read_facts
+from ibrobot_mcap.facts import Facts, custom_beside, parse_facts, read_facts
 from ibrobot_mcap.metadata import DROPPED, METADATA, MISSING, OUTCOME, RECORD, RECORD_KEY, Topic
 from ibrobot_mcap.options import COMPRESSIONS
 from ibrobot_mcap.sources import McapSource, Raw, Source
@@ -69,7 +69,8 @@ class Rosbag2Reader(EpisodeReader):
         self.stated: Mapping[str, int] = facts.counts if path.is_dir() else self._source.stated
         """Topic -> number of messages according to the bag's metadata, including copies in later files."""
         self._stated_types = facts.types
-        self._custom = dict(facts.custom or self._source.custom)
+        beside = {} if path.is_dir() else custom_beside(path)
+        self._custom = dict(beside or facts.custom or self._source.custom)
 
     @property
     def finished(self) -> bool:

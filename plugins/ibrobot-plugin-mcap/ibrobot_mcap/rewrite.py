@@ -7,21 +7,24 @@ import shutil
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from uuid import NAMESPACE_OID, uuid5
+from uuid import NAMESPACE_OID, UUID, uuid5
 
 import attrs
 
 from ibrobot_core.api import EpisodeStart, EpisodeSummary, RecorderError
 from ibrobot_mcap.bagfile import Item
-from ibrobot_mcap.metadata import MISSING
+from ibrobot_mcap.metadata import MARKED, MISSING
 from ibrobot_mcap.options import McapOptions
+from ibrobot_mcap.owning import REPAIRING, UNFINISHED, beside, owning
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.storage import Storage
 
 REPAIRED = "repaired"
 """Key of `custom_data` that states that an episode was repaired."""
 STATED = "stated_outcome"
-"""Key of the outcome before the repair."""
+"""Key of the outcome before the repair, or before the end was cut off."""
+TRIMMED_FROM = "trimmed_from"
+"""Key of a part: the recordings of which it is a part, newest last; each by its UUID, or by its digest without one."""
 
 
 @attrs.frozen
@@ -46,6 +49,8 @@ def rewrite(
         end_ns: time of receipt of the last message to copy [ns].
         marks: keys to add to the metadata.
 
+    The outcome of a part without the end is unknown: what was judged may not be in it.
+
     Raises:
         RecorderError: if `source` cannot be read or `target` cannot be written; `target` is then removed.
     """
@@ -56,9 +61,12 @@ def rewrite(
         latched = reader.latched()
         topics = {name: reader.stored(name) for name in reader.topics}
         start_ns = summary.start_ns if begin_ns is None else begin_ns
-        metadata = {**summary.metadata, **(marks or {})}
-        if begin_ns is not None or end_ns is not None:  # a part needs its own UUID
-            metadata["uuid"] = str(uuid5(NAMESPACE_OID, f"{metadata.get('uuid', source.name)} {begin_ns} {end_ns}"))
+        metadata, outcome = {**summary.metadata, **(marks or {})}, summary.outcome
+        if begin_ns is not None or end_ns is not None:
+            metadata |= _of_a_part(reader, summary, begin_ns, end_ns)
+        if end_ns is not None and end_ns < summary.end_ns and outcome != "unknown":
+            metadata[STATED], outcome = outcome, "unknown"
+            metadata.pop(MARKED, None)
         if missing := {name: topic.missing for name, topic in summary.topics.items() if topic.missing}:
             metadata[MISSING] = json.dumps(missing)
         options = McapOptions(min_free=0, compression=reader.compression())
@@ -74,7 +82,7 @@ def rewrite(
                 received_ns = max(raw.received_ns, start_ns)
                 storage.write(Item(topics[raw.topic], memoryview(raw.data), received_ns, raw.published_ns))
             dropped = {name: topic.dropped for name, topic in summary.topics.items() if topic.dropped}
-            storage.finish(summary.outcome, dropped)
+            storage.finish(outcome, dropped)
         except BaseException:
             storage.discard()
             raise
@@ -85,6 +93,16 @@ def rewrite(
         written.close()
 
 
+def _of_a_part(
+    reader: Rosbag2Reader, summary: EpisodeSummary, begin_ns: int | None, end_ns: int | None
+) -> dict[str, str]:
+    """The metadata that identify a part of an episode: its own UUID, and the recordings of which it is a part."""
+    uuid = summary.metadata.get("uuid", summary.path.name)
+    own = str(uuid5(NAMESPACE_OID, f"{uuid} {begin_ns} {end_ns}"))
+    whole = uuid if _is_random(uuid) else reader.digest()
+    return {"uuid": own, TRIMMED_FROM: f"{summary.metadata.get(TRIMMED_FROM, '')} {whole}".strip()}
+
+
 def repair(path: Path) -> Rewritten | None:
     """Repair an unfinished or incomplete episode in place; returns None if it is already complete.
 
@@ -92,8 +110,14 @@ def repair(path: Path) -> Rewritten | None:
     renamed to `.NAME.unfinished` until the new episode has been read back and has every message.
 
     Raises:
+        InUse: if it is being recorded or changed.
         RecorderError: if it cannot be read or written; the original is then restored.
     """
+    with owning(path, "is being repaired"):
+        return _repair(path)
+
+
+def _repair(path: Path) -> Rewritten | None:
     reader = Rosbag2Reader(path)
     try:
         before, short = reader.summary(), reader.short()
@@ -103,12 +127,10 @@ def repair(path: Path) -> Rewritten | None:
         return None
     if not path.is_dir():
         raise RecorderError(f"{path}: repair takes the episode's folder, not a file of it")
-    staging = path.with_name(f".{path.name}.repairing")
-    aside = path.with_name(f".{path.name}.unfinished")
+    staging, aside = beside(path, REPAIRING), beside(path, UNFINISHED)
     if aside.exists():
         raise RecorderError(f"{aside} exists already, from an interrupted repair; decide which one to keep")
     try:
-        shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir()
         marks = {REPAIRED: "true"} | ({STATED: before.stated_outcome} if before.stated_outcome != "unknown" else {})
         made = rewrite(path, staging / path.name, marks=marks)
@@ -123,3 +145,11 @@ def repair(path: Path) -> Rewritten | None:
     finally:
         shutil.rmtree(staging, ignore_errors=True)
     return Rewritten(path, attrs.evolve(made.summary, path=path))
+
+
+def _is_random(uuid: str) -> bool:
+    """Whether a UUID identifies one recording; in lockstep it is derived from the run."""
+    try:
+        return UUID(uuid).version == 4
+    except ValueError:
+        return False

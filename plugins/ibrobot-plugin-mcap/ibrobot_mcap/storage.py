@@ -7,6 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NoReturn
 
 from ibrobot_core.api import NS_PER_S, EpisodeStart, RecorderError, ns
@@ -34,6 +35,8 @@ class Storage:
         self._directory = episode.directory
         self._period_ns = ns(options.chunk_period_s)
         self._files: dict[str, Counted] = {}
+        self._inodes: dict[Path, os.stat_result] = {}
+        """The folder and the files as they were created."""
         self._topics: dict[Topic, int] = {}
         self._latched: dict[str, Item] = {}
         self._looked_at = 0
@@ -48,6 +51,7 @@ class Storage:
         except OSError as error:
             raise RecorderError(f"cannot record into {self._directory}: {error.strerror}") from error
         try:
+            self._inodes[self._directory] = self._directory.stat()
             self._file = self._open_file()
         except OSError as error:
             shutil.rmtree(self._directory)
@@ -103,6 +107,7 @@ class Storage:
             self._check_space(self._directory)
             period_s = self._options.sync_period_s
             if period_s is not None and time.monotonic() - self._synced_s >= period_s:
+                self._check_place()
                 self._file.sync_aside()
                 self._synced_s = time.monotonic()
         except OSError as error:
@@ -112,7 +117,8 @@ class Storage:
         """Finish the episode: write the files' indices, then `metadata.yaml`, which marks it as complete.
 
         Raises:
-            RecorderError: if the write fails; the episode then remains unfinished but readable.
+            RecorderError: if the write fails; the episode then remains unfinished but readable. Also if its folder or
+                one of its files is no longer the one at its path, since what was recorded is then not there.
         """
         if self._broken is not None:
             self._file.abandon()
@@ -120,19 +126,24 @@ class Storage:
         lost = json.dumps(dict(sorted(dropped.items())))
         custom = {**self._episode.metadata, OUTCOME: outcome, DROPPED: lost}
         try:
+            self._check_place()
             self._close_file(custom)
             write_metadata(self._directory, self._facts(custom))
         except OSError as error:
             self._file.abandon()
             self._fail(error)
+        except RecorderError:
+            self._file.abandon()
+            raise
 
     def discard(self) -> None:
         """Remove the episode.
 
         Raises:
-            RecorderError: if it cannot be removed.
+            RecorderError: if it cannot be removed, or if what is at its path is not what was recorded.
         """
         self._file.abandon()
+        self._check_place()
         try:
             shutil.rmtree(self._directory)
         except OSError as error:
@@ -142,6 +153,7 @@ class Storage:
         path = self._directory / f"{self._directory.name}_{len(self._files)}.mcap"
         file = BagFile(path, self._options, self._facts(self._episode.metadata))
         self._files[path.name] = file.counted
+        self._inodes[path] = path.stat()
         self._looked_at = 0
         return file
 
@@ -172,6 +184,20 @@ class Storage:
     def _flush(self) -> None:
         self._file.flush()
         self._waits_since_s = None
+
+    def _check_place(self) -> None:
+        """Check that the folder and all files are still at their paths: other programs may ignore who owns them."""
+        for path, created in self._inodes.items():
+            try:
+                there = os.path.samestat(created, path.stat())
+            except OSError:
+                there = False
+            if not there:
+                self._broken = RecorderError(
+                    f"{path}: was moved, replaced or removed while it was being recorded; what is there is not the "
+                    "recording"
+                )
+                raise self._broken
 
     def _check_space(self, path: os.PathLike[str]) -> None:
         try:

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import shutil
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
 import attrs
 
 from ibrobot_core.api import RecorderError, ns, seconds
+from ibrobot_mcap.owning import DELETING, TRIMMING, beside, owning, reading_owned
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
 from ibrobot_mcap.rewrite import Rewritten, rewrite
 
@@ -34,6 +37,8 @@ class Trashed:
     name: str
     """Name of the episode."""
     done: str
+    link: str | None = None
+    """Where it pointed, if it was a link to an episode."""
 
     @property
     def id(self) -> str:
@@ -51,20 +56,49 @@ class Trashed:
         return self.folder.parents[1] / self.name
 
 
-def discard(episode: Path, done: str = DELETED) -> Trashed:
+def discard(episode: Path) -> Trashed:
     """Move an episode to the trash folder beside it.
 
     Raises:
+        InUse: if it is being recorded or changed.
         RecorderError: if it is not an episode's folder, or cannot be moved.
     """
+    with owning(episode, "is being deleted"):
+        return _discard(episode, DELETED)
+
+
+def delete(episode: Path) -> None:
+    """Delete an episode for good; of a link to one, the link.
+
+    Raises:
+        InUse: if it is being recorded or changed.
+        RecorderError: if it is not an episode's folder, or cannot be removed.
+    """
+    with owning(episode, "is being deleted"):
+        if not (episode.is_dir() and is_rosbag2(episode)):
+            raise RecorderError(f"{episode}: is not an episode; nothing was deleted")
+        try:
+            if episode.is_symlink():
+                episode.unlink()
+            else:
+                shutil.rmtree(episode.rename(beside(episode, DELETING)))
+        except OSError as error:
+            raise RecorderError(f"{episode}: cannot be deleted: {error.strerror}") from error
+
+
+def _discard(episode: Path, done: str) -> Trashed:
     if not (episode.is_dir() and is_rosbag2(episode)):
         raise RecorderError(f"{episode}: is not an episode; nothing was moved")
     try:
-        trash = episode.parent / TRASH
-        trash.mkdir(exist_ok=True)
-        trashed = Trashed(_new_folder(trash), episode.name, done)
-        (trashed.folder / _NOTE).write_text(json.dumps({"name": episode.name, "done": done}), encoding="utf-8")
-        episode.rename(trashed.kept)
+        link = os.readlink(episode) if episode.is_symlink() else None
+        trashed = Trashed(_new_folder(episode.parent / TRASH), episode.name, done, link)
+        note = {"name": episode.name, "done": done} | ({"link": link} if link is not None else {})
+        (trashed.folder / _NOTE).write_text(json.dumps(note), encoding="utf-8")
+        if link is None:
+            episode.rename(trashed.kept)
+        else:  # a relative one would point to nothing from there
+            trashed.kept.symlink_to(episode.resolve())
+            episode.unlink()
     except OSError as error:
         raise RecorderError(f"{episode}: cannot be moved to {TRASH}: {error.strerror}") from error
     return trashed
@@ -79,17 +113,26 @@ def trim(episode: Path, begin_s: float, end_s: float | None) -> tuple[Rewritten,
         end_s: end of the part [s]; None for the end of the episode.
 
     Raises:
+        InUse: if the episode is being recorded or changed.
         RecorderError: if the part is not within the episode, or cannot be written; the episode is then unchanged.
     """
-    if not episode.is_dir():
-        raise RecorderError(f"{episode}: must be the episode's folder, not a file of it")
-    staging = episode.with_name(f".{episode.name}.trimming")
+    with owning(episode, "is being trimmed"):
+        if not episode.is_dir():
+            raise RecorderError(f"{episode}: must be the episode's folder, not a file of it")
+        return _trim(episode, begin_s, end_s)
+
+
+def _trim(episode: Path, begin_s: float, end_s: float | None) -> tuple[Rewritten, Trashed]:
+    staging = beside(episode, TRIMMING)
     try:
-        shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir()
-        made = copy_part(episode, staging / episode.name, begin_s, end_s)
-        trashed = discard(episode, TRIMMED)
-        made.path.rename(episode)
+        made = _copy_part(episode, staging / episode.name, begin_s, end_s)
+        trashed = _discard(episode, TRIMMED)
+        try:
+            made.path.rename(episode)
+        except BaseException:
+            _put_back(trashed, episode)
+            raise
     except OSError as error:
         raise RecorderError(f"{episode}: cannot be trimmed: {error.strerror}") from error
     finally:
@@ -99,6 +142,11 @@ def trim(episode: Path, begin_s: float, end_s: float | None) -> tuple[Rewritten,
 
 def copy_part(episode: Path, output: Path, begin_s: float, end_s: float | None) -> Rewritten:
     """Copy a part of an episode to a new one; arguments and errors as of `trim`."""
+    with reading_owned(episode, "is being copied"), owning(output, "is being written"):
+        return _copy_part(episode, output, begin_s, end_s)
+
+
+def _copy_part(episode: Path, output: Path, begin_s: float, end_s: float | None) -> Rewritten:
     reader = Rosbag2Reader(episode)
     try:
         summary = reader.summary()
@@ -127,21 +175,33 @@ def restore(trashed: Trashed) -> Path:
         Where it is now: its own place, or `NAME_restored` if a later recording has taken its name.
 
     Raises:
+        InUse: if an episode in its place is being recorded or changed.
         RecorderError: if it cannot be moved.
     """
     origin = trashed.origin
-    try:
-        if origin.exists() and trashed.done in (TRIMMED, REPLACED):
-            discard(origin, REPLACED)
-        while origin.exists():
-            origin = origin.with_name(f"{origin.name}_restored")
-        trashed.kept.rename(origin)
-        shutil.rmtree(trashed.folder)
-        if not any(trashed.folder.parent.iterdir()):
-            trashed.folder.parent.rmdir()
-    except OSError as error:
-        raise RecorderError(f"{trashed.kept}: cannot be restored: {error.strerror}") from error
+    with owning(origin, "is being restored"):
+        try:
+            if not trashed.kept.exists():
+                raise RecorderError(f"{trashed.kept}: is no longer there; another command restored or deleted it")
+            if origin.exists() and trashed.done in (TRIMMED, REPLACED):
+                _discard(origin, REPLACED)
+            while origin.exists():
+                origin = origin.with_name(f"{origin.name}_restored")
+            _put_back(trashed, origin)
+            with suppress(OSError):  # it has another original by now
+                trashed.folder.parent.rmdir()
+        except OSError as error:
+            raise RecorderError(f"{trashed.kept}: cannot be restored: {error.strerror}") from error
     return origin
+
+
+def _put_back(trashed: Trashed, origin: Path) -> None:
+    """Move an original to `origin`, and remove its folder in the trash."""
+    if trashed.link is None:
+        trashed.kept.rename(origin)
+    else:
+        origin.symlink_to(trashed.link)
+    shutil.rmtree(trashed.folder)
 
 
 def empty(path: Path) -> list[Trashed]:
@@ -154,7 +214,7 @@ def empty(path: Path) -> list[Trashed]:
     try:
         for trashed in found:
             shutil.rmtree(trashed.folder)
-            if not any(trashed.folder.parent.iterdir()):
+            with suppress(OSError):  # it has another original by now
                 trashed.folder.parent.rmdir()
     except OSError as error:
         raise RecorderError(f"{path}: cannot be emptied: {error.strerror}") from error
@@ -165,8 +225,8 @@ def _new_folder(trash: Path) -> Path:
     """A new folder named after the time, so that names sort by age."""
     for number in itertools.count():
         folder = trash / f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}-{number}"
-        if not folder.exists():
-            folder.mkdir()
+        with suppress(FileExistsError):
+            folder.mkdir(parents=True)  # a restore at the same time may have removed the empty trash
             return folder
     raise AssertionError
 
@@ -176,8 +236,9 @@ def _found(path: Path) -> Iterator[Trashed]:
         for note in path.glob(f"{pattern}/*/{_NOTE}"):
             try:
                 known = json.loads(note.read_text(encoding="utf-8"))
-                found = Trashed(note.parent, Path(known["name"]).name, str(known["done"]))
-            except (OSError, ValueError, KeyError, TypeError):
+                link = known.get("link")
+                found = Trashed(note.parent, Path(known["name"]).name, str(known["done"]), link and str(link))
+            except (OSError, ValueError, KeyError, TypeError, AttributeError):
                 continue  # not from here
             if not found.name.startswith(".") and found.kept.is_dir() and is_rosbag2(found.kept):
                 yield found

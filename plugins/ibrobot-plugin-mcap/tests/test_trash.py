@@ -53,11 +53,12 @@ def test_a_trim_in_place_keeps_the_original_until_the_trash_is_emptied(tmp_path,
     before = files(episode)
     run("mark", episode, "failure")
     run("mark", episode, "success")
-    run("trim", episode, "--in-place", "--from", "0.3", "--to", "0.5")
+    cut = run("trim", episode, "--in-place", "--from", "0.3", "--to", "0.5")
+    assert "its outcome was success, now it is unknown: `ibrobot episodes mark` sets it" in cut
     part = read(episode)
     assert [item.received_ns for item in part] == [stamp(index) for index in range(30, 51)]
     assert summary(episode).metadata["trimmed"] == "0.3 s to 0.5 s of episode_000001"
-    assert summary(episode).outcome == "success"
+    assert (summary(episode).outcome, summary(episode).metadata.get("marked")) == ("unknown", None)
     (trimmed,) = trash.trashed_in(tmp_path)
     trash.restore(trimmed)
     assert files(episode).keys() == before.keys()
@@ -70,6 +71,29 @@ def test_a_trim_in_place_keeps_the_original_until_the_trash_is_emptied(tmp_path,
     assert [each.name for each in episode.parent.iterdir()] == [episode.name]
 
 
+def test_a_part_with_the_end_keeps_the_outcome_and_a_person_may_set_it_for_others(tmp_path, episode):
+    run("trim", episode, "--from", "0.3", "-o", tmp_path / "end")
+    assert summary(tmp_path / "end").outcome == "success"
+    run("trim", episode, "--to", "0.3", "-o", tmp_path / "begin")
+    assert summary(tmp_path / "begin").outcome == "unknown"
+    run("mark", tmp_path / "begin", "success")
+    assert summary(tmp_path / "begin").outcome == "success"
+    assert "its outcome" not in run("trim", tmp_path / "begin", "-o", tmp_path / "whole")
+
+
+def test_a_link_to_an_episode_comes_back_as_the_link_that_it_was(tmp_path, episode):
+    link = tmp_path / "links" / "first"
+    link.parent.mkdir()
+    link.symlink_to("../pick/episodes/episode_000001")
+    run("delete", "--to-trash", link)
+    assert not link.is_symlink()
+    (row,) = json.loads(run("trash", link.parent, "--json"))
+    assert "restored" in run("trash", link.parent, "--restore", row["id"])
+    assert (link.readlink().as_posix(), len(read(link))) == ("../pick/episodes/episode_000001", 100)
+    run("delete", "--yes", link)
+    assert (link.is_symlink(), len(read(episode))) == (False, 100)
+
+
 def test_a_failed_trim_leaves_the_episode(tmp_path, episode, monkeypatch):
     before = files(tmp_path)
     with pytest.raises(RecorderError, match=r"is 0\.99 s long; --from 0\.5 --to 2 is outside it"):
@@ -78,7 +102,7 @@ def test_a_failed_trim_leaves_the_episode(tmp_path, episode, monkeypatch):
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(trash, "discard", fail)
+    monkeypatch.setattr(trash, "_discard", fail)
     with pytest.raises(RecorderError, match="cannot be trimmed: No space left on device"):
         trash.trim(episode, 0.1, 0.2)
     assert files(tmp_path) == before

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import click
@@ -35,8 +34,5 @@ def delete(episodes: tuple[Path, ...], yes: bool, to_trash: bool) -> None:
             continue
         if not (yes or click.confirm(f"delete {episode} ({told_size(size_of(episode))})?")):
             raise Declined
-        try:
-            shutil.rmtree(episode)
-        except OSError as error:
-            raise RecorderError(f"{episode}: cannot be deleted: {error.strerror}") from error
+        trash.delete(episode)
         echo(f"{episode}: deleted")

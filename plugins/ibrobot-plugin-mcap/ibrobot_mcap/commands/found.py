@@ -8,7 +8,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from ibrobot_core.api import NS_PER_S, EpisodeSummary, RecorderError
+from ibrobot_mcap.owning import interrupted, is_owned
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
+from ibrobot_mcap.rewrite import STATED
 
 
 def episodes_in(path: Path) -> list[Path]:
@@ -75,6 +77,21 @@ def date_of(summary: EpisodeSummary) -> str:
     if not summary.start_ns:
         return ""
     return datetime.fromtimestamp(summary.start_ns / NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M")
+
+
+def told_stated(summary: EpisodeSummary) -> str:
+    """A description of the outcome before the end was lost or cut off; empty if the outcome is not unknown."""
+    stated = summary.metadata.get(STATED)
+    if stated is None or summary.outcome != "unknown":
+        return ""
+    return f"; its outcome was {stated}, now it is unknown: `ibrobot episodes mark` sets it"
+
+
+def told_interrupted(path: Path) -> Iterator[str]:
+    """A line for each episode at or below `path` of which a change was interrupted."""
+    for episode in interrupted(path):
+        if not is_owned(episode):
+            yield f"interrupted: {episode}: `ibrobot episodes repair {episode}` finishes the change"
 
 
 def told_size(size: int) -> str:

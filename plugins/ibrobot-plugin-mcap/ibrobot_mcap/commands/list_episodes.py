@@ -24,8 +24,18 @@ def list_episodes(path: Path, as_json: bool) -> None:
 
     PATH is a folder of datasets (by default `episodes`), a dataset, or an episode.
     """
-    from ibrobot_mcap.commands.found import date_of, duration_s, episodes_in, size_of, summary_of, told_size
+    from ibrobot_mcap.commands.found import (
+        date_of,
+        duration_s,
+        episodes_in,
+        size_of,
+        summary_of,
+        told_interrupted,
+        told_size,
+    )
 
+    for line in told_interrupted(path):
+        echo(line, err=True)
     rows = []
     problems = []
     for episode in episodes_in(path):

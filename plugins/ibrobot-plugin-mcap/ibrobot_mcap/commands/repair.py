@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import click
 
-from ibrobot_core.api import EpisodeSummary, RecorderError, echo, wrong_input
+from ibrobot_core.api import EpisodeSummary, InUse, RecorderError, echo, wrong_input
 
 
 @click.command()
@@ -17,16 +18,21 @@ def repair(path: Path) -> None:
 
     It writes index and metadata.yaml for the readable part. The episode records the missing messages, and `verify`
     reports them. The outcome becomes unknown, since the end may be missing: look at the episode, and set it with
-    `mark`. The original is removed only after the new episode has been read back and has all its messages.
+    `mark`. The original is removed only after the new episode has been read back and has all its messages. Trims,
+    repairs and deletions that were interrupted are finished.
     """
     from ibrobot_mcap import rewrite
     from ibrobot_mcap.commands.found import duration_s, episodes_in
+    from ibrobot_mcap.owning import interrupted, owning
 
     failed = 0
+    for episode in interrupted(path):
+        with suppress(InUse), owning(episode, "is being repaired"):
+            echo(f"{episode}: an interrupted change is finished")
     for episode in episodes_in(path):
         try:
             made = rewrite.repair(episode)
-        except RecorderError as error:
+        except (RecorderError, InUse) as error:
             failed += 1
             echo(f"error: {error}", err=True)
             continue
@@ -41,9 +47,7 @@ def repair(path: Path) -> None:
 
 def _description(summary: EpisodeSummary) -> str:
     """A description of missing messages, and the former outcome."""
-    from ibrobot_mcap.rewrite import STATED
+    from ibrobot_mcap.commands.found import told_stated
 
     missing = sum(topic.missing for topic in summary.topics.values())
-    lost = f", {missing} are missing" if missing else ""
-    stated = summary.metadata.get(STATED)
-    return lost + (f"; its outcome was {stated}, now it is unknown: `ibrobot episodes mark` sets it" if stated else "")
+    return (f", {missing} are missing" if missing else "") + told_stated(summary)

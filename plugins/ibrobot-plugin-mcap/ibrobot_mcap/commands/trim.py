@@ -19,11 +19,12 @@ from ibrobot_core.api import echo, wrong_input
 def trim(episode: Path, begin_s: float, end_s: float | None, output: Path | None, in_place: bool) -> None:
     """Copy a part of an EPISODE to a new one.
 
-    Times are in seconds from its first message. The last message of a latched topic before this part is kept, because a
-    late subscriber would have received it. After --in-place, `ibrobot episodes trash --restore` puts the original back.
+    Times are in seconds from its first message. Without the end of the episode, the outcome is unknown: set it with
+    `mark`. The last message of a latched topic before this part is kept, because a late subscriber would have received
+    it. After --in-place, `ibrobot episodes trash --restore` puts the original back.
     """
     from ibrobot_mcap import trash
-    from ibrobot_mcap.commands.found import duration_s, opened
+    from ibrobot_mcap.commands.found import duration_s, opened, told_stated
 
     if in_place == (output is not None):
         raise click.UsageError("give either --output or --in-place")
@@ -35,4 +36,4 @@ def trim(episode: Path, begin_s: float, end_s: float | None, output: Path | None
     else:
         made = trash.copy_part(episode, output, begin_s, end_s)
     count = sum(topic.count for topic in made.summary.topics.values())
-    echo(f"{made.path}: {count} messages, {duration_s(made.summary):.2f} s")
+    echo(f"{made.path}: {count} messages, {duration_s(made.summary):.2f} s{told_stated(made.summary)}")

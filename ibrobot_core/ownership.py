@@ -1,0 +1,133 @@
+"""Who owns an episode or a dataset: a lock of the operating system, which ends with its process, however that ends."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from ibrobot_core.errors import InUse
+
+_LONGEST = 200
+"""Longer names are replaced by a hash, since the name of the lock file would be too long [bytes]."""
+_POLL_S = 0.02
+_READ_ONLY = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
+
+
+class Ownership:
+    """The right to change a folder, or with `shared` to read it while nobody changes it; until `close`.
+
+    The lock (`flock`) is on a hidden file beside the folder, so that it covers the folder's name while the folder is
+    created, replaced or removed. The file names the owner. The last owner removes it; after a kill it stays, without
+    effect.
+
+    Args:
+        path: the folder, which need not exist; or one of an episode's files, for their folder.
+        doing: what the owner does to it, for others' errors, e.g. `is being recorded`.
+        file: the lock file, if it is not beside the folder.
+        shared: whether others may share it.
+        wait_s: how long to wait for another owner [s]; the default is enough for owners that end at once.
+
+    Raises:
+        InUse: if it has another owner; names what that does, and its process.
+        OSError: if the lock file cannot be created. To share a folder that cannot be written, no file is needed.
+    """
+
+    def __init__(
+        self, path: Path, doing: str, *, file: Path | None = None, shared: bool = False, wait_s: float = 0.5
+    ) -> None:
+        self.path = path
+        self._file = file or lock_file(path)
+        self._descriptor: int | None = None
+        deadline_s = time.monotonic() + wait_s
+        while not self._acquire(shared):
+            if time.monotonic() >= deadline_s:
+                raise InUse(f"{path}: {self._owner()}; try again when that has ended")
+            time.sleep(_POLL_S)
+        if self._descriptor is not None:
+            with suppress(OSError):  # only others' errors need it
+                os.ftruncate(self._descriptor, 0)
+                os.pwrite(self._descriptor, f"{doing} by process {os.getpid()}".encode(), 0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give it up. Safe to call twice."""
+        descriptor, self._descriptor = self._descriptor, None
+        if descriptor is None:
+            return
+        with suppress(OSError):  # others share it, or it cannot be removed
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is_at(descriptor, self._file):
+                self._file.unlink()
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_UN)  # a process forked meanwhile has the file open, too
+        os.close(descriptor)
+
+    def _acquire(self, shared: bool) -> bool:
+        """Lock the file; returns whether that succeeded."""
+        while True:
+            descriptor = _open(self._file, shared)
+            if descriptor is None:
+                return True
+            try:
+                fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(descriptor)
+                return False
+            except OSError:
+                os.close(descriptor)
+                raise
+            if _is_at(descriptor, self._file):
+                self._descriptor = descriptor
+                return True
+            os.close(descriptor)  # its last owner removed it after it was opened here
+
+    def _owner(self) -> str:
+        with suppress(OSError):
+            if owner := self._file.read_text(encoding="utf-8", errors="replace"):
+                return owner
+        return "is being changed by another process"
+
+
+def lock_file(path: Path) -> Path:
+    """The lock file of a folder, beside it."""
+    folder = path.resolve()
+    if folder.is_file():
+        folder = folder.parent
+    name = os.fsencode(folder.name)
+    short = folder.name if len(name) <= _LONGEST else hashlib.sha256(name).hexdigest()
+    return folder.with_name(f".{short}.lock")
+
+
+def _open(file: Path, shared: bool) -> int | None:
+    """Open a lock file; None if there is none and nobody can create one here."""
+    try:
+        return os.open(file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    except OSError as error:
+        if not shared or error.errno not in _READ_ONLY:
+            raise
+    try:
+        return os.open(file, os.O_RDONLY | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return None
+
+
+def _is_at(descriptor: int, file: Path) -> bool:
+    """Whether the open file is still the one at its path."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), file.stat(follow_symlinks=False))
+    except FileNotFoundError:
+        return False
