@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
+import signal
+import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +17,7 @@ from click.testing import CliRunner
 from ibrobot_lerobot import train as training
 from ibrobot_lerobot.commands import datasets
 from ibrobot_lerobot.train import arguments, progress, train
+from ibrobot_lerobot.training_checkpoints import newest_checkpoint
 
 from ibrobot_core.api import DatasetError, Feature, MissingDependency
 
@@ -20,14 +26,62 @@ from .conftest import CAMERA, FPS, write
 FEATURES = {"observation.state": Feature("float32", (2,), ("a.pos", "b.pos")), "observation.images.top": CAMERA}
 LINE = "INFO 19:45:10 ot_train.py:300 step:{step} smpl:2K ep:9 epch:0.10 loss:{loss} grdn:1.2 lr:5.0e-04 updt_s:0.1"
 PROGRAM = f"""#!{sys.executable}
-import sys
-steps = next(int(each.partition("=")[2]) for each in sys.argv if each.startswith("--steps="))
-every = next(int(each.partition("=")[2]) for each in sys.argv if each.startswith("--log_freq="))
+import json, sys, time
+from pathlib import Path
+given = dict(each.removeprefix("--").partition("=")[::2] for each in sys.argv[1:])
+steps, every, save = (int(given[name]) for name in ("steps", "log_freq", "save_freq"))
+out = Path(given["output_dir"])
+begun = 0
+if "resume" in given:
+    settings = json.loads(Path(given["config_path"]).read_text())
+    state = Path(given["config_path"]).parents[1] / "training_state" / "training_step.json"
+    begun = json.loads(state.read_text())["step"]
+else:
+    out.mkdir(parents=True)
+    settings = {{}}
+    for key, value in given.items():
+        *folders, last = key.split(".")
+        inner = settings
+        for folder in folders:
+            inner = inner.setdefault(folder, {{}})
+        try:
+            inner[last] = json.loads(value)
+        except ValueError:
+            inner[last] = value
 print("WARNING no wandb")
-for step in range(every, steps + 1, every):
-    print({LINE!r}.format(step=step, loss=1 / step))
-raise SystemExit(7 * ("--fail" in sys.argv))
+print("BEGUN", begun)
+print("INFO Creating dataset")
+print("INFO Start offline training on a fixed dataset")
+for step in range(begun + 1, steps + 1):
+    if step % every == 0:
+        print({LINE!r}.format(step=step, loss=1 / step), flush=True)
+    if step % save == 0 or step == steps:
+        folder = out / "checkpoints" / f"{{step:06}}"
+        (folder / "pretrained_model").mkdir(parents=True)
+        (folder / "pretrained_model" / "train_config.json").write_text(json.dumps(settings))
+        (folder / "training_state").mkdir()
+        (folder / "training_state" / "training_step.json").write_text(json.dumps({{"step": step}}))
+        nothing = b"\\2\\0\\0\\0\\0\\0\\0\\0{{}}"  # a safetensors file without tensors
+        (folder / "training_state" / "optimizer_state.safetensors").write_bytes(nothing)
+        (folder / "pretrained_model" / "model.safetensors").write_bytes(nothing)
+        (folder / "training_state" / "scheduler_state.json").write_text("{{}}")
+        (out / "checkpoints" / "last").unlink(missing_ok=True)
+        (out / "checkpoints" / "last").symlink_to(folder.name)
+    if step == int(given.get("stop_at", 0)) and not begun:
+        Path(given["stopped"]).write_text("")
+        time.sleep(60)
+raise SystemExit(7 * ("fail" in given))
 """
+
+
+@pytest.fixture
+def dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A dataset; `ibrobot train` runs the program above in place of LeRobot's."""
+    program = tmp_path / "lerobot-train"
+    program.write_text(PROGRAM)
+    program.chmod(0o755)
+    monkeypatch.setattr(training, "_program", lambda: str(program))
+    return write(tmp_path / "set", FEATURES, (3,), codec="h264")
 
 
 def run(command: Any, *words: object, code: int = 0) -> list[str]:
@@ -51,20 +105,112 @@ def test_a_dataset_shows_counts_units_and_statistics(tmp_path: Path):
         run(datasets, "info", tmp_path)
 
 
-def test_training_reports_its_progress_as_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    root = write(tmp_path / "set", FEATURES, (3,), codec="h264")
-    program = tmp_path / "lerobot-train"
-    program.write_text(PROGRAM)
-    program.chmod(0o755)
-    monkeypatch.setattr(training, "_program", lambda: str(program))
-    lines = run(train, root, "--out", tmp_path / "out", "--steps", 1000, "--events")
+def test_training_reports_its_progress_as_events(dataset: Path, tmp_path: Path):
+    lines = run(train, dataset, "--out", tmp_path / "out", "--steps", 1000, "--events")
     events = [json.loads(line) for line in lines if line.startswith("{")]
     steps = [event for event in events if event["event"] == "progress"]
-    assert (events[0], len(steps)) == ({"event": "begin", "steps": 1000}, 200)
+    assert (events[0], len(steps)) == ({"event": "begin", "step": 0, "steps": 1000}, 200)
     assert (steps[0]["step"], steps[-1]["step"], steps[-1]["loss"], steps[-1]["lr"]) == (5, 1000, 0.001, 5e-4)
     assert events[-1]["checkpoint"] == str(tmp_path / "out/checkpoints/last/pretrained_model")
+    phases = [event["text"] for event in events if event["event"] == "phase"]
+    assert phases == ["loading torch and LeRobot", "opening the dataset", "training"]
     assert "WARNING no wandb" in lines
-    run(train, root, "--out", tmp_path / "out", "--steps", 10, "--events", "--fail", code=7)
+    run(train, dataset, "--out", tmp_path / "other", "--steps", 10, "--events", "--fail=1", code=7)
+
+
+def test_training_saves_a_tenth_of_its_steps_apart(dataset: Path, tmp_path: Path):
+    run(train, dataset, "--out", tmp_path / "out", "--steps", 1000)
+    saved = sorted(path.name for path in (tmp_path / "out/checkpoints").iterdir())
+    assert saved == [*(f"{step:06}" for step in range(100, 1001, 100)), "last"]
+    run(train, dataset, "--out", tmp_path / "more", "--steps", 1000, "--save-every", 400)
+    assert sorted(path.name for path in (tmp_path / "more/checkpoints").iterdir())[0] == "000400"
+
+
+def interrupted(
+    dataset: Path, out: Path, stop_at: int, number: signal.Signals
+) -> tuple[int, str, Callable[[], list[str]]]:
+    """Begin a training of 100 steps, and end it at a step.
+
+    Returns:
+        Exit code and standard error, and a function that runs the same command again.
+    """
+    stopped = dataset.parent / f"stopped-{stop_at}"
+    words = ["--out", out, "--steps", 100, f"--stop_at={stop_at}", f"--stopped={stopped}"]
+    command = (
+        sys.executable, "-c", SCRIPT, str(dataset.parent / "lerobot-train"), str(dataset), *map(str, words)
+    )  # fmt: skip
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while not stopped.exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(number)
+        _, errors = process.communicate()
+    return process.returncode, errors, lambda: run(train, dataset, *words, "--events")
+
+
+SCRIPT = """
+import sys
+from ibrobot_lerobot import train as training
+training._program = lambda: sys.argv[1]
+training.train(sys.argv[2:])
+"""
+
+
+@pytest.mark.parametrize(("stop_at", "kept"), [(5, 0), (57, 50), (90, 90)])
+def test_interrupted_training_says_what_is_kept_and_continues_by_the_same_command(
+    dataset: Path, tmp_path: Path, stop_at: int, kept: int
+):
+    out = tmp_path / "out"
+    _, errors, again = interrupted(dataset, out, stop_at, signal.SIGINT)
+    if kept:
+        checkpoint = out / f"checkpoints/{kept:06}"
+        assert f"interrupted; kept: {checkpoint} (step {kept}); the same command continues from there" in errors
+    else:
+        assert "interrupted; nothing is kept, since the first checkpoint would have been written at step 10" in errors
+    if not kept:
+
+        def again() -> list[str]:
+            return run(train, dataset, "--out", out, "--steps", 100, "--events")
+
+    lines = again()
+    assert f"BEGUN {kept}" in lines
+    events = [json.loads(line) for line in lines if line.startswith("{")]
+    assert events[0] == {"event": "begin", "step": kept, "steps": 100}
+    assert [event["step"] for event in events if event["event"] == "progress"] == list(range(kept + 1, 101))
+    assert (out / "checkpoints/last/training_state/training_step.json").read_text() == '{"step": 100}'
+    assert "BEGUN 0" not in again()  # it has ended: nothing runs, and the checkpoint is named again
+
+
+def test_killed_train_takes_the_trainer_along(dataset: Path, tmp_path: Path):
+    code, _, _ = interrupted(dataset, tmp_path / "out", 20, signal.SIGKILL)
+    assert code == -signal.SIGKILL  # its pipes were closed, so that the trainer that held them is dead, too
+
+
+def test_training_with_other_settings_is_refused_and_kept(dataset: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    run(train, dataset, "--out", out, "--steps", 10)
+    with pytest.raises(
+        DatasetError, match=r"has a training with other settings \(batch_size is 32, not 64\): repeat its "
+    ):
+        run(train, dataset, "--out", out, "--steps", 10, "--batch-size", 64)
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").write_text("mine")
+    with pytest.raises(DatasetError, match="exists already, and is not a training to continue; choose a new folder"):
+        run(train, dataset, "--out", tmp_path / "notes", "--steps", 10)
+    assert (tmp_path / "notes" / "mine.txt").read_text() == "mine"
+
+
+def test_newest_checkpoint_is_found_without_its_link(dataset: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    run(train, dataset, "--out", out, "--steps", 20)
+    (out / "checkpoints/last").unlink()
+    shutil.copytree(out / "checkpoints/000020", out / "checkpoints/000021")
+    (out / "checkpoints/000021/training_state/optimizer_state.safetensors").write_bytes(
+        b"\2\0\0"
+    )  # killed in this save
+    newest = newest_checkpoint(out)
+    assert newest is not None
+    assert (newest.step, newest.folder.name) == (20, "000020")
 
 
 def test_a_training_without_lerobot_names_the_command_that_installs_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -73,12 +219,13 @@ def test_a_training_without_lerobot_names_the_command_that_installs_it(tmp_path:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(MissingDependency, match=r"pip install 'lerobot\[dataset,training\]"):
         run(train, root, "--out", tmp_path / "out")
-    with pytest.raises(DatasetError, match="exists already"):
-        run(train, root, "--out", root)
 
 
 def test_other_policies_keep_the_settings_of_lerobot():
-    words = arguments(Path("set"), Path("out"), "diffusion", 100, 8, "cuda")
+    words = arguments(Path("set"), Path("out"), "diffusion", 100, 8, None, "cuda")
     assert {"--policy.type=diffusion", "--policy.device=cuda", "--steps=100", "--log_freq=1"} < set(words)
+    small = arguments(Path("set"), Path("out"), "small_act", 100, 8, 7, "auto")
+    assert not any(word.startswith("--policy.device") for word in small)  # LeRobot takes a GPU if there is one
+    assert "--save_freq=7" in small
     assert not any(word.startswith("--optimizer") for word in words)
     assert progress("step:1 without numbers", 0, 10) is None

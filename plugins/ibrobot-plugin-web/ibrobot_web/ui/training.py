@@ -61,7 +61,7 @@ def _row(ui: Ui, path: Path) -> dict[str, Any]:
 def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
     """Begin a training."""
     dataset, out = ui.folders.find(text(facts, "dataset")), ui.folders.find(text(facts, "out"))
-    policy, device = text(facts, "policy", "small_act"), text(facts, "device", "cpu")
+    policy, device = text(facts, "policy", "small_act"), text(facts, "device", "auto")
     if _WORD.fullmatch(policy) is None or _DEVICE.fullmatch(device) is None:
         raise IbrobotError(f"policy {policy!r} and device {device!r} must be names, e.g. act and cuda:0")
     steps, batch_size = integer(facts, "steps", least=1), integer(facts, "batch_size", least=1)
@@ -84,7 +84,10 @@ def event_reader(ui: Ui) -> Reader:
         event = parse_event(line)
         match event.get("event"):
             case "begin":
-                return {"steps": event["steps"], "text": f"loading, then {event['steps']} steps"}
+                goes_on = f"continues from step {event['step']} of" if event["step"] else "begins:"
+                return {"steps": event["steps"], "text": f"{goes_on} {event['steps']} steps"}
+            case "phase":
+                return {"text": f"{event['text']} …"}
             case "progress":
                 step, steps = int(event["step"]), int(event["steps"])
                 points.append((step, float(event["loss"])))
