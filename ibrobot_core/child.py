@@ -183,6 +183,15 @@ class Channel:
         self._socket.close()
 
 
+def is_stopped(pid: int) -> bool:
+    """Whether a process is stopped, e.g. by SIGSTOP or Ctrl-Z; False where the system does not say (no /proc)."""
+    try:
+        with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as stat:
+            return stat.read().rpartition(")")[2].split()[0] in "Tt"
+    except OSError:
+        return False
+
+
 class Child:
     """The parent's side of a child process and its channel.
 
@@ -219,6 +228,11 @@ class Child:
         """The process id of the child."""
         return self._process.pid
 
+    @property
+    def alive(self) -> bool:
+        """Whether the child runs. A process forked by it may keep the channel open after its death."""
+        return self._process.poll() is None
+
     def receive(self) -> list[Mapping[str, Any]]:
         """The messages that have arrived. Reports are handled here."""
         messages, self._waiting = [*self._waiting, *self.channel.receive()], []
@@ -232,9 +246,16 @@ class Child:
             ComponentFailed: if the child has died.
         """
         if not self._waiting:
+            alive = self.alive
             self._waiting = [*self.channel.wait(timeout_s)]
             self._take_reports()
+            if not (alive or self._waiting or self.failure):
+                raise ComponentFailed("the process at the other end is gone")
         return self._waiting.pop(0) if self._waiting else None
+
+    def resume(self) -> None:
+        """Continue the child if it is stopped, e.g. by SIGSTOP."""
+        self._process.send_signal(signal.SIGCONT)
 
     def kill(self) -> None:
         """Kill the child."""

@@ -22,7 +22,7 @@ from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
 from ibrobot_core.interfaces import EpisodeSetup, Executor, JointReading, Signal, Torque
 from ibrobot_core.robot import Vector
-from ibrobot_core.units import ns
+from ibrobot_core.units import NS_PER_S, ns
 
 EMERGENCY_STOP = "emergency stop"
 """The fault raised by `/estop`."""
@@ -33,6 +33,8 @@ _FIRST_READING_S = 2.0
 _POSE_SPEED = 0.25
 """Speed of motions to a start or stop pose, as a fraction of the velocity limits."""
 _POSE_TIMEOUT_S = 10.0
+_RECENT_NS = NS_PER_S
+"""Time after its last command for which a robot at rest counts as commanded [ns]."""
 _POSE_TOLERANCE = 0.2
 """Largest distance of a joint from the commanded startup pose, e.g. due to its weight [rad]."""
 
@@ -68,6 +70,8 @@ class ControlCore:
         self._target: Vector | None = None
         self._health = Health(config.control.load_shedding, self._log)
         self._shedding = self._has_shed = False
+        self._commanded_ns: int | None = None
+        """Time of the last plan or goal of this generation [ns]; None before the first."""
         self._unwell = ""
         """The fault, if a joint's condition caused it; otherwise empty."""
         self._arriving = False
@@ -173,7 +177,24 @@ class ControlCore:
         if plan.generation != self.generation or self.fault:
             self._counts["old_plans"] += 1
             return
+        self._commanded_ns = self._clock.now_ns()
         self._executors.set_plan(plan)
+
+    def note_silence(self, silent_s: float, fault: str) -> None:
+        """Raise a fault if braking must begin for motion to end within `control.peer_timeout` of a silence.
+
+        A robot that nobody commands needs none: at rest, without a policy, and without a plan for a second.
+
+        Args:
+            silent_s: how long the host, or this loop, has not run [s].
+            fault: what happened.
+        """
+        longest_s = self._config.control.peer_timeout
+        if silent_s <= longest_s / 3 or self.fault or self._stopping or not self._is_commanded:
+            return
+        braking_s = float(np.max(np.abs(self._safety.velocity) / self._robot.max_acceleration))
+        if silent_s + braking_s >= longest_s:
+            self._raise_fault(f"{fault} for {silent_s * 1e3:.0f} ms")
 
     def handle(self, command: Mapping[str, Any]) -> dict[str, Any]:
         """Execute a command of the host and return the reply; the reply to a refused command has the key `error`."""
@@ -260,6 +281,16 @@ class ControlCore:
             time.sleep(0.001)  # hardware that reads in a thread of its own is stale at once
         self._answered_ns = measured.stamp_ns
         return measured
+
+    @property
+    def _is_commanded(self) -> bool:
+        """Whether someone has the robot move, or may have it move on without being asked again."""
+        if not self._safety.at_rest:
+            return True
+        if self._commanded_ns is None:
+            return False
+        by_policy = self._config.control_modes[self.mode].inference is not None
+        return by_policy or self._clock.now_ns() - self._commanded_ns < _RECENT_NS
 
     def _move_to(self, pose: str) -> None:
         self._target = self._robot.pose(pose.strip())
@@ -440,6 +471,7 @@ class ControlCore:
     def _leave(self) -> None:
         """Deactivate all executors; without one, every joint brakes and holds."""
         self._executors.leave(self._at_tick)
+        self._commanded_ns = None
         self.generation += 1
 
     def _enter(self) -> None:
@@ -491,6 +523,7 @@ class ControlCore:
 
     def _goal(self, executor: str, goal_id: str, goal: Mapping[str, Any]) -> None:
         self._executors.set_goal(executor, goal_id, goal, self._at_tick)
+        self._commanded_ns = self._clock.now_ns()
 
     def _cancel(self) -> None:
         self._executors.cancel(self._at_tick)

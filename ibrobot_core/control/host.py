@@ -13,8 +13,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, override
 
-from ibrobot_core.child import Child
+from ibrobot_core.child import Child, is_stopped
 from ibrobot_core.clock import RealClock, SteppedClock
+from ibrobot_core.component import raise_thread_priority
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.link import ControlState, LinkLayout, PlanRecord, SharedMemory, raise_error
@@ -24,12 +25,20 @@ from ibrobot_core.memory import create_memory
 from ibrobot_core.plugins import Registry
 
 _START_TIMEOUT_S = 60.0
+_BEAT_S = 0.05
+"""Longest time between two signs of life to control [s]."""
 _GLANCE_S = 0.1
 """Interval at which a start checks whether it was given up."""
 _REPLY_TIMEOUT_S = 5.0
 _STOP_TIMEOUT_S = 15.0
 """Time after which a control process that has not ended is killed; moving to a stop pose takes up to 10 s."""
 _GONE = "the control process is gone"
+_STOPS = ("estop", "fault")
+"""Commands sent to a control process that does not run at present, since they still matter once it runs again."""
+_SLOW = ("reset", "reset_episode", "switch_mode")
+"""Commands during which control may be silent, e.g. while hardware is set up again."""
+
+_LOG = logging.getLogger("ibrobot")
 
 OnState = Callable[[ControlState], None]
 OnEvent = Callable[[Mapping[str, Any]], None]
@@ -173,6 +182,7 @@ class ControlClient(ControlHost):
     ) -> None:  # fmt: skip
         super().__init__(on_state, on_event)
         self._config = config
+        self._clock = clock
         self._order = {
             "document": config.complete, "source": str(config.source), "sim": config.simulated, "seed": seed,
             "mode": config.default_control_mode, "epoch_offset_ns": clock.epoch_offset_ns,
@@ -181,6 +191,11 @@ class ControlClient(ControlHost):
         self._given_up = given_up or threading.Event()
         self._aftermath = aftermath
         self._replies: dict[int, queue.SimpleQueue[Mapping[str, Any]]] = {}
+        self._slow: set[int] = set()
+        """Ids of the pending commands of `_SLOW`."""
+        self._silence = ""
+        """What is wrong while control does not run; empty while it does."""
+        self._generation = 0
         self._ids = itertools.count(1)
         self._stopping = False
         self._child: Child | None = None
@@ -234,24 +249,26 @@ class ControlClient(ControlHost):
 
     @override
     def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
-        if self._child is None:
-            raise ComponentFailed(_GONE)
+        if self._child is None or (self._silence and do not in _STOPS):
+            raise ComponentFailed(self._silence or _GONE)
         channel = self._child.channel
         number = next(self._ids)
         answer: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
         self._replies[number] = answer
+        self._slow |= {number} if do in _SLOW else set()
         try:
             channel.send({"do": do, "id": number, **arguments})
-            if channel.closed:
-                raise ComponentFailed(_GONE)
+            if channel.closed or self._silence:
+                raise ComponentFailed(self._silence or _GONE)
             reply = answer.get(timeout=_REPLY_TIMEOUT_S)
-            if reply.get("error") == _GONE:
-                raise ComponentFailed(_GONE)
+            if "gone" in reply:
+                raise ComponentFailed(reply["gone"])
             return raise_error(reply)
         except queue.Empty:
             raise ComponentFailed(f"control did not answer {do!r} within {_REPLY_TIMEOUT_S:.0f} s") from None
         finally:
             del self._replies[number]
+            self._slow.discard(number)
 
     @override
     def write_plan(self, plan: PlanRecord) -> None:
@@ -264,14 +281,13 @@ class ControlClient(ControlHost):
             return
         self._stopping = True
         self._child.channel.send({"do": "stop", "id": 0, "unmoved": unmoved})
+        self._child.resume()
         self._end(self._child)
 
     def _end(self, child: Child) -> None:
         """Wait for the process to end and release the shared resources."""
         if child.end(_STOP_TIMEOUT_S):
-            logging.getLogger("ibrobot").error(
-                "the control process did not end within %g s: killed%s", _STOP_TIMEOUT_S, self._aftermath
-            )
+            _LOG.error("the control process did not end within %g s: killed%s", _STOP_TIMEOUT_S, self._aftermath)
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
         child.channel.close()
@@ -289,32 +305,74 @@ class ControlClient(ControlHost):
     def _receive(self, child: Child) -> None:
         try:
             self._pass_on(child)
-        except Exception as error:  # noqa: BLE001 - reported to the run, which cannot go on without states
+        except BaseException as error:  # noqa: BLE001 - reported to the run, which cannot go on without states
             self._on_death(ComponentFailed(f"control's states cannot be passed on ({type(error).__name__}: {error})"))
+            self._let_go("control's states cannot be passed on")
             return
         if child.failure is not None:
             self.holding = child.failure.holding
         if not self._stopping:
             self._on_death(self._failure(child, "the control process died"))
         # Wake waiting callers only afterwards, so that the cause is reported and not its consequence.
+        self._let_go(_GONE)
+
+    def _let_go(self, why: str) -> None:
+        """Have waiting callers raise `why`."""
         for number in list(self._replies):
-            self._take({"reply": number, "error": _GONE})
+            self._take({"reply": number, "gone": why})
 
     def _pass_on(self, child: Child) -> None:
-        """Forward states and messages until control has ended."""
+        """Forward states and messages, and give signs of life, until control has ended."""
         assert self._memory is not None
-        while not child.channel.closed:
-            ready, _, _ = select.select([self._wake, child.channel.fileno()], [], [])
+        raise_thread_priority()  # its delay is taken for a host that is stopped
+        heard_s = time.monotonic()
+        while child.alive and not child.channel.closed:
+            ready, _, _ = select.select([self._wake, child.channel.fileno()], [], [], _BEAT_S)
             if self._wake in ready:
                 os.read(self._wake, 65536)
-            # Read states after the socket, so that everything measured before an answer is published before the answer.
-            messages = child.receive()
-            for state in self._memory.read_states():
-                self._on_state(state)
-            for message in messages:
-                self._take(message)
+            self._forward(child)
+            self._memory.beat()
+            if ready:
+                heard_s = time.monotonic()
+            self._note_silence(child, time.monotonic() - heard_s)
+        self._forward(child)
+
+    def _forward(self, child: Child) -> None:
+        """Forward the messages and states that have arrived."""
+        assert self._memory is not None
+        # Read states after the socket, so that everything measured before an answer is published before the answer.
+        messages = child.receive()
         for state in self._memory.read_states():
+            self._generation = state.generation
             self._on_state(state)
+        for message in messages:
+            self._take(message)
+
+    def _note_silence(self, child: Child, silent_s: float) -> None:
+        """Report control as stopped or blocked after `control.peer_timeout`; meanwhile commands are refused."""
+        if silent_s < self._config.control.peer_timeout:
+            if self._silence:
+                self._silence = ""
+                _LOG.warning("the control process %d runs again", child.pid)
+        elif not (self._silence or self._stopping):
+            stopped = is_stopped(child.pid)
+            if stopped or not self._slow:
+                self._silence = self._describe_silence(child.pid, silent_s, stopped=stopped)
+                self._on_event(
+                    {
+                        "event": "fault", "fault": self._silence, "then": "keeps the last command of its motors",
+                        "stamp_ns": self._clock.now_ns(), "generation": self._generation,
+                    }
+                )  # fmt: skip
+                # Whatever it was doing, it does not go on with it unasked.
+                child.channel.send({"do": "fault", "id": 0, "fault": "the control process was silent"})
+                self._let_go(self._silence)
+
+    def _describe_silence(self, pid: int, silent_s: float, *, stopped: bool) -> str:
+        what = "is stopped" if stopped else f"has been silent for {silent_s * 1e3:.0f} ms"
+        ways = ["Ctrl-C ends the run"] if self._config.simulated else ["switch off the power of its motors"]
+        ways += [f"`kill -CONT {pid}` continues the process"] if stopped else []
+        return f"the control process {pid} {what}, and STOP does not reach the robot: {', or '.join(ways)}"
 
     def _take(self, message: Mapping[str, Any]) -> None:
         if "reply" in message:

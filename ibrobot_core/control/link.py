@@ -28,6 +28,7 @@ STATE_SLOTS = 256
 PLAN_ROWS = 2048
 """Maximum length of a plan, in setpoints."""
 _SEQUENCE_BYTES = 8
+_BEAT_BYTES = 8
 _PLAN_HEAD_BYTES = 48
 """The integers of a plan, before its mask; the checksum covers everything after the first two, `seq` and `crc`."""
 
@@ -93,11 +94,11 @@ class LinkLayout:
     @property
     def size(self) -> int:
         """Bytes of shared memory."""
-        return STATE_SLOTS * self.state.itemsize + 2 * self.plan.itemsize
+        return STATE_SLOTS * self.state.itemsize + 2 * self.plan.itemsize + _BEAT_BYTES
 
 
 class SharedMemory:
-    """The ring of states (written by the control process) and the newest plan (written by the host).
+    """The ring of states (written by the control process), and the newest plan and the heartbeat (by the host).
 
     Args:
         descriptor: file descriptor from `create_memory`; the file is resized here and closed by `close`.
@@ -111,7 +112,8 @@ class SharedMemory:
         split = STATE_SLOTS * layout.state.itemsize
         self._bytes = memoryview(self._map)
         self._states = np.frombuffer(self._bytes[:split], layout.state)
-        self._plans = np.frombuffer(self._bytes[split:], layout.plan)
+        self._plans = np.frombuffer(self._bytes[split:-_BEAT_BYTES], layout.plan)
+        self._beat = np.frombuffer(self._bytes[-_BEAT_BYTES:], np.int64)
         self._state_size = layout.state.itemsize
         self._plan_size = layout.plan.itemsize
         self._split = split
@@ -164,6 +166,15 @@ class SharedMemory:
             self._read = wanted
             states.append(_state(raw[0]))
 
+    def beat(self) -> None:
+        """The host's sign of life: count on."""
+        self._beat[0] += 1
+
+    @property
+    def beats(self) -> int:
+        """The number of the host's signs of life; 0 before the first."""
+        return int(self._beat[0])
+
     def write_plan(self, plan: PlanRecord) -> None:
         """Replace the plan.
 
@@ -210,7 +221,7 @@ class SharedMemory:
 
     def close(self) -> None:
         """Unmap the memory; it is freed once both sides have unmapped it."""
-        del self._states, self._plans
+        del self._states, self._plans, self._beat
         self._bytes.release()
         self._map.close()
         os.close(self._descriptor)

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.child import FAREWELL_S, Channel, Failure, open_parent
+from ibrobot_core.child import FAREWELL_S, Channel, Failure, is_stopped, open_parent
 from ibrobot_core.clock import RealClock
 from ibrobot_core.component import error_text, exit_code
 from ibrobot_core.config import from_document
@@ -26,8 +26,11 @@ from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
 from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.units import NS_PER_S
 
 _STARTUP_TIMEOUT_S = 30.0
+_GLANCE_S = 0.03
+"""Silence of the host from which its state is looked at [s]."""
 _COMMANDED = "the host asked for it"
 
 
@@ -46,6 +49,9 @@ class ControlProcess:
         self._host = host
         self._ready: Mapping[str, Any] | None = ready
         self._punctuality = Punctuality()
+        self._beats = 0
+        self._heard_ns = 0
+        """When the host last gave a sign of life [ns]."""
         self._stopping = False
         self._terminated = False
 
@@ -71,6 +77,7 @@ class ControlProcess:
         self._report("stopped", holding=self._core.holding())
 
     def _cycle(self, deadline: int, late: int, periods: int) -> None:
+        self._note_silences(late)
         plan = self._memory.read_plan()
         if plan is not None:
             self._core.set_plan(plan)
@@ -85,6 +92,17 @@ class ControlProcess:
         elif self._ready is not None and not self._stopping and self._core.arrived():
             self._channel.send({**self._ready, "generation": self._core.generation})
             self._ready = None
+
+    def _note_silences(self, late: int) -> None:
+        """Have the robot brake if the host, or this process, has been stopped or blocked."""
+        now_ns, beats = self._clock.now_ns(), self._memory.beats
+        if beats != self._beats:
+            self._beats, self._heard_ns = beats, now_ns
+        self._core.note_silence((late + self._core.period_ns) / NS_PER_S, "the control loop has not run")
+        silent_s = (now_ns - self._heard_ns) / NS_PER_S if beats else 0.0
+        if silent_s > _GLANCE_S:
+            stopped = " is stopped, and" if is_stopped(self._host) else ""
+            self._core.note_silence(silent_s, f"the host process {self._host}{stopped} has been silent")
 
     def _handle_commands(self) -> bool:
         """Execute the host's commands; return whether this took longer than a period."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import queue
+import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,6 +98,23 @@ def make(site: Site, reports: Reports) -> Iterator[Callable[..., ControlHost]]:
     yield make_host
     for host in made:
         host.stop()
+
+
+def move(host: ControlHost, reports: Reports) -> None:
+    """Have the joints move for a minute, and wait until they do."""
+    first = reports.state(lambda state: True)
+    ramp = np.linspace(first.command, [1.0, 1.0], 2000)
+    host.write_plan(PlanRecord(first.generation, first.stamp_ns, 30_000_000, np.ones(2, dtype=bool), ramp))
+    reports.state(lambda state: not np.array_equal(state.command, first.command))
+
+
+def beats_of(host: ControlClient) -> Generator[None]:
+    """The heartbeat of a host, which ends once it is closed."""
+    while True:
+        memory = host._memory
+        assert memory is not None
+        memory._beat[0] += 1
+        yield
 
 
 class TestBoth:
@@ -214,15 +232,88 @@ class TestProcess:
 
     def test_one_that_ignores_its_end_is_killed_and_reported(self, make, reports, monkeypatch, caplog):
         monkeypatch.setattr("ibrobot_core.control.host._STOP_TIMEOUT_S", 0.2)
-        host = make()
+        host = make(trouble="disconnect")
         host.start()
         reports.state(lambda state: state.tick >= 1)
         pid = host.pid
-        os.kill(pid, signal.SIGSTOP)
         host.stop()
 
         assert "the control process did not end within 0.2 s: killed" in caplog.text
         assert not Path(f"/proc/{pid}").exists()
+
+    def test_its_death_is_noticed_while_a_process_forked_by_it_holds_its_socket(self, make, reports):
+        host = make(fork=True)
+        host.start()
+        helpers = [int(pid) for pid in Path(f"/proc/{host.pid}/task/{host.pid}/children").read_text().split()]
+        try:
+            os.kill(host.pid, signal.SIGKILL)
+
+            assert str(reports.deaths.get(timeout=PATIENCE_S)) == "the control process died (killed by SIGKILL)"
+            assert Path(f"/proc/{helpers[0]}").exists()
+        finally:
+            for pid in helpers:
+                os.kill(pid, signal.SIGKILL)
+
+    def test_one_that_is_stopped_is_named_and_stop_says_how_else_to_stop(self, make, reports):
+        host = make()
+        host.start()
+        move(host, reports)
+        os.kill(host.pid, signal.SIGSTOP)
+        named = (
+            f"the control process {host.pid} is stopped, and STOP does not reach the robot: Ctrl-C ends the run, "
+            f"or `kill -CONT {host.pid}` continues the process"
+        )
+
+        assert reports.events.get(timeout=PATIENCE_S)["fault"] == named
+        for command in ("estop", "reset"):
+            with pytest.raises(ComponentFailed, match=f"^{re.escape(named)}$"):
+                host.call(command)
+
+    def test_one_that_runs_again_holds_until_a_reset(self, make, reports):
+        host = make()
+        host.start()
+        move(host, reports)
+        os.kill(host.pid, signal.SIGSTOP)
+        named = reports.events.get(timeout=PATIENCE_S)
+        os.kill(host.pid, signal.SIGCONT)
+
+        fault = reports.events.get(timeout=PATIENCE_S)
+        assert "is stopped" in named["fault"]
+        assert "the control loop has not run for" in fault["fault"]
+        assert fault["then"] == "holds"
+        held = [reports.state(lambda state: state.generation >= fault["generation"]).command]
+        while len(held) < 50:
+            held.append(reports.state(lambda state: True).command)
+        np.testing.assert_array_equal(held[-1], held[-2])
+        assert host.call("reset")["cleared"] == fault["fault"]
+
+    def test_one_that_is_stopped_ends_in_order_when_the_run_ends(self, make, reports, tmp_path):
+        host = make(closed=str(tmp_path / "closed"))
+        host.start()
+        os.kill(host.pid, signal.SIGSTOP)
+        reports.events.get(timeout=PATIENCE_S)
+        host.stop()
+
+        assert (tmp_path / "closed").exists()
+
+    def test_a_call_that_waits_when_it_is_stopped_is_let_go(self, make, reports):
+        host = make()
+        host.start()
+        os.kill(host.pid, signal.SIGSTOP)
+
+        with pytest.raises(ComponentFailed, match=r"is stopped, and STOP does not reach the robot"):
+            host.call("estop")
+
+    def test_without_the_hosts_signs_of_life_it_holds(self, make, reports, monkeypatch):
+        monkeypatch.setattr("ibrobot_core.control.link.SharedMemory.beat", lambda memory: next(beats, None))
+        host = make()
+        beats = beats_of(host)
+        host.start()
+        move(host, reports)
+        beats.close()
+
+        fault = reports.events.get(timeout=PATIENCE_S)
+        assert re.fullmatch(rf"the host process {os.getpid()} has been silent for \d+ ms", fault["fault"])
 
     def test_sigterm_stops_it_in_order(self, make, reports, tmp_path):
         host = make(closed=str(tmp_path / "closed"))

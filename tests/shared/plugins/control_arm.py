@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import time
+
 import attrs
 from ibrobot_testing.fakes import FakeHardware, FakeTrajectoryExecutor
 
@@ -21,6 +24,9 @@ class Arm(FakeHardware):
         if self.options.trouble == "connect":
             raise HardwareError("servo 3 does not answer: check its cable")
         super().connect()
+        if self.options.fork and os.fork() == 0:
+            time.sleep(60)
+            os._exit(0)
 
     def read(self):
         if self.options.trouble == "read":
@@ -32,6 +38,8 @@ class Arm(FakeHardware):
 
     def disconnect(self):
         super().disconnect()
+        if self.options.trouble == "disconnect":
+            time.sleep(60)
         if self.options.closed:
             open(self.options.closed, "w").close()
 
@@ -40,6 +48,7 @@ class Arm(FakeHardware):
 class Options:
     trouble: str = option("", help="when it fails")
     closed: str = option("", help="file made when it is released")
+    fork: bool = option(False, help="whether a process forked by it outlives it")
     holds: bool = option(False, help="whether it has torque")
 
 
