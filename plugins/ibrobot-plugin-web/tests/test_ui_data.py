@@ -165,7 +165,7 @@ def test_the_loss_of_a_training_is_plotted(ui: Ui) -> None:
     facts: dict[str, Any] = {}
     said = []
     for line in events(
-        {"event": "begin", "steps": 10},
+        {"event": "begin", "step": 0, "steps": 10},
         {"event": "progress", "step": 1, "steps": 10, "loss": 0.7, "seconds": 300.0},
         {"event": "progress", "step": 4, "steps": 10, "loss": 0.5, "seconds": 360.0},
         {"event": "progress", "step": 9, "steps": 10, "loss": 0.4, "seconds": 460.0},

@@ -19,7 +19,7 @@ export class View {
     this.policy = h("select", { id: "train-policy" }, POLICIES.map(([value, text]) => h("option", { value }, text)));
     this.steps = h("input", { type: "number", id: "train-steps", min: "1", value: "5000" });
     this.batch = h("input", { type: "number", id: "train-batch", min: "1", value: "32" });
-    this.device = h("input", { type: "text", id: "train-device", value: "cpu" });
+    this.device = h("input", { type: "text", id: "train-device", value: "auto" });
     this.begin = h("button", { class: "primary", disabled: true }, "Train");
     const form = h("form", { class: "card" }, this.missing, h("div", { class: "fields" },
       h("label", { for: "train-dataset" }, "Dataset"), this.dataset, h("label", { for: "train-policy" }, "Policy"), this.policy,
