@@ -114,6 +114,7 @@ from ibrobot_core.errors import (
     PolicyError as PolicyError,
     Problem as Problem,
     RecorderError as RecorderError,
+    RequestError as RequestError,
     SensorError as SensorError,
     TeleopError as TeleopError,
     TransportError as TransportError,
@@ -162,6 +163,12 @@ from ibrobot_core.robot import Description as Description, Joint as Joint, Robot
 from ibrobot_core.deadman import Deadman as Deadman
 from ibrobot_core.clock import Clock as Clock, RealClock as RealClock, SteppedClock as SteppedClock
 from ibrobot_core.bus import Bus as Bus, Received as Received, Subscription as Subscription
+from ibrobot_core.services import (
+    NoRequest as NoRequest,
+    Plain as Plain,
+    RequestLimits as RequestLimits,
+    Service as Service,
+)
 from ibrobot_core.component import (
     CONTROL as CONTROL,
     Component as Component,
@@ -180,7 +187,13 @@ from ibrobot_core.launch.sources.policy import PolicySource as PolicySource
 from ibrobot_core.launch.sources.source_worker import SourceWorker as SourceWorker
 from ibrobot_core.control.link import ControlState as ControlState
 from ibrobot_core.control.spline import Spline as Spline
-from ibrobot_core.launch.runtime import SET_MODE as SET_MODE, Runtime as Runtime
+from ibrobot_core.launch.runtime import (
+    ESTOP as ESTOP,
+    RESET as RESET,
+    SET_MODE as SET_MODE,
+    Runtime as Runtime,
+    SetMode as SetMode,
+)
 from ibrobot_core.cli.run import run_robot as run_robot
 from ibrobot_core.launch.absence import absent_sensors as absent_sensors, describe_absent as describe_absent
 from ibrobot_core.launch.models import check_models as check_models

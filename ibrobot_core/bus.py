@@ -5,13 +5,25 @@ from __future__ import annotations
 import threading
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, overload
 
 import attrs
 
 from ibrobot_core.clock import Clock
+from ibrobot_core.convert import no_files
 from ibrobot_core.errors import TransportError
 from ibrobot_core.messages import Message
+from ibrobot_core.services import Plain, Service
+
+
+@attrs.frozen(eq=False)
+class _Server[Q, A]:
+    """A service, and what answers its calls."""
+
+    service: Service[Q, A]
+    handler: Callable[[Q], A]
+    files: Callable[[str], Path]
 
 
 @attrs.frozen
@@ -79,7 +91,7 @@ class Bus:
         self._types: dict[str, str] = {}
         self._latched: dict[str, Received] = {}
         self._counts: dict[str, int] = {}
-        self._services: dict[str, Callable[[Any], Any]] = {}
+        self._servers: dict[str, _Server[Any, Any]] = {}
 
     def publish(self, topic: str, message: Message, *, latched: bool = False) -> None:
         """Deliver `message` to every subscriber of `topic`; a latched one is also delivered to later subscribers.
@@ -142,40 +154,62 @@ class Bus:
                 lost[topic or "*"] += sum(subscription.dropped for subscription in subscriptions)
             return dict(+lost)
 
-    def serve(self, name: str, handler: Callable[[Any], Any]) -> None:
-        """Answer calls of service `name` with `handler`, in the caller's thread.
+    def serve[Q, A](
+        self, service: Service[Q, A], handler: Callable[[Q], A], files: Callable[[str], Path] = no_files
+    ) -> None:
+        """Answer calls of a service with `handler`, in the caller's thread.
+
+        Args:
+            service: the service.
+            handler: computes the answer to a request, which fits the service's class.
+            files: finds the file that a text in a plain request names; see `Service.read`.
 
         Raises:
             TransportError: if the service is served already.
         """
         with self._lock:
-            if name in self._services:
-                raise TransportError(f"service {name} is served already")
-            self._services[name] = handler
+            if service.name in self._servers:
+                raise TransportError(f"service {service.name} is served already")
+            self._servers[service.name] = _Server(service, handler, files)
 
-    def unserve(self, name: str) -> None:
-        """Stop serving `name`; does nothing if it is not served."""
+    def unserve(self, service: Service[Any, Any] | str) -> None:
+        """Stop serving a service; does nothing if it is not served."""
         with self._lock:
-            self._services.pop(name, None)
+            self._servers.pop(_name(service), None)
 
-    def serves(self, name: str) -> bool:
-        """Whether service `name` is served."""
+    def serves(self, service: Service[Any, Any] | str) -> bool:
+        """Whether a service is served."""
         with self._lock:
-            return name in self._services
+            return _name(service) in self._servers
 
-    def services(self) -> list[str]:
-        """Names of the served services, sorted."""
+    def services(self) -> dict[str, Service[Any, Any]]:
+        """The served services by name, sorted."""
         with self._lock:
-            return sorted(self._services)
+            return {name: server.service for name, server in sorted(self._servers.items())}
 
-    def call(self, name: str, request: Any) -> Any:
-        """Call service `name`.
+    @overload
+    def call[Q, A](self, service: Service[Q, A], request: Q) -> A: ...
+
+    @overload
+    def call[A](self, service: Service[Any, A], request: Plain = None) -> A: ...
+
+    @overload
+    def call(self, service: str, request: Any = None) -> Any: ...
+
+    def call(self, service: Service[Any, Any] | str, request: Any = None) -> Any:
+        """Call a service, given by its declaration or its name, with an object of its request's class or plain data.
 
         Raises:
             TransportError: if it has no server.
+            RequestError: for plain data that does not fit.
         """
+        name = _name(service)
         with self._lock:
-            handler = self._services.get(name)
-        if handler is None:
+            server = self._servers.get(name)
+        if server is None:
             raise TransportError(f"nobody serves {name}; served: {', '.join(self.services()) or 'nothing'}")
-        return handler(request)
+        return server.handler(server.service.read(request, server.files))
+
+
+def _name(service: Service[Any, Any] | str) -> str:
+    return service if isinstance(service, str) else service.name

@@ -172,6 +172,12 @@ class TransportError(IbrobotError):
     """A message cannot be sent, e.g. because a request has no server."""
 
 
+class RequestError(IbrobotError):
+    """A request does not fit its service, e.g. because of an unknown key; nothing was done."""
+
+    exit_code = 2
+
+
 class WireError(IbrobotError):
     """Bytes are not a valid frame of the wire format, e.g. because they are truncated, or a frame cannot be encoded."""
 

@@ -64,6 +64,7 @@ def option(
     validator: Any = None,
     secret: bool = False,
     key: str | None = None,
+    plain: Any = None,
 ) -> Any:
     """An attrs field for an options class.
 
@@ -80,10 +81,11 @@ def option(
         validator: a further attrs validator; its ValueError states the valid values.
         secret: whether to hide the value; recordings and `config show` contain `${NAME}` as in the YAML, else `***`.
         key: the key in the YAML, if it differs from the field's name.
+        plain: type of the value in files and requests, if programs may set others as well.
     """
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
     metadata = {"unit": unit, "help": help, "choices": tuple(choices) if choices is not None else None, **bounds}
-    metadata["secret"] = secret
+    metadata |= {"secret": secret, "plain": plain}
     shown: Any = _hidden if secret else True
 
     def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
@@ -124,7 +126,11 @@ def not_a_key(default: Any = attrs.NOTHING, *, factory: Any = None, repr: bool =
 def fields(kind: type[Any]) -> Mapping[str, attrs.Attribute[Any]]:
     """The keys of an options class, with resolved types."""
     attrs.resolve_types(kind)
-    return {str(field.alias): field for field in attrs.fields(kind) if field.init and field.metadata.get("key", True)}
+    keys = (field for field in attrs.fields(kind) if field.init and field.metadata.get("key", True))
+    return {
+        str(field.alias): field.evolve(type=field.metadata["plain"]) if field.metadata.get("plain") else field
+        for field in keys
+    }
 
 
 def default_of(field: attrs.Attribute[Any]) -> Any:

@@ -4,16 +4,28 @@ from __future__ import annotations
 
 import threading
 from bisect import bisect_right
+from types import NoneType
 from typing import Any
 
+import attrs
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import RealClock, SteppedClock
-from ibrobot_core.errors import TransportError
+from ibrobot_core.errors import RequestError, TransportError
 from ibrobot_core.messages import Int32, String
+from ibrobot_core.options import option
+from ibrobot_core.services import Service
+
+
+@attrs.frozen
+class Number:
+    to: int = option(help="what to add one to")
+
+
+ADD = Service("/add", Number, int)
 
 
 @pytest.fixture
@@ -150,20 +162,31 @@ def test_what_was_received_by_the_snapshot_is_in_the_queues() -> None:
 
 
 def test_services_answer_and_their_absence_is_reported(bus: Bus) -> None:
-    bus.serve("/add", lambda request: request + 1)
+    bus.serve(ADD, lambda request: request.to + 1)
 
-    assert bus.call("/add", 2) == 3
-    assert bus.services() == ["/add"]
+    assert bus.call(ADD, Number(2)) == bus.call("/add", Number(2)) == bus.call("/add", {"to": 2}) == 3
+    assert bus.services() == {"/add": ADD}
     with pytest.raises(TransportError, match=r"^service /add is served already$"):
-        bus.serve("/add", lambda request: request)
+        bus.serve(ADD, lambda request: 0)
     with pytest.raises(TransportError, match=r"^nobody serves /sub; served: /add$"):
         bus.call("/sub", 2)
+    bus.unserve(ADD)
+    assert not bus.serves(ADD)
+
+
+def test_a_request_that_does_not_fit_never_reaches_the_handler(bus: Bus) -> None:
+    seen: list[Number] = []
+    bus.serve(ADD, lambda request: len(seen) if seen.append(request) else 0)
+
+    with pytest.raises(RequestError, match=r"^/add: to: expected a whole number, got 'two'$"):
+        bus.call("/add", {"to": "two"})
+    assert seen == []
 
 
 def test_a_service_may_publish(bus: Bus) -> None:
     subscription = bus.subscribe("/a")
-    bus.serve("/shout", lambda value: bus.publish("/a", Int32(value)))
+    bus.serve(Service("/shout", Number, NoneType), lambda request: bus.publish("/a", Int32(request.to)))
 
-    bus.call("/shout", 4)
+    bus.call("/shout", Number(4))
 
     assert [item.message for item in subscription.drain()] == [Int32(4)]

@@ -19,7 +19,8 @@ from ibrobot_core.config.schema import (
     devices_of,
 )
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
-from ibrobot_core.config.yaml_nodes import Document, Key
+from ibrobot_core.config.yaml_nodes import Document
+from ibrobot_core.convert import Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TeleopDescriptor, TransportDescriptor
 from ibrobot_core.options import OptionFault
 from ibrobot_core.plugins import example_type

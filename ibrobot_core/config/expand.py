@@ -49,7 +49,7 @@ def resolve_path(text: str, base: Path) -> Path:
     if not text.startswith("package://"):
         return base / text
     package, _, inside = text.removeprefix("package://").partition("/")
-    if not package.isidentifier() or not inside:
+    if not package.isidentifier() or not inside or ".." in Path(inside).parts:
         raise ValueError(f"expected package://PACKAGE/path, got {text!r}")
     spec = find_spec(package)
     if spec is None or not spec.submodule_search_locations:

@@ -12,13 +12,13 @@ import attrs
 import ibrobot_core
 from ibrobot_core.config.checks import Checks
 from ibrobot_core.config.contract_checks import ContractChecks
-from ibrobot_core.config.convert import shown
 from ibrobot_core.config.missing import split
 from ibrobot_core.config.overrides import apply_overrides, put
 from ibrobot_core.config.schema import ComponentConfig, ContractConfig, PeripheralConfig, RobotConfig
 from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_literals
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections, SectionParser
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse_yaml
+from ibrobot_core.convert import shown
 from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import Registry, installed_plugins

@@ -8,7 +8,8 @@ from typing import Any
 import attrs
 
 from ibrobot_core.config.schema import ContractConfig
-from ibrobot_core.config.yaml_nodes import Document, Key
+from ibrobot_core.config.yaml_nodes import Document
+from ibrobot_core.convert import Key
 from ibrobot_core.errors import PluginNotInstalled, plugin_type
 from ibrobot_core.plugins import install_command
 

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.config.convert import Converter, Faults, error_message, shown
-from ibrobot_core.config.yaml_nodes import Document, Key, Place, parse_yaml
+from ibrobot_core.config.expand import resolve_path
+from ibrobot_core.config.yaml_nodes import Document, Place, parse_yaml
+from ibrobot_core.convert import Converter, Faults, Key, error_message, shown
 from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.options import did_you_mean
 
@@ -89,7 +90,7 @@ def single_options[T](kind: type[T], overrides: Sequence[str], name: str, flag: 
     apply_overrides(document, overrides, flag)
     document.raise_problems()
     try:
-        found: T = Converter(Path.cwd()).structure(document.root, kind)
+        found: T = Converter(lambda path: resolve_path(path, Path.cwd())).structure(document.root, kind)
     except Faults as faults:
         for key, message in faults.found:
             document.add(key, message)

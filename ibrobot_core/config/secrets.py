@@ -11,7 +11,8 @@ from typing import Any, get_args
 import attrs
 
 from ibrobot_core.config.expand import expand
-from ibrobot_core.config.yaml_nodes import Document, Key
+from ibrobot_core.config.yaml_nodes import Document
+from ibrobot_core.convert import Key
 from ibrobot_core.options import HIDDEN, fields
 from ibrobot_core.outside import redacted, remember_secret, without_credentials
 

@@ -11,11 +11,11 @@ from typing import Any
 import attrs
 
 from ibrobot_core.config import schema
-from ibrobot_core.config.convert import Converter, Faults, error_message, unknown_key
-from ibrobot_core.config.expand import missing_package
+from ibrobot_core.config.expand import missing_package, resolve_path
 from ibrobot_core.config.missing import Missing
 from ibrobot_core.config.secrets import note
-from ibrobot_core.config.yaml_nodes import Document, Key
+from ibrobot_core.config.yaml_nodes import Document
+from ibrobot_core.convert import Converter, Faults, Key, error_message, unknown_key
 from ibrobot_core.descriptors import Descriptor, HardwareDescriptor, SensorDescriptor
 from ibrobot_core.errors import PluginError, PluginNotInstalled
 from ibrobot_core.options import fields
@@ -100,7 +100,10 @@ class SectionParser:
     _missing: list[Missing] = attrs.field(init=False, factory=list)
 
     def __attrs_post_init__(self) -> None:
-        self._converter = Converter(self.base)
+        self._converter = Converter(self._files)
+
+    def _files(self, text: str) -> Path:
+        return resolve_path(text, self.base)
 
     def sections(self) -> ParsedSections:
         """All sections."""
@@ -160,7 +163,7 @@ class SectionParser:
             elif (entry := self.registry.entries.get(("section", name))) is not None:
                 reason = f"{entry.package} adds a section of this name, which is one of ibrobot's own"
                 faults.add((name,), f"{reason}: rename it there, or pip uninstall {entry.package}")
-        sections.plain = _Outline(self.base).arguments(known, self._with_installed_models(sections), faults)
+        sections.plain = _Outline(self._files).arguments(known, self._with_installed_models(sections), faults)
         self._report((), faults)
 
     def _with_installed_models(self, sections: ParsedSections) -> Mapping[str, Any]:

@@ -15,12 +15,10 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from yaml.resolver import BaseResolver
 
 from ibrobot_core.config.expand import expand
+from ibrobot_core.convert import Key
 from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.outside import redacted
-
-Key = tuple[str | int, ...]
-"""The path of a value in a document: mapping keys and list indices from the root."""
 
 _DEFAULT_TAGS = (BaseResolver.DEFAULT_SCALAR_TAG, BaseResolver.DEFAULT_SEQUENCE_TAG, BaseResolver.DEFAULT_MAPPING_TAG)
 _BOOLS = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import NoneType
 from typing import Any
+
+import attrs
 
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.component import Component, Worker, error_line, error_text, exit_code
@@ -12,12 +15,22 @@ from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, Pl
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_components
 from ibrobot_core.launch.session import Session
+from ibrobot_core.options import documented, option
+from ibrobot_core.services import NoRequest, Service
 from ibrobot_core.units import ns
 
-SET_MODE = "/set_mode"
-"""Service that switches the control mode."""
-RESET = "/reset"
-ESTOP = "/estop"
+
+@documented
+@attrs.frozen
+class SetMode:
+    """A request to `/set_mode`."""
+
+    mode: str = option(help="a control mode of the robot YAML")
+
+
+SET_MODE = Service("/set_mode", SetMode, NoneType, "Enter another control mode.", alone="mode")
+RESET = Service("/reset", NoRequest, str, "Clear faults and the emergency stop; answers with what the robot does now.")
+ESTOP = Service("/estop", NoRequest, NoneType, "Stop the robot at once, and hold until a reset.")
 _GLANCE_S, _GLANCES = 0.1, 100
 """Timeout [s] and number of waits for the first joint state; several, since time passes for a stopped process too."""
 
@@ -25,7 +38,7 @@ _GLANCE_S, _GLANCES = 0.1, 100
 class Runtime:
     """One run. Call `start`, then `step` (lockstep) or `wait` until the run has ended, then `stop`.
 
-    Services on the bus: `/set_mode` (a mode's name), `/reset`, `/estop`.
+    It serves `/set_mode`, `/reset` and `/estop`.
     """
 
     def __init__(self, session: Session) -> None:
@@ -80,9 +93,9 @@ class Runtime:
             if ended and isinstance(error, ComponentFailed):
                 return
             raise
-        session.bus.serve(SET_MODE, self.switch_mode)
+        session.bus.serve(SET_MODE, lambda request: self.switch_mode(request.mode))
         session.bus.serve(RESET, lambda _: self.reset())
-        session.bus.serve(ESTOP, lambda _: session.control.call("estop"))
+        session.bus.serve(ESTOP, self._estop)
 
     def wait(self, timeout_s: float) -> bool:
         """Wait up to `timeout_s` [s] for the end of the run; return whether it has ended."""
@@ -162,6 +175,9 @@ class Runtime:
         then = f"holding: {session.to_go_on()}" if session.held else f"mode {session.mode} starts over"
         session.log.info("reset; %s", then)
         return f"reset; {then}"
+
+    def _estop(self, request: NoRequest) -> None:
+        self.session.control.call("estop")
 
     def _go_on(self) -> None:
         """Enter the present mode again after a reset made the robot hold."""

@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.errors import NotSupported, TeleopError
+from ibrobot_core.errors import RequestError, TeleopError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
 from ibrobot_core.robot import Vector
 
@@ -170,7 +170,7 @@ def test_the_service_takes_the_robot_for_other_front_ends(begin) -> None:
     assert episode.ticks(40)[-1] == "policy"
     call("/intervene", None)
     assert episode.ticks(3)[-1] == "handover"
-    with pytest.raises(NotSupported, match="/intervene takes True, False or None, got 'yes'"):
+    with pytest.raises(RequestError, match="/intervene: take: expected true or false, got 'yes'"):
         call("/intervene", "yes")
 
 

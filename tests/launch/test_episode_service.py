@@ -13,7 +13,7 @@ from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_service import DISCARD, START, STATUS, STOP, EpisodeService
 
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import DiskFull, InUse, NotSupported, RecorderError
+from ibrobot_core.errors import DiskFull, InUse, NotSupported, RecorderError, RequestError
 from ibrobot_core.ownership import Ownership
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def test_what_cannot_be_is_refused(run: Runtime):
     bus.call(START, "")
     with pytest.raises(RecorderError, match="an episode is being recorded; end it first"):
         bus.call(START, "")
-    with pytest.raises(RecorderError, match="outcome must be one of success, failure, unknown, not 'good'"):
+    with pytest.raises(RequestError, match="outcome: 'good' is not one of: success, failure, unknown"):
         bus.call(STOP, "good")
 
 

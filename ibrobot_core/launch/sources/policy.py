@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from types import NoneType
 from typing import override
+
+import attrs
 
 from ibrobot_core.component import Component
 from ibrobot_core.config.schema import ControlMode, InferenceConfig
@@ -15,10 +18,23 @@ from ibrobot_core.launch.models import check_model
 from ibrobot_core.launch.session import ActingPolicy, Session
 from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.launch.transport import TransportLink
+from ibrobot_core.options import documented, option
 from ibrobot_core.robot import Vector
+from ibrobot_core.services import Service
 from ibrobot_core.units import NS_PER_S
 
-TOGGLE_SMOOTHING = "/action_dispatcher/toggle_smoothing"
+
+@documented
+@attrs.frozen
+class ToggleSmoothing:
+    """A request to `/action_dispatcher/toggle_smoothing`."""
+
+    enabled: bool = option(help="whether chunks are blended, from the next one on")
+
+
+TOGGLE_SMOOTHING = Service(
+    "/action_dispatcher/toggle_smoothing", ToggleSmoothing, NoneType, "Blend chunks, or do not.", alone="enabled"
+)
 
 
 class LoadedModel(Component):
@@ -115,7 +131,7 @@ class PolicySource(SourceWorker):
         self._step_ns = contract.step_ns
 
     def toggle_smoothing(self, enabled: bool) -> None:
-        """Service: enable or disable the blending of chunks, from the next chunk on."""
+        """Enable or disable the blending of chunks, from the next chunk on."""
         with self.lock:
             self._dispatcher.toggle_smoothing(enabled)
 
@@ -125,7 +141,7 @@ class PolicySource(SourceWorker):
         self.session.acting = ActingPolicy(self._dispatcher.stats, model.engine.stats, model.described)
         self._next_ns = self.session.bus.snapshot_ns() + self._step_ns
         self._dispatcher.begin(seed)
-        self.session.bus.serve(TOGGLE_SMOOTHING, self.toggle_smoothing)
+        self.session.bus.serve(TOGGLE_SMOOTHING, lambda request: self.toggle_smoothing(request.enabled))
 
     def suspend(self) -> None:
         """Drop the plan and request none, e.g. while an operator commands the robot; observations are still sampled."""

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-from ibrobot_core.api import Bus, Vector
+import attrs
 
-CLEARANCE = "/world/clearance"
-"""Service: positions [rad or m] by joint; the others are measured -> distance from the nearest object [m]."""
+from ibrobot_core.api import Bus, Service, Vector, documented, option
+
+
+@documented
+@attrs.frozen
+class Configuration:
+    """A request to `/world/clearance`: a configuration of the arm."""
+
+    positions: Mapping[str, float] = option(factory=dict, unit="rad or m", help="of joints; the others are measured")
+
+
+CLEARANCE = Service("/world/clearance", Configuration, float, "Distance from the nearest object [m].")
 
 
 def world_clearance(bus: Bus | None, joints: Sequence[str]) -> Callable[[Vector], float] | None:
@@ -27,6 +37,6 @@ def world_clearance(bus: Bus | None, joints: Sequence[str]) -> Callable[[Vector]
     def clearance(position: Vector) -> float:
         if not bus.serves(CLEARANCE):
             return math.inf
-        return float(bus.call(CLEARANCE, dict(zip(joints, position.tolist(), strict=True))))
+        return bus.call(CLEARANCE, Configuration(dict(zip(joints, position.tolist(), strict=True))))
 
     return clearance

@@ -5,25 +5,40 @@ from __future__ import annotations
 import queue
 from typing import override
 
+import attrs
+
 from ibrobot_core.api import (
     CONTROL,
     ControlMode,
     NotSupported,
     OperatorDevices,
     PolicySource,
+    Service,
     Session,
     SourceWorker,
     String,
     TeleopCommand,
     TeleopDescriptor,
     TeleopError,
+    documented,
+    option,
     seconds,
 )
 from ibrobot_data.handover import Handover
 from ibrobot_data.options import COMMANDER, HANDOVER, OPERATOR, POLICY, EpisodesOptions, options_of
 
-INTERVENE = "/intervene"
-"""Takes the robot from the policy (True), gives it back (False), or toggles (None); returns who commands then."""
+
+@documented
+@attrs.frozen
+class Intervene:
+    """A request to `/intervene`."""
+
+    take: bool | None = option(None, help="true: take the robot from the policy; false: give it back; else: toggle")
+
+
+INTERVENE = Service(
+    "/intervene", Intervene, str, "Take the robot from its policy; answers with who commands then.", alone="take"
+)
 _ANSWER_S = 60.0
 """How long the arm holds while the policy does not answer, before its setpoints count as stale [s]."""
 
@@ -84,7 +99,7 @@ class Corrections(SourceWorker):
                 "without a terminal and a button of %s, only the service %s takes the robot from the policy; "
                 "`episodes: {takeover: deadman}` lets the deadman take it, too",
                 self._devices,
-                INTERVENE,
+                INTERVENE.name,
             )
         self._publish()
 
@@ -102,7 +117,7 @@ class Corrections(SourceWorker):
         self._set(POLICY)
         self._typed()
         self._policy.begin(seed)
-        self.session.bus.serve(INTERVENE, self.intervene)
+        self.session.bus.serve(INTERVENE, lambda request: self.intervene(request.take))
 
     @override
     def end_mode(self) -> None:
@@ -112,13 +127,11 @@ class Corrections(SourceWorker):
         self.session.commander = ""
 
     def intervene(self, take: bool | None = None) -> str:
-        """Service: take the robot from the policy, give it back, or toggle; returns who commands then.
+        """Take the robot from the policy, give it back, or toggle; returns who commands then.
 
         Raises:
-            NotSupported: if the mode has ended, or for another request.
+            NotSupported: if the mode has ended.
         """
-        if take not in (True, False, None):
-            raise NotSupported(f"{INTERVENE} takes True, False or None, got {take!r}")
         with self.lock:
             if not self.active:
                 raise NotSupported(f"mode {self.mode.name} does not run: nobody can take the robot from its policy")

@@ -5,15 +5,22 @@ from __future__ import annotations
 import shutil
 import threading
 from collections.abc import Mapping
+from types import NoneType
 from typing import TYPE_CHECKING, Any, override
+
+import attrs
 
 from ibrobot_core.api import (
     Contract,
     DiskFull,
     Episodes,
+    NoRequest,
     NotSupported,
     RecorderError,
+    Service,
     Session,
+    documented,
+    option,
     seconds,
     wrong_input,
 )
@@ -23,15 +30,31 @@ from ibrobot_data.episode_start import is_kept
 if TYPE_CHECKING:
     from ibrobot_data.recording_worker import RecordingWorker
 
-START = "/record_episode/start"
-"""Begins an episode. Request: a prompt, or None for the last prompt."""
-STOP = "/record_episode/stop"
-"""Ends the episode. Request: `success`, `failure` or `unknown`."""
-DISCARD = "/record_episode/discard"
-"""Ends and deletes the episode. Request: None."""
-STATUS = "/record_episode/status"
-"""Returns `EpisodeService.status`. Request: None."""
 OUTCOMES = ("success", "failure", "unknown")
+
+
+@documented
+@attrs.frozen
+class StartEpisode:
+    """A request to `/record_episode/start`."""
+
+    prompt: str | None = option(None, help="description of the task; without one, that of the last episode")
+
+
+@documented
+@attrs.frozen
+class StopEpisode:
+    """A request to `/record_episode/stop`."""
+
+    outcome: str = option("unknown", choices=OUTCOMES, help="how the episode ended")
+
+
+START = Service("/record_episode/start", StartEpisode, NoneType, "Begin an episode.", alone="prompt")
+STOP = Service("/record_episode/stop", StopEpisode, NoneType, "End the episode.", alone="outcome")
+DISCARD = Service("/record_episode/discard", NoRequest, NoneType, "End the episode, and delete it.")
+STATUS: Service[NoRequest, Mapping[str, Any]] = Service(
+    "/record_episode/status", NoRequest, Mapping, "The state of recording, for a user interface."
+)
 _MIB = 1 << 20
 
 
@@ -178,8 +201,8 @@ class EpisodeService(Episodes):
     def serve(self) -> None:
         """Register the services on the bus."""
         bus = self._session.bus
-        bus.serve(START, self.start)
-        bus.serve(STOP, self.stop)
+        bus.serve(START, lambda request: self.start(request.prompt))
+        bus.serve(STOP, lambda request: self.stop(request.outcome))
         bus.serve(DISCARD, lambda _: self.discard())
         bus.serve(STATUS, lambda _: self.status())
 

@@ -5,14 +5,24 @@ from __future__ import annotations
 import queue
 from collections import deque
 from functools import partial
+from types import NoneType
 from typing import override
 
-from ibrobot_core.api import EpisodeEnd, Received, RecorderError, RecordingConfig, Session, String, ns
+from ibrobot_core.api import (
+    EpisodeEnd,
+    NoRequest,
+    Received,
+    RecorderError,
+    RecordingConfig,
+    Service,
+    Session,
+    String,
+    ns,
+)
 from ibrobot_data.options import COMMANDER, POLICY, EpisodesOptions
 from ibrobot_data.recording_worker import RecordingWorker
 
-HIGHLIGHT = "/record_episode/highlight"
-"""Begins or ends a highlight, as its key does. Request: None."""
+HIGHLIGHT = Service("/record_episode/highlight", NoRequest, NoneType, "Begin or end a highlight, as its key does.")
 
 
 class PartialRecording(RecordingWorker):

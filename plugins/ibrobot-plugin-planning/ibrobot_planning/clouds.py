@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from types import NoneType
 from typing import Any, override
 
 import numpy as np
@@ -13,8 +14,10 @@ from ibrobot_core.api import (
     ContractError,
     Image,
     Message,
+    NoRequest,
     PointCloud2,
     Received,
+    Service,
     Session,
     SessionWorker,
     Vector,
@@ -26,12 +29,12 @@ from ibrobot_planning.frames import Frames
 from ibrobot_planning.shapes import geometry
 from ibrobot_planning.transforms import matrix, pose
 from ibrobot_planning.voxels import cloud_points, depth_points, outside, voxels
-from ibrobot_planning.world import SNAPSHOT, Voxels, World, WorldObject
+from ibrobot_planning.world import SNAPSHOT, Voxels, WorldObject
 from ibrobot_planning.world_keeper import WorldKeeper
 from ibrobot_planning.world_options import CloudOptions, WorldOptions
 
-CLEAR = "/clear_octomap"
-"""Service that removes the cells of all clouds until the next message; MoveIt's name."""
+CLEAR = Service("/clear_octomap", NoRequest, NoneType, "Remove the cells of all clouds until the next message.")
+"""MoveIt's name."""
 _PIXELS = 3
 """Least pixels along the edge of a cell at the furthest distance; images are thinned to about this."""
 
@@ -82,8 +85,7 @@ class CloudKeeper(SessionWorker):
         """The cells that neither the arm nor an object occupies."""
         arm = self._arm
         assert arm is not None
-        world = self.session.bus.call(SNAPSHOT, None)
-        assert isinstance(world, World)
+        world = self.session.bus.call(SNAPSHOT)
         q = self.session.measured().position
         arm_shapes = arm.placed_shapes(q)
         others: list[tuple[Any, Vector]] = []
@@ -96,7 +98,7 @@ class CloudKeeper(SessionWorker):
         # What stands on an object must stay, however flat.
         return None if left is None else outside(left, others, cells.size / 2)
 
-    def _clear(self, request: object) -> None:
+    def _clear(self, request: NoRequest) -> None:
         for name, cloud in self._clouds.items():
             cloud.forget()
             self._keeper.put(name, None)

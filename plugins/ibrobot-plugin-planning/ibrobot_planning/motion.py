@@ -6,29 +6,41 @@ from typing import Literal
 
 import attrs
 
-from ibrobot_core.api import JointState, PlanCode, Pose
+from ibrobot_core.api import Header, JointState, PlanCode, Pose, Vector, documented, option
 
 type Outcome = Literal["SUCCEEDED", "REJECTED", "PLANNING_FAILED", "EXECUTION_FAILED", "CANCELLED"]
 
 
+@documented
 @attrs.frozen
 class MoveToPose:
     """Request of ibrobot_msgs/srv/MoveToPose."""
 
-    target_pose: Pose
-    """Of the tool centre point, in the base frame."""
-    velocity_scaling: float = 0.0
-    """Fraction of the velocity limits, in (0, 1]; 0 means 1."""
+    target_pose: Pose = option(help="of the tool centre point, in the base frame")
+    velocity_scaling: float = option(0.0, help="fraction of the velocity limits, in (0, 1]; 0 means 1")
 
 
+@attrs.frozen(eq=False)
+class JointTarget:
+    """A sensor_msgs/msg/JointState as a goal, of which only names and positions are read."""
+
+    name: tuple[str, ...]
+    position: Vector
+    """One for each joint [rad]."""
+    velocity: Vector | None = None
+    effort: Vector | None = None
+    header: Header = Header()
+
+
+@documented
 @attrs.frozen
 class MoveToConfiguration:
     """Request of ibrobot_msgs/srv/MoveToConfiguration."""
 
-    target_joint_state: JointState
-    """Names and positions [rad]; all other joints stay."""
-    velocity_scaling: float = 0.0
-    """Fraction of the velocity limits, in (0, 1]; 0 means 1."""
+    target_joint_state: JointState | JointTarget = option(
+        plain=JointTarget, help="names and positions [rad]; all other joints stay"
+    )
+    velocity_scaling: float = option(0.0, help="fraction of the velocity limits, in (0, 1]; 0 means 1")
 
 
 @attrs.frozen

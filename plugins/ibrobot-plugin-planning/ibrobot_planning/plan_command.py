@@ -257,7 +257,7 @@ def _clearance(
 ) -> dict[str, Any] | None:
     """The least distance of the arm, and of what it carries, from objects; None without objects or collision checks."""
     bus = session.bus
-    world = bus.call(SNAPSHOT, None) if bus.serves(SNAPSHOT) else World()
+    world = bus.call(SNAPSHOT) if bus.serves(SNAPSHOT) else World()
     assert isinstance(world, World)
     if not world.objects:
         return None

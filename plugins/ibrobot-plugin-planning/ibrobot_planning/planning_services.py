@@ -15,6 +15,7 @@ from ibrobot_core.api import (
     Header,
     IbrobotError,
     JointState,
+    NoRequest,
     PlanCode,
     PlanningError,
     PlanRequest,
@@ -22,6 +23,7 @@ from ibrobot_core.api import (
     PoseGoal,
     PoseStamped,
     PositionGoal,
+    Service,
     Session,
     Vector,
 )
@@ -41,7 +43,6 @@ from ibrobot_planning.requests import (
     PlanningScene,
     PlanQuery,
     any_goal,
-    requested,
 )
 from ibrobot_planning.world import SNAPSHOT, World
 
@@ -49,18 +50,14 @@ if TYPE_CHECKING:
     from ibrobot_planning.checked_arm import CheckedArm
     from ibrobot_planning.goals import Tool
 
-COMPUTE_IK = "/compute_ik"
-"""Takes an `IkQuery`, and answers with an `IkAnswer`."""
-COMPUTE_FK = "/compute_fk"
-"""Takes an `FkQuery`, and answers with an `FkAnswer`."""
-PLAN = "/plan_kinematic_path"
-"""Takes a `PlanQuery`, and answers with a `PlanAnswer`."""
-PLAN_GOAL = "/planning/plan"
-"""Takes a goal as `/planning/go_to` does, or a `PlanAhead`, and answers with a `PlanAnswer`."""
-CARTESIAN = "/compute_cartesian_path"
-"""Takes a `CartesianQuery`, and answers with a `PlanAnswer`."""
-SCENE = "/get_planning_scene"
-"""Takes nothing, and answers with a `PlanningScene`."""
+COMPUTE_IK = Service("/compute_ik", IkQuery, IkAnswer, "Joint positions for a position or pose of the tool.")
+COMPUTE_FK = Service("/compute_fk", FkQuery, FkAnswer, "Poses of links.")
+PLAN = Service("/plan_kinematic_path", PlanQuery, PlanAnswer, "Plan to the first goal that can be reached, and stay.")
+PLAN_GOAL = Service("/planning/plan", PlanAhead, PlanAnswer, "Plan to a goal, and stay.", alone="goal")
+CARTESIAN = Service(
+    "/compute_cartesian_path", CartesianQuery, PlanAnswer, "Plan straight lines of the tool through waypoints."
+)
+SCENE = Service("/get_planning_scene", NoRequest, PlanningScene, "The robot and what is around it.")
 BASE_FRAME = "base_link"
 """Frame of poses in answers."""
 
@@ -82,7 +79,7 @@ class PlanningServices:
         self._robot = session.config.robot
         self._mode = mode
         self._plans = plans
-        self.handlers: dict[str, Callable[[Any], Any]] = {
+        self.handlers: dict[Service[Any, Any], Callable[[Any], Any]] = {
             COMPUTE_IK: self._ik,
             COMPUTE_FK: self._fk,
             PLAN: self._plan,
@@ -107,14 +104,11 @@ class PlanningServices:
 
         return checked_arm(self._robot, self._session.log)
 
-    def _plan(self, request: object) -> PlanAnswer:
-        query = requested(PlanQuery, request)
+    def _plan(self, query: PlanQuery) -> PlanAnswer:
         scaling = query.velocity_scaling, query.acceleration_scaling
         return self._planned(lambda: any_goal(query.goals), query.start, *scaling)
 
-    def _plan_goal(self, request: Any) -> PlanAnswer:
-        query = request if isinstance(request, PlanAhead) else PlanAhead(request)
-
+    def _plan_goal(self, query: PlanAhead) -> PlanAnswer:
         def planned() -> PlanResult:
             aim = target(query.goal, self._robot)
             self._plans.check(aim)
@@ -125,8 +119,7 @@ class PlanningServices:
 
         return _answer(planned)
 
-    def _cartesian(self, request: object) -> PlanAnswer:
-        query = requested(CartesianQuery, request)
+    def _cartesian(self, query: CartesianQuery) -> PlanAnswer:
         return self._planned(query.goal, query.start, query.velocity_scaling, query.acceleration_scaling)
 
     def _planned(
@@ -172,8 +165,7 @@ class PlanningServices:
             start[self._robot.joint_names.index(name)] = value
         return np.asarray(start)
 
-    def _ik(self, request: object) -> IkAnswer:
-        query = requested(IkQuery, request)
+    def _ik(self, query: IkQuery) -> IkAnswer:
         try:
             goal = query.goal.goal()
             if not isinstance(goal, PositionGoal | PoseGoal):
@@ -214,8 +206,7 @@ class PlanningServices:
             )
         return free
 
-    def _fk(self, request: object) -> FkAnswer:
-        query = requested(FkQuery, request)
+    def _fk(self, query: FkQuery) -> FkAnswer:
         try:
             q = self._start(query.joints) if query.joints else self._session.measured().position
             header = Header(self._session.clock.now_ns(), BASE_FRAME)
@@ -242,11 +233,9 @@ class PlanningServices:
 
     def _world(self) -> World:
         bus = self._session.bus
-        world = bus.call(SNAPSHOT, None) if bus.serves(SNAPSHOT) else World()
-        assert isinstance(world, World)
-        return world
+        return bus.call(SNAPSHOT) if bus.serves(SNAPSHOT) else World()
 
-    def _scene(self, request: object) -> PlanningScene:
+    def _scene(self, request: NoRequest) -> PlanningScene:
         robot, reading = self._robot, self._session.measured()
         objects = {
             name: ObjectSummary(type(each.shape).__name__.lower(), each.pose, each.link, tuple(sorted(each.may_touch)))

@@ -1,8 +1,7 @@
-"""Requests and answers of the services that plan, as attrs classes; requests may be YAML or mappings as well."""
+"""Requests and answers of the services that plan, as attrs classes."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -31,36 +30,12 @@ from ibrobot_core.api import (
     Vector3,
     documented,
     option,
-    single_options,
 )
 from ibrobot_planning.goal_text import Target
 from ibrobot_planning.transforms import from_rpy
 
 _NEARLY_ONE = 1e-3
 """Allowed deviation of a quaternion's length from 1."""
-
-
-def requested[T](kind: type[T], request: object) -> T:
-    """A request as an object of its class.
-
-    Args:
-        kind: the class.
-        request: an object of the class, or its keys as YAML text or as a mapping.
-
-    Raises:
-        ConfigError: for wrong keys and values.
-        PlanningError: for a request of another type.
-    """
-    if isinstance(request, kind):
-        return request
-    if isinstance(request, Mapping):
-        request = json.dumps(request)
-    if not isinstance(request, str):
-        keys = ", ".join(attrs.fields_dict(kind))  # type: ignore[arg-type]
-        raise PlanningError(
-            f"the request must be a {kind.__name__}, or a mapping or YAML with {keys}; got {type(request).__name__}"
-        )
-    return single_options(kind, (), "the request", text=request)
 
 
 @documented
@@ -151,14 +126,29 @@ class PlanQuery:
     acceleration_scaling: float = _scaling("acceleration")
 
 
+@documented
+@attrs.frozen
+class GoTo:
+    """A request to `/planning/go_to`."""
+
+    goal: str | Goal | Target = option(plain=str, help="a pose's name, joints, or a position of the tool, as `--goal`")
+
+
+@documented
 @attrs.frozen
 class PlanAhead:
     """A request to `/planning/plan`: plan to a goal, and stay."""
 
-    goal: str | Goal | Target
-    """As `/planning/go_to` takes it."""
-    start: Mapping[str, float] = attrs.field(factory=dict)
-    """Start of joints [rad]; the others are where they are."""
+    goal: str | Goal | Target = option(plain=str, help="as `/planning/go_to` takes it")
+    start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints are where they are")
+
+
+@documented
+@attrs.frozen
+class Numbered:
+    """A request to `/planning/result`."""
+
+    number: int = option(ge=0, help="what the service that took the goal answered with")
 
 
 @documented
@@ -274,6 +264,24 @@ class PlanningScene:
     objects: Mapping[str, ObjectSummary]
 
 
+@documented
+@attrs.frozen(eq=False)
+class Execute:
+    """A request to `/execute_trajectory`: the keys of a trajectory_msgs/msg/JointTrajectory."""
+
+    joint_names: tuple[str, ...] = option(help="the joints of the trajectory")
+    points: tuple[JointTrajectoryPoint, ...] = option(help="positions, and velocities and accelerations if wanted")
+    header: Header = option(Header(), help="is not read: a trajectory begins when it is executed")
+
+    def __attrs_post_init__(self) -> None:
+        if not self.joint_names or not self.points:
+            raise ValueError("a trajectory needs joint_names and points, neither of them empty")
+
+    def trajectory(self) -> JointTrajectory:
+        """The trajectory."""
+        return JointTrajectory(Header(), self.joint_names, self.points)
+
+
 def any_goal(goals: tuple[GoalOptions, ...]) -> Goal:
     """One goal as it is, several as alternatives.
 
@@ -283,33 +291,3 @@ def any_goal(goals: tuple[GoalOptions, ...]) -> Goal:
     if not goals:
         raise PlanningError("a request needs at least one goal", PlanCode.INVALID_GOAL_CONSTRAINTS)
     return goals[0].goal() if len(goals) == 1 else AnyGoal(tuple(each.goal() for each in goals))
-
-
-def trajectory_from(request: object) -> JointTrajectory:
-    """A trajectory, from a `JointTrajectory` or a mapping with its keys.
-
-    Raises:
-        PlanningError: for other values; executors check the numbers.
-    """
-    if isinstance(request, JointTrajectory):
-        return request
-    if not isinstance(request, Mapping):
-        raise _no_plan(f"a trajectory must be a mapping with joint_names and points, got {type(request).__name__}")
-    names, points = request.get("joint_names"), request.get("points")
-    if not isinstance(names, list | tuple) or not isinstance(points, list | tuple) or not names or not points:
-        raise _no_plan("a trajectory needs joint_names and points, neither of them empty")
-    return JointTrajectory(Header(), tuple(map(str, names)), tuple(_point(*each) for each in enumerate(points)))
-
-
-def _point(number: int, point: object) -> JointTrajectoryPoint:
-    if not isinstance(point, Mapping) or not isinstance(point.get("time_from_start_ns"), int):
-        raise _no_plan(f"point {number} of the trajectory needs time_from_start_ns, in whole nanoseconds")
-    try:
-        values = [np.array(point.get(key, ()), dtype=float) for key in ("positions", "velocities", "accelerations")]
-    except (ValueError, TypeError):
-        raise _no_plan(f"point {number} of the trajectory has values that are not numbers") from None
-    return JointTrajectoryPoint(point["time_from_start_ns"], *values)
-
-
-def _no_plan(message: str) -> PlanningError:
-    return PlanningError(message, PlanCode.INVALID_MOTION_PLAN)

@@ -143,8 +143,7 @@ class RrtConnectPlanner(Planner):
     def _snapshot(self) -> World:
         bus, world = self._ctx.bus, self.world
         if bus is not None and bus.serves(SNAPSHOT):
-            world = bus.call(SNAPSHOT, None)
-            assert isinstance(world, World)
+            world = bus.call(SNAPSHOT)
         floor = self._options.floor
         if floor is None or FLOOR in world.objects:
             return world

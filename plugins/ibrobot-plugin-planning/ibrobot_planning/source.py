@@ -8,6 +8,7 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from types import NoneType
 from typing import Any, override
 
 import attrs
@@ -20,7 +21,7 @@ from ibrobot_core.api import (
     Goal,
     HardwareError,
     JointGoal,
-    JointState,
+    NoRequest,
     NotSupported,
     OrientationPolicy,
     PlanCode,
@@ -30,6 +31,8 @@ from ibrobot_core.api import (
     Pose,
     PoseGoal,
     PoseStamped,
+    RequestLimits,
+    Service,
     Session,
     SourceWorker,
     String,
@@ -41,22 +44,31 @@ from ibrobot_planning.goal_plans import GoalPlans
 from ibrobot_planning.goal_text import Target, target
 from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Outcome
 from ibrobot_planning.planning_services import PlanningServices
-from ibrobot_planning.requests import MoveRequest, requested, trajectory_from
+from ibrobot_planning.requests import Execute, GoTo, MoveRequest, Numbered
 
-GO_TO = "/planning/go_to"
-"""Takes a goal, as text or as a goal of `ibrobot_core.api`, which replaces the present one; answers with its number."""
-RESULT = "/planning/result"
-"""Number of a goal -> its `MoveResult`; None while the robot moves."""
-CANCEL = "/planning/cancel"
-"""Drops all goals: the robot slows down and holds."""
-MOVE_ACTION = "/move_action"
-"""Takes a `MoveRequest`, and answers like `GO_TO`; named like MoveIt's action."""
-EXECUTE = "/execute_trajectory"
-"""Takes a trajectory that begins where the robot is, and answers like `GO_TO`; named like MoveIt's action."""
-MOVE_TO_POSE = "/moveit_gateway/move_to_pose"
-"""Takes a `MoveToPose`, and answers with a `MoveResult` when the motion has ended."""
-MOVE_TO_CONFIGURATION = "/moveit_gateway/move_to_configuration"
-"""Takes a `MoveToConfiguration`, and answers with a `MoveResult` when the motion has ended."""
+GO_TO = Service(
+    "/planning/go_to", GoTo, int, "Move to a goal, which replaces the present one; answers with its number.", "goal"
+)
+RESULT: Service[Numbered, MoveResult | None] = Service(
+    "/planning/result", Numbered, MoveResult | None, "The result of a goal; null while the robot moves.", "number"
+)
+CANCEL = Service("/planning/cancel", NoRequest, NoneType, "Drop all goals: the robot slows down and holds.")
+MOVE_ACTION = Service(
+    "/move_action", MoveRequest, int, "Move to the first goal that can be reached; answers with its number."
+)
+"""Named like MoveIt's action, and so is the next one."""
+EXECUTE = Service(
+    "/execute_trajectory", Execute, int, "Follow a trajectory that begins where the robot is; answers with its number.",
+    limits=RequestLimits(values=100_000),
+)  # fmt: skip
+MOVE_TO_POSE = Service(
+    "/moveit_gateway/move_to_pose", MoveToPose, MoveResult,
+    "Move the tool to a pose; answers when the motion has ended.",
+)  # fmt: skip
+MOVE_TO_CONFIGURATION = Service(
+    "/moveit_gateway/move_to_configuration", MoveToConfiguration, MoveResult,
+    "Move joints to positions; answers when the motion has ended.",
+)  # fmt: skip
 CMD_POSE = "/cmd_pose"
 """geometry_msgs/msg/PoseStamped or Pose: a goal."""
 MOTION_STATUS = "/moveit_gateway/motion_status"
@@ -139,10 +151,10 @@ class PlannerSource(SourceWorker):
         self._asked = len(self._queue)
         self._ends = bool(self._queue)
         self._over = False
-        self._services: dict[str, Callable[[Any], Any]] = {
-            GO_TO: lambda goal: self._submit(goal).number,
+        self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
+            GO_TO: lambda request: self._submit(request.goal).number,
             RESULT: self._result,
-            CANCEL: lambda request: self._inbox.put(None),
+            CANCEL: lambda _: self._inbox.put(None),
             MOVE_ACTION: self._move_action,
             EXECUTE: self._execute,
             MOVE_TO_POSE: self._move_to_pose,
@@ -172,14 +184,14 @@ class PlannerSource(SourceWorker):
         if self._move is not None:
             self._finish(self._move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, "control was reset")
         self._poses.drain()
-        for name, handler in self._services.items():
-            self.session.bus.serve(name, handler)
+        for service, handler in self._services.items():
+            self.session.bus.serve(service, handler)
         self._show("idle")
 
     @override
     def end_mode(self) -> None:
-        for name in self._services:
-            self.session.bus.unserve(name)
+        for service in self._services:
+            self.session.bus.unserve(service)
 
     @override
     def take_goal(self, event: Mapping[str, Any]) -> None:
@@ -243,15 +255,13 @@ class PlannerSource(SourceWorker):
         self._inbox.put(self._known(move))
         return move
 
-    def _move_action(self, request: object) -> int:
-        wanted = requested(MoveRequest, request)
+    def _move_action(self, wanted: MoveRequest) -> int:
         move = self._new(wanted.goal(), wanted.velocity_scaling)
         move.target = attrs.evolve(move.target, acceleration_scaling=wanted.acceleration_scaling)
         return self._submitted(move).number
 
-    def _execute(self, request: object) -> int:
-        trajectory = trajectory_from(request)
-        parsed = Target("trajectory", trajectory=trajectory)
+    def _execute(self, request: Execute) -> int:
+        parsed = Target("trajectory", trajectory=request.trajectory())
         self._plans.check(parsed)
         return self._submitted(_Move(next(self._numbers), parsed)).number
 
@@ -262,32 +272,27 @@ class PlannerSource(SourceWorker):
             self._moves.pop(next(iter(self._moves)))
         return move
 
-    def _result(self, number: int) -> MoveResult | None:
-        if not isinstance(number, int) or number not in self._moves:
-            raise PlanningError(f"no goal {number!r}; {GO_TO} answers with the number of a goal")
-        return self._moves[number].result
+    def _result(self, request: Numbered) -> MoveResult | None:
+        if request.number not in self._moves:
+            raise PlanningError(f"no goal {request.number}; {GO_TO.name} answers with the number of a goal")
+        return self._moves[request.number].result
 
-    def _move_to_pose(self, request: object) -> MoveResult:
-        wanted = requested(MoveToPose, request)
+    def _move_to_pose(self, wanted: MoveToPose) -> MoveResult:
         try:
             goal = _nearest(wanted.target_pose)
         except PlanningError as error:
             return MoveResult(False, str(error), 0.0, "REJECTED", error.code)
         return self._wait(goal, wanted.velocity_scaling)
 
-    def _move_to_configuration(self, request: object) -> MoveResult:
-        given = request.get("target_joint_state") if isinstance(request, Mapping) else None
-        if isinstance(request, Mapping) and isinstance(given, Mapping):  # a goal has no time and no frame
-            request = {**request, "target_joint_state": {"header": {}, **given}}
-        wanted = requested(MoveToConfiguration, request)
-        state: JointState = wanted.target_joint_state
+    def _move_to_configuration(self, wanted: MoveToConfiguration) -> MoveResult:
+        state = wanted.target_joint_state
         return self._wait(JointGoal(state.name, state.position), wanted.velocity_scaling)
 
     def _wait(self, goal: Goal, velocity_scaling: float) -> MoveResult:
         """Submit a goal and wait for its end; an invalid goal is REJECTED."""
         if self.session.request.lockstep and threading.get_ident() == self._worker:
             raise NotSupported(
-                f"this service waits for the motion: in lockstep call it from another thread, or {GO_TO}"
+                f"this service waits for the motion: in lockstep call it from another thread, or {GO_TO.name}"
             )
         try:
             move = self._submit(goal, velocity_scaling or 1.0)

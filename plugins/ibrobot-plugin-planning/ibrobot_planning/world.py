@@ -12,10 +12,8 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector
+from ibrobot_core.api import NoRequest, PlanCode, PlanningError, Pose, Service, Vector
 
-SNAPSHOT = "/world/snapshot"
-"""Service that answers with the `World` of the run."""
 _LARGEST_M = 100.0
 """Sizes above this are most likely millimetres."""
 
@@ -248,6 +246,9 @@ class World:
         return self.objects[name]
 
 
+SNAPSHOT = Service("/world/snapshot", NoRequest, World, "The objects around the robot.")
+
+
 def read_mesh(path: Path, scale: float = 1.0, *, convex: bool = False) -> Mesh:
     """A mesh from a file, e.g. STL, OBJ or PLY.
 
@@ -261,7 +262,11 @@ def read_mesh(path: Path, scale: float = 1.0, *, convex: bool = False) -> Mesh:
     """
     import coal
 
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from error
+    if not found:
         raise ValueError(f"no file {path}")
     if not scale > 0:
         raise ValueError(f"scale is {scale}, must be above 0")

@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, override
 
 import attrs
 import numpy as np
-from ibrobot_kinematics.clearance import CLEARANCE
+from ibrobot_kinematics.clearance import CLEARANCE, Configuration
 
 from ibrobot_core.api import (
     Component,
     Float64MultiArray,
     HardwareDescriptor,
+    PlanCode,
     PlanningError,
     Pose,
     Quaternion,
     Registry,
     RobotConfig,
     SceneObject,
+    Service,
     Session,
     Subscription,
     Vector,
     Vector3,
+    did_you_mean,
+    resolve_path,
 )
-from ibrobot_planning.requests import requested
 from ibrobot_planning.transforms import from_rpy, matrix, pose
 from ibrobot_planning.world import SNAPSHOT, Box, Capsule, Cylinder, Plane, Shape, Sphere, World, WorldObject
 from ibrobot_planning.world_options import Added, Allowed, Attached, Detached, Moved, Named, Touched, WorldOptions
@@ -34,9 +38,16 @@ if TYPE_CHECKING:
     from ibrobot_planning.arm import Arm
     from ibrobot_planning.clearance import Clearance
 
-ATTACH, DETACH, TOUCH = "/world/attach", "/world/detach", "/world/touch"
-"""Services that take `Attached`, `Detached` and `Touched`."""
 SECTION = "world"
+_MESHES = (".stl", ".obj", ".ply")
+_ANSWER = " Answers with the names of all objects."
+ADD = Service("/world/add", Added, list, "Add an object." + _ANSWER)
+REMOVE = Service("/world/remove", Named, list, "Remove an object." + _ANSWER, alone="name")
+MOVE = Service("/world/move", Moved, list, "Put an object elsewhere." + _ANSWER)
+ATTACH = Service("/world/attach", Attached, list, "Let a link carry an object from now on." + _ANSWER)
+DETACH = Service("/world/detach", Detached, list, "Leave an object where it is." + _ANSWER)
+TOUCH = Service("/world/touch", Touched, list, "Let the hand touch objects, until the next call." + _ANSWER)
+ALLOW = Service("/world/allow", Allowed, list, "State what an object may touch." + _ANSWER)
 _STILL = 1e-4
 """Smaller changes of an object's position [m] and axes are no motion."""
 
@@ -85,8 +96,6 @@ def _shape(thing: SceneObject) -> Shape:
 class WorldKeeper(Component):
     """Serves `/world/add`, `remove`, `move`, `attach`, `detach`, `allow` and `touch`; snapshots and clearances.
 
-    Requests are mappings, or the same as YAML.
-
     A change answers with the names of all objects. Planners see a whole world: each change makes a new one. Objects of
     the simulated scene are where the simulation has them now, unless they are attached.
     """
@@ -96,21 +105,22 @@ class WorldKeeper(Component):
         self._world = first_world(options, scene)
         super().__init__("world", f"{len(self._world.objects)} objects for planners", ())
         self._session = session
+        self._meshes = options.meshes
         self._lock = threading.RLock()
         self._arm: Arm | None = None
         self._moving = {thing.name: thing for thing in scene if thing.topic}
         """Objects of the scene that may move."""
         self._poses: dict[str, Subscription] = {}
         self._touched: tuple[str, ...] = ()
-        self._services: dict[str, Callable[[Any], Any]] = {
-            SNAPSHOT: lambda request: self._snapshot(),
-            "/world/add": self._changing(Added, self._add),
-            "/world/remove": self._changing(Named, lambda world, it: world.remove(it.name)),
-            "/world/move": self._changing(Moved, self._move),
-            ATTACH: self._changing(Attached, self._attach),
-            DETACH: self._changing(Detached, self._detach),
-            TOUCH: self._changing(Touched, self._touch),
-            "/world/allow": self._changing(Allowed, lambda world, it: world.allow(it.name, frozenset(it.may_touch))),
+        self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
+            SNAPSHOT: lambda _: self._snapshot(),
+            ADD: self._changing(self._add),
+            REMOVE: self._changing(lambda world, it: world.remove(it.name)),
+            MOVE: self._changing(self._move),
+            ATTACH: self._changing(self._attach),
+            DETACH: self._changing(self._detach),
+            TOUCH: self._changing(self._touch),
+            ALLOW: self._changing(lambda world, it: world.allow(it.name, frozenset(it.may_touch))),
             CLEARANCE: self._distance,
         }
         self._near: tuple[World, Clearance] | None = None
@@ -121,13 +131,13 @@ class WorldKeeper(Component):
             self._poses[topic] = self._session.bus.subscribe(topic, 1)
         if self._session.config.robot.description.mjcf is not None:
             self._robot()  # reading it takes a moment, which the first service call should not wait for
-        for name, handler in self._services.items():
-            self._session.bus.serve(name, handler)
+        for service, handler in self._services.items():
+            self._session.bus.serve(service, handler, self._mesh_file)
 
     @override
     def stop(self) -> None:
-        for name in self._services:
-            self._session.bus.unserve(name)
+        for service in self._services:
+            self._session.bus.unserve(service)
         for subscription in self._poses.values():
             subscription.close()
         self._poses.clear()
@@ -170,9 +180,8 @@ class WorldKeeper(Component):
             others = {key: value for key, value in self._world.objects.items() if key != name}
             self._world = World(others if thing is None else {**others, name: thing})
 
-    def _changing[T](self, kind: type[T], change: Callable[[World, T], World]) -> Callable[[object], list[str]]:
-        def handler(request: object) -> list[str]:
-            wanted = requested(kind, request)
+    def _changing[T](self, change: Callable[[World, T], World]) -> Callable[[T], list[str]]:
+        def handler(wanted: T) -> list[str]:
             with self._lock:
                 try:
                     self._world = change(self._observed(), wanted)
@@ -186,6 +195,21 @@ class WorldKeeper(Component):
         if it.replace and it.name in world.objects:
             world = world.remove(it.name)
         return world.add(it.name, it.object.made())
+
+    def _mesh_file(self, text: str) -> Path:
+        """The file of a mesh that a request names: of a package, or in the folder that the YAML allows.
+
+        Raises:
+            ValueError: for other files, whether they exist or not.
+        """
+        if Path(text).suffix.lower() not in _MESHES:
+            raise ValueError(f"a mesh is a file {', '.join(_MESHES)}, got {text!r}")
+        if text.startswith("package://"):
+            return resolve_path(text, Path())
+        folder = self._meshes.resolve() if self._meshes is not None else None
+        if folder is None or not (path := (folder / text).resolve()).is_relative_to(folder):
+            raise ValueError(f"{text!r}: a request names package://PACKAGE/path, or a mesh in the folder world.meshes")
+        return path
 
     def _move(self, world: World, it: Moved) -> World:
         return world.move(it.name, Pose(Vector3(*it.position), from_rpy(*it.rpy)))
@@ -225,12 +249,17 @@ class WorldKeeper(Component):
         """Present pose of a link, shape (4, 4)."""
         return self._robot().link_pose(link, self._session.measured().position)
 
-    def _distance(self, positions: Mapping[str, float]) -> float:
+    def _distance(self, request: Configuration) -> float:
         """Distance of the arm from the nearest object [m], where joints not given are where they are measured."""
         from ibrobot_planning.clearance import Clearance
 
         q = self._session.measured().position.copy()
-        q[self._session.config.robot.indices(tuple(positions))] = list(positions.values())
+        robot, positions = self._session.config.robot, request.positions
+        for name in positions:
+            if name not in robot.joint_names:
+                known = did_you_mean(name, robot.joint_names, "the joints are")
+                raise PlanningError(f"no joint {name!r}{known}", PlanCode.INVALID_ROBOT_STATE)
+        q[robot.indices(tuple(positions))] = list(positions.values())
         with self._lock:
             world = self._snapshot()
             if self._near is None or self._near[0] != world:

@@ -112,6 +112,7 @@ class WorldOptions:
 
     objects: Mapping[str, ObjectOptions] = option(factory=dict, help="objects by name")
     clouds: Mapping[str, CloudOptions] = option(factory=dict, help="point clouds and depth images by name")
+    meshes: Path | None = option(None, help="folder of meshes that requests to /world/add may name, besides packages'")
     scene: bool = option(False, help="whether a simulation adds the objects of its scene, at their present poses")
 
 

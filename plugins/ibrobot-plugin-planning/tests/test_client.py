@@ -39,7 +39,7 @@ LEFT = [1.0, 0.8, 0.8, 0.5, 0.0]
 @pytest.fixture
 def run(start: Make, tmp_path: Path) -> Callable[..., Runtime]:
     def started(*overrides: str, **asked: Any) -> Runtime:
-        return start(*overrides, text=robot_yaml(tmp_path) + "world: {}\n", **asked)
+        return start(*overrides, text=robot_yaml(tmp_path) + f"world: {{meshes: {tmp_path}}}\n", **asked)
 
     return started
 
@@ -259,7 +259,11 @@ WRONG: list[tuple[Callable[[MoveIt2], Any], type[Exception], str]] = [
     (lambda arm: arm.add_collision_cone("c", 1, 1), NotSupported, "the world has no cones"),
     (lambda arm: arm.add_collision_mesh(None, "m", mesh=1), NotSupported, "takes a file on the robot's machine"),
     (lambda arm: arm.add_collision_mesh("m.stl", "m", scale=(1, 2, 1)), NotSupported, "takes one scale"),
-    (lambda arm: arm.add_collision_mesh("/no.stl", "m", position=(0, 0, 0)), PlanningError, "no file /no.stl"),
+    (
+        lambda arm: arm.add_collision_mesh("/no.stl", "m", position=(0, 0, 0)),
+        PlanningError,
+        "or a mesh in the folder world.meshes",
+    ),
     (lambda arm: arm.add_collision_box("b", (1, 1, 1)), PlanningError, "the object needs a place"),
     (lambda arm: arm.add_collision_box("b", (1, 1, 0), position=(0, 0, 0)), PlanningError, "three lengths above 0"),
     (lambda arm: arm.remove_collision_object("cup"), PlanningError, "no object 'cup'; the objects are: none"),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose
+from ibrobot_planning.requests import GoTo
 from ibrobot_planning.source import (
     CANCEL,
     CMD_POSE,
@@ -21,7 +22,6 @@ from ibrobot_planning.source import (
 )
 
 from ibrobot_core.api import (
-    ConfigError,
     Header,
     JointState,
     NotSupported,
@@ -31,6 +31,7 @@ from ibrobot_core.api import (
     PoseStamped,
     PositionGoal,
     Quaternion,
+    RequestError,
     Runtime,
     String,
     Vector,
@@ -100,7 +101,7 @@ def finish(runtime: Runtime, number: int, commands: list[Vector] | None = None) 
 
 
 def go(runtime: Runtime, goal: Any) -> MoveResult:
-    return finish(runtime, runtime.session.bus.call(GO_TO, goal))
+    return finish(runtime, runtime.session.bus.call(GO_TO, GoTo(goal)))
 
 
 def test_position_with_an_axis_and_the_gripper(run):
@@ -256,8 +257,18 @@ def test_end_of_the_run_ends_a_service_that_waits(run):
             "goal 'xyz=0.2,0,0.1 pan=1': pan moves the tool, and cannot be given beside its position",
         ),
         (RESULT, 99, PlanningError, "no goal 99; /planning/go_to answers with the number of a goal"),
-        (MOVE_TO_POSE, Pose(), PlanningError, "the request must be a MoveToPose, or a mapping or YAML with"),
-        (MOVE_TO_CONFIGURATION, "up", ConfigError, "the request: expected a mapping, got 'up'"),
+        (
+            MOVE_TO_POSE,
+            Pose(),
+            RequestError,
+            "/moveit_gateway/move_to_pose: a Pose is no plain data",
+        ),
+        (
+            MOVE_TO_CONFIGURATION,
+            "up",
+            RequestError,
+            "/moveit_gateway/move_to_configuration: expected a mapping with target_joint_state",
+        ),
         (MOVE_TO_POSE, MoveToPose(Pose()), NotSupported, "this service waits for the motion: "),
     ],
 )

@@ -14,6 +14,8 @@ from click.testing import CliRunner
 from ibrobot_planning import ibrobot_planners
 from ibrobot_planning.client import LocalNode, MoveIt2
 from ibrobot_planning.plan_command import plan
+from ibrobot_planning.requests import GoTo
+from ibrobot_planning.source import GO_TO
 from ibrobot_testing import PlannerSuite
 from ibrobot_testing.site import made_up_site
 
@@ -88,7 +90,7 @@ def test_run_moves_with_it(run: Callable[..., Runtime], mode: str):
     runtime.step()
     bus = runtime.session.bus
     for goal in ("left", "xyz=0.2,0.05,0.1 jaw=0.4", "pan=-0.3"):
-        assert finish(runtime, bus.call("/planning/go_to", goal)).success
+        assert finish(runtime, bus.call(GO_TO, GoTo(goal))).success
     assert runtime.session.state is not None
     assert runtime.session.state.position[0] == pytest.approx(-0.3, abs=0.03)
     result = finish(runtime, bus.call("/planning/go_to", "xyz=2,0,0"))

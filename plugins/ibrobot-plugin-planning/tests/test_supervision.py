@@ -161,8 +161,8 @@ def test_obstacle_that_appears_stops_the_arm_before_it(run):
     runtime = run()
     number = runtime.session.bus.call(GO_TO, "left")
     commands = step(runtime, 15)
-    box = "{shape: box, size: [0.2, 0.02, 0.3], position: [0.09, 0.13, 0.2], rpy: [0, 0, 1.0]}"
-    runtime.session.bus.call("/world/add", f"{{name: crate, object: {box}}}")
+    box = {"shape": "box", "size": [0.2, 0.02, 0.3], "position": [0.09, 0.13, 0.2], "rpy": [0, 0, 1.0]}
+    runtime.session.bus.call("/world/add", {"name": "crate", "object": box})
     result = finish(runtime, number, commands)
     assert (result.outcome, result.code.name) == (
         "EXECUTION_FAILED",
@@ -174,7 +174,7 @@ def test_obstacle_that_appears_stops_the_arm_before_it(run):
     step(runtime, 20, commands)
     np.testing.assert_array_equal(commands[-1], commands[-2])
     assert clearance(runtime) > PADDING
-    runtime.session.bus.call("/world/remove", "{name: crate}")
+    runtime.session.bus.call("/world/remove", {"name": "crate"})
     assert finish(runtime, runtime.session.bus.call(GO_TO, "left"), commands).success
 
 
@@ -182,7 +182,9 @@ def test_obstacle_elsewhere_does_not_stop_the_arm(run):
     runtime = run()
     number = runtime.session.bus.call(GO_TO, "left")
     step(runtime, 25)
-    runtime.session.bus.call("/world/add", "{name: far, object: {shape: sphere, radius: 0.05, position: [0, -0.6, 0]}}")
+    runtime.session.bus.call(
+        "/world/add", {"name": "far", "object": {"shape": "sphere", "radius": 0.05, "position": [0, -0.6, 0]}}
+    )
     assert finish(runtime, number).success
 
 

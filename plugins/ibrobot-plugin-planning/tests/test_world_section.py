@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from typing import override
+from pathlib import Path
+from typing import Any, override
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.rrt import RrtConnectPlanner
 from ibrobot_planning.transforms import matrix
 from ibrobot_planning.world import SNAPSHOT, Box, Capsule, Cylinder, Mesh, Plane, Sphere
-from ibrobot_planning.world_keeper import ATTACH, DETACH, TOUCH, WorldKeeper
+from ibrobot_planning.world_keeper import ADD, ATTACH, DETACH, REMOVE, TOUCH, WorldKeeper
 from ibrobot_planning.world_options import WorldOptions
 from ibrobot_testing import SectionSuite, make_session
 
@@ -24,6 +25,7 @@ from ibrobot_core.api import (
     JointGoal,
     PlanningError,
     PlanRequest,
+    RequestError,
     SteppedClock,
     single_options,
 )
@@ -76,22 +78,22 @@ def test_objects_come_from_the_yaml(run):
 
 def test_services_change_the_world_and_leave_snapshots_alone(run):
     before = run.call(SNAPSHOT, None)
-    names = run.call("/world/add", "{name: post, object: {shape: box, size: [0.1, 0.1, 0.4]}}")
+    names = run.call("/world/add", {"name": "post", "object": {"shape": "box", "size": [0.1, 0.1, 0.4]}})
     assert names == ["table", "can", "ball", "pen", "wall", "post"]
     assert "post" not in before.objects
-    run.call("/world/move", "{name: post, position: [0.2, 0.3, 0.2]}")
+    run.call("/world/move", {"name": "post", "position": [0.2, 0.3, 0.2]})
     assert run.call(SNAPSHOT, None).objects["post"].pose.position.y == 0.3
-    assert "post" not in run.call("/world/remove", "{name: post}")
+    assert "post" not in run.call("/world/remove", {"name": "post"})
 
 
 def test_attached_objects_stay_where_they_are(run):
     before = matrix(run.call(SNAPSHOT, None).objects["ball"].pose)
-    run.call("/world/attach", "{name: ball, link: hand, may_touch: [finger]}")
+    run.call("/world/attach", {"name": "ball", "link": "hand", "may_touch": ["finger"]})
     held = run.call(SNAPSHOT, None).objects["ball"]
     assert (held.link, held.may_touch) == ("hand", {"hand", "finger"})
     # The hand is 0.41 m above the base.
     np.testing.assert_allclose(matrix(held.pose)[:3, 3], [0.1, 0, 0.19], atol=1e-9)
-    run.call("/world/detach", "{name: ball}")
+    run.call("/world/detach", {"name": "ball"})
     put = run.call(SNAPSHOT, None).objects["ball"]
     assert put.link is None
     np.testing.assert_allclose(matrix(put.pose), before, atol=1e-9)
@@ -103,27 +105,35 @@ def test_planners_use_the_world_of_the_run(run, tmp_path):
     planner.load()
     goal = JointGoal(ARM, np.array([0.3, 1.45, 0.0, 0.0, 0.0]))
     planner.plan(PlanRequest(ARM, np.zeros(5), goal))
-    run.call("/world/add", "{name: block, object: {shape: box, size: [0.4, 0.4, 0.1], position: [0.3, 0.1, 0.1]}}")
+    run.call(
+        "/world/add",
+        {"name": "block", "object": {"shape": "box", "size": [0.4, 0.4, 0.1], "position": [0.3, 0.1, 0.1]}},
+    )
     with pytest.raises(PlanningError, match=r"the goal is in collision: \w+ overlaps block"):
         planner.plan(PlanRequest(ARM, np.zeros(5), goal))
 
 
 def test_clearance_is_the_distance_from_the_nearest_object(run):
-    upright = run.call(CLEARANCE, {"pan": 0.0})
+    upright = run.call(CLEARANCE, {"positions": {"pan": 0.0}})
     assert run.call(CLEARANCE, {}) == pytest.approx(upright)
-    run.call("/world/add", "{name: above, object: {shape: box, size: [0.1, 0.1, 0.02], position: [0, 0, 0.5]}}")
+    run.call(
+        "/world/add", {"name": "above", "object": {"shape": "box", "size": [0.1, 0.1, 0.02], "position": [0, 0, 0.5]}}
+    )
     near = run.call(CLEARANCE, {})
     assert 0.02 < near < upright
-    run.call("/world/move", "{name: above, position: [0, 0, 0.49]}")
+    run.call("/world/move", {"name": "above", "position": [0, 0, 0.49]})
     assert run.call(CLEARANCE, {}) == pytest.approx(near - 0.01, abs=1e-6)
-    run.call("/world/move", "{name: above, position: [0, 0, 0.4]}")
+    run.call("/world/move", {"name": "above", "position": [0, 0, 0.4]})
     assert run.call(CLEARANCE, {}) < 0
-    assert run.call(CLEARANCE, {"lift": 1.5}) > 0
+    assert run.call(CLEARANCE, {"positions": {"lift": 1.5}}) > 0
 
 
 def test_carried_objects_count_as_the_arm(run):
-    run.call("/world/attach", "{name: ball, link: hand, may_touch: [hand, finger]}")
-    run.call("/world/add", "{name: beside, object: {shape: box, size: [0.02, 0.1, 0.1], position: [0.14, 0, 0.6]}}")
+    run.call("/world/attach", {"name": "ball", "link": "hand", "may_touch": ["hand", "finger"]})
+    run.call(
+        "/world/add",
+        {"name": "beside", "object": {"shape": "box", "size": [0.02, 0.1, 0.1], "position": [0.14, 0, 0.6]}},
+    )
     assert run.call(CLEARANCE, {}) == pytest.approx(0.01)
 
 
@@ -200,27 +210,27 @@ def test_objects_of_the_simulated_scene_are_where_the_simulation_has_them(make, 
 def test_attached_object_of_the_scene_moves_with_the_hand(make, tmp_path):
     runtime = scene_run(make, tmp_path)
     bus = runtime.session.bus
-    bus.call(ATTACH, "{name: cube}")
+    bus.call(ATTACH, {"name": "cube"})
     held = bus.call(SNAPSHOT, None).objects["cube"]
     assert (held.link, held.may_touch) == ("hand", {"hand", "finger"}), "the hand is what the tool's last joint carries"
     bus.publish(POSES, Float64MultiArray(np.array([0.1, 0.2, 0.3, 1, 0, 0, 0] * 2)))
     assert bus.call(SNAPSHOT, None).objects["cube"] == held
-    bus.call(DETACH, "{name: cube}")
+    bus.call(DETACH, {"name": "cube"})
     bus.publish(POSES, Float64MultiArray(np.array([0.1, 0.2, 0.3, 1, 0, 0, 0] * 2)))
     assert at(bus.call(SNAPSHOT, None), "cube") == (0.1, 0.2, 0.3)
 
 
 def test_hand_and_what_it_carries_may_touch_named_objects(make, tmp_path):
     bus = scene_run(make, tmp_path).session.bus
-    bus.call(ATTACH, "{name: cube}")
-    bus.call(TOUCH, "{objects: [can]}")
+    bus.call(ATTACH, {"name": "cube"})
+    bus.call(TOUCH, {"objects": ["can"]})
     objects = bus.call(SNAPSHOT, None).objects
     assert objects["can"].may_touch == {"hand", "finger", "cube"}
     assert objects["table"].may_touch == frozenset()
-    bus.call(TOUCH, "{}")
+    bus.call(TOUCH, {})
     assert bus.call(SNAPSHOT, None).objects["can"].may_touch == frozenset()
     with pytest.raises(PlanningError, match="no object 'cup'"):
-        bus.call(TOUCH, "{objects: [cup]}")
+        bus.call(TOUCH, {"objects": ["cup"]})
 
 
 def test_name_in_the_yaml_and_in_the_scene_is_refused(make, tmp_path):
@@ -235,15 +245,65 @@ def test_scene_is_left_out_unless_asked_for(make, tmp_path):
     assert set(runtime.session.bus.call(SNAPSHOT, None).objects) == {"can"}
 
 
+IMPOSSIBLE = (
+    (ADD, {"name": "can", "object": {"shape": "plane"}}, PlanningError, "there is an object 'can' already"),
+    (ADD, {"name": "cup", "object": {"shape": "box", "size": [600, 1, 1]}}, PlanningError, "at most 100 m"),
+    (ADD, {"name": "cup"}, RequestError, "/world/add: object: required key is missing"),
+    (ADD, "{name: cup}", RequestError, "expected a mapping with name, object, replace, got '{name: cup}'"),
+    (REMOVE, "cup", PlanningError, "no object 'cup'; the objects are: table, can"),
+    (ATTACH, {"name": "can", "link": "foot"}, PlanningError, "no link 'foot'; the links are: world, base"),
+    (DETACH, {"name": "can"}, PlanningError, "object 'can' is not attached"),
+    (CLEARANCE, {"positions": {"pam": 1.0}}, PlanningError, "no joint 'pam', did you mean 'pan'"),
+    (CLEARANCE, {"positions": [1.0]}, RequestError, "positions: expected a mapping, got a list"),
+    (CLEARANCE, [1.0], RequestError, "expected a mapping with positions, got a list"),
+)  # fmt: skip
+
+
 def test_impossible_requests_are_refused(run):
-    for service, text, error, message in (
-        ("/world/add", "{name: can, object: {shape: plane}}", PlanningError, "there is an object 'can' already"),
-        ("/world/add", "{name: cup, object: {shape: box, size: [600, 1, 1]}}", PlanningError, "at most 100 m"),
-        ("/world/add", "{name: cup}", ConfigError, "required key is missing"),
-        ("/world/remove", "{name: cup}", PlanningError, "no object 'cup'; the objects are: table, can"),
-        ("/world/attach", "{name: can, link: foot}", PlanningError, "no link 'foot'; the links are: world, base"),
-        ("/world/detach", "{name: can}", PlanningError, "object 'can' is not attached"),
-    ):
+    for service, request, error, message in IMPOSSIBLE:
         with pytest.raises(error, match=message):
-            run.call(service, text)
+            run.call(service, request)
     assert len(run.call(SNAPSHOT, None).objects) == 5
+
+
+def mesh(file: str) -> dict[str, Any]:
+    return {"name": "part", "object": {"shape": "mesh", "file": file}}
+
+
+FILES = {
+    "absolute": "/etc/part.stl", "outside of the folder": "../part.stl", "of the home": "~/part.stl",
+    "outside of a package": "package://ibrobot_planning/../part.stl", "no mesh": "/etc/passwd",
+    "of the environment": "${HOME}/part.stl", "long": "a" * 300 + ".stl",
+    "long, in a package": "package://ibrobot_planning/" + "a" * 300 + ".stl",
+}  # fmt: skip
+"""Files that a request cannot name, whether they exist or not."""
+
+
+@pytest.mark.parametrize("file", FILES.values(), ids=FILES)
+def test_requests_name_no_file_of_the_machine(run, file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "part.stl").write_text(STL)
+    with pytest.raises(RequestError, match="file") as refused:
+        run.call(ADD, mesh(file))
+    assert str(tmp_path) not in str(refused.value)
+
+
+def test_requests_name_meshes_of_packages_and_of_the_folder_that_the_yaml_allows(tmp_path: Path):
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    (folder / "part.stl").write_text(STL)
+    (tmp_path / "secret.stl").write_text(STL)
+    (folder / "link.stl").symlink_to(tmp_path / "secret.stl")
+    session = make_session()
+    keeper = WorldKeeper(options(f"meshes: {folder}"), session)
+    keeper.start()
+    try:
+        for file in ("part.stl", str(folder / "part.stl")):
+            assert session.bus.call(ADD, mesh(file) | {"replace": True}) == ["part"]
+        for file in ("../secret.stl", str(tmp_path / "secret.stl"), "link.stl"):
+            with pytest.raises(RequestError, match=r"or a mesh in the folder world\.meshes"):
+                session.bus.call(ADD, mesh(file))
+        with pytest.raises(RequestError, match=r"the Python package 'ibrobot_planning' has no file 'part\.stl'"):
+            session.bus.call(ADD, mesh("package://ibrobot_planning/part.stl"))
+    finally:
+        keeper.stop()

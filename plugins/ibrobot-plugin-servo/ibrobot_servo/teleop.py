@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from typing import Any, override
+from typing import override
 
 import numpy as np
 from ibrobot_kinematics import KinematicsError, Servo, ServoStatus, robot_model, world_clearance
@@ -18,6 +17,7 @@ from ibrobot_core.api import (
     KeyValue,
     Message,
     Received,
+    Service,
     Subscription,
     Teleop,
     TeleopCommand,
@@ -26,7 +26,6 @@ from ibrobot_core.api import (
     Vector,
     Vector3,
     ns,
-    single_options,
 )
 from ibrobot_servo.options import TwistOptions
 
@@ -78,7 +77,7 @@ class TwistTeleop(Teleop):
         # Devices may share a topic; one of them serves it.
         self._serves = not ctx.bus.serves(self._options.topic)
         if self._serves:
-            ctx.bus.serve(self._options.topic, self._asked)
+            ctx.bus.serve(twist_service(self._options.topic), self._asked)
         self._fresh = True
 
     @override
@@ -122,15 +121,8 @@ class TwistTeleop(Teleop):
         frames = f"{options.frame} or {self._ctx.robot.description.tip}"
         return f"publish geometry_msgs/msg/TwistStamped on {options.topic}, its frame_id {frames}"
 
-    def _asked(self, request: Any) -> int:
-        """Publish the twist of a service call; answers with the newest status.
-
-        Raises:
-            ConfigError: for wrong keys and values.
-        """
-        if not isinstance(request, TwistStamped):
-            text = request if isinstance(request, str) else json.dumps(request)
-            request = single_options(TwistStamped, (), "the twist", text=text)
+    def _asked(self, request: TwistStamped) -> int:
+        """Publish the twist of a service call; answers with the newest status."""
         assert self._ctx.bus is not None
         self._ctx.bus.publish(self._options.topic, request)
         return int(self._published[0]) if self._published is not None else int(ServoStatus.NO_WARNING)
@@ -180,6 +172,11 @@ class TwistTeleop(Teleop):
         self._published = servo.status, now_ns
         if self._ctx.bus is not None:
             self._ctx.bus.publish(self._options.status_topic, Int8(int(servo.status)))
+
+
+def twist_service(topic: str) -> Service[TwistStamped, int]:
+    """The service of a topic of twists: moves the tool, and answers with the newest `ServoStatus`."""
+    return Service(topic, TwistStamped, int, "Move the tool along a twist; answers with the newest status.")
 
 
 def _array(vector: Vector3) -> Vector:

@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_kinematics import KinematicModel, ServoStatus, robot_model
-from ibrobot_kinematics.clearance import CLEARANCE
+from ibrobot_kinematics.clearance import CLEARANCE, Configuration
 from ibrobot_servo import ibrobot_sections, ibrobot_teleop
 from ibrobot_servo.options import TwistOptions
 from ibrobot_servo.teleop import TwistTeleop
@@ -17,7 +17,6 @@ from ibrobot_testing import TeleopSuite, host_context, make_robot
 
 from ibrobot_core.api import (
     Bool,
-    ConfigError,
     Context,
     Description,
     DiagnosticArray,
@@ -26,6 +25,7 @@ from ibrobot_core.api import (
     Joint,
     JointReading,
     Message,
+    RequestError,
     Robot,
     Teleop,
     TeleopError,
@@ -231,7 +231,7 @@ def test_service_of_the_topic_takes_twists_and_answers_with_the_status(model):
     rig.bus.call(TOPIC, twist((np.nan, 0, 0)))
     rig.tick()
     assert rig.bus.call(TOPIC, asked) == ServoStatus.INVALID
-    with pytest.raises(ConfigError, match=r"twist\.linear\.w: unknown key"):
+    with pytest.raises(RequestError, match=r"twist\.linear\.w: unknown key"):
         rig.bus.call(TOPIC, {"twist": {"linear": {"w": 0.1}}})
     other = TwistTeleop(TwistOptions(), rig.ctx)
     other.connect()
@@ -337,8 +337,8 @@ def test_tool_slows_down_and_stands_before_obstacles(model: Path):
     rig = Rig(model)
     ceiling = rig.tool()[2] + 0.04
 
-    def distance(positions: dict[str, float]) -> float:
-        return float(ceiling - rig.kinematics.forward(np.array([*positions.values(), 0.0])).position[2])
+    def distance(request: Configuration) -> float:
+        return float(ceiling - rig.kinematics.forward(np.array([*request.positions.values(), 0.0])).position[2])
 
     rig.bus.serve(CLEARANCE, distance)
     up = rig.follow(twist((0.0, 0.0, 0.2)), seconds=2.0)

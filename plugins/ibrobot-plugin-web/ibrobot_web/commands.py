@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from ibrobot_core.api import IbrobotError, PlanningError, Session, error_text, seconds
-from ibrobot_web.teleop import JOG, Jog
+from ibrobot_web.teleop import JOG, RELEASE, Jog
 
 Reply = Callable[[Mapping[str, Any]], None]
 Handler = Callable[[Session, Mapping[str, Any]], Any]
@@ -82,8 +82,8 @@ def _jog(session: Session, message: Mapping[str, Any]) -> None:
 
 
 def _release(session: Session, message: Mapping[str, Any]) -> None:
-    if session.bus.serves(JOG):
-        session.bus.call(JOG, None)
+    if session.bus.serves(RELEASE):
+        session.bus.call(RELEASE)
 
 
 def _joints_of(session: Session, pose: str) -> dict[str, float]:

@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from types import NoneType
 from typing import Any, override
 
 import attrs
 import numpy as np
 from ibrobot_kinematics import JogArm, JogMotion, VelocityJog
 
-from ibrobot_core.api import Context, JointReading, Teleop, TeleopCommand, TeleopError, Vector, ns, seconds
+from ibrobot_core.api import (
+    Context,
+    JointReading,
+    NoRequest,
+    Service,
+    Teleop,
+    TeleopCommand,
+    TeleopError,
+    Vector,
+    ns,
+    seconds,
+)
 from ibrobot_web.options import WebTeleopOptions
 
-JOG = "/web_teleop/jog"
-"""Service: a `Jog` moves the robot until the next one, or for the timeout; None releases the deadman."""
 _LONGEST_STEP_S = 0.1
 """Longest motion of one command [s], so that the robot does not jump after a pause of the host."""
 
@@ -76,6 +86,10 @@ def _number(value: Any) -> float:
     return float(value)
 
 
+JOG = Service("/web_teleop/jog", Jog, NoneType, "Move the robot until the next call, or for the timeout.")
+RELEASE = Service("/web_teleop/release", NoRequest, NoneType, "Release the deadman.")
+
+
 class WebTeleop(Teleop):
     """Moves as the newest `Jog` says, for at most `timeout` after its arrival.
 
@@ -111,6 +125,7 @@ class WebTeleop(Teleop):
         if self._tool:
             self._arm.load_model("robot.description.mjcf")
         self._ctx.bus.serve(JOG, self.take)
+        self._ctx.bus.serve(RELEASE, lambda _: self.take(None))
         self._connected = True
 
     def take(self, request: Jog | None) -> None:
@@ -162,6 +177,7 @@ class WebTeleop(Teleop):
     def disconnect(self) -> None:
         if self._connected and self._ctx.bus is not None:
             self._ctx.bus.unserve(JOG)
+            self._ctx.bus.unserve(RELEASE)
         self._connected = False
         self._request = self._moved_ns = self._setpoint = None
 

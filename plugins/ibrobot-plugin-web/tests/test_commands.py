@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import pytest
-from ibrobot_testing import make_session
+from ibrobot_testing import make_session, stand_in
 from ibrobot_web.commands import Commands
 
 from ibrobot_core.api import IbrobotError
@@ -33,7 +33,7 @@ def answers(commands: Mapping[str, Any], *messages: Mapping[str, Any]) -> list[M
     session = make_session()
     for name, handler in commands.items():
         session.bus.unserve(name)
-        session.bus.serve(name, handler)
+        session.bus.serve(stand_in(name), handler)
     replies: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
     carried_out = Commands(session, replies.put)
     try:

@@ -16,7 +16,7 @@ import simplejpeg
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_ros2.jpeg import to_jpeg
-from ibrobot_testing import make_session
+from ibrobot_testing import make_session, stand_in
 from ibrobot_web.link import JPEG, PICTURE_HEAD, FrameSender, receive_frame
 from ibrobot_web.objects import SceneObjects
 from ibrobot_web.pictures import as_jpeg, to_payload
@@ -174,7 +174,7 @@ def test_objects_around_the_robot_are_shown_where_they_are() -> None:
 
     session = make_session()
     objects = {"crate": thing(Box((0.2, 0.4, 0.6))), "floor": thing(Plane()), "held": thing(Box((1, 1, 1)), "gripper")}
-    session.bus.serve("/world/snapshot", lambda request: SimpleNamespace(objects=objects))
+    session.bus.serve(stand_in("/world/snapshot"), lambda request: SimpleNamespace(objects=objects))
     (crate,) = SceneObjects(session).json()
     shape = {"type": "box", "size": [0.1, 0.2, 0.3], "pos": [1, 2, 3], "quat": [1, 0, 0, 0]}
     assert crate == {"name": "crate", **shape}

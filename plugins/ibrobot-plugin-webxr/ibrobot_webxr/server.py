@@ -18,7 +18,7 @@ from typing import Any
 import attrs
 from aiohttp import WSMsgType, web
 
-from ibrobot_core.api import Bus, Clock, RobotStatus, TeleopError, error_text
+from ibrobot_core.api import ESTOP, Bus, Clock, RobotStatus, TeleopError, error_text
 from ibrobot_webxr.certificate import CERTIFICATE, own_folder, server_names, tls_context
 from ibrobot_webxr.exchange import Delays, Exchange
 from ibrobot_webxr.guard import Guard, Refused, Request
@@ -43,7 +43,6 @@ _HANDSHAKE_S = 5.0
 _MOST_PAGES = 8
 _MOST_REFUSED = 100
 """Wrong messages after which a page is disconnected."""
-_ESTOP = "/estop"
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -298,9 +297,9 @@ class PageServer:
         """Stop the robot, in any mode."""
         self.exchange.stop()
         bus = self._bus
-        if bus is not None and bus.serves(_ESTOP):
+        if bus is not None and bus.serves(ESTOP):
             try:
-                await self._loop.run_in_executor(None, bus.call, _ESTOP, None)
+                await self._loop.run_in_executor(None, lambda: bus.call(ESTOP))
             except Exception as error:  # noqa: BLE001 - contained: the device in `read` stops the robot, too
                 self._log.error("webxr: the emergency stop failed: %s", error_text(error))
 

@@ -22,11 +22,13 @@ from ibrobot_webxr.server import PageServer
 from ibrobot_webxr.teleop import WebxrTeleop
 
 from ibrobot_core.api import (
+    ESTOP,
     Bool,
     Context,
     Header,
     Image,
     JointReading,
+    NoRequest,
     RealClock,
     RobotStatus,
     SteppedClock,
@@ -270,11 +272,11 @@ def test_a_page_that_opens_while_the_host_pauses_keeps_control(
 def test_the_stop_reaches_the_run_in_any_mode(ctx: Context, page: PageServer, browser: Browser):
     assert ctx.bus is not None
     stopped: list[object] = []
-    ctx.bus.serve("/estop", stopped.append)
+    ctx.bus.serve(ESTOP, stopped.append)
     browser.log_in().connect()
     browser.send({"type": "stop"})
     browser.state()
-    assert stopped == [None]
+    assert stopped == [NoRequest()]
 
 
 def test_buttons_reach_the_run(ctx: Context, teleop: WebxrTeleop, browser: Browser):

@@ -20,6 +20,7 @@ from ibrobot_testing.policy import PolicySuite
 from ibrobot_testing.recorder import RecorderSuite
 from ibrobot_testing.section import SectionSuite, make_session
 from ibrobot_testing.sensor import SensorSuite
+from ibrobot_testing.service import stand_in
 from ibrobot_testing.suite import Suite, checks, failed_checks, run_checks
 from ibrobot_testing.teleop import TeleopSuite
 from ibrobot_testing.transport import TransportSuite
@@ -50,4 +51,5 @@ __all__ = [
     "make_robot",
     "make_session",
     "run_checks",
+    "stand_in",
 ]

@@ -7,7 +7,9 @@ from typing import override
 import pytest
 from ibrobot_testing import SectionSuite, checks, failed_checks
 
-from ibrobot_core.api import CONTROL, Int32, SessionWorker
+from ibrobot_core.api import CONTROL, Int32, NoRequest, Service, SessionWorker
+
+RESET_COUNT = Service("/reset_count", NoRequest, str, "Count from 0 again.")
 
 
 class Counter(SessionWorker):
@@ -18,7 +20,7 @@ class Counter(SessionWorker):
     @override
     def setup(self):
         self.states = self.session.bus.subscribe("/joint_states", 1)
-        self.session.bus.serve("/reset_count", self.reset)
+        self.session.bus.serve(RESET_COUNT, self.reset)
 
     @override
     def work(self, timeout_s):
@@ -28,7 +30,7 @@ class Counter(SessionWorker):
 
     @override
     def teardown(self):
-        self.session.bus.unserve("/reset_count")
+        self.session.bus.unserve(RESET_COUNT)
         self.states.close()
 
     def reset(self, request):
@@ -61,7 +63,7 @@ class ServesForEver(Counter):
 
 class ListensForEver(Counter):
     def teardown(self):
-        self.session.bus.unserve("/reset_count")
+        self.session.bus.unserve(RESET_COUNT)
 
 
 WRONG = {

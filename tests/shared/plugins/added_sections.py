@@ -6,7 +6,19 @@ from typing import override
 
 import attrs
 
-from ibrobot_core.api import CONTROL, Int32, SectionDescriptor, SessionWorker, String, hookimpl, option
+from ibrobot_core.api import (
+    CONTROL,
+    Int32,
+    NoRequest,
+    SectionDescriptor,
+    Service,
+    SessionWorker,
+    String,
+    hookimpl,
+    option,
+)
+
+RESET_COUNT = Service("/reset_count", NoRequest, str, "Count from 0 again.")
 
 
 @attrs.frozen
@@ -28,7 +40,7 @@ class Counter(SessionWorker):
     @override
     def setup(self):
         self._states = self.session.bus.subscribe("/joint_states", 1)
-        self.session.bus.serve("/reset_count", self._reset)
+        self.session.bus.serve(RESET_COUNT, self._reset)
 
     @override
     def work(self, timeout_s):
@@ -38,7 +50,7 @@ class Counter(SessionWorker):
 
     @override
     def teardown(self):
-        self.session.bus.unserve("/reset_count")
+        self.session.bus.unserve(RESET_COUNT)
         self._states.close()
 
     def _reset(self, request):

@@ -63,6 +63,8 @@ class CollisionObjects:
     ) -> None:  # fmt: skip
         """Add a mesh of a file on the robot's machine, or replace an object.
 
+        The file is `package://PACKAGE/path`, or lies in the folder `world.meshes` of the robot YAML.
+
         Raises:
             NotSupported: for `mesh`, and for a scale that differs along the axes.
         """
@@ -71,7 +73,7 @@ class CollisionObjects:
         scales = {float(scale)} if isinstance(scale, int | float) else {float(each) for each in scale}
         if len(scales) != 1:
             raise NotSupported("add_collision_mesh takes one scale for all axes")
-        shape = {"shape": "mesh", "file": str(Path(filepath).absolute()), "scale": scales.pop()}
+        shape = {"shape": "mesh", "file": str(filepath), "scale": scales.pop()}
         self._add(id, shape, pose, position, quat_xyzw, frame_id)
 
     def add_collision_primitive(

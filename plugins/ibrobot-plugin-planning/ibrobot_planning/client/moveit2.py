@@ -27,7 +27,7 @@ from ibrobot_planning.client.motion import (
     positions_of,
 )
 from ibrobot_planning.client.node import BaseNode
-from ibrobot_planning.requests import trajectory_from
+from ibrobot_planning.source import EXECUTE
 
 __all__ = ["MoveIt2", "MoveIt2State", "MoveItErrorCodes"]
 
@@ -404,7 +404,7 @@ class MoveIt2(CollisionObjects):
         return self._trajectory(self._node.call("/compute_cartesian_path", request))
 
     def _trajectory(self, answer: Mapping[str, Any]) -> JointTrajectory | None:
-        return None if self._failed(answer) else trajectory_from(answer["trajectory"])
+        return None if self._failed(answer) else EXECUTE.read(answer["trajectory"]).trajectory()
 
     def _follow(self, trajectory: JointTrajectory | None) -> None:
         if trajectory is not None:

@@ -24,6 +24,7 @@ from ibrobot_core.api import (
     run_overrides,
     run_robot,
 )
+from ibrobot_planning.requests import Numbered
 from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
 from ibrobot_planning.tasks.reading import TaskFile, find_task, read_task
 from ibrobot_planning.tasks.result import TaskResult
@@ -133,7 +134,7 @@ class TaskHooks(RunHooks):
                 session.outcome.goals_failed -= 1
             except IbrobotError as error:
                 session.fail("task", error)
-        elif (result := session.bus.call(RESULT, self._number)) is not None:
+        elif (result := session.bus.call(RESULT, Numbered(self._number))) is not None:
             self._result = result
             session.finish()
 

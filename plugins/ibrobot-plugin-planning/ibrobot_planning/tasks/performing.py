@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -16,6 +15,7 @@ from ibrobot_core.api import (
     Image,
     PlanningError,
     Session,
+    SetMode,
     Vector,
     ns,
     seconds,
@@ -24,7 +24,7 @@ from ibrobot_planning.executors.options import GripperOptions
 from ibrobot_planning.goal_text import Target
 from ibrobot_planning.motion import MoveResult
 from ibrobot_planning.planning_services import PLAN_GOAL
-from ibrobot_planning.requests import PlanAhead, PlanAnswer
+from ibrobot_planning.requests import GoTo, Numbered, PlanAhead, PlanAnswer
 from ibrobot_planning.source import CANCEL as CANCEL_MOTION
 from ibrobot_planning.source import GO_TO
 from ibrobot_planning.source import RESULT as MOTION_RESULT
@@ -44,6 +44,7 @@ from ibrobot_planning.tasks.goals import move_target
 from ibrobot_planning.tasks.result import StepOutcome, StepResult
 from ibrobot_planning.world import SNAPSHOT, World
 from ibrobot_planning.world_keeper import ATTACH, DETACH, TOUCH
+from ibrobot_planning.world_options import Attached, Detached, Touched
 
 BEGIN_EPISODE, END_EPISODE = "/record_episode/start", "/record_episode/stop"
 """Services of a run that records: take a prompt, and an outcome."""
@@ -169,7 +170,7 @@ class Performance:
     def _world(self) -> World:
         if not self._session.bus.serves(SNAPSHOT):
             return World()
-        world = self._session.bus.call(SNAPSHOT, None)
+        world = self._session.bus.call(SNAPSHOT)
         assert isinstance(world, World)
         return world
 
@@ -180,7 +181,7 @@ class Performance:
 
     def _enter(self, mode: str) -> None:
         if self._session.mode != mode:
-            self._session.bus.call(SET_MODE, mode)
+            self._session.bus.call(SET_MODE, SetMode(mode))
 
     # Steps.
 
@@ -244,25 +245,25 @@ class Performance:
         """Let the hand touch what a step names."""
         bus = self._session.bus
         if step.touch:
-            bus.call(TOUCH, f"{{objects: {json.dumps(step.touch)}}}")
+            bus.call(TOUCH, Touched(tuple(step.touch)))
         try:
             yield
         finally:
             if step.touch:
-                bus.call(TOUCH, "{}")
+                bus.call(TOUCH)
 
     def _go(self, target: Target) -> Generator[None, None, MoveResult]:
         """Move to a goal in the planning mode, and wait for the end."""
         bus = self._session.bus
         self._enter(self.checked.mode.name)
-        number = bus.call(GO_TO, target)
+        number = bus.call(GO_TO, GoTo(target))
         try:
-            while (result := bus.call(MOTION_RESULT, number)) is None:
+            while (result := bus.call(MOTION_RESULT, Numbered(number))) is None:
                 yield from self._tick()
         except Cancelled:
             if bus.serves(CANCEL_MOTION):  # otherwise the end of the mode stops the robot
-                bus.call(CANCEL_MOTION, None)
-            while bus.serves(MOTION_RESULT) and bus.call(MOTION_RESULT, number) is None:
+                bus.call(CANCEL_MOTION)
+            while bus.serves(MOTION_RESULT) and bus.call(MOTION_RESULT, Numbered(number)) is None:
                 yield
             raise
         assert isinstance(result, MoveResult)
@@ -291,7 +292,7 @@ class Performance:
         joint = executor.joints[0]
         target = Target(f"{joint}={step.position:g}", None, {joint: step.position})
         if step.release is not None:
-            session.bus.call(DETACH, f"{{name: {json.dumps(step.release)}}}")
+            session.bus.call(DETACH, Detached(step.release))
             self._held = None
         yield from self._go(target)
         position = float(session.measured().position[session.config.robot.joint_names.index(joint)])
@@ -302,7 +303,7 @@ class Performance:
                 raise StepFailed(
                     f"nothing stopped the gripper on its way to {step.position:g} rad: no {step.grasp!r} there"
                 )
-            session.bus.call(ATTACH, f"{{name: {json.dumps(step.grasp)}}}")
+            session.bus.call(ATTACH, Attached(step.grasp))
             self._held = step.grasp
         return {"position_rad": round(position, 4)}
 

@@ -7,11 +7,25 @@ import json
 import queue
 import threading
 from collections.abc import Callable
+from types import NoneType
 from typing import Any, override
 
 import attrs
 
-from ibrobot_core.api import CONTROL, PlanningError, Session, SessionWorker, String, seconds
+from ibrobot_core.api import (
+    CONTROL,
+    NoRequest,
+    PlanningError,
+    RequestLimits,
+    Service,
+    Session,
+    SessionWorker,
+    String,
+    documented,
+    option,
+    seconds,
+)
+from ibrobot_planning.requests import Numbered
 from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
 from ibrobot_planning.tasks.format import Step
 from ibrobot_planning.tasks.performing import Performance
@@ -20,14 +34,22 @@ from ibrobot_planning.tasks.result import TaskResult
 from ibrobot_planning.world import SNAPSHOT
 from ibrobot_planning.world_keeper import SECTION, scene_objects
 
-RUN = "/task/run"
-"""Takes a task as YAML; checks all of it, begins, and answers with its number."""
-CHECK = "/task/check"
-"""Takes a task as YAML, and raises what `/task/run` would."""
-RESULT = "/task/result"
-"""Number of a task -> its `TaskResult`; None until it has ended."""
-CANCEL = "/task/cancel"
-"""Ends the present task: the robot slows down and holds."""
+
+@documented
+@attrs.frozen
+class RunTask:
+    """A request to `/task/run` and `/task/check`."""
+
+    task: str = option(help="the YAML of a task; it cannot read the environment")
+
+
+_LIMITS = RequestLimits(text=100_000)
+RUN = Service("/task/run", RunTask, int, "Check a task and begin it; answers with its number.", "task", _LIMITS)
+CHECK = Service("/task/check", RunTask, NoneType, "Check a task; fails as /task/run would.", "task", _LIMITS)
+RESULT: Service[Numbered, TaskResult | None] = Service(
+    "/task/result", Numbered, TaskResult | None, "The result of a task; null until it has ended.", "number"
+)
+CANCEL = Service("/task/cancel", NoRequest, NoneType, "End the present task: the robot slows down and holds.")
 STATUS = "/task/status"
 """std_msgs/msg/String, latched: JSON with `task`, `step`, `steps`, `kind`, `name` and `state`."""
 _POLL_S = 0.01
@@ -35,6 +57,10 @@ _KEPT = 100
 """Number of results kept for `RESULT`."""
 _STOP_S = 3.0
 """Longest wait for the robot to slow down at the end of a run [s]."""
+
+
+def _read(request: RunTask) -> TaskFile:
+    return read_task(request.task, "the request")
 
 
 @attrs.frozen(eq=False)
@@ -50,28 +76,28 @@ class TaskRunner(SessionWorker):
 
     def __init__(self, session: Session) -> None:
         world = (SECTION,) if SECTION in session.config.plugin_sections else ()
-        super().__init__(session, "tasks", f"performs tasks: {RUN}", (CONTROL, *world))
+        super().__init__(session, "tasks", f"performs tasks: {RUN.name}", (CONTROL, *world))
         self._numbers = itertools.count(1)
         self._running: _Running | None = None
         self._results: dict[int, TaskResult | None] = {}
         self._lock = threading.Lock()
         self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
-        self._services: dict[str, Callable[[Any], Any]] = {
-            RUN: lambda text: self.run(read_task(text, "the request")),
-            CHECK: lambda text: self._checked(read_task(text, "the request")) and None,
-            RESULT: self.result,
-            CANCEL: lambda request: self.cancel("cancelled"),
+        self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
+            RUN: lambda request: self.run(_read(request)),
+            CHECK: lambda request: self._checked(_read(request)) and None,
+            RESULT: lambda request: self.result(request.number),
+            CANCEL: lambda _: self.cancel("cancelled"),
         }
 
     @override
     def setup(self) -> None:
-        for name, handler in self._services.items():
-            self.session.bus.serve(name, handler)
+        for service, handler in self._services.items():
+            self.session.bus.serve(service, handler)
 
     @override
     def teardown(self) -> None:
-        for name in self._services:
-            self.session.bus.unserve(name)
+        for service in self._services:
+            self.session.bus.unserve(service)
         self._end_early()
         super().teardown()
 
@@ -85,7 +111,7 @@ class TaskRunner(SessionWorker):
         checked = self._checked(file)
         with self._lock:
             if self._running is not None:
-                raise PlanningError(f"task {self._running.number} is running; {CANCEL} ends it")
+                raise PlanningError(f"task {self._running.number} is running; {CANCEL.name} ends it")
             number = next(self._numbers)
             performance = Performance(self.session, checked, lambda step: self._show(number, performance, step))
             running = _Running(number, performance)
@@ -138,7 +164,7 @@ class TaskRunner(SessionWorker):
             why = "the robot YAML has no section `recording`"
         elif not session.request.by_operator:
             why = "this run records its episodes itself; `ibrobot task run` leaves that to the task"
-        world = session.bus.call(SNAPSHOT, None) if session.bus.serves(SNAPSHOT) else None
+        world = session.bus.call(SNAPSHOT) if session.bus.serves(SNAPSHOT) else None
         movable = [thing.name for thing in scene if thing.topic]
         start = session.state.command if session.state is not None else None
         return check_task(file, Circumstances(config, session.registry, world, movable, start, why))
@@ -149,8 +175,8 @@ class TaskRunner(SessionWorker):
         Raises:
             PlanningError: for an unknown number.
         """
-        if not isinstance(number, int) or number not in self._results:
-            raise PlanningError(f"no task {number!r}; {RUN} answers with the number of a task")
+        if number not in self._results:
+            raise PlanningError(f"no task {number}; {RUN.name} answers with the number of a task")
         return self._results[number]
 
     def _finish(self, running: _Running) -> None:

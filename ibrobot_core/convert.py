@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
@@ -12,9 +12,10 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.config.expand import resolve_path
-from ibrobot_core.config.yaml_nodes import Key
 from ibrobot_core.options import did_you_mean, fields
+
+Key = tuple[str | int, ...]
+"""The path of a value in a document: mapping keys and list indices from the root."""
 
 _SHOWN = 200
 """Maximum length of a value in a message, in characters."""
@@ -85,8 +86,13 @@ def _wrong(expected: str, value: Any, remark: str = "") -> ValueError:
 def _scalar(value: Any, kind: type) -> Any:
     taken, expected = _SCALARS[kind]
     fits = isinstance(value, taken) and (kind is bool or not isinstance(value, bool))
+    if fits and kind is float:
+        try:
+            return float(value)
+        except OverflowError:
+            raise ValueError(f"{shown(value)} is too large") from None
     if fits:
-        return float(value) if kind is float else value
+        return value
     remark = ""
     if kind is bool and str(value).lower() in _YAML_1_1_BOOLS:
         remark = " (only true and false, unquoted, are truth values)"
@@ -115,12 +121,26 @@ def is_literal(kind: Any) -> bool:
     return get_origin(kind) is Literal
 
 
+def is_array(kind: Any) -> bool:
+    """Whether a type annotation is `NDArray[...]`."""
+    return get_origin(kind) in (np.ndarray, NDArray)  # NDArray is an alias of its own in later versions of numpy
+
+
+def no_files(text: str) -> Path:
+    """For values that cannot name a file.
+
+    Raises:
+        ValueError: always.
+    """
+    raise ValueError(f"{shown(text)}: no file can be named here")
+
+
 @attrs.frozen
 class Converter:
     """Converts plain values to the types of annotations."""
 
-    base: Path
-    """The folder of relative paths."""
+    files: Callable[[str], Path] = no_files
+    """Finds the file that a text names; raises ValueError if there is none."""
 
     def structure(self, value: Any, kind: Any) -> Any:
         """Convert `value` to a `kind`.
@@ -130,17 +150,18 @@ class Converter:
             ValueError: for a fault of the value as a whole.
             TypeError: for an unsupported kind, which is a bug in an options class.
         """
-        if kind is Any or get_origin(kind) in (np.ndarray, NDArray):  # an array's class converts it
+        if kind is Any:
             return value
         if kind in _SCALARS:
             return _scalar(value, kind)
         if kind is Path:
-            return resolve_path(_scalar(value, str), self.base)
+            return self._path(_scalar(value, str))
         for fits, structure in (
             (is_union, self._union),
             (is_literal, self._literal),
             (is_sequence, self._sequence),
             (is_mapping, self._mapping),
+            (is_array, self._array),
             (attrs.has, self._attrs),
         ):
             if fits(kind):
@@ -159,6 +180,12 @@ class Converter:
             elif field.default is attrs.NOTHING:
                 faults.add((name,), "required key is missing")
         return arguments
+
+    def _path(self, text: str) -> Path:
+        try:
+            return self.files(text)
+        except OSError as error:
+            raise ValueError(f"{shown(text)}: {error.strerror}") from error
 
     def _field(self, field: attrs.Attribute[Any], value: Any) -> Any:
         try:
@@ -202,6 +229,20 @@ class Converter:
         items = self._items((name, item, item_kind) for name, item in value.items())
         return dict(zip(value, items, strict=True))
 
+    def _array(self, value: Any, kind: Any) -> NDArray[Any]:
+        """A list of numbers as an array, shape (N,)."""
+        if not isinstance(value, list | tuple):
+            raise _wrong("a list of numbers", value)
+        scalar_type = get_args(kind)[-1]
+        dtype = np.dtype(scalar_type if get_origin(kind) is not np.ndarray else get_args(scalar_type)[0])
+        scalar = float if dtype.kind == "f" else int
+        numbers = self._items((i, item, scalar) for i, item in enumerate(value))
+        try:
+            return np.array(numbers, dtype)
+        except OverflowError:
+            limits = np.iinfo(dtype)
+            raise ValueError(f"expected whole numbers from {limits.min} to {limits.max}") from None
+
     def _items(self, items: Iterable[tuple[str | int, Any, Any]]) -> list[Any]:
         """Convert items, given as key, value and kind."""
         faults, found = Faults(), []
@@ -237,4 +278,4 @@ class Converter:
         choices = get_args(kind)
         if value in choices:
             return value
-        raise ValueError(f"{value!r} is not one of: {', '.join(str(c) for c in choices)}")
+        raise ValueError(f"{shown(value)} is not one of: {', '.join(str(c) for c in choices)}")

@@ -1,0 +1,145 @@
+"""Declared services: a name, and the classes of its request and answer. Requests from outside are plain data."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import UnionType
+from typing import Any
+
+import attrs
+
+from ibrobot_core.convert import Converter, Faults, Key, error_message, no_files, shown
+from ibrobot_core.errors import RequestError
+from ibrobot_core.options import fields
+
+type Plain = bool | int | float | str | Sequence[Plain] | Mapping[str, Plain] | None
+"""What JSON can say. Nothing in it is expanded: neither `${NAME}`, nor `~`, nor YAML in a text."""
+
+_SHOWN = 5
+"""Largest number of faults in a message."""
+_UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+"""Control characters, and halves of characters, which no file and no terminal takes."""
+_INTEGERS = range(-(2**63), 2**63)
+
+
+@attrs.frozen
+class RequestLimits:
+    """Bounds on a plain request, which are checked before anything else."""
+
+    values: int = 2_000
+    """Number of values: lists, mappings, and what they contain."""
+    text: int = 1_000
+    """Characters of a text, and of a key."""
+    depth: int = 10
+    """Lists and mappings within one another."""
+
+
+@attrs.frozen
+class NoRequest:
+    """The request to a service that needs nothing."""
+
+
+@attrs.frozen(eq=False)
+class Service[Q, A]:
+    """A service, declared by its owner.
+
+    Its request is an object of a frozen attrs class, whose fields (`option`) state units, bounds and help. Callers from
+    outside send the same as plain data.
+    """
+
+    name: str
+    """E.g. `/planning/go_to`."""
+    request: type[Q]
+    """Class of the request."""
+    answer: type[A] | UnionType
+    """Type of the answer."""
+    help: str = ""
+    """One sentence that says what it does."""
+    alone: str = ""
+    """The field that a plain request without keys stands for, e.g. `pose` if `home` means `{pose: home}`."""
+    limits: RequestLimits = RequestLimits()
+
+    def __attrs_post_init__(self) -> None:
+        if not attrs.has(self.request):
+            raise TypeError(f"{self.name}: the request must be an attrs class, got {self.request}")
+
+    def read(self, request: Q | Plain, files: Callable[[str], Path] = no_files) -> Q:
+        """A request as an object of its class.
+
+        Args:
+            request: such an object, or plain data.
+            files: finds the file that a text names; raises ValueError for files that no request may name.
+
+        Raises:
+            RequestError: for data that does not fit, with every fault: its key, the value, and what would be right.
+        """
+        if isinstance(request, self.request):
+            return request
+        faults = _too_much(request, self.limits)
+        if not faults:
+            found: Any = {} if request is None else request
+            if self.alone and not isinstance(found, Mapping):
+                found = {self.alone: found}
+            if not isinstance(found, Mapping):
+                raise RequestError(f"{self.name}: expected {self._keys()}, got {shown(found)}")
+            try:
+                return Converter(files).structure(found, self.request)  # type: ignore[no-any-return]
+            except Faults as error:
+                faults = error.found
+            except (ValueError, TypeError, ArithmeticError) as error:  # values that exclude each other
+                faults = [((), error_message(error))]
+        raise RequestError(f"{self.name}: {_listed(faults)}")
+
+    def _keys(self) -> str:
+        known = fields(self.request)
+        return f"a mapping with {', '.join(known)}" if known else "nothing"
+
+
+def _listed(faults: list[tuple[Key, str]]) -> str:
+    lines = [": ".join(filter(None, (".".join(map(str, key)), message))) for key, message in faults[:_SHOWN]]
+    more = [f"and {len(faults) - _SHOWN} more"] if len(faults) > _SHOWN else []
+    return "; ".join([*lines, *more])
+
+
+def _too_much(request: object, limits: RequestLimits) -> list[tuple[Key, str]]:
+    """The first value that is beyond the limits, or is no plain data, with its fault."""
+    left = limits.values
+    todo: list[tuple[Key, object]] = [((), request)]
+    while todo:
+        key, value = todo.pop()
+        left -= 1
+        wrong = _misfit(value, limits)
+        if isinstance(value, Mapping | list | tuple) and not wrong:
+            if len(value) > left:
+                return [((), f"the request has more than {limits.values} values")]
+            if value and len(key) >= limits.depth:
+                return [(key, f"more than {limits.depth} lists and mappings within one another")]
+            items = list(value.items() if isinstance(value, Mapping) else enumerate(value))
+            wrong = next((found for part, _ in items if (found := _key_misfit(part, limits))), "")
+            todo += [((*key, part), item) for part, item in items]
+        if wrong:
+            return [(key, wrong)]
+    return []
+
+
+def _misfit(value: object, limits: RequestLimits) -> str:
+    """Why a value cannot be part of a request; empty if it can."""
+    if not isinstance(value, bool | int | float | str | list | tuple | Mapping | None):
+        return f"a {type(value).__name__} is no plain data: text, numbers, lists and mappings"
+    if isinstance(value, str) and len(value) > limits.text:
+        return f"a text of {len(value)} characters, at most {limits.text} are allowed"
+    if isinstance(value, str) and _UNPRINTABLE.search(value):
+        return f"{shown(value)} has control characters"
+    if isinstance(value, int) and value not in _INTEGERS:
+        return "a whole number of more than 64 bits"
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"{value} is not a finite number"
+    return ""
+
+
+def _key_misfit(key: object, limits: RequestLimits) -> str:
+    """Why a key cannot be part of a request; empty if it can, or is an index."""
+    return _misfit(key, limits) if isinstance(key, str | int) else f"{shown(key)} is no key: a key is a text"
