@@ -15,6 +15,7 @@ from ibrobot_planning.client import LocalNode, MoveIt2
 from ibrobot_planning.completion import LONGEST_S, MOST_POINTS, completed
 from ibrobot_planning.goal_text import Target
 from ibrobot_planning.motion import MoveResult
+from ibrobot_planning.requests import Execute, GoTo
 from ibrobot_planning.source import EXECUTE, GO_TO
 from ibrobot_testing.fakes import FakePlanner
 
@@ -39,7 +40,7 @@ from .conftest import Make
 from .table_arm import ARM, WALL, make_planner
 from .test_motion import assert_within_limits, command, finish, robot_yaml
 
-WALL_YAML = "{shape: box, size: [0.3, 0.02, 0.3], position: [0.2, 0, 0.15]}"
+WALL_BOX = {"shape": "box", "size": [0.3, 0.02, 0.3], "position": [0.2, 0, 0.15]}
 LEFT, RIGHT = [1.0, 0.8, 0.8, 0.5, 0.0], [-1.0, 0.8, 0.8, 0.5, 0.0]
 PERIOD_NS = ns(0.01)
 
@@ -63,7 +64,7 @@ def at_left(run: Callable[..., Runtime]) -> Runtime:
     """A run with the arm on the left of a wall."""
     runtime = run()
     assert finish(runtime, runtime.session.bus.call(GO_TO, "left")).success
-    runtime.session.bus.call("/world/add", f"{{name: wall, object: {WALL_YAML}}}")
+    runtime.session.bus.call("/world/add", {"name": "wall", "object": WALL_BOX})
     return runtime
 
 
@@ -74,8 +75,13 @@ def trajectory(*points: tuple[float, list[float]], fields: int = 1, names: tuple
     return JointTrajectory(Header(), names, tuple(made))
 
 
+def asked(wanted: Any) -> Any:
+    """A request to follow a trajectory."""
+    return Execute(wanted.joint_names, wanted.points) if isinstance(wanted, JointTrajectory) else wanted
+
+
 def follow(runtime: Runtime, wanted: Any, commands: list[Vector] | None = None) -> MoveResult:
-    return finish(runtime, runtime.session.bus.call(EXECUTE, wanted), commands)
+    return finish(runtime, runtime.session.bus.call(EXECUTE, asked(wanted)), commands)
 
 
 @pytest.mark.parametrize("fields", [1, 2, 3], ids=["positions", "velocities", "accelerations"])
@@ -93,10 +99,10 @@ def test_trajectory_through_a_wall_is_refused_whatever_its_fields(run, fields: i
 def test_wall_that_appears_stops_a_given_trajectory_whatever_its_fields(run, fields: int):
     runtime = run()
     assert finish(runtime, runtime.session.bus.call(GO_TO, "left")).success
-    number = runtime.session.bus.call(EXECUTE, trajectory((0, LEFT), (8, RIGHT), fields=fields))
+    number = runtime.session.bus.call(EXECUTE, asked(trajectory((0, LEFT), (8, RIGHT), fields=fields)))
     for _ in range(20):
         runtime.step()
-    runtime.session.bus.call("/world/add", f"{{name: wall, object: {WALL_YAML}}}")
+    runtime.session.bus.call("/world/add", {"name": "wall", "object": WALL_BOX})
     result = finish(runtime, number)
     assert result.code is PlanCode.MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE
     assert command(runtime)[0] > 0.2, "it stands before the wall"
@@ -108,7 +114,7 @@ def through_service(runtime: Runtime, wanted: JointTrajectory) -> MoveResult:
 
 
 def through_target(runtime: Runtime, wanted: JointTrajectory) -> MoveResult:
-    return finish(runtime, runtime.session.bus.call(GO_TO, Target("trajectory", trajectory=wanted)))
+    return finish(runtime, runtime.session.bus.call(GO_TO, GoTo(Target("trajectory", trajectory=wanted))))
 
 
 def through_client(runtime: Runtime, wanted: JointTrajectory) -> MoveResult:
@@ -177,7 +183,7 @@ def test_wrong_velocities_are_refused(run, velocities: list[float]):
 def test_joint_named_twice_is_refused(run):
     runtime = run()
     with pytest.raises(PlanningError, match="no executor of mode plan follows trajectories of pan, pan"):
-        runtime.session.bus.call(EXECUTE, trajectory((0, [0.0] * 6), (1, [0.0] * 6), names=("pan", *ARM)))
+        runtime.session.bus.call(EXECUTE, asked(trajectory((0, [0.0] * 6), (1, [0.0] * 6), names=("pan", *ARM))))
 
 
 @pytest.mark.parametrize("fields", [1, 2, 3], ids=["positions", "velocities", "accelerations"])
