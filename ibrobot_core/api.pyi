@@ -181,6 +181,7 @@ from ibrobot_core.launch.session import (
     LaunchRequest as LaunchRequest,
     Session as Session,
     SessionWorker as SessionWorker,
+    StateWatch as StateWatch,
 )
 from ibrobot_core.launch.sources.operator_devices import OperatorDevices as OperatorDevices
 from ibrobot_core.launch.sources.policy import PolicySource as PolicySource

@@ -208,7 +208,8 @@ class Align:
     strategy: str = option(
         "hold",
         choices=("hold", "asof", "drop"),
-        help="hold: the newest; asof: the newest if at most tol_ms old; drop: the newest if within the last step",
+        help="hold: the newest if at most contract.max_age old; asof: the newest if at most tol_ms old; "
+        "drop: the newest if within the last step",
     )
     stamp: str = option("header", choices=("header", "receive"), help="stamp to use: of the header, or of receipt")
     tol_ms: float | None = option(None, unit="ms", ge=0, help="maximum age, for asof")
@@ -271,6 +272,9 @@ class ActionSpec:
         choices=("hold", "next"),
         help="the action of a row in a dataset: hold takes the command in effect at the tick, next the first after it",
     )
+    max_age: float | None = option(
+        None, unit="s", gt=0, help="how long a command counts in a dataset without a newer one; None: contract.max_age"
+    )
     joints: tuple[str, ...] = option((), help="in a file with only a contract: names of the numbers, in order")
 
 
@@ -294,6 +298,11 @@ class SignalSpec:
     )
 
 
+MAX_AGE = 0.25
+"""Default of `contract.max_age` [s], also for contracts recorded before it was stated; as `stale_timeout`, 25 states at
+100 Hz. Part of the meaning of a fingerprint: a contract with another value has another one."""
+
+
 @documented
 @attrs.frozen
 class ContractConfig:
@@ -301,6 +310,9 @@ class ContractConfig:
 
     rate_hz: float = option(30.0, unit="Hz", gt=0, help="rate of observations and actions")
     max_duration_s: float = option(90.0, unit="s", gt=0, help="longest episode")
+    max_age: float = option(
+        MAX_AGE, unit="s", gt=0, help="greatest age of a held observation or command; an older one is missing"
+    )
     observations: tuple[ObservationSpec, ...] = option((), help="topics -> observation keys")
     actions: tuple[ActionSpec, ...] = option((), help="the action vector -> executors")
     signals: tuple[SignalSpec, ...] = option((), help="topics -> task, reward and end of a dataset's rows")

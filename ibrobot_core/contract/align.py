@@ -24,14 +24,14 @@ class Stream[T]:
 
     At tick `t`, only samples with a stamp `<= t` that were received by `t` are considered, so that a conversion sees
     no more than a live run. The sample with the newest stamp is chosen; of equal stamps, the one received last. `hold`
-    accepts it at any age, `asof` if `t - stamp <= tol_ms`, `drop` if `stamp > t - step`.
+    accepts it if `t - stamp <= max_age`, `asof` if `t - stamp <= tol_ms`, `drop` if `stamp > t - step`.
 
     A jump of the stamps resets the stream: it drops all earlier samples and increments `resets`. With a limit of
     `max(1 s, 2 steps)`, a jump is
 
     - a stamp further than the limit ahead of the newest so far, or behind it. A smaller step back is an
       out-of-order message, sorted by its stamp. (A sender whose clock is set back by less than the limit therefore
-      goes unnoticed until it has caught up; until then `asof` and `drop` bound the age of the value.)
+      goes unnoticed until it has caught up; until then the greatest age of a value bounds the error.)
     - a stamp further than the limit ahead of its own receipt. The sender's clock differs from ours, and the tick at
       which the sample is due is unknown. The sample is dropped.
 
@@ -41,15 +41,16 @@ class Stream[T]:
     Args:
         align: strategy, stamp, and for `asof` the maximum age.
         step_ns: time between ticks [ns].
+        max_age_ns: greatest age of a sample that `hold` gives [ns].
     """
 
-    def __init__(self, align: Align, step_ns: int) -> None:
+    def __init__(self, align: Align, step_ns: int, max_age_ns: int) -> None:
         self.resets = 0
         self._by_header = align.stamp == "header"
         self._limit_ns = max(NS_PER_S, 2 * step_ns)
         # Maximum age of a sample [ns]; in integers, `stamp > t - step` is an age of at most step - 1.
         tolerance_ns = round((align.tol_ms or 0.0) * 1e6)
-        self._max_age_ns = {"hold": None, "asof": tolerance_ns, "drop": step_ns - 1}[align.strategy]
+        self._max_age_ns = {"hold": max_age_ns, "asof": tolerance_ns, "drop": step_ns - 1}[align.strategy]
         self._unseen: deque[Sample[T]] = deque()
         self._ahead: list[Sample[T]] = []
         self._chosen: Sample[T] | None = None
@@ -89,9 +90,7 @@ class Stream[T]:
             self._take(self._unseen.popleft())
         if self._ahead:
             self._choose(t_ns)
-        if self._chosen is None:
-            return None
-        if self._max_age_ns is not None and t_ns - self._chosen.stamp_ns > self._max_age_ns:
+        if self._chosen is None or t_ns - self._chosen.stamp_ns > self._max_age_ns:
             return None
         return self._chosen
 

@@ -19,6 +19,7 @@ from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.policy import Frame
 from ibrobot_core.messages import MESSAGE_TYPES, CompressedImage, Message
 from ibrobot_core.selection import Selection
+from ibrobot_core.units import ns
 
 _IMAGE_DEPTH = 32
 _VECTOR_DEPTH = 256
@@ -29,9 +30,9 @@ type _Array = NDArray[np.generic]
 class _Part:
     """One topic's part of an observation: its stream, and the decoded value of the last chosen sample."""
 
-    def __init__(self, part: ObservationPart, step_ns: int) -> None:
+    def __init__(self, part: ObservationPart, contract: Contract) -> None:
         self.part = part
-        self.stream: Stream[Message] = Stream(part.align, step_ns)
+        self.stream: Stream[Message] = Stream(part.align, contract.step_ns, ns(contract.max_age))
         self._read: Callable[[Any], _Array] = (
             Selection(part.type, part.select) if part.image is None else partial(decode_image, spec=part.image)
         )
@@ -95,7 +96,7 @@ class FrameAssembler:
         if unknown:
             has = ", ".join(contract.observations) or "none"
             raise ContractError(f"the contract has no observation {unknown[0]!r}; it has: {has}")
-        self._keys = {key: [_Part(part, contract.step_ns) for part in contract.parts(key)] for key in wanted}
+        self._keys = {key: [_Part(part, contract) for part in contract.parts(key)] for key in wanted}
         self._topics: dict[str, list[_Part]] = {}
         for part in (part for parts in self._keys.values() for part in parts):
             self._topics.setdefault(part.part.topic, []).append(part)

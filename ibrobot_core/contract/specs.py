@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import attrs
 
 from ibrobot_core.config.contract_checks import completed
-from ibrobot_core.config.schema import ActionSpec, Align, ImageSpec, ObservationSpec, RobotConfig
+from ibrobot_core.config.schema import MAX_AGE, ActionSpec, Align, ImageSpec, ObservationSpec, RobotConfig
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.dataset import Feature
 from ibrobot_core.messages import MESSAGE_TYPES, CompressedImage, Image, JointState
@@ -50,6 +51,8 @@ class ActionPart:
     """Paths to the joints' numbers in foreign messages; empty if `data` has them in order."""
     align: str = "hold"
     """The command that is a tick's action: `hold`, the newest sent by the tick; `next`, the first sent after it."""
+    max_age: float | None = None
+    """How far a command may be from the tick whose action it is [s]; None for the contract's."""
 
 
 @attrs.frozen
@@ -85,6 +88,8 @@ class Contract:
     """Action parts in file order; their joints concatenate to the action vector."""
     signal_parts: tuple[SignalPart, ...] = ()
     """Signals, used only in datasets."""
+    max_age: float = MAX_AGE
+    """Greatest age of a sample that `hold` gives [s]."""
 
     @classmethod
     def from_config(cls, config: RobotConfig, extra: Sequence[ObservationSpec] = ()) -> Contract:
@@ -99,7 +104,7 @@ class Contract:
         signals = tuple(
             SignalPart(spec.key, spec.topic, spec.type, spec.select[0], spec.align) for spec in config.contract.signals
         )
-        return cls(float(config.contract.rate_hz), parts, actions, signals)
+        return cls(float(config.contract.rate_hz), parts, actions, signals, config.contract.max_age)
 
     @classmethod
     def from_canonical(cls, canonical: Mapping[str, Any]) -> Contract:
@@ -117,7 +122,8 @@ class Contract:
             ]
             actions = [_recorded_action(**part) for part in canonical["action"]]
             signals = [SignalPart(**each) for each in canonical.get("signals", ())]
-            contract = cls(float(canonical["rate_hz"]), tuple(parts), tuple(actions), tuple(signals))
+            max_age = _recorded_age(canonical.get("max_age", MAX_AGE))
+            contract = cls(float(canonical["rate_hz"]), tuple(parts), tuple(actions), tuple(signals), max_age)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ContractError(f"not a recorded contract: {error!r}") from None
         if canonical.get("version") != contract.canonical()["version"]:
@@ -173,16 +179,19 @@ class Contract:
         """Everything that affects data, as plain JSON values; `fingerprint` hashes and `difference` compares it.
 
         The order of observation keys does not affect data and is not hashed; the order of parts and of joints is.
+        Fields that contracts of earlier versions lack are left out at their defaults, so that fingerprints stay equal.
         """
         return {
             "version": 1,
             "units": "SI",
             "rate_hz": self.rate_hz,
+            **({"max_age": self.max_age} if self.max_age != MAX_AGE else {}),
             "observations": {key: [_canonical(p) for p in self.parts(key)] for key in self.observations},
             "action": [
                 {"topic": p.topic, "type": p.type, "joints": list(p.joints)}
                 | ({"select": list(p.select)} if p.select else {})
                 | ({"align": p.align} if p.align != "hold" else {})
+                | ({"max_age": p.max_age} if p.max_age is not None else {})
                 for p in self.action_parts
             ],
         } | ({"signals": [attrs.asdict(p) for p in self.signal_parts]} if self.signal_parts else {})
@@ -242,9 +251,17 @@ def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
 
 
 def _recorded_action(
-    topic: str, type: str, joints: Sequence[str], select: Sequence[str] = (), align: str = "hold"
-) -> ActionPart:
-    return ActionPart(topic, topic, type, "hold", tuple(joints), tuple(select), align)
+    topic: str, type: str, joints: Sequence[str], select: Sequence[str] = (), align: str = "hold",
+    max_age: float | None = None,
+) -> ActionPart:  # fmt: skip
+    max_age = None if max_age is None else _recorded_age(max_age)
+    return ActionPart(topic, topic, type, "hold", tuple(joints), tuple(select), align, max_age)
+
+
+def _recorded_age(value: Any) -> float:
+    if not 0 < (age := float(value)) < math.inf:
+        raise ValueError(f"max_age {value!r} must be above 0 s")
+    return age
 
 
 def _image_feature(image: ImageSpec, size: tuple[int, int] | None) -> Feature:
@@ -259,7 +276,9 @@ def _action(spec: ActionSpec, config: RobotConfig) -> ActionPart:
     select = spec.select
     if not select and spec.type == JointState.ros_type:
         select = tuple(f"position.{joint}" for joint in executor.joints)
-    return ActionPart(executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints, select, spec.align)
+    return ActionPart(
+        executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints, select, spec.align, spec.max_age
+    )
 
 
 def _joined(features: list[Feature]) -> Feature:
@@ -286,6 +305,7 @@ def _canonical(part: ObservationPart) -> dict[str, Any]:
 def _flat(canonical: Mapping[str, Any]) -> dict[str, str]:
     """One line per observation and one for the action, to print and compare."""
     rows = {name: str(canonical[name]) for name in ("version", "units", "rate_hz")}
+    rows["max_age"] = str(canonical.get("max_age", MAX_AGE))
     for key, parts in canonical["observations"].items():
         for i, part in enumerate(parts):
             rows[f"{key}[{i}]" if len(parts) > 1 else key] = _line(part)

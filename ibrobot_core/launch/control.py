@@ -68,11 +68,12 @@ class ControlComponent(Component):
 
     def _publish(self, state: ControlState) -> None:
         session = self._session
-        session.state = state
+        session.take_state(state)
         bus = session.bus
-        header = Header(state.stamp_ns)
-        effort = state.effort if np.isfinite(state.effort).all() else np.empty(0)
-        bus.publish("/joint_states", JointState(header, self._joints, state.position, state.velocity, effort))
+        if not state.stale:  # what was not measured is missing, not repeated
+            header = Header(state.stamp_ns)
+            effort = state.effort if np.isfinite(state.effort).all() else np.empty(0)
+            bus.publish("/joint_states", JointState(header, self._joints, state.position, state.velocity, effort))
         for topic, columns in self._actions[session.mode]:
             bus.publish(topic, Float64MultiArray(state.command[columns]))
         begin = 0

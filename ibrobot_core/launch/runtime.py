@@ -282,16 +282,13 @@ class Runtime:
 
     def _await_state(self) -> None:
         session = self.session
-        states = session.bus.subscribe("/joint_states", 1)
-        try:
-            for _ in range(_GLANCES):
-                if session.state is not None:
-                    return
-                self.raise_failure()
-                states.get(_GLANCE_S)
-            raise HardwareError("control is ready but sends no joint states")
-        finally:
-            states.close()
+        states = session.watch_states()
+        for _ in range(_GLANCES):
+            if session.state is not None:
+                return
+            self.raise_failure()
+            states.get(_GLANCE_S)
+        raise HardwareError("control is ready but sends no joint states")
 
     def _begin_mode(self) -> None:
         """Begin a mode without simulated episodes: one open-ended episode from the robot's present state."""

@@ -159,7 +159,8 @@ class Session:
         request: the user's request.
         clock: the clock of the run; real, or stepped in lockstep.
         bus: topics and services within the host process.
-        state: the newest state of the joints and of control; None before the first.
+        state: the newest state of the joints and of control; None before the first. Set by `take_state`.
+        on_state: called with each state before its messages are published, in the thread that receives states.
         mode: name of the active control mode.
         generation: counts mode switches and resets; plans of an earlier generation are ignored.
         plan: the newest plan that control was sent; None before the first.
@@ -196,6 +197,7 @@ class Session:
         self.held = False
         self.start_failed = False
         self.state: ControlState | None = None
+        self.on_state: list[Callable[[ControlState], None]] = []
         self.plan: PlanRecord | None = None
         self.acting: ActingPolicy | None = None
         self.sensors: dict[str, SensorFigures] = {}
@@ -206,6 +208,7 @@ class Session:
         self._faults: list[tuple[int, str]] = []
         self._control: ControlHost | None = None
         self._commanding = threading.Lock()
+        self._new_state = threading.Condition()
 
     @cached_property
     def absent(self) -> tuple[AbsentSensor, ...]:
@@ -263,6 +266,21 @@ class Session:
     def make(self, kind: str, component: ComponentConfig, name: str, **more: Any) -> Any:
         """Make a component of the YAML by its plugin; `name` and `more` go into the context."""
         return self.registry.find(kind, component.type).make(component.options, self.context(name, **more))
+
+    def take_state(self, state: ControlState) -> None:
+        """Set the newest state, and wake those who wait for it."""
+        with self._new_state:
+            self.state = state
+            self._new_state.notify_all()
+        for call in tuple(self.on_state):
+            call(state)
+
+    def watch_states(self) -> StateWatch:
+        """Wait for the states from now on: one at each tick of control, even while the joints do not answer.
+
+        `/joint_states`, in contrast, has a message only for each state that was measured.
+        """
+        return StateWatch(self, self._new_state)
 
     def measured(self) -> JointReading:
         """The newest joint state.
@@ -364,6 +382,22 @@ class Session:
         if self.failure is None and not self.finished.is_set():
             self.failure = (component, error)
         self.finished.set()
+
+
+class StateWatch:
+    """Waits for states of control; made by `Session.watch_states`."""
+
+    def __init__(self, session: Session, new_state: threading.Condition) -> None:
+        self._session, self._new_state = session, new_state
+        self._seen = session.state
+
+    def get(self, timeout_s: float = 0.0) -> ControlState | None:
+        """The newest state, if it has not been returned yet; None if none comes within `timeout_s` [s]."""
+        with self._new_state:
+            if not self._new_state.wait_for(lambda: self._session.state is not self._seen, timeout_s):
+                return None
+            self._seen = self._session.state
+            return self._seen
 
 
 class SessionWorker(Worker):

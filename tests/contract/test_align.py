@@ -15,6 +15,8 @@ from ibrobot_core.contract.align import Stream
 MS = 1_000_000
 S = 1000 * MS
 
+HOLD_NS = 250 * MS
+"""Greatest age of a sample that `hold` gives."""
 ALIGNS = [
     Align("hold"),
     Align("hold", "receive"),
@@ -44,6 +46,8 @@ def oracle(samples: list[tuple[int, int, int]], align: Align, step_ns: int, t_ns
     if not due:
         return None, resets
     stamp, _, value = max(due)
+    if align.strategy == "hold" and t_ns - stamp > HOLD_NS:
+        return None, resets
     if align.strategy == "asof":
         assert align.tol_ms is not None
         if not t_ns - stamp <= align.tol_ms * MS:
@@ -77,7 +81,7 @@ def test_agrees_with_the_rules_at_every_tick(
         got += delta * MS
         behind += clock_step * MS
         samples.append((got - latency * MS - behind, got, value))
-    stream: Stream[int] = Stream(align, step_ms * MS)
+    stream: Stream[int] = Stream(align, step_ms * MS, HOLD_NS)
     waiting = list(samples)
     t_ns = 10 * S - 20 * MS
     for tick in ticks:
@@ -89,8 +93,10 @@ def test_agrees_with_the_rules_at_every_tick(
         assert found == oracle(samples, align, step_ms * MS, t_ns)
 
 
-def filled(align: Align, *samples: tuple[int, int, str], step_ns: int = 33 * MS) -> Stream[str]:
-    stream: Stream[str] = Stream(align, step_ns)
+def filled(
+    align: Align, *samples: tuple[int, int, str], step_ns: int = 33 * MS, hold_ns: int = 10_000 * S
+) -> Stream[str]:
+    stream: Stream[str] = Stream(align, step_ns, hold_ns)
     for sample in samples:
         stream.add(*sample)
     return stream
@@ -121,7 +127,9 @@ def test_ages_at_their_very_limits() -> None:
     drop = filled(Align("drop"), (S, S, "x"))
     assert value(drop, S + 33 * MS - 1) == "x"
     assert value(drop, S + 33 * MS) is None
-    assert value(filled(Align("hold"), (S, S, "x")), 10_000 * S) == "x"
+    hold = filled(Align("hold"), (S, S, "x"), hold_ns=HOLD_NS)
+    assert value(hold, S + HOLD_NS) == "x"
+    assert value(hold, S + HOLD_NS + 1) is None
 
 
 @pytest.mark.parametrize("step_ns", [33 * MS, 700 * MS])
@@ -157,7 +165,7 @@ def test_a_jump_counts_from_its_receipt_on_and_no_sooner() -> None:
 
 
 def test_a_sender_ahead_of_us_is_followed_sample_by_sample() -> None:
-    stream: Stream[int] = Stream(Align(), 33 * MS)
+    stream: Stream[int] = Stream(Align(), 33 * MS, HOLD_NS)
     for k in range(300):
         stream.add(k * 10 * MS + 500 * MS, k * 10 * MS, k)
         chosen = stream.at(k * 10 * MS)
@@ -171,7 +179,7 @@ class Payload:
 @pytest.mark.parametrize("ahead_ns", [0, 900 * MS, 3600 * S, -3600 * S])
 def test_what_is_kept_is_bounded(ahead_ns: int) -> None:
     """Also for a sender whose clock is ahead of ours, a little or by an hour."""
-    stream: Stream[Payload] = Stream(Align(), 33 * MS)
+    stream: Stream[Payload] = Stream(Align(), 33 * MS, HOLD_NS)
     alive: weakref.WeakSet[Payload] = weakref.WeakSet()
     for k in range(1000):
         payload = Payload()
@@ -196,7 +204,7 @@ def test_misuse_is_refused() -> None:
 
 
 def test_without_header_the_receipt_counts() -> None:
-    stream: Stream[str] = Stream(Align(stamp="receive"), 33 * MS)
+    stream: Stream[str] = Stream(Align(stamp="receive"), 33 * MS, HOLD_NS)
     stream.add(None, S, "x")
     sample = stream.at(S)
     assert sample is not None

@@ -1,4 +1,4 @@
-"""Teleop: reads the devices at every joint state, and sends control plans of one setpoint."""
+"""Teleop: reads the devices at every state of control, and sends control plans of one setpoint."""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ class TeleopSource(SourceWorker):
     def setup(self) -> None:
         self.on_end.callback(self._devices.disconnect)
         self._devices.connect()
-        self._states = self.session.bus.subscribe("/joint_states", 1)
-        self.on_end.callback(self._states.close)
+        self._states = self.session.watch_states()  # also while the joints do not answer: a device may stop the robot
 
     @override
     def recover(self) -> None:

@@ -10,6 +10,7 @@ import attrs
 from ibrobot_core.api import (
     CONTROL,
     ControlMode,
+    ControlState,
     NotSupported,
     OperatorDevices,
     PolicySource,
@@ -91,8 +92,9 @@ class Corrections(SourceWorker):
         session = self.session
         self.on_end.callback(self._devices.disconnect)
         self._devices.connect()
-        self._states = session.bus.subscribe("/joint_states", 1)
-        self.on_end.callback(self._states.close)
+        self._states = session.watch_states()
+        session.on_state.append(self._label)
+        self.on_end.callback(session.on_state.remove, self._label)
         self._keys = session.request.keys() if session.request.keys is not None else None
         if self._keys is None and self._options.takeover == "button" and not self._has_button():
             session.log.warning(
@@ -177,7 +179,6 @@ class Corrections(SourceWorker):
         state = session.state
         assert state is not None
         self._arm.see(state)
-        self._publish()  # of the command in this state, which precedes what follows here
         try:
             command = self._devices.read(session.measured())
             self._press(command, presses)
@@ -264,6 +265,11 @@ class Corrections(SourceWorker):
         self._commander, self._changed_ns = commander, now_ns
         self.session.commander = commander
         if not self.active:  # before the first state of an episode
+            self._publish()
+
+    def _label(self, state: ControlState) -> None:
+        """Say who commanded in a state, in the thread that publishes it, however late `work` is."""
+        if self.active:
             self._publish()
 
     def _publish(self) -> None:

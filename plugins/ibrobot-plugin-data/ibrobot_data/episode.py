@@ -49,7 +49,7 @@ INTERVENTION, REWARD, DONE = "intervention", "next.reward", "next.done"
 DATASET = "dataset"
 """The dataset within a unit."""
 _RECORD = "episode.json"
-_VERSION = 4
+_VERSION = 5
 """Version of the unit format; units of an older one are converted again."""
 
 

@@ -13,7 +13,7 @@ from ibrobot_core.api import (
     ControlState,
     Session,
     SourceWorker,
-    Subscription,
+    StateWatch,
     Vector,
     ns,
     seconds,
@@ -54,7 +54,7 @@ class ReplaySource(SourceWorker):
         self._replay = replay
         self._period_ns = ns(1.0 / session.config.control.rate_hz)
         self._columns = session.config.robot.indices(replay.playback.joints)
-        self._states: Subscription | None = None
+        self._states: StateWatch | None = None
         self._begun_ns: int | None = None
         """When the approach began [ns]; None before."""
         self._rows: Vector = np.empty((0, 0))
@@ -67,7 +67,7 @@ class ReplaySource(SourceWorker):
 
     @override
     def setup(self) -> None:
-        self._states = self.session.bus.subscribe("/joint_states", 1)
+        self._states = self.session.watch_states()
 
     @override
     def begin_mode(self, seed: int) -> None:
@@ -172,11 +172,6 @@ class ReplaySource(SourceWorker):
             "source": replay.source, "speed": replay.speed, "recorded_s": round(replay.playback.duration, 3),
             "recorded_outcome": replay.playback.outcome, "success": self._success, "tracking": tracking,
         }  # fmt: skip
-
-    @override
-    def teardown(self) -> None:
-        if self._states is not None:
-            self._states.close()
 
     @override
     def help(self) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
-from typing import Any
+from typing import Any, NoReturn
 
 import attrs
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from ibrobot_core.api import (
     Recorded,
     RecorderError,
     SignalPart,
+    ns,
     seconds,
     value_at,
 )
@@ -34,8 +35,12 @@ from ibrobot_core.api import (
 ACTION = "action"
 _LONGEST_SILENCE_S = 60
 """Longest time without a message of any topic [s]; a damaged stamp would otherwise produce rows for years."""
-_COMMAND = Align("hold", "receive")
-"""The command in effect at a tick is the newest sent until then, at any age."""
+_ANY_AGE = Align("asof", "receive", 1e12)
+"""For signals, which may pause."""
+
+
+type _Incomplete = tuple[int, frozenset[str]]
+"""Time of an incomplete tick [ns], and what is missing."""
 
 
 def with_action(contract: Contract) -> Contract:
@@ -44,21 +49,30 @@ def with_action(contract: Contract) -> Contract:
     With `align: hold` a row has the command in effect at its tick: the one that the robot followed at the observation,
     after the safety layer. Commands at the control rate are at most one control period old; of commands as slow as the
     ticks it is the one before the observation. With `align: next` it is the first command
-    after the tick. Signals are aligned in the same way; tasks are numbers, which index `Ticks.tasks`.
+    after the tick. A command further from the tick than `max_age` is missing. Signals are aligned in the same way, but
+    count at any age; tasks are numbers, which index `Ticks.tasks`.
     """
-    features = {part.topic: Feature("float32", (len(part.joints),)) for part in contract.action_parts}
     parts = tuple(
         ObservationPart(
-            ACTION, _source_of(part), part.type, part.select or ("data",), None, _COMMAND, features[part.topic]
+            ACTION, _source_of(part), part.type, part.select or ("data",), None, _command(part, contract), feature
         )
-        for part in contract.action_parts
+        for part, feature in ((part, Feature("float32", (len(part.joints),))) for part in contract.action_parts)
     )
     signals = tuple(
-        ObservationPart(part.key, _source_of(part), *_read_as(part), None, _COMMAND, part.feature)
+        ObservationPart(part.key, _source_of(part), *_read_as(part), None, _ANY_AGE, part.feature)
         for part in contract.signal_parts
     )
     every = (*contract.observation_parts, *parts, *signals)
     return attrs.evolve(contract, observation_parts=every, action_parts=(), signal_parts=())
+
+
+def _command(part: ActionPart, contract: Contract) -> Align:
+    """How the commands of a part become actions; `_Following` bounds the distance of those after the tick."""
+    return _ANY_AGE if part.align == "next" else Align("asof", "receive", _max_age(part, contract) * 1e3)
+
+
+def _max_age(part: ActionPart, contract: Contract) -> float:
+    return contract.max_age if part.max_age is None else part.max_age
 
 
 def _source_of(part: ActionPart | SignalPart) -> str:
@@ -80,19 +94,36 @@ class _Following:
     """The messages of a topic, each with the time of receipt of the one before it, or of the episode's start.
 
     The newest of these at a tick is then the first that was received after it.
+
+    Args:
+        max_age_ns: how long after a tick its message may be received [ns]; None for any time.
     """
 
-    def __init__(self, reader: EpisodeReader, part: ActionPart | SignalPart) -> None:
-        self._reader, self._part = reader, part
+    def __init__(self, reader: EpisodeReader, part: ActionPart | SignalPart, max_age_ns: int | None) -> None:
+        self._reader, self._part, self._max_age_ns = reader, part, max_age_ns
         self.end_ns: int | None = None
         """Receipt of the last message [ns]; None until it is known."""
+        self._silences: deque[tuple[int, int]] = deque()
+        """The times that no message follows soon enough [ns]: from the first, up to but without the second."""
 
     def __iter__(self) -> Iterator[Recorded]:
         before_ns = self._reader.summary().start_ns
         for item in self._reader.messages({self._part.topic}):
+            if self._max_age_ns is not None and item.received_ns - self._max_age_ns > before_ns:
+                self._silences.append((before_ns, item.received_ns - self._max_age_ns))
             yield attrs.evolve(item, topic=_source_of(self._part), received_ns=before_ns)
             before_ns = item.received_ns
         self.end_ns = before_ns
+
+    def is_silent(self, t_ns: int) -> bool:
+        """Whether the message after tick `t_ns` [ns] is too far from it; ticks must not decrease."""
+        while self._silences and self._silences[0][1] <= t_ns:
+            self._silences.popleft()
+        return bool(self._silences) and self._silences[0][0] <= t_ns
+
+    def ends_early(self, t_ns: int) -> bool:
+        """Whether the last message is too far before the last tick `t_ns` [ns]."""
+        return self.end_ns is not None and self._max_age_ns is not None and t_ns - self.end_ns > self._max_age_ns
 
 
 class _Tasks:
@@ -114,7 +145,13 @@ class _Source:
 
     def __init__(self, reader: EpisodeReader, contract: Contract, tasks: list[str]) -> None:
         aligned: tuple[ActionPart | SignalPart, ...] = (*contract.action_parts, *contract.signal_parts)
-        shifted = {_source_of(part): _Following(reader, part) for part in aligned if part.align == "next"}
+        shifted = {
+            _source_of(part): _Following(
+                reader, part, ns(_max_age(part, contract)) if isinstance(part, ActionPart) else None
+            )
+            for part in aligned
+            if part.align == "next"
+        }
         self._following = list(shifted.values())
         direct = {part.topic for part in contract.observation_parts}
         direct |= {part.topic for part in aligned if _source_of(part) == part.topic}
@@ -131,6 +168,14 @@ class _Source:
     def is_over(self, t_ns: int) -> bool:
         """Whether no command or signal follows tick `t_ns` [ns] where one has to."""
         return any(each.end_ns is not None and t_ns >= each.end_ns for each in self._following)
+
+    def misses_action(self, t_ns: int) -> bool:
+        """Whether the command after tick `t_ns` [ns], where it is the action, is too far from it."""
+        return any(each.is_silent(t_ns) for each in self._following)
+
+    def action_ended(self, t_ns: int) -> bool:
+        """Whether the commands after the ticks, where these are the actions, ended long before tick `t_ns` [ns]."""
+        return any(each.ends_early(t_ns) for each in self._following)
 
     def __iter__(self) -> Iterator[tuple[str, Message, int]]:
         while self._read or self._read_on():
@@ -194,6 +239,8 @@ def frames(
 class Ticks:
     """The rows of an episode, from the first complete tick to the last message.
 
+    A first complete tick later than `max_age` after the first message is the end of a gap.
+
     Args:
         reader: the episode.
         contract: observations, actions and rate.
@@ -213,6 +260,7 @@ class Ticks:
         self._contract = with_action(contract)
         self._signals = frozenset(_source_of(part) for part in contract.signal_parts)
         self._missing = missing
+        self._max_age_ns = ns(contract.max_age)
         self.tasks: list[str] = []
         """The texts of the task's topic; each row has an index into them."""
         self._source = _Source(reader, contract, self.tasks)
@@ -246,41 +294,77 @@ class Ticks:
         """
         source, before = self._source, frozenset[str]()
         last: dict[str, NDArray[Any]] = {}
-        absent = frozenset(self._contract.observations)
+        leading: list[_Incomplete] = []
+        over: list[int] = []
         for frame in frames(self._assembler, source, source.ticks(self._contract.step_ns)):
             if source.is_over(frame.stamp_ns):
-                break
+                over.append(frame.stamp_ns)
+                continue
+            missing = frame.missing | ({ACTION} if source.misses_action(frame.stamp_ns) else set())
             if not last:
-                absent &= frame.missing
-                if frame.missing:
+                if missing:
+                    leading.append((frame.stamp_ns, missing))
                     continue
-            for key in frame.missing - before:
+                self._begin_late(leading, frame.stamp_ns)
+            for key in missing - before:
                 self.gaps[key] = self.gaps.get(key, 0) + 1
-            before = frame.missing
-            if frame.missing and not self._take(frame.missing, frame.stamp_ns, self.rows):
+            before = missing
+            if missing and not self._take(missing, frame.stamp_ns):
                 continue
             last = {**last, **frame.values}
             self.rows += 1
             self.stamp_ns = frame.stamp_ns
             yield last
         if not last:
-            what = f"{', '.join(sorted(absent))} is missing at every one" if absent else "each time another was missing"
-            raise RecorderError(f"no tick has every observation and action: {what}")
+            raise RecorderError(f"no tick has every observation and action: {self._never(leading)}")
+        if over and source.action_ended(over[-1]):
+            self._leave_out([ACTION], over[0], len(over))
 
-    def _take(self, missing: frozenset[str], t_ns: int, row: int) -> bool:
-        """Whether a tick with a missing observation gives a row, which would be number `row`."""
+    def _begin_late(self, leading: Sequence[_Incomplete], t_ns: int) -> None:
+        """Count the ticks before the first complete one, at `t_ns` [ns], if it is late: later than `max_age`."""
+        late_ns = self._source.first_ns + self._max_age_ns
+        if t_ns > late_ns:
+            late = [missing for stamp_ns, missing in leading if stamp_ns > late_ns] or [leading[-1][1]]
+            self._leave_out(sorted(frozenset.union(*late)), leading[0][0], len(leading))
+
+    def _leave_out(self, keys: Sequence[str], t_ns: int, count: int) -> None:
+        """Leave out `count` ticks from `t_ns` [ns] on, at an end of the episode, where nothing can be held."""
         if self._missing == "refuse":
-            at_s = seconds(t_ns - self._source.first_ns)
-            raise RecorderError(
-                f"{', '.join(sorted(missing))} is missing {at_s:.3f} s after the beginning; "
-                "--missing skip leaves such ticks out, --missing hold repeats the last value"
-            )
+            self._refuse(keys, t_ns)
+        for key in keys:
+            self.gaps[key] = self.gaps.get(key, 0) + 1
+        self._cut(count)
+
+    def _take(self, missing: frozenset[str], t_ns: int) -> bool:
+        """Whether a tick with a missing observation gives a row."""
+        if self._missing == "refuse":
+            self._refuse(sorted(missing), t_ns)
         if self._missing == "skip":
-            before = self.cuts.pop()[1] if self.cuts and self.cuts[-1][0] == row else 0
-            self.cuts.append((row, before + 1))
+            self._cut(1)
             return False
         self.held += 1
         return True
+
+    def _cut(self, count: int) -> None:
+        """Leave out `count` ticks before the next row."""
+        before = self.cuts.pop()[1] if self.cuts and self.cuts[-1][0] == self.rows else 0
+        self.cuts.append((self.rows, before + count))
+
+    def _refuse(self, keys: Sequence[str], t_ns: int) -> NoReturn:
+        raise RecorderError(
+            f"{', '.join(keys)} is missing {seconds(t_ns - self._source.first_ns):.3f} s after the beginning; "
+            "--missing skip leaves such ticks out, --missing hold repeats the last value"
+        )
+
+    def _never(self, leading: Sequence[_Incomplete]) -> str:
+        """Why no tick was complete."""
+        absent = frozenset.intersection(*(missing for _, missing in leading)) if leading else frozenset()
+        if not absent:
+            return "each time another was missing"
+        return (
+            f"{', '.join(sorted(absent))} is missing at every one (held values count for {self._contract.max_age:g} s, "
+            "contract.max_age)"
+        )
 
 
 def _text_at(message: Message, path: str) -> str:

@@ -19,7 +19,6 @@ from ibrobot_core.api import (
     ContractError,
     IbrobotError,
     Image,
-    JointState,
     Session,
     Subscription,
     Viewer,
@@ -88,7 +87,7 @@ class WebViewer(Viewer):
         self.url, self.watch_url = str(ready["url"]), str(ready["watch_url"])
         self._log = LogLines()
         self._ctx.log.parent.addHandler(self._log) if self._ctx.log.parent else None
-        self._states = bus.subscribe("/joint_states", 1)
+        self._states = session.watch_states()
         self._objects = SceneObjects(session)
         self._pictures: dict[str, Subscription] = {}
         self._samples: dict[str, Subscription] = {}
@@ -130,7 +129,7 @@ class WebViewer(Viewer):
         if self.url:
             if self._ctx.log.parent is not None:
                 self._ctx.log.parent.removeHandler(self._log)
-            for subscription in (self._states, *self._pictures.values(), *self._samples.values()):
+            for subscription in (*self._pictures.values(), *self._samples.values()):
                 subscription.close()
             self._objects.close()
             self._commands.close(_END_S)
@@ -214,12 +213,10 @@ class WebViewer(Viewer):
         return True
 
     def _send_state(self) -> None:
-        arrived = self._states.drain()
-        if not arrived or self._session.state is None:
+        state = self._states.get()
+        if state is None:
             return
-        newest = arrived[-1].message
-        assert isinstance(newest, JointState)
-        self.newest = state_json(self._session.state)
+        self.newest = state_json(state)
         if self._shows(STATE):
             self._send(STATE, self.newest)
 

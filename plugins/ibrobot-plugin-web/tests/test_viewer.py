@@ -47,8 +47,9 @@ class TestConformance(ViewerSuite):
     def message(self, ctx: Context, i: int) -> Message:
         session = ctx.session
         assert session is not None
-        session.state = state(i, ctx.clock.now_ns())
-        return JointState(Header(session.state.stamp_ns), ctx.robot.joint_names, session.state.position)
+        now = state(i, ctx.clock.now_ns())
+        session.take_state(now)
+        return JointState(Header(now.stamp_ns), ctx.robot.joint_names, now.position)
 
     @override
     def shut(self, viewer: Viewer) -> None:
