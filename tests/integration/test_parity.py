@@ -82,6 +82,7 @@ def contract(rng: np.random.Generator) -> Contract:
             ),
         ),
         (ActionPart("arm", COMMANDS, Float64MultiArray.ros_type, "hold", JOINTS),),
+        max_age=float(rng.choice([0.1, 0.25, 5.0])),
     )  # fmt: skip
 
 
@@ -189,9 +190,9 @@ def check_rows(reader: Any, spec: Contract, seen: list[Frame], sent: list[tuple[
     """The rows of a conversion are the frames in which nothing is missing, with the newest command beside."""
     wanted = []
     for frame in seen:
-        commands = [made for received, topic, made in sent if topic == COMMANDS and received <= frame.stamp_ns]
-        if commands and not frame.missing:
-            wanted.append({**frame.values, "action": np.asarray(commands[-1].data, np.float32)})  # type: ignore[attr-defined]
+        commands = [(at, made) for at, topic, made in sent if topic == COMMANDS and at <= frame.stamp_ns]
+        if commands and frame.stamp_ns - commands[-1][0] <= spec.max_age * 1e9 and not frame.missing:
+            wanted.append({**frame.values, "action": np.asarray(commands[-1][1].data, np.float32)})  # type: ignore[attr-defined]
     if not wanted:
         return 0
     rows = list(Ticks(reader, spec, "skip"))

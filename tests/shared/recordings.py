@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,7 @@ def record(
     outcome: str = "success",
     contract: Contract | None = CONTRACT,
     gap: Mapping[str, tuple[float, float]] | None = None,
+    stamped: Mapping[str, Callable[[float], float]] | None = None,
     commanders: Sequence[tuple[float, str]] = (),
     chunk_size: int = 1 << 20,
     **metadata: str,
@@ -74,6 +75,7 @@ def record(
         outcome: how it ends.
         contract: what its metadata says; None for no contract there.
         gap: topic -> from when to when [s] it is silent.
+        stamped: topic -> its header's stamp [s] for a message of this time [s], both since the beginning.
         commanders: from when on [s] who commands, as the topic `/commander` says with each state.
         chunk_size: of the file [bytes].
         metadata: more of it.
@@ -92,6 +94,8 @@ def record(
         for i in range(int(seconds * rate)):
             stamp = START_NS + round(i * 1e9 / rate)
             received = stamp + int(rng.integers(0, 9_000_000))
+            if stamped and topic in stamped:
+                stamp = START_NS + round(stamped[topic](i / rate) * 1e9)
             if topic == "/joint_states":
                 message: Any = JointState(Header(stamp), JOINTS, rng.uniform(-1, 1, size=3))
             elif topic == "/commands":
