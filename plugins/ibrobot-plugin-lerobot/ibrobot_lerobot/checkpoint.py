@@ -15,6 +15,7 @@ from ibrobot_lerobot import layout
 from ibrobot_lerobot.untrusted import (
     MAX_ACTIONS,
     MAX_HISTORY,
+    check_models,
     check_steps,
     check_type,
     check_values,
@@ -132,23 +133,29 @@ def read_checkpoint(path: Path, base_models: Collection[str] = ()) -> Checkpoint
         raise PolicyError(f"{path} is not a folder with a checkpoint: it has no config.json; {hint}")
     file = path / "config.json"
     config = read_json(path, file.name)
-    check_values(file, config, base_models)
     if config.get("use_peft"):
         raise PolicyError(f"{path} contains only an adapter (use_peft); merge it into its base model")
-    processors = {name: _processor(path, name, base_models) for name in (PREPROCESSOR, POSTPROCESSOR)}
+    kind = check_type(file, config.get("type"))
+    check_values(file, config)
+    processors = {name: _processor(path, name) for name in (PREPROCESSOR, POSTPROCESSOR)}
+    check_models(path, {file.name: config, **processors}, base_models)
     try:
-        kind = check_type(file, config["type"])
         inputs = {
             name: (feature["type"], _shape(file, name, feature))
             for name, feature in config["input_features"].items()
             if feature["type"] in ("STATE", "ENV", "VISUAL") and not name.startswith(_EMPTY_CAMERA)
         }
         [action_size] = shape(file, ACTION, config["output_features"][ACTION]["shape"])
-        sizes = ("n_action_steps",) if kind in _SHORTER_CHUNKS else _CHUNK_SIZES
-        size = next(size for size in sizes if config.get(size) is not None)
-    except (KeyError, TypeError, ValueError, AttributeError, StopIteration) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise PolicyError(f"{file}: is not a policy configuration of LeRobot 0.6: {error!r}") from None
-    chunk_size = whole(file, size, config[size], MAX_ACTIONS)
+    sizes = [size for size in _CHUNK_SIZES if config.get(size) is not None]
+    if not sizes:
+        raise PolicyError(
+            f"{file}: policies of type {kind!r} are not supported: none of {', '.join(_CHUNK_SIZES)} gives the length "
+            "of their action chunks"
+        )
+    size = "n_action_steps" if kind in _SHORTER_CHUNKS else sizes[0]
+    chunk_size = whole(file, size, config.get(size), MAX_ACTIONS)
     n_obs_steps = whole(file, "n_obs_steps", config.get("n_obs_steps", 1), MAX_HISTORY)
     note = _note_path(path)
     trained_on = read_json(note.parent, note.name) if note is not None else {}
@@ -218,7 +225,7 @@ def _shape(file: Path, name: str, feature: Mapping[str, Any]) -> tuple[int, ...]
     return (*sizes[1:], sizes[0]) if feature["type"] == "VISUAL" else sizes
 
 
-def _processor(folder: Path, name: str, base_models: Collection[str]) -> dict[str, Any]:
+def _processor(folder: Path, name: str) -> dict[str, Any]:
     if not (folder / name).exists():
         raise PolicyError(
             f"{folder} has no {name}: it is from before LeRobot 0.4; "
@@ -226,5 +233,5 @@ def _processor(folder: Path, name: str, base_models: Collection[str]) -> dict[st
         )
     document = read_json(folder, name)
     check_steps(folder / name, document)
-    check_values(folder / name, document, base_models)
+    check_values(folder / name, document)
     return document

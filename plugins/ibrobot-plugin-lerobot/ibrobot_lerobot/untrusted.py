@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import stat
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -158,30 +158,55 @@ def check_step_name(path: Path, name: str) -> None:
         raise PolicyError(f"{path}: step {name!r} runs downloaded code; such policies are not supported")
 
 
-def check_values(path: Path, document: Mapping[str, Any], base_models: Collection[str]) -> None:
+def check_values(path: Path, document: Mapping[str, Any]) -> None:
     """Check every value of a checkpoint's JSON file.
 
     Args:
         path: the file.
         document: its content.
-        base_models: models that the user trusts in addition to `BASE_MODELS`.
 
     Raises:
-        PolicyError: if a number is implausibly large, a value would run foreign code, or a file or model outside the
-            checkpoint is not trusted.
+        PolicyError: if a number is implausibly large, or a value would run foreign code.
     """
     for place, value in _leaves(document):
+        key = _key(place)
         where = f"{path}: {'.'.join(map(str, place))}"
-        key = next((str(each) for each in reversed(place) if isinstance(each, str)), "")
         if key == "trust_remote_code" and value:
             raise PolicyError(f"{where}: would run code that comes with a model; such policies are not supported")
         if isinstance(value, int | float) and not key.startswith(_TRAINING) and not abs(value) <= _MAX_NUMBER:
             raise PolicyError(f"{where} is {value}, must be at most {_MAX_NUMBER}")
-        if isinstance(value, str) and names_a_model(key, value) and value not in {*BASE_MODELS, *base_models}:
-            raise PolicyError(
-                f"{where} loads {value!r} in addition to the checkpoint; if you trust it, allow it in the robot YAML "
-                f"with the model's base_models: [{value}]"
-            )
+
+
+def check_models(path: Path, documents: Mapping[str, Mapping[str, Any]], base_models: Collection[str]) -> None:
+    """Check that LeRobot loads no model or file besides the checkpoint that the user does not trust.
+
+    Args:
+        path: the checkpoint's folder.
+        documents: file -> its content.
+        base_models: models that the user trusts in addition to `BASE_MODELS`.
+
+    Raises:
+        PolicyError: names all untrusted models, and what allows them.
+    """
+    trusted = {*BASE_MODELS, *base_models}
+    found = {
+        value: f"{file}: {'.'.join(map(str, place))}"
+        for file, document in documents.items()
+        for place, value in _leaves(document)
+        if isinstance(value, str) and value not in trusted and names_a_model(_key(place), value)
+    }
+    if found:
+        named = " and ".join(f"{where} loads {value!r}" for value, where in found.items())
+        it, allowed = "it" if len(found) == 1 else "them", ", ".join([*base_models, *found])
+        raise PolicyError(
+            f"{path}: {named} in addition to the checkpoint; if you trust {it}, allow {it} in the robot YAML with the "
+            f"model's base_models: [{allowed}]"
+        )
+
+
+def _key(place: Sequence[str | int]) -> str:
+    """The innermost key of a place in a document."""
+    return next((each for each in reversed(place) if isinstance(each, str)), "")
 
 
 def names_a_model(key: str, value: str) -> bool:

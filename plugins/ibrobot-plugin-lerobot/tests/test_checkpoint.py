@@ -293,6 +293,42 @@ def test_folders_without_a_checkpoint(tmp_path: Path, spoil: Any, message: str) 
         make(path)
 
 
+def _without_chunk(path: Path) -> None:
+    file = path / "config.json"
+    config = json.loads(file.read_text())
+    for name in ("chunk_size", "n_action_steps"):
+        config.pop(name, None)
+    file.write_text(json.dumps({**config, "type": "lingbot_va", "frame_chunk_size": 4}))
+
+
+@pytest.mark.parametrize("kind", ["groot", "pi0_fast", "wall_x"])
+def test_policy_that_runs_downloaded_code_is_refused_before_it_asks_for_allowances(tmp_path: Path, kind: str) -> None:
+    path = write(tmp_path / kind, type=kind, text_tokenizer_name="google/any", pretrained_name_or_path="x/y")
+    with pytest.raises(PolicyError) as found:
+        make(path)
+    assert str(found.value) == (
+        f"{path}/config.json: policies of type '{kind}' run downloaded code and are not supported"
+    )
+
+
+def test_policy_without_the_length_of_its_chunks_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    path = write(tmp_path / "lingbot")
+    _without_chunk(path)
+    with pytest.raises(PolicyError) as found:
+        make(path)
+    assert str(found.value) == (
+        f"{path}/config.json: policies of type 'lingbot_va' are not supported: none of chunk_size, action_chunk_size, "
+        "action_horizon, n_action_steps gives the length of their action chunks"
+    )
+
+
+def test_all_allowances_are_asked_for_at_once(tmp_path: Path) -> None:
+    tokenizer = step("tokenizer_processor", tokenizer_name="me/words")
+    path = write(tmp_path / "vla", (tokenizer,), type="smolvla", vlm_model_name="me/vlm")
+    with pytest.raises(PolicyError, match=r"with the model's base_models: \[me/vlm, me/words\]$"):
+        make(path)
+
+
 def test_the_robots_side_needs_neither_torch_nor_weights(tmp_path: Path) -> None:
     path = write(tmp_path / "act")
     code = f"""
