@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from abc import ABC, abstractmethod
 from typing import override
 
 from ibrobot_core.units import NS_PER_S
+
+_BOOTTIME = time.CLOCK_BOOTTIME if sys.platform == "linux" else time.CLOCK_MONOTONIC
+"""Goes on while the computer is suspended, unlike CLOCK_MONOTONIC; only Linux has it."""
 
 
 class Clock(ABC):
@@ -19,6 +23,10 @@ class Clock(ABC):
     @abstractmethod
     def sleep_until(self, deadline_ns: int) -> None:
         """Return at `deadline_ns` [ns], or at once if it has passed."""
+
+    def asleep_ns(self) -> int:
+        """Time for which the computer was suspended since it was started [ns], which `now_ns` does not count."""
+        return 0
 
 
 class RealClock(Clock):
@@ -41,16 +49,29 @@ class RealClock(Clock):
         if remaining > 0:
             time.sleep(remaining / NS_PER_S)
 
+    @override
+    def asleep_ns(self) -> int:
+        return time.clock_gettime_ns(_BOOTTIME) - time.monotonic_ns()  # in this order: it may be too low, not too high
+
 
 class SteppedClock(Clock):
     """Time that moves only by `advance`: for lockstep runs and tests."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
+        self._asleep_ns = 0
 
     @override
     def now_ns(self) -> int:
         return self._now_ns
+
+    @override
+    def asleep_ns(self) -> int:
+        return self._asleep_ns
+
+    def suspend(self, duration_ns: int) -> None:
+        """Act as if the computer had been suspended for `duration_ns` [ns]."""
+        self._asleep_ns += duration_ns
 
     @override
     def sleep_until(self, deadline_ns: int) -> None:

@@ -106,7 +106,10 @@ def _run(runtime: Runtime, hooks: RunHooks, *, live: bool, as_json: bool) -> int
 
 
 def _stop_on_signals(session: Session, keys: KeyReader | None) -> None:
-    """Stop the run at the first of the `end_signals`; a second Ctrl-C ends the host, and control stops the robot."""
+    """Stop the run at the first of the `end_signals`; a second SIGTERM brakes the robot on its way to a stop pose.
+
+    A second Ctrl-C ends the host, and control brakes the robot.
+    """
     terminals = [fd for fd in (1, 2) if os.isatty(fd)]
 
     def stop(number: int, frame: object) -> None:
@@ -116,10 +119,19 @@ def _stop_on_signals(session: Session, keys: KeyReader | None) -> None:
             os._exit(_INTERRUPTED_TWICE)
         if number == signal.SIGHUP:  # the terminal may be closed; writing to it must not fail
             _discard(terminals)
+        if session.finished.is_set() and number == signal.SIGTERM:
+            threading.Thread(target=brake, name="signal", daemon=True).start()
+            return
         if session.request.lockstep:  # does not block: the run ends at a tick
             finish()
         else:  # see `on_signals`
             threading.Thread(target=finish, name="signal", daemon=True).start()
+
+    def brake() -> None:
+        try:
+            session.emergency_stop()
+        except IbrobotError as error:
+            session.log.error("%s", error)
 
     def finish() -> None:
         session.log.info("stopping; Ctrl-C again stops at once")
@@ -177,7 +189,8 @@ class _Panel:
         _log_to(self._log)
         self._display = stack.enter_context(Live(console=Screen(stderr=err), auto_refresh=False, screen=False))
         self._next_s = 0.0
-        self._pressed: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._pressed: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
+        """Keys, each with the number of emergency stops when it was pressed."""
         keys = runtime.session.request.keys
         if keys is not None:
             threading.Thread(target=self._listen, args=(keys(),), name="runtime keys", daemon=True).start()
@@ -192,7 +205,7 @@ class _Panel:
             return
         self._next_s = time.monotonic() + 1.0 / _PANEL_HZ
         while not self._pressed.empty():
-            self._handle_key(self._pressed.get())
+            self._handle_key(*self._pressed.get())
         session = self._runtime.session
         help_text = "\n".join(text for text in (session.command_source.help(), self._hooks.help()) if text)
         self._rates.sample(session)
@@ -203,15 +216,19 @@ class _Panel:
         while True:
             key = keys.get()
             if key == "esc":
-                self._try(lambda: self._runtime.session.control.call("estop"))
+                self._try(self._runtime.session.emergency_stop)
             else:
-                self._pressed.put(key)
+                self._pressed.put((key, self._runtime.session.stops))
 
-    def _handle_key(self, key: str) -> None:
+    def _handle_key(self, key: str, stops: int) -> None:
+        session = self._runtime.session
+        if session.stops > stops:
+            session.log.warning("%s was pressed before the emergency stop, which cancels it", key)
+            return
         if self._hooks.key(key):
             return
         if key == "f10":
-            self._try(self._runtime.reset)
+            self._try(lambda: self._runtime.reset(stops))
         elif (mode := self._runtime.session.mode_keys.get(key.upper())) is not None:
             self._try(lambda: self._runtime.switch_mode(mode))
 

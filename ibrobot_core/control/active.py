@@ -89,7 +89,11 @@ class ActiveExecutors:
         active = {owned.name: owned for owned in self._active}
         if executor not in active:
             raise GoalRejected(f"executor {executor!r} is not active; active: {', '.join(active) or 'none'}")
-        active[executor].executor.set_goal(goal_id, goal, active[executor].reading(measured))
+        try:
+            active[executor].executor.set_goal(goal_id, goal, active[executor].reading(measured))
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            # A goal comes from outside, and an executor from a plugin: neither may end the loop.
+            raise GoalRejected(f"{executor}: the goal is malformed: {type(error).__name__}: {error}") from error
 
     def cancel(self, measured: JointReading) -> None:
         """Cancel all goals; the executors then hold."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import enum
+import itertools
 import logging
 import time
 from collections import deque
@@ -18,6 +20,7 @@ from ibrobot_core.control.following import FollowingError
 from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.control.health import Health
 from ibrobot_core.control.link import ControlState, PlanRecord
+from ibrobot_core.control.plausible import Plausibility
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
 from ibrobot_core.interfaces import EpisodeSetup, Executor, JointReading, Signal, Torque
@@ -37,6 +40,28 @@ _RECENT_NS = NS_PER_S
 """Time after its last command for which a robot at rest counts as commanded [ns]."""
 _POSE_TOLERANCE = 0.2
 """Largest distance of a joint from the commanded startup pose, e.g. due to its weight [rad]."""
+_SUSPENDED_NS = ns(0.1)
+"""Shortest suspend that is a fault [ns]."""
+
+
+class Phase(enum.Enum):
+    """What the control loop does; the value says when a command is refused."""
+
+    ARRIVING = "while the robot moves to its startup pose"
+    RUNNING = "while executors command the robot"
+    FAULTED = "before a reset"
+    STOPPING = "while the robot is stopping"
+
+
+_ALWAYS = frozenset({"estop", "fault", "cancel", "counters", "halt"})
+"""Commands that stop the robot or change nothing."""
+PERMITTED: Mapping[Phase, frozenset[str]] = {
+    Phase.ARRIVING: _ALWAYS,
+    Phase.RUNNING: _ALWAYS | {"switch_mode", "goal", "reset", "reset_episode"},
+    Phase.FAULTED: _ALWAYS | {"reset", "reset_episode"},
+    Phase.STOPPING: _ALWAYS,
+}
+"""The commands of the host that each phase accepts."""
 
 
 class ControlCore:
@@ -47,6 +72,10 @@ class ControlCore:
         hardware: all hardware of the robot; connected by `start`.
         executors: name -> executor.
         clock: the source of stamps.
+
+    Attributes:
+        take_stops: executes emergency stops that have arrived; called during commands that may take long.
+        stops: number of emergency stops so far, also of those pressed while one was latched.
     """
 
     def __init__(
@@ -61,13 +90,18 @@ class ControlCore:
         self._safety = SafetyLayer(config.robot, self.period_ns)
         self._state_timeout_ns = ns(config.control.state_timeout)
         self._counts = {"read_errors": 0, "write_errors": 0, "signal_errors": 0, "stale_states": 0, "old_plans": 0}
-        self._counts["following_errors"] = 0
+        self._counts |= {"following_errors": 0, "implausible_states": 0}
         self._relaxed = False
         self._stopping = False
         self._following = FollowingError(config.control.following_error, config.robot, self.period_ns)
         self._yielded: Vector | None = None
         """Held positions of joints that did not follow, until a reset [rad]; NaN for the others, shape (J,)."""
         self._target: Vector | None = None
+        self._plausibility = Plausibility(config.robot, self.period_ns)
+        self._implausible = ""
+        """Why the last reading is not believed; empty if it is."""
+        # A value is too low if the process is interrupted between its two clocks, never too high.
+        self._asleep_ns = max(clock.asleep_ns() for _ in range(3))
         self._health = Health(config.control.load_shedding, self._log)
         self._shedding = self._has_shed = False
         self._commanded_ns: int | None = None
@@ -80,13 +114,16 @@ class ControlCore:
         self._commands: dict[str, Callable[..., Mapping[str, Any] | None]] = {
             "switch_mode": self._switch_mode,
             "reset_episode": self._reset_episode,
-            "estop": self._estop,
+            "estop": self.emergency_stop,
             "fault": self._raise_fault,
             "reset": self._reset,
             "goal": self._goal,
             "cancel": self._cancel,
             "counters": self.counters,
+            "halt": self._halt,
         }
+        self.take_stops: Callable[[], None] = lambda: None
+        self.stops = 0
         self.mode = ""
         self.generation = 0
         self.fault = ""
@@ -126,11 +163,14 @@ class ControlCore:
         """Whether the robot has entered its mode. Until then it moves to its startup pose; keep calling `tick`.
 
         Raises:
-            HardwareError: on a fault during the motion, or if the motion takes too long.
+            HardwareError: after a fault or an emergency stop during the motion, or if it takes too long; the robot is
+                at rest then.
         """
         if not self._arriving:
             return True
         if self.fault or self._target is None:
+            if not (self._safety.at_rest or self._relaxed):
+                return False  # still braking
             raise HardwareError(f"control.startup: {self._config.control.startup}: {self.fault}")
         away = np.abs(self._measured.position - self._target)
         # The mode starts from the measured positions; those of an old reading would pull the robot back.
@@ -138,7 +178,7 @@ class ControlCore:
             self._target, self._arriving = None, False
             self._switch_mode(self.mode)
             return True
-        if self._late_to_pose:
+        if self._late_to_pose and self._safety.at_rest:
             joint = self._robot.joint_names[int(away.argmax())]
             raise HardwareError(
                 f"control.startup: {self._config.control.startup}: not reached within {_POSE_TIMEOUT_S:g} s: "
@@ -155,6 +195,7 @@ class ControlCore:
             periods: periods since the last tick; more than one after missed ticks, to keep simulated time in step.
         """
         self._due_ns = self._clock.now_ns() if due_ns is None else due_ns
+        self._check_suspend()
         self._read()
         signals = self._read_signals()
         success = self._hardware.success()
@@ -168,7 +209,7 @@ class ControlCore:
         self.state = ControlState(
             tick=self._tick, stamp_ns=measured.stamp_ns, late_ns=late_ns, generation=self.generation,
             estop=self._safety.estopped, stale=measured.stale, success=success, position=measured.position,
-            velocity=measured.velocity, effort=measured.effort, command=command, signals=signals,
+            velocity=measured.velocity, effort=measured.effort, command=command, signals=signals, stops=self.stops,
         )  # fmt: skip
         return self.state
 
@@ -196,16 +237,30 @@ class ControlCore:
         if silent_s + braking_s >= longest_s:
             self._raise_fault(f"{fault} for {silent_s * 1e3:.0f} ms")
 
+    @property
+    def phase(self) -> Phase:
+        """What the loop does now."""
+        if self._stopping:
+            return Phase.STOPPING
+        if self._arriving:
+            return Phase.ARRIVING
+        return Phase.FAULTED if self.fault else Phase.RUNNING
+
     def handle(self, command: Mapping[str, Any]) -> dict[str, Any]:
         """Execute a command of the host and return the reply; the reply to a refused command has the key `error`."""
-        if self._stopping:
-            return {"reply": command["id"], "error": f"{command['do']}: refused, the robot is stopping"}
         arguments = {key: value for key, value in command.items() if key not in ("do", "id")}
         try:
+            self._permit(command["do"])
             result = self._commands[command["do"]](**arguments) or {}
         except IbrobotError as error:
-            return {"reply": command["id"], "error": str(error)}
-        return {"reply": command["id"], "generation": self.generation, **result}
+            return {"reply": command["id"], "stops": self.stops, "error": str(error)}
+        return {"reply": command["id"], "stops": self.stops, "generation": self.generation, **result}
+
+    def _permit(self, do: str) -> None:
+        phase = self.phase
+        if do not in PERMITTED[phase]:
+            cause = f": {self.fault}" if phase is Phase.FAULTED else ""
+            raise HardwareError(f"{do}: refused {phase.value}{cause}")
 
     def counters(self) -> dict[str, Any]:
         """Counts of all interventions and refusals by the safety layer, the executors, the hardware and the loop."""
@@ -219,16 +274,18 @@ class ControlCore:
         }
 
     def begin_stop(self, *, unmoved: bool = False) -> None:
-        """Start the configured stop behaviour; keep calling `tick` until `stopped`.
+        """Start the configured stop behaviour, unless it has begun; keep calling `tick` until `stopped`.
 
         Args:
             unmoved: whether nothing has moved the robot, since the start failed elsewhere; torque that the start
                 switched on is then switched off again.
         """
+        if self._stopping:
+            return
         self._stopping = True
         self._leave()
         self._target = None
-        self._shedding = False
+        self._shedding = self._arriving = False
         if unmoved and self._config.control.startup == "hold":
             self._hardware.undo_connect()
             self._relaxed = True
@@ -272,15 +329,21 @@ class ControlCore:
         self._hardware.disconnect()
 
     def _first_reading(self, patience_s: float = 0.0) -> JointReading:
+        """A reading that agrees with the one before it: the command begins there."""
         deadline_s = time.monotonic() + patience_s
-        readings = 1
-        while (measured := self._hardware.read()).stale:
-            if readings >= _FIRST_READINGS and time.monotonic() >= deadline_s:
-                raise HardwareError("the joints do not answer yet")
-            readings += 1
-            time.sleep(0.001)  # hardware that reads in a thread of its own is stale at once
-        self._answered_ns = measured.stamp_ns
-        return measured
+        last: JointReading | None = None
+        for number in itertools.count(1):
+            measured = self._hardware.read()
+            if not measured.stale:
+                if last is not None and not self._plausibility.jump(last.position, measured.position, 0):
+                    self._answered_ns = measured.stamp_ns
+                    return measured
+                last = measured
+            else:
+                time.sleep(0.001)  # hardware that reads in a thread of its own is stale at once
+            if number > _FIRST_READINGS and time.monotonic() >= deadline_s:
+                raise HardwareError("the joints do not answer yet, or each time with other positions")
+        raise AssertionError
 
     @property
     def _is_commanded(self) -> bool:
@@ -319,12 +382,31 @@ class ControlCore:
             measured = attrs.evolve(self._measured, stale=True)
             self._raise_fault(str(error))
         else:
+            measured = self._believed(measured)
             if measured.stale:
                 self._counts["stale_states"] += 1
                 self._stale()
             else:
                 self._answered_ns = measured.stamp_ns
         self._measured = measured
+
+    def _believed(self, measured: JointReading) -> JointReading:
+        """The reading, or the one before it, as after a lost reply, if no joint can have moved like that."""
+        self._implausible = ""
+        if not measured.stale:
+            since_ns = measured.stamp_ns - self._answered_ns
+            self._implausible = self._plausibility.jump(self._measured.position, measured.position, since_ns)
+        if not self._implausible:
+            return measured
+        self._counts["implausible_states"] += 1
+        return attrs.evolve(self._measured, stamp_ns=measured.stamp_ns, stale=True)
+
+    def _check_suspend(self) -> None:
+        """Raise a fault if the computer was asleep: whatever was planned before belongs to another time."""
+        slept_ns = self._clock.asleep_ns() - self._asleep_ns
+        self._asleep_ns += max(0, slept_ns)
+        if slept_ns >= _SUSPENDED_NS:
+            self._raise_fault(f"the computer was suspended for {slept_ns / NS_PER_S:.1f} s")
 
     def _read_signals(self) -> Vector:
         try:
@@ -338,7 +420,8 @@ class ControlCore:
         """Handle a tick without a new state; raise a fault once states have been missing for `state_timeout`."""
         age_ns = self._clock.now_ns() - self._answered_ns
         if age_ns >= self._state_timeout_ns:
-            self._raise_fault(f"the joints do not answer: no state for {age_ns / 1e6:.0f} ms")
+            what = self._implausible or "the joints do not answer"
+            self._raise_fault(f"{what}: no state for {age_ns / 1e6:.0f} ms")
 
     def _check_following(self) -> None:
         """Raise a fault if a joint does not follow, and stop pressing against the obstacle."""
@@ -362,20 +445,24 @@ class ControlCore:
             if (fault := self._health.fault) and not self.fault:
                 self._unwell = fault
                 self._raise_fault(fault)
-        if self._shedding and (self._at_target or not self._may_shed_in_motion):
-            self._shedding, self._target = False, None
-            self._relax("load shedding")
+        if self._shedding:
+            arrived = self._at_target
+            if arrived or not self._may_shed_in_motion:
+                self._target = None
+            if arrived or (self._target is None and self._safety.at_rest):
+                self._shedding = False
+                self._relax("load shedding")
 
     @property
     def _may_shed_in_motion(self) -> bool:
-        """Whether the motion to the pose may continue: no emergency stop, and the joints answer."""
+        """Whether the motion to the pose may continue: the joints answer, and it is not late."""
         silent = self._clock.now_ns() - self._answered_ns >= self._state_timeout_ns
-        return self._target is not None and not (self._late_to_pose or self._safety.estopped or silent)
+        return self._target is not None and not (self._late_to_pose or silent)
 
     def _shed(self, why: str) -> None:
         """Move to the load-shedding pose, unless a fault other than the joints' health prevents motion, then relax."""
         options = self._config.control.load_shedding
-        moves = options.pose and self.fault in ("", self._unwell)
+        moves = options.pose and self.fault in ("", self._unwell) and not self._safety.estopped
         then = f"goes to pose {options.pose} and relaxes" if moves else "relaxes"
         self._announce(f"{why}; this has lasted for {options.after:g} s", then)
         self._shedding = self._has_shed = True
@@ -450,6 +537,7 @@ class ControlCore:
     def _raise_fault(self, fault: str) -> None:
         if self.fault:
             return
+        fault = fault.strip() or "a fault without a message"
         relaxes = self._config.control.stop == "relax"
         self._announce(fault, "relaxes" if relaxes else "holds")
         if relaxes and not self._relaxed:
@@ -481,26 +569,54 @@ class ControlCore:
     def _switch_mode(self, mode: str) -> None:
         if mode not in self._config.control_modes:
             raise NotSupported(f"no mode {mode!r}; the modes are: {', '.join(self._config.control_modes)}")
-        if self.fault:
-            raise HardwareError(f"cannot enter mode {mode} before a reset: {self.fault}")
         self._leave()
         self.mode = mode
         self._enter()
 
-    def _reset_episode(self, seed: int) -> None:
+    def _reset_episode(self, seed: int) -> dict[str, Any]:
+        """Set up the scene again, which clears faults; not an emergency stop, since only a person may do so.
+
+        Returns:
+            `begun`: whether it was set up; false if an emergency stop is latched.
+        """
+        self.take_stops()
+        if self._safety.estopped:
+            return {"begun": False}
         self._leave()
         self._hardware.reset_episode(EpisodeSetup(seed))
-        self._restart_executors()
+        self._hardware.reset_faults()
+        self._begin_again(self._first_reading())
+        return {"begun": True}
 
-    def _estop(self) -> None:
+    def emergency_stop(self) -> None:
+        """Brake and hold, whatever the robot does; a load that was to be shed is given its time again."""
+        self.stops += 1
         self._safety.estop()
+        self._shedding = self._has_shed = False
+        self._target = None
+        self._health.restart()
         self._raise_fault(EMERGENCY_STOP)
 
-    def _reset(self) -> dict[str, Any]:
+    def _halt(self, *, unmoved: bool) -> dict[str, Any]:
+        """Begin the stop behaviour; `halted` says whether it has finished."""
+        self.begin_stop(unmoved=unmoved)
+        return {"halted": self.stopped}
+
+    def _reset(self, stops: int | None = None) -> dict[str, Any]:
         """Clear faults and the emergency stop, and enter the mode again at the measured positions.
 
-        The reply's `cleared` is the cleared fault, or empty if none was set.
+        Args:
+            stops: the number of emergency stops that the sender knew of; None: all so far.
+
+        Returns:
+            `cleared`: the cleared fault, or empty if none was set.
+
+        Raises:
+            HardwareError: if the robot is still braking, the sender did not know of a stop, one arrives during the
+                reset, or the joints have no valid positions. Nothing has changed then.
         """
+        stops = self.stops if stops is None else stops
+        self._refuse_after(stops)
         cleared = self.fault
         if not self._safety.at_rest and not self._relaxed:
             if cleared:
@@ -508,15 +624,26 @@ class ControlCore:
             # The robot moves as commanded: restart the executors only, so that commands continue within the limits.
             self._switch_mode(self.mode)
         else:
-            self._restart_executors()
+            self._hardware.reset_faults()
+            self.take_stops()
+            self._refuse_after(stops)
+            self._begin_again(self._first_reading())
         return {"cleared": cleared}
 
-    def _restart_executors(self) -> None:
-        self._hardware.reset_faults()
-        self._measured = self._first_reading()
+    def _refuse_after(self, stops: int) -> None:
+        if self.stops > stops:
+            raise HardwareError("reset: refused, an emergency stop came after it was requested")
+
+    def _begin_again(self, measured: JointReading) -> None:
+        """Enter the mode at `measured`, without faults.
+
+        Raises:
+            HardwareError: if it is not a valid position; nothing has changed then.
+        """
+        self._safety.reset(measured.position)
+        self._measured = measured
         self._leave()
         self._after_relax()
-        self._safety.reset(self._measured.position)
         self._yielded = None
         self.fault = self._unwell = ""
         self._enter()

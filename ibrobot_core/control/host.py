@@ -29,6 +29,8 @@ _BEAT_S = 0.05
 """Longest time between two signs of life to control [s]."""
 _GLANCE_S = 0.1
 """Interval at which a start checks whether it was given up."""
+_HALT_GLANCE_S = 0.02
+"""Interval at which `halt` asks whether the robot has stopped."""
 _REPLY_TIMEOUT_S = 5.0
 _STOP_TIMEOUT_S = 15.0
 """Time after which a control process that has not ended is killed; moving to a stop pose takes up to 10 s."""
@@ -52,6 +54,8 @@ class ControlHost(ABC):
         report: the last `loop` and `counters` reported by control.
         refused: real-time settings refused by the machine, one line each.
         holding: parts that held torque when control ended, and how to switch it off, one line each.
+        stops: number of emergency stops in this run, by the newest state or answer.
+        generation: the generation that began when the robot arrived; see `arrive`.
     """
 
     def __init__(self, on_state: OnState, on_event: OnEvent) -> None:
@@ -61,10 +65,17 @@ class ControlHost(ABC):
         self.report: dict[str, Any] = {"loop": Punctuality().summary(), "counters": {}}
         self.refused: list[str] = []
         self.holding: list[str] = []
+        self.stops = 0
+        self.generation = 0
+
+    @property
+    @abstractmethod
+    def running(self) -> bool:
+        """Whether commands reach control, now or as soon as it ticks."""
 
     @abstractmethod
     def start(self) -> None:
-        """Connect the hardware and start ticking.
+        """Connect the hardware and start ticking. From then on, `call` may stop the robot.
 
         Raises:
             IbrobotError: e.g. if the hardware does not connect.
@@ -84,8 +95,27 @@ class ControlHost(ABC):
         """Replace the plan."""
 
     @abstractmethod
+    def arrive(self) -> None:
+        """Wait until the robot has arrived at its startup pose, and entered its mode.
+
+        Raises:
+            IbrobotError: if it has not arrived, e.g. after an emergency stop.
+        """
+
+    @abstractmethod
+    def halt(self, *, unmoved: bool = False) -> None:
+        """Stop the robot with the configured behaviour, and wait for the end; `call` may still brake it.
+
+        Args:
+            unmoved: as for `stop`.
+
+        Raises:
+            ComponentFailed: if control has died.
+        """
+
+    @abstractmethod
     def stop(self, *, unmoved: bool = False) -> None:
-        """Stop the robot with the configured behaviour and end control. Safe to call twice.
+        """Stop the robot with the configured behaviour, unless it has halted, and end control. Safe to call twice.
 
         Args:
             unmoved: the run failed before anything moved the robot: the torque that its start put on goes off again.
@@ -111,22 +141,32 @@ class InlineControl(ControlHost):
         self._punctuality = Punctuality()
         self._started = False
 
+    @property
+    @override
+    def running(self) -> bool:
+        return self._started
+
     @override
     def start(self) -> None:
         try:
             self._core.start(self._mode)
-            while not self._core.arrived():
-                self._clock.advance(self._core.period_ns)
-                self._core.tick()
         except BaseException:
             self._close()
             raise
         self.signals = [(signal.topic, signal.size) for signal in self._core.signals]
         self._started = True
 
+    @override
+    def arrive(self) -> None:
+        while not self._core.arrived():
+            self._clock.advance(self._core.period_ns)
+            self.step()
+        self.generation = self._core.generation
+
     def step(self) -> None:
         """Run one tick at the clock's time."""
         state = self._core.tick()
+        self.stops = state.stops
         self._on_state(state)
         self._punctuality.tick(self._clock.now_ns(), 0, 0)
         if state.tick % REPORT_TICKS == 0:
@@ -136,21 +176,31 @@ class InlineControl(ControlHost):
 
     @override
     def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
-        return raise_error(self._core.handle({"do": do, "id": 0, **arguments}))
+        reply = self._core.handle({"do": do, "id": 0, **arguments})
+        self.stops = reply["stops"]
+        return raise_error(reply)
 
     @override
     def write_plan(self, plan: PlanRecord) -> None:
         self._core.set_plan(plan)
 
     @override
-    def stop(self, *, unmoved: bool = False) -> None:
+    def halt(self, *, unmoved: bool = False) -> None:
         if not self._started:
             return
-        self._started = False
         self._core.begin_stop(unmoved=unmoved)
         while not self._core.stopped:
             self._clock.advance(self._core.period_ns)
-            self._on_state(self._core.tick())
+            self.step()
+
+    @override
+    def stop(self, *, unmoved: bool = False) -> None:
+        if not self._started:
+            return
+        try:
+            self.halt(unmoved=unmoved)
+        finally:
+            self._started = False
         self._report()
         self._close()
 
@@ -172,7 +222,7 @@ class ControlClient(ControlHost):
         on_state: called with each state, in that thread.
         on_event: called with each event, in that thread.
         on_death: called when the process dies.
-        given_up: set to abort a start; the robot then stops at once, even on its way to a pose.
+        given_up: set to abort `start` and `arrive`.
         aftermath: text appended to the report of its death.
     """
 
@@ -201,6 +251,12 @@ class ControlClient(ControlHost):
         self._child: Child | None = None
         self._memory: SharedMemory | None = None
         self._thread: threading.Thread | None = None
+        self._arrived = threading.Event()
+
+    @property
+    @override
+    def running(self) -> bool:
+        return self._child is not None
 
     @property
     def pid(self) -> int | None:
@@ -271,6 +327,20 @@ class ControlClient(ControlHost):
             self._slow.discard(number)
 
     @override
+    def arrive(self) -> None:
+        while not self._arrived.wait(_GLANCE_S):
+            if self._given_up.is_set():
+                raise ComponentFailed("given up while the robot moved to its startup pose")
+
+    @override
+    def halt(self, *, unmoved: bool = False) -> None:
+        deadline_s = time.monotonic() + _STOP_TIMEOUT_S
+        while self.running and not self.call("halt", unmoved=unmoved)["halted"]:
+            if time.monotonic() >= deadline_s:
+                return
+            time.sleep(_HALT_GLANCE_S)
+
+    @override
     def write_plan(self, plan: PlanRecord) -> None:
         if self._memory is not None:
             self._memory.write_plan(plan)
@@ -312,7 +382,7 @@ class ControlClient(ControlHost):
         if child.failure is not None:
             self.holding = child.failure.holding
         if not self._stopping:
-            self._on_death(self._failure(child, "the control process died"))
+            self._on_death(self._death(child))
         # Wake waiting callers only afterwards, so that the cause is reported and not its consequence.
         self._let_go(_GONE)
 
@@ -320,6 +390,13 @@ class ControlClient(ControlHost):
         """Have waiting callers raise `why`."""
         for number in list(self._replies):
             self._take({"reply": number, "gone": why})
+
+    def _death(self, child: Child) -> ComponentFailed:
+        if child.failure is None or self._arrived.is_set():
+            return self._failure(child, "the control process died")
+        failure = ComponentFailed(child.failure.error)  # the robot did not arrive, and control says why
+        failure.exit_code = child.failure.exit_code
+        return failure
 
     def _pass_on(self, child: Child) -> None:
         """Forward states and messages, and give signs of life, until control has ended."""
@@ -343,7 +420,7 @@ class ControlClient(ControlHost):
         # Read states after the socket, so that everything measured before an answer is published before the answer.
         messages = child.receive()
         for state in self._memory.read_states():
-            self._generation = state.generation
+            self._generation, self.stops = state.generation, max(self.stops, state.stops)
             self._on_state(state)
         for message in messages:
             self._take(message)
@@ -376,9 +453,13 @@ class ControlClient(ControlHost):
 
     def _take(self, message: Mapping[str, Any]) -> None:
         if "reply" in message:
+            self.stops = max(self.stops, message.get("stops", 0))
             waiting = self._replies.get(message["reply"])
             if waiting is not None:
                 waiting.put(message)
+        elif message["event"] == "arrived":
+            self.generation = message["generation"]
+            self._arrived.set()
         elif message["event"] in ("report", "stopped"):
             self.report = {"loop": message["loop"], "counters": message["counters"]}
             self.holding = message.get("holding", [])

@@ -54,6 +54,8 @@ class ControlState:
     """Command written to the hardware [rad], shape (J,)."""
     signals: Vector
     """All hardware signals, concatenated, shape (S,)."""
+    stops: int = 0
+    """Number of emergency stops since the run began, also of those pressed while one was latched."""
 
 
 @attrs.frozen(eq=False)
@@ -80,7 +82,8 @@ class LinkLayout:
     def state(self) -> np.dtype[Any]:
         """One slot of the state ring."""
         vector = ("f8", (self.joints,))
-        integers = [(name, "i8") for name in ("tick", "stamp", "late", "generation", "estop", "stale", "success")]
+        names = ("tick", "stamp", "late", "generation", "stops", "estop", "stale", "success")
+        integers = [(name, "i8") for name in names]
         arrays = [(name, *vector) for name in ("position", "velocity", "effort", "command")]
         return np.dtype([("seq", "i8"), *integers, *arrays, ("signals", "f8", (self.signals,)), ("crc", "i8")])
 
@@ -134,8 +137,9 @@ class SharedMemory:
         body = self._body
         success = -1 if state.success is None else int(state.success)
         body[0] = (
-            self._written, state.tick, state.stamp_ns, state.late_ns, state.generation, state.estop, state.stale,
-            success, state.position, state.velocity, state.effort, state.command, state.signals, 0,
+            self._written, state.tick, state.stamp_ns, state.late_ns, state.generation, state.stops,
+            state.estop, state.stale, success, state.position, state.velocity, state.effort, state.command,
+            state.signals, 0,
         )  # fmt: skip
         raw = body.view(np.uint8)
         body["crc"][0] = crc32(raw[: self._state_size - _SEQUENCE_BYTES])
@@ -236,7 +240,8 @@ def _state(record: Any) -> ControlState:
     success = int(record["success"])
     return ControlState(
         tick=int(record["tick"]), stamp_ns=int(record["stamp"]), late_ns=int(record["late"]),
-        generation=int(record["generation"]), estop=bool(record["estop"]), stale=bool(record["stale"]),
+        generation=int(record["generation"]), stops=int(record["stops"]),
+        estop=bool(record["estop"]), stale=bool(record["stale"]),
         success=None if success < 0 else bool(success), position=record["position"], velocity=record["velocity"],
         effort=record["effort"], command=record["command"], signals=record["signals"],
     )  # fmt: skip

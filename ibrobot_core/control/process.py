@@ -11,6 +11,7 @@ import logging
 import os
 import signal
 import sys
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from ibrobot_core.clock import RealClock
 from ibrobot_core.component import error_text, exit_code
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
-from ibrobot_core.control.core import ControlCore
+from ibrobot_core.control.core import ControlCore, Phase
 from ibrobot_core.control.link import LinkLayout, SharedMemory
 from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
@@ -31,11 +32,10 @@ from ibrobot_core.units import NS_PER_S
 _STARTUP_TIMEOUT_S = 30.0
 _GLANCE_S = 0.03
 """Silence of the host from which its state is looked at [s]."""
-_COMMANDED = "the host asked for it"
 
 
 class ControlProcess:
-    """Runs the loop on absolute deadlines and sends the host `ready` once the robot has arrived."""
+    """Runs the loop on absolute deadlines; tells the host when it is `ready`, and when the robot has `arrived`."""
 
     def __init__(
         self, core: ControlCore, clock: RealClock, channel: Channel, memory: SharedMemory, wake: int, host: int,
@@ -47,22 +47,31 @@ class ControlProcess:
         self._memory = memory
         self._wake = wake
         self._host = host
-        self._ready: Mapping[str, Any] | None = ready
+        self._ready = ready
+        self._arrived = False
+        self._waiting: deque[Mapping[str, Any]] = deque()
+        """Commands of the host that were received and not executed yet."""
         self._punctuality = Punctuality()
         self._beats = 0
         self._heard_ns = 0
         """When the host last gave a sign of life [ns]."""
-        self._stopping = False
-        self._terminated = False
+        self._ends = False
+        self._orphaned = self._terminated = False
+        core.take_stops = self._receive
 
     def run(self) -> None:
-        """Tick until the host commands a stop, the host dies, or SIGTERM arrives; then run the stop behaviour."""
+        """Tick until the host commands a stop, the host dies, or SIGTERM arrives; then run the stop behaviour.
+
+        A host that dies during the stop behaviour, and a further SIGTERM, are an emergency stop: nobody else can stop
+        the motion any more.
+        """
         signal.signal(signal.SIGTERM, self._terminate)
         self._report("report")  # the first call is slow, so make it before the first tick
+        self._channel.send(self._ready)
         period = self._core.period_ns
         deadline = self._clock.now_ns() + period
         periods = 1
-        while not (self._stopping and self._core.stopped):
+        while not (self._ends and self._core.stopped):
             self._clock.sleep_until(deadline)
             late = self._clock.now_ns() - deadline
             self._cycle(deadline, late, periods)
@@ -85,13 +94,23 @@ class ControlProcess:
         self._punctuality.tick(deadline, late, periods - 1)
         self._report_to_host()
         # A process forked by the host keeps the socket open after the host's death.
-        if self._channel.closed or os.getppid() != self._host:
-            self._begin_stop("the host is gone", unmoved=self._ready is not None)
-        elif self._terminated:
-            self._begin_stop("terminated")
-        elif self._ready is not None and not self._stopping and self._core.arrived():
-            self._channel.send({**self._ready, "generation": self._core.generation})
-            self._ready = None
+        if not self._orphaned and (self._channel.closed or os.getppid() != self._host):
+            self._orphaned = True
+            self._end("the host is gone", unmoved=not self._arrived)
+        if self._terminated:
+            self._terminated = False
+            self._end("terminated")
+        if not self._arrived and self._core.phase is not Phase.STOPPING and self._core.arrived():
+            self._arrived = True
+            self._channel.send({"event": "arrived", "generation": self._core.generation})
+
+    def _receive(self) -> None:
+        """Receive commands; emergency stops overtake all others."""
+        for command in self._channel.receive():
+            if command["do"] == "estop":
+                self._channel.send(self._core.handle(command))
+            else:
+                self._waiting.append(command)
 
     def _note_silences(self, late: int) -> None:
         """Have the robot brake if the host, or this process, has been stopped or blocked."""
@@ -107,9 +126,12 @@ class ControlProcess:
     def _handle_commands(self) -> bool:
         """Execute the host's commands; return whether this took longer than a period."""
         begun_ns = self._clock.now_ns()
-        for command in self._channel.receive():
+        self._receive()
+        while self._waiting:
+            command = self._waiting.popleft()
             if command["do"] == "stop":
-                self._begin_stop(_COMMANDED, unmoved=command["unmoved"])
+                self._ends = True
+                self._core.begin_stop(unmoved=command["unmoved"])
             else:
                 self._channel.send(self._core.handle(command))
         return self._clock.now_ns() - begun_ns > self._core.period_ns
@@ -127,13 +149,13 @@ class ControlProcess:
         loop, counters = self._punctuality.summary(), self._core.counters()
         self._channel.send({"event": event, "loop": loop, "counters": counters, **more})
 
-    def _begin_stop(self, why: str, *, unmoved: bool = False) -> None:
-        if not self._stopping:
-            self._stopping = True
-            logging.getLogger("ibrobot.control").log(
-                logging.DEBUG if why == _COMMANDED else logging.WARNING, "stopping: %s", why
-            )
-            self._core.begin_stop(unmoved=unmoved)
+    def _end(self, why: str, *, unmoved: bool = False) -> None:
+        """End the loop after the stop behaviour; brake if that has begun already."""
+        logging.getLogger("ibrobot.control").warning("stopping: %s", why)
+        if self._core.phase is Phase.STOPPING and not self._core.stopped:
+            self._core.emergency_stop()
+        self._ends = True
+        self._core.begin_stop(unmoved=unmoved)
 
     def _terminate(self, number: int, frame: Any) -> None:
         self._terminated = True

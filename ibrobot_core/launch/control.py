@@ -53,6 +53,15 @@ class ControlComponent(Component):
         for line in host.refused:
             session.log.warning(line)
 
+    def arrive(self) -> None:
+        """Wait until the robot has arrived at its startup pose.
+
+        Raises:
+            IbrobotError: as `ControlHost.arrive`.
+        """
+        self._session.control.arrive()
+        self._session.generation = self._session.control.generation
+
     @override
     def step(self, now_ns: int) -> None:
         host = self._session.control

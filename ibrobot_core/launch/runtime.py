@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from types import NoneType
 from typing import Any
 
@@ -11,7 +12,7 @@ import attrs
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.component import Component, Worker, error_line, error_text, exit_code
 from ibrobot_core.config.missing import absent_models, unavailable_modes
-from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, PluginError
+from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, NotSupported, PluginError
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_components
 from ibrobot_core.launch.session import Session
@@ -28,9 +29,19 @@ class SetMode:
     mode: str = option(help="a control mode of the robot YAML")
 
 
+@documented
+@attrs.frozen
+class Reset:
+    """A request to `/reset`."""
+
+    stops: int | None = option(None, ge=0, help="number of emergency stops that the sender knew of; none: all so far")
+
+
 SET_MODE = Service("/set_mode", SetMode, NoneType, "Enter another control mode.", alone="mode")
-RESET = Service("/reset", NoRequest, str, "Clear faults and the emergency stop; answers with what the robot does now.")
+RESET = Service("/reset", Reset, str, "Clear faults and the emergency stop; answers with what the robot does now.")
 ESTOP = Service("/estop", NoRequest, NoneType, "Stop the robot at once, and hold until a reset.")
+_CHANGE_S = 10.0
+"""How long the end of a run waits for a mode switch or reset under way [s]."""
 _GLANCE_S, _GLANCES = 0.1, 100
 """Timeout [s] and number of waits for the first joint state; several, since time passes for a stopped process too."""
 
@@ -38,7 +49,7 @@ _GLANCE_S, _GLANCES = 0.1, 100
 class Runtime:
     """One run. Call `start`, then `step` (lockstep) or `wait` until the run has ended, then `stop`.
 
-    It serves `/set_mode`, `/reset` and `/estop`.
+    It serves `/set_mode`, `/reset` and, from the start to the end of the run, `/estop`.
     """
 
     def __init__(self, session: Session) -> None:
@@ -77,14 +88,18 @@ class Runtime:
         config = session.config
         for line in (*absent_models(config.absent_models), *unavailable_modes(config.unavailable)):
             session.log.warning("%s", line)
+        session.bus.serve(ESTOP, self._estop)
         try:
             for component in self.plan.components:
+                if component is self.plan.episodes_worker:
+                    self._arrive()
                 on_start(component.name)
                 self._started.append(component)
                 self._start(component)
-            self._begun_ns = session.clock.now_ns()
             if self.plan.episodes_worker is None:
+                self._arrive()
                 self._begin_mode()
+            self._begun_ns = session.clock.now_ns()
         except BaseException as error:
             ended = session.finished.is_set()
             session.start_failed = True
@@ -94,8 +109,7 @@ class Runtime:
                 return
             raise
         session.bus.serve(SET_MODE, lambda request: self.switch_mode(request.mode))
-        session.bus.serve(RESET, lambda _: self.reset())
-        session.bus.serve(ESTOP, self._estop)
+        session.bus.serve(RESET, lambda request: self.reset(request.stops))
 
     def wait(self, timeout_s: float) -> bool:
         """Wait up to `timeout_s` [s] for the end of the run; return whether it has ended."""
@@ -121,20 +135,29 @@ class Runtime:
     def switch_mode(self, name: str) -> None:
         """Enter another mode: start its components, then change the owner of the joints within one tick.
 
-        For the present mode, continue it if a reset made the robot hold; otherwise do nothing.
+        For the present mode, continue it if a reset made the robot hold; otherwise do nothing. A request waits for a
+        mode switch or reset under way.
 
         Raises:
-            IbrobotError: if there is no such mode or its components do not start; the present mode continues.
+            IbrobotError: if there is no such mode, its components do not start, or the robot is stopped, now or
+                before this request's turn; the present mode continues.
         """
         session = self.session
         if name not in session.config.control_modes:
             raise NotSupported(f"no mode {name!r}; the modes are: {', '.join(session.config.control_modes)}")
         if (reason := session.config.unavailable.get(name)) is not None:
             raise PluginError(f"mode {name} is unavailable: {reason}")
-        if name == session.mode:
-            if session.held:
+        if session.faults:
+            raise HardwareError(f"mode {name}: refused before a reset: {session.faults[-1]}")
+        with self._changing(f"mode {name}", session.stops):
+            if name != session.mode:
+                self._enter(name)
+            elif session.held:
                 self._go_on()
-            return
+
+    def _enter(self, name: str) -> None:
+        """Enter another mode."""
+        session = self.session
         added = mode_components(session, name, self.plan.link)
         new = added.components()
         try:
@@ -155,29 +178,59 @@ class Runtime:
         if not session.request.by_operator:
             session.episodes.begin()
 
-    def reset(self) -> str:
+    def reset(self, stops: int | None = None) -> str:
         """Clear faults and the emergency stop, and restart the mode at the measured positions.
 
         An autonomous mode does not restart: after a fault the robot holds until the operator enters the mode again.
+
+        Args:
+            stops: number of emergency stops that the operator knew of, see `ControlState.stops`; None: all so far.
 
         Returns:
             What the robot does now, and how to continue.
 
         Raises:
-            IbrobotError: if the hardware, or a device that the mode needs, does not answer yet.
+            IbrobotError: if the hardware, or a device that the mode needs, does not answer yet, or an emergency stop
+                came that the operator did not know of. The robot stays stopped.
         """
         session = self.session
-        session.command_source.recover()
-        session.command_source.end()
-        stopped = bool(session.command("reset")["cleared"])
-        session.held = session.command_source.autonomous and (stopped or session.held)
-        session.begin_source()
-        then = f"holding: {session.to_go_on()}" if session.held else f"mode {session.mode} starts over"
-        session.log.info("reset; %s", then)
-        return f"reset; {then}"
+        stops = session.stops if stops is None else stops
+        with self._changing("reset", stops):
+            session.command_source.recover()
+            session.end_source()
+            try:
+                stopped = bool(session.command("reset", stops=stops)["cleared"])
+            except BaseException:
+                if not session.faults:  # the robot was not stopped, and its mode goes on
+                    session.begin_source()
+                raise
+            session.held = session.command_source.autonomous and (stopped or session.held)
+            try:
+                session.begin_source()
+            except IbrobotError as error:
+                session.control.call("fault", fault=f"mode {session.mode} does not start over: {error}")
+                raise
+            then = f"holding: {session.to_go_on()}" if session.held else f"mode {session.mode} starts over"
+            session.log.info("reset; %s", then)
+            return f"reset; {then}"
+
+    @contextmanager
+    def _changing(self, what: str, stops: int) -> Iterator[None]:
+        """Change the state of the run when nobody else does, at the request of a user who knew of `stops` stops.
+
+        Raises:
+            IbrobotError: if the run has ended, or there were more emergency stops, when its turn comes.
+        """
+        session = self.session
+        with session.changing:
+            if session.finished.is_set():
+                raise NotSupported(f"{what}: refused, the run ends")
+            if session.stops > stops:
+                raise HardwareError(f"{what}: refused, an emergency stop came after it was requested")
+            yield
 
     def _estop(self, request: NoRequest) -> None:
-        self.session.control.call("estop")
+        self.session.emergency_stop()
 
     def _go_on(self) -> None:
         """Enter the present mode again after a reset made the robot hold."""
@@ -193,14 +246,31 @@ class Runtime:
         """Stop every component in reverse starting order. Errors are logged, so that all are stopped."""
         session = self.session
         session.finish()
-        for service in (SET_MODE, RESET, ESTOP):
+        for service in (SET_MODE, RESET):
             session.bus.unserve(service)
-        started, self._started = self._started, []
-        if (worker := self.plan.episodes_worker) in started:
-            started.remove(worker)
+        if (worker := self.plan.episodes_worker) in self._started:
+            self._started.remove(worker)
             self._stop_all([worker])
         session.episodes.end("unknown")
-        self._stop_all(started)
+        self._halt()
+        changing = session.changing.acquire(timeout=_CHANGE_S)
+        try:
+            started, self._started = self._started, []
+            self._stop_all(started)
+        finally:
+            if changing:
+                session.changing.release()
+            session.bus.unserve(ESTOP)
+
+    def _halt(self) -> None:
+        """Let control carry out the stop behaviour while everything that can send an emergency stop still runs."""
+        session, stops = self.session, self.session.stops
+        if not session.has_control:
+            return
+        with suppress(Exception):  # a bug or a death, which the end of control reports
+            session.control.halt(unmoved=session.start_failed)
+        if session.stops > stops:
+            session.log.warning("emergency stop: the robot holds where it is, and the run ends")
 
     def raise_failure(self) -> None:
         """Raise the failure that ended the run, if any.
@@ -239,16 +309,12 @@ class Runtime:
         }
 
     def _start(self, component: Component) -> None:
-        try:
+        with _named(component):
             if isinstance(component, Worker):
                 component.given_up = self.session.finished
             component.start()
             if isinstance(component, ControlComponent) and self.session.request.lockstep:
                 component.step(self.session.clock.now_ns())
-        except Exception as error:
-            failure = ComponentFailed(f"{component.name}: {error_text(error)}")
-            failure.exit_code = exit_code(error)
-            raise failure from error
 
     def _stop_all(self, components: list[Component]) -> None:
         """Stop `components` in reverse order. Errors are logged, so that all are stopped."""
@@ -290,12 +356,31 @@ class Runtime:
             states.get(_GLANCE_S)
         raise HardwareError("control is ready but sends no joint states")
 
+    def _arrive(self) -> None:
+        """Wait until the robot is in its mode, and has been seen there.
+
+        Raises:
+            ComponentFailed: if it does not arrive, e.g. after an emergency stop.
+        """
+        control = next(each for each in self._started if isinstance(each, ControlComponent))
+        with _named(control):
+            control.arrive()
+        self._await_state()
+
     def _begin_mode(self) -> None:
         """Begin a mode without simulated episodes: one open-ended episode from the robot's present state."""
         session = self.session
-        self._await_state()
-        assert session.state is not None
-        session.generation = session.state.generation
         session.begin_source()
         if not session.request.by_operator:
             session.episodes.begin()
+
+
+@contextmanager
+def _named(component: Component) -> Iterator[None]:
+    """Put the component's name before an error."""
+    try:
+        yield
+    except Exception as error:
+        failure = ComponentFailed(f"{component.name}: {error_text(error)}")
+        failure.exit_code = exit_code(error)
+        raise failure from error

@@ -174,6 +174,8 @@ class Session:
         command_source: the source that commands the active executors.
         episodes: begins, ends and counts the episodes; replaced by what records them.
         devices: the open teleoperation devices, which modes share.
+        changing: held while the state of the run changes: by a mode switch, a reset, and the beginning or end of a
+            simulated episode. An emergency stop never waits for it.
         commander: who commands the robot in a mode in which an operator may take it from the policy: `policy`,
             `operator`, or `handover` while neither does; empty in other modes.
         held: whether the robot holds after the reset of a fault, until the operator enters the mode again.
@@ -193,6 +195,7 @@ class Session:
         self.command_source = CommandSource()
         self.episodes = Episodes(self)
         self.devices = SharedDevices()
+        self.changing = threading.RLock()
         self.commander = ""
         self.held = False
         self.start_failed = False
@@ -303,6 +306,23 @@ class Session:
         full[:, columns] = positions
         self.plan = PlanRecord(self.generation, start_ns, step_ns, mask, full)
         self.control.write_plan(self.plan)
+
+    @property
+    def stops(self) -> int:
+        """Number of emergency stops in this run, as far as known here; see `ControlState.stops`."""
+        return self._control.stops if self._control is not None else 0
+
+    def emergency_stop(self) -> None:
+        """Brake all joints and hold, from any thread and at any time. Before control runs, the run ends.
+
+        Raises:
+            IbrobotError: if control does not confirm it.
+        """
+        if self._control is not None and self._control.running:
+            self._control.call("estop")
+        else:
+            self.finish()
+            self.log.error("emergency stop while nothing commands the robot: the run ends")
 
     def command(self, do: str, **arguments: Any) -> Mapping[str, Any]:
         """Execute a command that begins a new generation, e.g. a mode switch, and return control's answer."""

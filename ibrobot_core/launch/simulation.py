@@ -22,15 +22,18 @@ class SimulatedEpisodes(SessionWorker):
     @override
     def work(self, timeout_s: float) -> None:
         session = self.session
-        if not session.finished.is_set():
-            self._judge(session)
+        # A mode switch holds this lock while it waits for this thread to end.
+        if not session.finished.is_set() and session.changing.acquire(blocking=False):
+            try:
+                self._judge(session)
+            finally:
+                session.changing.release()
         if timeout_s > 0:
             self.pause(min(timeout_s, session.config.control.rate_hz**-1))
 
     def _judge(self, session: Session) -> None:
         state = session.state
         if self._begun_ns is None:
-            # Setting up the scene again would clear an emergency stop and move the robot; only a person may do so.
             if not (session.held or (state is not None and state.estop)):
                 self._begin_episode()
         elif state is not None and state.generation == session.generation and state.success:
@@ -42,7 +45,8 @@ class SimulatedEpisodes(SessionWorker):
     def _begin_episode(self) -> None:
         session = self.session
         seed = session.request.seed + session.episodes.number
-        session.command("reset_episode", seed=seed)
+        if not session.command("reset_episode", seed=seed)["begun"]:
+            return  # an emergency stop is latched
         self._begun_ns = session.clock.now_ns()
         session.episodes.begin()
         session.command_source.begin(seed)

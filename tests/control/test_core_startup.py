@@ -77,7 +77,8 @@ def test_a_joint_that_is_blocked_is_named(rig):
         HardwareError, match=r"control.startup: pose rest: joint lift does not follow: it is \d\.\d\d rad"
     ):
         arrive(rig)
-    assert "not active; active: none" in rig.call("goal", executor="arm_position", goal_id="1", goal={})["error"]
+    refused = rig.call("goal", executor="arm_position", goal_id="1", goal={})["error"]
+    assert refused == "goal: refused while the robot moves to its startup pose"
 
 
 def test_a_joint_that_hangs_too_far_from_the_pose_is_named(rig):
@@ -101,7 +102,8 @@ def test_a_fault_on_the_way_is_reported(rig):
     rig.hardware.silent = True
     rig.tick()
     with pytest.raises(HardwareError, match=r"control.startup: pose rest: .*the bus is silent"):
-        rig.core.arrived()
+        arrive(rig, 10)
+    assert_at_rest(rig)
 
 
 @pytest.mark.parametrize("stop", ["hold", "relax"])
@@ -126,3 +128,37 @@ def test_a_start_waits_for_joints_that_answer_late(make_rig, monkeypatch):
     monkeypatch.setattr(hardware, "read", late)
     rig.core.start("stream")
     assert rig.core.arrived()
+
+
+def assert_at_rest(rig) -> None:
+    """The last command moved no joint, and nothing before it broke a limit."""
+    np.testing.assert_array_equal(rig.hardware.written[-1], rig.hardware.written[-2])
+    rig.assert_within_limits()
+
+
+@pytest.mark.parametrize("stop", ["hold", "pose rest"])
+def test_a_stop_on_the_way_brakes_before_the_start_fails(make_rig, stop):
+    rig = start(make_rig, stop=stop)
+    rig.tick(20)
+    assert np.abs(rig.hardware.written[-1] - rig.hardware.written[-2]).max() > 0.004
+    assert rig.call("estop")["stops"] == 1
+    with pytest.raises(HardwareError, match=r"control\.startup: pose rest: emergency stop"):
+        arrive(rig, 20)
+
+    assert_at_rest(rig)
+
+
+def test_a_pose_that_is_late_brakes_before_the_start_fails(make_rig):
+    joints = [
+        {"name": name, "lower": -1.5, "upper": 1.5, "max_velocity": 0.3, "max_acceleration": 1.0}
+        for name in ("pan", "lift", "grip")
+    ]
+    rig = make_rig({"robot": make_rig({}).config.document["robot"] | {"joints": joints}, **STARTS_AT_REST})
+    rig.core.start("stream")
+    with pytest.raises(HardwareError, match="not reached within 10 s"):
+        arrive(rig)
+
+    np.testing.assert_array_equal(rig.hardware.written[-1], rig.hardware.written[-2])
+
+
+STARTS_AT_REST = {"control": {"startup": "pose rest"}}

@@ -20,6 +20,12 @@ SHED = {"control": {"load_shedding": {"after": 1.0, "pose": "rest"}}}
 REST = [-0.8, 1.0, 0.1]
 
 
+def assert_at_rest(rig) -> None:
+    """The last command moved no joint, and nothing before it broke a limit."""
+    np.testing.assert_array_equal(rig.hardware.written[-1], rig.hardware.written[-2])
+    rig.assert_within_limits()
+
+
 def worse(condition: Condition) -> Condition:
     return attrs.evolve(condition, severity=Severity.FAULT)
 
@@ -176,21 +182,41 @@ class TestShedding:
             "torque of hardware cannot be taken off: servo 2 keeps it",
         ]
 
-    @pytest.mark.parametrize("trouble", ["estop", "silent"])
-    def test_on_the_way_an_emergency_stop_or_silence_ends_the_motion(self, make_rig, trouble):
+    def test_on_the_way_silence_brakes_and_then_relaxes(self, make_rig):
         rig = make_rig(SHED).start()
         rig.hardware.conditions = (HOT,)
         rig.tick(120)
-        assert not rig.hardware.relaxed
-        if trouble == "estop":
-            rig.call("estop")
-        else:
-            rig.hardware.stale = True
+        assert np.abs(rig.hardware.written[-1] - rig.hardware.written[-2]).max() > 0.004
+        rig.hardware.stale = True
         rig.tick(12)
 
         assert rig.hardware.relaxed
         assert np.abs(rig.hardware.written[-1] - REST).max() > 0.1
-        rig.assert_within_limits()
+        assert_at_rest(rig)
+
+    def test_on_the_way_an_emergency_stop_brakes_and_holds_until_the_load_has_had_its_time_again(self, make_rig):
+        rig = make_rig(SHED).start()
+        rig.hardware.conditions = (HOT,)
+        rig.tick(120)
+        assert np.abs(rig.hardware.written[-1] - rig.hardware.written[-2]).max() > 0.004
+        rig.call("estop")
+        rig.tick(95)
+        assert not rig.hardware.relaxed
+        assert np.abs(rig.hardware.written[-1] - REST).max() > 0.1
+        assert_at_rest(rig)
+
+        rig.tick(10)
+        assert rig.hardware.relaxed
+        assert rig.events("fault")[-1]["then"] == "relaxes"
+
+    def test_on_the_move_and_without_a_pose_it_brakes_before_it_relaxes(self, make_rig):
+        rig = make_rig({"control": {"load_shedding": {"after": 0.2}}}).start()
+        rig.hardware.conditions = (HOT,)
+        rig.plan([0.9, 1.0, 0.9], 0.6)
+        rig.tick(40)
+
+        assert rig.hardware.relaxed
+        assert_at_rest(rig)
 
     def test_its_pose_must_be_there(self, make_rig):
         with pytest.raises(ConfigError, match=r"control\.load_shedding\.pose"):

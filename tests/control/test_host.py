@@ -6,9 +6,11 @@ import os
 import queue
 import re
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,6 +65,14 @@ class Reports:
         return found
 
 
+def list_of(waiting: queue.SimpleQueue[Any]) -> list[Any]:
+    """All that is in a queue."""
+    found = []
+    while not waiting.empty():
+        found.append(waiting.get())
+    return found
+
+
 @pytest.fixture(params=[pytest.param("process", marks=pytest.mark.integration), "inline"])
 def kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
@@ -79,11 +89,13 @@ def make(site: Site, reports: Reports) -> Iterator[Callable[..., ControlHost]]:
     made: list[ControlHost] = []
 
     def make_host(
-        kind: str = "process", startup: str = "hold", given_up: threading.Event | None = None, **options: Any
-    ) -> ControlHost:
+        kind: str = "process", startup: str = "hold", given_up: threading.Event | None = None, stop: str = "hold",
+        mode: str = "stream", **options: Any,
+    ) -> ControlHost:  # fmt: skip
         document = yaml.safe_load(DOCUMENT)
         document["simulation"] |= options
-        document["control"] = {"startup": startup}
+        document["control"] = {"startup": startup, "stop": stop}
+        document["default_control_mode"] = mode
         config = from_document(document, source=Path("mini.yaml"), sim=True)
         host: ControlHost
         if kind == "process":
@@ -153,11 +165,12 @@ class TestBoth:
     def test_the_mode_begins_at_the_startup_pose(self, make, kind, reports):
         host = make(kind, startup="pose out")
         host.start()
-        generation = host.call("counters")["generation"]
+        host.arrive()
+        assert host.call("counters")["generation"] == host.generation
         if isinstance(host, InlineControl):
             host.step()
         np.testing.assert_allclose(
-            reports.state(lambda state: state.generation == generation).command, [0.4, 0.8], atol=0.01
+            reports.state(lambda state: state.generation == host.generation).command, [0.4, 0.8], atol=0.01
         )
 
     def test_commands_are_answered_with_the_generation_and_refused_with_the_reason(self, make, kind):
@@ -192,14 +205,95 @@ class TestProcess:
         # A host that was stopped for seconds comes too late for some, and says so.
         assert ticks[-1] - first.tick + 1 - len(ticks) <= host.lost_states
 
-    def test_a_start_that_is_given_up_on_the_way_stops_the_robot(self, make, tmp_path):
+    @pytest.mark.parametrize("when", ["before it runs", "on the way"])
+    def test_a_start_that_is_given_up_stops_the_robot(self, make, tmp_path, when):
         given_up = threading.Event()
-        given_up.set()
         host = make(startup="pose out", given_up=given_up, closed=str(tmp_path / "closed"))
-        with pytest.raises(ComponentFailed, match="given up"):
+        if when == "on the way":
             host.start()
+        given_up.set()
+        with pytest.raises(ComponentFailed, match="given up"):
+            host.start() if when == "before it runs" else host.arrive()
 
+        host.stop()
         assert (tmp_path / "closed").exists()
+
+    def test_an_emergency_stop_on_the_way_to_the_startup_pose_brakes_and_ends_it(self, make, reports):
+        host = make(startup="pose out")
+        host.start()
+        reports.state(lambda state: abs(state.command - state.position).max() > 1e-3)
+        host.call("estop")
+
+        assert str(reports.deaths.get(timeout=PATIENCE_S)) == "control.startup: pose out: emergency stop"
+        commands = [state.command for state in list_of(reports.states)]
+        np.testing.assert_array_equal(commands[-1], commands[-2])
+        assert np.abs(commands[-1] - [0.4, 0.8]).max() > 0.01
+
+    @pytest.mark.parametrize("how", ["command", "SIGTERM", "end of the host"])
+    def test_an_emergency_stop_on_the_way_to_the_stop_pose_brakes(self, make, reports, how):
+        host = make(stop="pose out")
+        host.start()
+        reports.state(lambda state: True)
+
+        def halt() -> None:
+            with suppress(ComponentFailed):  # it may end before it answers
+                host.halt()
+
+        halting = threading.Thread(target=halt)
+        halting.start()
+        reports.state(lambda state: abs(state.command - state.position).max() > 1e-3)
+        if how == "command":
+            assert host.call("estop")["stops"] == 1
+        elif how == "SIGTERM":
+            os.kill(host.pid, signal.SIGTERM)
+        else:
+            host._child.channel._socket.shutdown(socket.SHUT_WR)
+            host._child._process.wait(PATIENCE_S)
+            for state in host._memory.read_states():
+                reports.states.put(state)
+        halting.join()
+        host.stop()
+
+        commands = [state.command for state in list_of(reports.states)]
+        np.testing.assert_array_equal(commands[-1], commands[-2])
+        assert np.abs(commands[-1] - [0.4, 0.8]).max() > 0.01
+
+    def test_a_stop_during_a_slow_reset_wins(self, make, reports):
+        host = make(slow=1.0)
+        host.start()
+        host.call("fault", fault="a cable is loose")
+        answers: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+        def reset() -> None:
+            with pytest.raises(HardwareError) as refused:
+                host.call("reset", stops=0)
+            answers.put(str(refused.value))
+
+        resetting = threading.Thread(target=reset)
+        resetting.start()
+        time.sleep(0.3)  # the hardware is being set up
+        assert host.call("estop")["stops"] == 1
+        resetting.join()
+
+        assert answers.get() == "reset: refused, an emergency stop came after it was requested"
+        assert reports.state(lambda state: state.stops == 1).estop
+        assert host.stops == 1
+
+    def test_a_stop_overtakes_commands_that_wait(self, make, reports):
+        host = make(mode="plan")
+        host.start()
+        tick = reports.state(lambda state: True).tick
+        os.kill(host.pid, signal.SIGSTOP)
+        goal = {"executor": "trajectory", "goal_id": "1", "goal": {}}
+        for command in ({"do": "goal", **goal}, {"do": "reset", "stops": 0}, {"do": "estop"}):
+            host._child.channel.send({"id": 0, **command})
+        os.kill(host.pid, signal.SIGCONT)
+
+        reports.state(lambda state: state.stops == 1)
+        host.call("counters")
+        reports.state(lambda state: state.tick > tick + 20)
+        assert reports.state(lambda state: True).estop
+        assert [event["event"] for event in list_of(reports.events)] == ["fault"]
 
     def test_a_fault_is_reported_and_reset(self, make, reports):
         host = make()

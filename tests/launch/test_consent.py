@@ -120,7 +120,7 @@ def test_a_held_policy_goes_on_in_no_other_way(policy: Runtime, runs: Runs, monk
     moves(policy, 15)
     policy.reset()
     press_the_emergency_stop(policy, runs)
-    with pytest.raises(HardwareError, match="cannot enter mode policy before a reset: emergency stop"):
+    with pytest.raises(HardwareError, match="refused before a reset: emergency stop"):
         policy.switch_mode("policy")
     policy.reset()
     with monkeypatch.context() as patched:

@@ -95,7 +95,7 @@ class OperatorDevices:
         return all([each.device.approach(measured.of(each.columns)) for each in self._connected])
 
     def read(self, measured: JointReading) -> TeleopCommand:
-        """The commands of all devices as one, which is finished when all are.
+        """The commands of all devices as one, which is finished when all are; an emergency stop is sent to control.
 
         Raises:
             TeleopError: if a device has failed; names all that have.
@@ -112,11 +112,12 @@ class OperatorDevices:
             except TeleopError as error:
                 each.lost = True
                 faults.append(str(error))
+        if any(command.estop for command in commands):
+            self._session.emergency_stop()
         if faults:
             raise TeleopError("; ".join(faults))
         return TeleopCommand(
             {joint: at for command in commands for joint, at in (command.positions or {}).items()} or None,
-            estop=any(command.estop for command in commands),
             finished=all(command.finished for command in commands),
             events=tuple(event for command in commands for event in command.events),
         )

@@ -55,9 +55,7 @@ class TeleopSource(SourceWorker):
             self.end()
             session.control.call("fault", fault=str(error))
             return
-        if command.estop:
-            session.control.call("estop")
-        elif command.positions:
+        if command.positions:
             setpoint = np.array([list(command.positions.values())])
             session.send_plan(session.clock.now_ns(), 1, tuple(command.positions), setpoint)
         for event in command.events:

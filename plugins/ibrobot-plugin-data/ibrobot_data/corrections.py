@@ -190,8 +190,6 @@ class Corrections(SourceWorker):
     def _press(self, command: TeleopCommand, presses: int) -> None:
         """Act on keys and buttons."""
         session = self.session
-        if command.estop:
-            session.control.call("estop")
         for event in command.events:
             if event == "intervention":
                 presses += 1

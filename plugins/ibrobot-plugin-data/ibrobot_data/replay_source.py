@@ -11,6 +11,7 @@ from ibrobot_core.api import (
     NS_PER_S,
     ControlMode,
     ControlState,
+    HardwareError,
     Session,
     SourceWorker,
     StateWatch,
@@ -73,8 +74,10 @@ class ReplaySource(SourceWorker):
     def begin_mode(self, seed: int) -> None:
         self._begun_ns, self._measured, self._success = None, [], None
         recorded = self._replay.playback.seed
-        if self.session.config.simulated and recorded is not None:
-            self.session.command("reset_episode", seed=recorded)
+        if not self.session.config.simulated or recorded is None:
+            return
+        if not self.session.command("reset_episode", seed=recorded)["begun"]:
+            raise HardwareError("the replay does not begin before a reset: an emergency stop is latched")
 
     @override
     def work(self, timeout_s: float) -> None:

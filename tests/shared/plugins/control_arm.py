@@ -33,6 +33,9 @@ class Arm(FakeHardware):
             raise HardwareError("servo 3 does not answer: check its cable")
         return super().read()
 
+    def reset_faults(self):
+        time.sleep(self.options.slow)
+
     def holding(self):
         return Holding("/dev/ttyARM", "arm torque off") if self.options.holds and not self.relaxed else None
 
@@ -49,6 +52,7 @@ class Options:
     trouble: str = option("", help="when it fails")
     closed: str = option("", help="file made when it is released")
     fork: bool = option(False, help="whether a process forked by it outlives it")
+    slow: float = option(0.0, unit="s", help="how long it takes to clear faults")
     holds: bool = option(False, help="whether it has torque")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections import deque
 from collections.abc import Mapping
 from typing import Any, override
@@ -194,6 +195,6 @@ class GripperExecutor(Executor):
 
 def _number(goal: Mapping[str, Any], key: str, default: float | None) -> float:
     value = goal.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         raise GoalRejected(f"{key} must be a finite number, got {value!r}")
     return float(value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import GoalRejected, Vector, ns
 from ibrobot_planning.executors.options import TrajectoryOptions
+
+_LONGEST_S = 1e9
+"""Largest `goal_time` [s]: 30 years, in nanoseconds still an int64."""
 
 
 @attrs.frozen
@@ -79,7 +82,7 @@ def parse_goal(goal: Mapping[str, Any], joints: Sequence[str], options: Trajecto
         accelerations,
         path_tolerance=_tolerance(goal, "path_tolerance", options.path_tolerance, joints),
         goal_tolerance=_tolerance(goal, "goal_tolerance", options.goal_tolerance, joints),
-        goal_time_ns=ns(_setting(goal.get("goal_time", 0), options.goal_time, "goal_time")),
+        goal_time_ns=ns(_setting(goal.get("goal_time", 0), options.goal_time, "goal_time", _LONGEST_S)),
         takes_over=_takeover(goal["takes_over"]) if "takes_over" in goal else None,
     )
 
@@ -157,12 +160,13 @@ def _tolerance(goal: Mapping[str, Any], name: str, default: float, joints: Seque
     return np.array([_setting(by_joint.get(joint, 0), default, name) for joint in joints], dtype=np.float64)
 
 
-def _setting(value: Any, default: float, name: str) -> float:
+def _setting(value: Any, default: float, name: str, highest: float = sys.float_info.max) -> float:
     """0 stands for the default, -1 for none (returned as 0)."""
-    if not _is_finite(value) or (value < 0 and value != -1):
-        raise GoalRejected(f"{name} is {value!r}; it must be above 0, or 0 for the default, or -1 for none")
+    if not _is_finite(value) or (value < 0 and value != -1) or value > highest:
+        up_to = "" if highest == sys.float_info.max else f" and at most {highest:g}"
+        raise GoalRejected(f"{name} is {value!r}; it must be above 0{up_to}, or 0 for the default, or -1 for none")
     return default if value == 0 else max(float(value), 0.0)
 
 
 def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
