@@ -30,6 +30,7 @@ from ibrobot_core.options import (
     OptionFault as OptionFault,
     did_you_mean as did_you_mean,
     documented as documented,
+    not_empty as not_empty,
     option as option,
 )
 from ibrobot_core.executor_options import StreamOptions as StreamOptions

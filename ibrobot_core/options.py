@@ -105,6 +105,12 @@ def option(
     return attrs.field(default=default, metadata=metadata, validator=validators, repr=shown, alias=key)
 
 
+def not_empty(instance: Any, attribute: attrs.Attribute[str], value: str) -> None:
+    """A validator of `option` for texts that must not be empty."""
+    if not value.strip():
+        raise ValueError(f"is empty; give the {attribute.metadata['help']}")
+
+
 def documented[C](cls: type[C]) -> type[C]:
     """Class decorator: add the `help` and `unit` of each option to the docstring, for `help()` and the API pages."""
     lines = [

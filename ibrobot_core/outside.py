@@ -20,15 +20,15 @@ _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e
 """Control characters except tab and line feed, characters that change the text direction, and lone surrogates."""
 _CREDENTIALS = re.compile(r"(?P<scheme>\b[A-Za-z][A-Za-z0-9+.-]*://)[^\s/?#]*@")
 _PARAMETERS = re.compile(r"(?i)(?P<name>[?&](?:user(?:name)?|pass(?:word|wd)?|pwd|secret)=)[^&\s#'\"]+")
-_SHORTEST = 4
-"""Shorter secrets are hidden only in their options, not wherever the same characters occur."""
+SHORTEST = 8
+"""Shorter secrets are hidden only in their options: their characters occur elsewhere, e.g. in names of files."""
 
 _secrets: set[str] = set()
 
 
 def remember_secret(value: str) -> None:
     """Hide a secret in all output from now on, including its forms in URLs and `repr`."""
-    if len(value) >= _SHORTEST:
+    if len(value) >= SHORTEST:
         _secrets.update({value, quote(value, safe=""), repr(value)[1:-1]})
 
 

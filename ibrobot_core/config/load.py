@@ -15,7 +15,7 @@ from ibrobot_core.config.contract_checks import ContractChecks
 from ibrobot_core.config.missing import split
 from ibrobot_core.config.overrides import apply_overrides, put
 from ibrobot_core.config.schema import ComponentConfig, ContractConfig, PeripheralConfig, RobotConfig
-from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_literals
+from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_secrets
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections, SectionParser
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse_yaml
 from ibrobot_core.convert import shown
@@ -53,7 +53,7 @@ def load_config(
     document = read_document(path)
     _override(document, overrides, mode)
     config = _build(document, Path(path), sim, registry or installed_plugins(), communicates)
-    warn_of_literals(document)
+    warn_of_secrets(document)
     return config
 
 

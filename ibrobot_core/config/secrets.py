@@ -14,8 +14,9 @@ from ibrobot_core.config.expand import expand
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
 from ibrobot_core.options import HIDDEN, fields
-from ibrobot_core.outside import redacted, remember_secret, without_credentials
+from ibrobot_core.outside import SHORTEST, redacted, remember_secret, without_credentials
 
+_LOG = logging.getLogger("ibrobot.config")
 _NAMES = re.compile(r"(?i)(.*_)?(password|passwd|passphrase|secret|token|api_?key)")
 """Keys treated as secrets in sections without an installed plugin, which would state the secret options."""
 
@@ -29,10 +30,19 @@ def note(document: Document, kind: type, value: Mapping[str, Any], key: Key) -> 
         if field.metadata.get("secret"):
             document.secrets.add((*key, name))
             remember_secret(str(item))
+            _hide_in_overrides(document, (*key, name), str(item))
         elif isinstance(item, Mapping):
             for member in (field.type, *get_args(field.type)):
                 if isinstance(member, type) and attrs.has(member):
                     note(document, member, item, (*key, name))
+
+
+def _hide_in_overrides(document: Document, key: Key, secret: str) -> None:
+    """Hide a secret in the text of the override that contains it, which is the place of its faults."""
+    for depth in range(1, len(key) + 1):
+        place = document.places.get(key[:depth])
+        if place is not None and place.line == 0:
+            document.places[key[:depth]] = attrs.evolve(place, file=place.file.replace(secret, HIDDEN))
 
 
 def expanded_again(document: Document) -> Document:
@@ -57,14 +67,17 @@ def public(document: Document) -> tuple[Any, dict[str, str]]:
     return root, instead
 
 
-def warn_of_literals(document: Document) -> None:
-    """Log a warning for each literal secret: recordings hide it, but readers of the YAML see it."""
-    for key, _, _ in _secrets(document):
+def warn_of_secrets(document: Document) -> None:
+    """Log a warning for each literal secret, which readers of the YAML see, and for each that is too short to hide."""
+    for key, text, _ in _secrets(document):
+        place = document.place(key)
+        where = f"{document.file}:{place.line}" if place.line else redacted(place.file)
         if key not in document.references:
-            place = document.place(key)
-            where = f"{document.file}:{place.line}" if place.line else redacted(place.file)
             warning = "a literal secret; take it from the environment, as ${NAME}"
-            logging.getLogger("ibrobot.config").warning("%s: %s: %s", where, document.dotted(key), warning)
+            _LOG.warning("%s: %s: %s", where, document.dotted(key), warning)
+        if len(text) < SHORTEST:
+            warning = f"has fewer than {SHORTEST} characters, so it is not hidden in messages; choose a longer one"
+            _LOG.warning("%s: %s: %s", where, document.dotted(key), warning)
 
 
 def _secrets(document: Document) -> Iterator[tuple[Key, str, str]]:

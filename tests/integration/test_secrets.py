@@ -93,6 +93,16 @@ def test_a_secret_that_is_written_out_is_hidden_and_warned_of(lab: Lab):
     assert lab.leaks() == []
 
 
+def test_a_short_secret_is_warned_of_and_leaves_other_texts_alone(lab: Lab):
+    lab.run("config", "check", lab.yaml, "--sim", "--set", f"transport.password={lab.yaml.stem[:6]}")
+    output = lab.printed.popitem()[1]
+    assert (
+        "transport.password: has fewer than 8 characters, so it is not hidden in messages; choose a longer one"
+        in output
+    )
+    assert f"{lab.yaml}: ok" in output
+
+
 def test_errors_hold_no_secret(lab: Lab):
     lab.run("config", "check", lab.camera, ok=False)
     lab.run("config", "check", lab.yaml, "--sim", "--set", "transport.mode=wrong", ok=False)
@@ -100,4 +110,6 @@ def test_errors_hold_no_secret(lab: Lab):
     output = lab.printed.popitem()[1]
     assert "transport.password" in output
     assert "1234567" not in output
+    lab.run("config", "check", lab.yaml, "--sim", "--set", "transport={type: zenoh, password: 1234567}", ok=False)
+    assert "1234567" not in lab.printed.popitem()[1]
     assert lab.leaks() == []

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import OptionFault, did_you_mean, documented, option
+from ibrobot_core.api import OptionFault, did_you_mean, documented, not_empty, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -24,7 +24,9 @@ _GRIPPER = ("gripper",)
 class FollowerOptions:
     """Options of `type: feetech_so101`: an arm whose joints are STS3215 servos on one bus."""
 
-    port: str = option(help="serial port, e.g. /dev/ttyACM0; a path under /dev/serial/by-id does not change")
+    port: str = option(
+        validator=not_empty, help="serial port, e.g. /dev/ttyACM0; a path under /dev/serial/by-id does not change"
+    )
     calibration: str = option(help="name or path of a calibration, which ibrobot feetech calibrate creates")
     baud_rate: int = option(1_000_000, unit="baud", gt=0, help="baud rate of the bus")
     anchored: tuple[str, ...] = option(
@@ -80,7 +82,9 @@ class FollowerOptions:
 class LeaderOptions:
     """Options of `type: so101_leader`: an arm with STS3215 servos that is moved by hand."""
 
-    port: str = option(help="serial port, e.g. /dev/ttyACM1; a path under /dev/serial/by-id does not change")
+    port: str = option(
+        validator=not_empty, help="serial port, e.g. /dev/ttyACM1; a path under /dev/serial/by-id does not change"
+    )
     calibration: str = option(help="name or path of a calibration, which ibrobot feetech calibrate creates")
     baud_rate: int = option(1_000_000, unit="baud", gt=0, help="baud rate of the bus")
     joints: Mapping[str, str] = option(
@@ -143,7 +147,7 @@ class EmulatedSignalOptions:
 def check_follower(options: FollowerOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
     """Check that the joints in the options exist; they may belong to another component of the robot."""
     for key, names in (("anchored", options.anchored), ("gentle", options.gentle)):
-        if joints == robot.joint_names or names != _GRIPPER:
+        if names != _GRIPPER:
             yield from _unknown(key, names, robot.joint_names, "joint")
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.api import OptionFault, did_you_mean, documented, option
+from ibrobot_core.api import OptionFault, did_you_mean, documented, not_empty, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -35,7 +35,9 @@ def _check_tool(instance: Any, attribute: attrs.Attribute[Any], value: Mapping[s
 class ImuOptions:
     """Options of `type: imu`; the joints' own limits bound every speed."""
 
-    port: str = option(help="serial port, e.g. /dev/ttyUSB0; a path under /dev/serial/by-id does not change")
+    port: str = option(
+        validator=not_empty, help="serial port, e.g. /dev/ttyUSB0; a path under /dev/serial/by-id does not change"
+    )
     model: str = option(
         choices=tuple(BAUD_RATES), help="bno08x: in UART-RVC mode; witmotion: any that sends angles (0x55 0x53)"
     )
