@@ -6,6 +6,9 @@ import math
 
 from ibrobot_core.api import IbrobotError, Vector
 
+_MANY_DIGITS = 1e4
+"""Lengths from here on are written with an exponent [m]."""
+
 
 class KinematicsError(IbrobotError):
     """A model is unusable, e.g. an MJCF lacks the tip's site."""
@@ -31,7 +34,7 @@ class UnreachableError(KinematicsError):
         turned = f" and {math.degrees(rotation_error):.1f} degrees" if rotation_error else ""
         super().__init__(
             f"{tip} cannot reach {_point(target)} as asked within the joint limits; the nearest is {_point(position)},"
-            f" {1000 * position_error:.1f} mm{turned} off"
+            f" {_off(position_error)}{turned} off"
         )
         self.nearest = nearest
         self.position = position
@@ -40,5 +43,9 @@ class UnreachableError(KinematicsError):
 
 
 def _point(position: Vector) -> str:
-    x, y, z = position
-    return f"({x:.3f}, {y:.3f}, {z:.3f}) m"
+    x, y, z = (f"{value:.3f}" if abs(value) < _MANY_DIGITS else f"{value:.6g}" for value in position)
+    return f"({x}, {y}, {z}) m"
+
+
+def _off(distance: float) -> str:
+    return f"{1000 * distance:.1f} mm" if distance < _MANY_DIGITS else f"{distance:.6g} m"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
+import attrs
 import numpy as np
 
 from ibrobot_core.api import Vector
@@ -35,6 +37,8 @@ _BY_POSITION = 8
 """Where all that was found misses the position by more, this many searches start near the position."""
 _SHIFTS = 3
 """How often to shift the target until its position is met with the nearest orientation."""
+_FAR = 100.0
+"""Targets farther than this many times the reach of the arm are beyond it, whatever the tolerances of a search."""
 _SAME = 0.02
 """Solutions whose joints all differ by less count as equal [rad or m]."""
 
@@ -121,6 +125,8 @@ def _solutions(
         if not tolerance > 0:
             raise ValueError(f"{name} is {tolerance}, must be above 0")
     start = np.clip(start, model.lower, model.upper)
+    if np.abs(target.position).max() > _FAR * model.reach:
+        return [_nearest_to_far(model, target, start, position_tolerance, rotation_tolerance)]
     near_misses = np.empty((0, len(start)))
     arm = _closed_form_for(model, target)
     if arm is not None:
@@ -148,6 +154,23 @@ def _solutions(
     if off <= position_tolerance and turned <= rotation_tolerance:
         return [nearest]
     raise UnreachableError(model.tip, target.position, nearest, tip.position, float(off), float(turned))
+
+
+def _nearest_to_far(
+    model: KinematicModel, target: Target, start: Vector, position_tolerance: float, rotation_tolerance: float
+) -> Vector:
+    """Solve for a target far beyond reach: the search takes a nearer one, since the squares would overflow."""
+    share = _FAR * model.reach / float(np.abs(target.position).max())
+    nearer = attrs.evolve(target, position=share * target.position)
+    try:
+        nearest = _solutions(model, nearer, start, POSITION_TOLERANCE_M, rotation_tolerance, every=False)[0]
+    except UnreachableError as error:
+        nearest = error.nearest
+    tip = model.forward(nearest)
+    off, turned = math.dist(target.position, tip.position), float(nearer.missed(tip)[1])
+    if off <= position_tolerance and turned <= rotation_tolerance:
+        return nearest
+    raise UnreachableError(model.tip, target.position, nearest, tip.position, off, turned)
 
 
 def _rounds(model: KinematicModel, target: Target, start: Vector, near_misses: Vector, every: bool) -> Iterator[Vector]:

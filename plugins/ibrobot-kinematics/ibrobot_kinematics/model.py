@@ -124,6 +124,17 @@ class KinematicModel:
         return np.array([joint.index for joint in self.chain], dtype=np.intp)
 
     @cached_property
+    def reach(self) -> float:
+        """Upper bound of the distance of the tip from the origin of the base frame [m]."""
+        lengths = sum(float(np.linalg.norm(joint.position)) for joint in self.chain)
+        ways = sum(
+            max(abs(self.lower[joint.index] - joint.reference), abs(self.upper[joint.index] - joint.reference))
+            for joint in self.chain
+            if joint.slides
+        )
+        return lengths + float(np.linalg.norm(self.tip_pose.position)) + float(ways)
+
+    @cached_property
     def _slides(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
         return np.array([joint.slides for joint in self.chain], dtype=bool)
 

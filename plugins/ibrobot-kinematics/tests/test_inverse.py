@@ -8,7 +8,7 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
-from ibrobot_kinematics import KinematicModel, Target, UnreachableError, read_mjcf, solve
+from ibrobot_kinematics import KinematicModel, Target, UnreachableError, read_mjcf, solve, solve_all
 
 from ibrobot_core.api import Vector
 
@@ -118,3 +118,17 @@ def test_five_joints_reach_a_pose_only_with_tolerance(tmp_path: Path):
 def test_target_that_makes_no_sense_is_refused(arguments: dict[str, Any], message: str):
     with pytest.raises(ValueError, match=message):
         Target(**({"position": [0.0, 0.0, 0.1]} | arguments))
+
+
+@pytest.mark.parametrize("far", [10.0, 1e3, 1e9, 1e155, 1e308])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("search", [solve, solve_all])
+def test_target_beyond_reach_by_any_factor_is_refused_with_the_nearest_point(model, far: float, kind: str, search):
+    q = bent(model)
+    target = attrs.evolve(target_at(model, q, kind), position=np.array([far, 0.0, 0.0]))
+    with pytest.raises(UnreachableError) as refusal:
+        search(model, target, q)
+    assert np.isfinite(refusal.value.nearest).all()
+    assert refusal.value.position_error == pytest.approx(far, abs=2 * model.reach)
+    np.testing.assert_allclose(refusal.value.position, model.forward(refusal.value.nearest).position)
+    assert len(str(refusal.value)) < 300

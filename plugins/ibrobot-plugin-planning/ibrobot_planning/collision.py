@@ -63,7 +63,7 @@ class Collisions:
         unchecked: pairs of links that may touch; see `unchecked_pairs`.
 
     Raises:
-        PlanningError: for a joint or link that the arm does not have.
+        PlanningError: for a joint or link that the arm does not have, or as `World.check`.
     """
 
     def __init__(
@@ -75,6 +75,7 @@ class Collisions:
                 raise PlanningError(
                     f"no joint {name!r}; the joints are: {', '.join(arm.joint_names)}", PlanCode.INVALID_GROUP_NAME
                 )
+        world.check(arm.frames)
         self.arm, self.world = arm, world
         indices = np.array([arm.joint_names.index(name) for name in joints], dtype=np.intp)
         self._still = arm.native(np.array([(others or {}).get(name, 0.0) for name in arm.joint_names]))
@@ -87,9 +88,7 @@ class Collisions:
 
         def engine(links: Sequence[LinkShape]) -> _Engine:
             shapes = [*links, *objects]
-            return _Engine(
-                arm.model, self.data, shapes, *_pairs(arm, world, shapes, padding, self_padding, set(unchecked))
-            )
+            return _Engine(arm.model, self.data, shapes, *_pairs(world, shapes, padding, self_padding, unchecked))
 
         self._exact = engine(arm.shapes)
         self._coarse = engine(arm.hulls) if arm.hulls else self._exact
@@ -321,31 +320,21 @@ def _objects(arm: Arm, world: World) -> list[LinkShape]:
     """Objects as shapes, each with the link that carries it, if any."""
     shapes = []
     for name, thing in world.objects.items():
-        if name in arm.frames:
-            raise PlanningError(f"an object has the name of link {name!r}", PlanCode.INVALID_OBJECT_NAME)
         joint, frame = (0, np.eye(4)) if thing.link is None else arm.frame(thing.link)
         shapes.append(LinkShape(name, joint, frame @ matrix(thing.pose), geometry(thing.shape)))
     return shapes
 
 
 def _pairs(
-    arm: Arm, world: World, shapes: Sequence[LinkShape], padding: float, self_padding: float, unchecked: set[Pair]
+    world: World, shapes: Sequence[LinkShape], padding: float, self_padding: float, unchecked: Collection[Pair]
 ) -> tuple[Flags, Vector]:
     """Which pairs of shapes to check, and their margins [m], both shape (S, S)."""
     names = list(dict.fromkeys(shape.link for shape in shapes))
     numbers = {name: number for number, name in enumerate(names)}
     apart = np.ones((len(names), len(names)), dtype=bool)
-    known = {*arm.frames, *world.objects}
     touching = set(unchecked)
     for name, thing in world.objects.items():
-        for other in thing.may_touch:
-            if other not in known:
-                raise PlanningError(
-                    f"object {name!r} may touch {other!r}, which is neither a link nor an object;"
-                    f" available: {', '.join(known)}",
-                    PlanCode.INVALID_LINK_NAME,
-                )
-            touching.add((name, other))
+        touching.update((name, other) for other in thing.may_touch)
     for first, second in touching:
         if first in numbers and second in numbers:
             apart[numbers[first], numbers[second]] = apart[numbers[second], numbers[first]] = False

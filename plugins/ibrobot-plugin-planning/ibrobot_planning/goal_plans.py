@@ -12,6 +12,7 @@ from ibrobot_core.api import (
     AnyGoal,
     ControlMode,
     Goal,
+    IbrobotError,
     JointGoal,
     JointTrajectory,
     NamedGoal,
@@ -195,4 +196,11 @@ class GoalPlans:
             PlanningError: with MoveIt's code.
         """
         with self._lock:
-            return self.planner.plan(request)
+            try:
+                return self.planner.plan(request)
+            except IbrobotError:
+                raise
+            except Exception as error:
+                # A request that no planner foresaw must not end the run of a robot.
+                self._session.log.exception("a bug of planner %s; please report it", type(self.planner).__name__)
+                raise PlanningError(f"the planner failed: {type(error).__name__}: {error}", PlanCode.FAILURE) from error

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import attrs
 import numpy as np
 from ibrobot_kinematics import KinematicModel, KinematicsError, Target, TipPose, UnreachableError, solve, solve_all
+from ibrobot_kinematics.rotations import log
 
 from ibrobot_core.api import (
     JointGoal,
@@ -35,6 +36,10 @@ _POSITION_WEIGHT = 100.0
 """A centimetre weighs as much as a radian."""
 _TURNS, _SETTLED = 40, 1e-6
 """Steps of a search for the nearest orientation, and a step [rad] that ends it."""
+_FAR = 10.0
+"""Positions farther than this many times the arm's reach are refused at once."""
+_WIDEST = 100.0
+"""Tolerances beyond this [m or rad] mean nothing."""
 _NEARLY_ONE = 1e-3
 """How far from 1 the length of a quaternion may be."""
 
@@ -102,16 +107,22 @@ def _vector(value: Vector3, what: str) -> Vector:
 
 def _tolerances(**values: float) -> None:
     for name, value in values.items():
-        if not 0 < value < np.inf:
-            raise _invalid(f"{name} of the goal is {value}, must be above 0")
+        if not 0 < value <= _WIDEST:
+            raise _invalid(f"{name} of the goal is {value}, must be above 0 and at most {_WIDEST:g}")
 
 
-def _unit(value: Vector3) -> Vector:
+def unit(value: Vector3) -> Vector:
+    """A direction as a unit vector, shape (3,).
+
+    Raises:
+        PlanningError: for one that is not finite or has no length.
+    """
     vector = _vector(value, "the axis")
-    length = float(np.linalg.norm(vector))
-    if length < 1e-9:
+    largest = float(np.abs(vector).max())
+    if largest < 1e-9:
         raise _invalid("the axis of the goal has no length; give a direction, e.g. (0, 0, -1) for down")
-    return vector / length
+    vector /= largest  # first, as the squares of large numbers overflow
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def pose_matrix(goal: PoseGoal) -> Vector:
@@ -149,17 +160,31 @@ class Tool:
         if isinstance(goal, PositionGoal):
             position = _vector(goal.position, "the position")
             _tolerances(position_tolerance=goal.position_tolerance, axis_tolerance=goal.axis_tolerance)
-            axis = None if goal.axis is None else _unit(goal.axis)
+            axis = None if goal.axis is None else unit(goal.axis)
+            self.check_reach(position, start)
             return self._at(position, axis, start, goal.position_tolerance, goal.axis_tolerance)
         placed = pose_matrix(goal)
         position, rotation = placed[:3, 3], placed[:3, :3]
         _tolerances(position_tolerance=goal.position_tolerance)
+        self.check_reach(position, start)
         if goal.orientation_tolerance is None:
             return self._at(position, None, start, goal.position_tolerance, 0.01)
         _tolerances(orientation_tolerance=goal.orientation_tolerance)
         found = self._posed(position, rotation, start, goal.position_tolerance)
         met = [each for each in found if each.orientation_error <= goal.orientation_tolerance]
         return met or self._beyond(goal, position, rotation, start, found)
+
+    def check_reach(self, position: Vector, start: Vector) -> None:
+        """Refuse a position [m], shape (3,), far beyond reach, where numbers would overflow or lines never end.
+
+        Raises:
+            PlanningError: with the nearest position that the arm reaches.
+        """
+        if np.abs(position).max() > _FAR * self.model.reach:
+            try:
+                solve(self.model, Target(position), start)
+            except UnreachableError as error:
+                raise _unreachable(str(error)) from error
 
     def _beyond(
         self, goal: PoseGoal, position: Vector, rotation: Vector, start: Vector, found: list[Candidate]
@@ -298,7 +323,7 @@ def _turned_towards(model: KinematicModel, position: Vector, rotation: Vector, s
 
     def errors(q: Vector) -> tuple[Vector, Vector]:
         tip, jacobian = model.forward_and_jacobian(q)
-        error = np.concatenate([_POSITION_WEIGHT * (position - tip.position), _vector_of(rotation @ tip.rotation.T)])
+        error = np.concatenate([_POSITION_WEIGHT * (position - tip.position), log(rotation @ tip.rotation.T)])
         return error, np.concatenate([_POSITION_WEIGHT * jacobian[:3, moving], jacobian[3:, moving]])
 
     q, damping = np.clip(start, model.lower, model.upper), 1e-2
@@ -331,23 +356,10 @@ def _turned_towards(model: KinematicModel, position: Vector, rotation: Vector, s
     return q
 
 
-def _vector_of(relative: Vector) -> Vector:
-    """Rotation vector of a rotation matrix [rad], shape (3,)."""
-    skewed = np.array(
-        [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
-    )
-    sine = float(np.linalg.norm(skewed)) / 2
-    angle = float(np.arctan2(sine, (np.trace(relative) - 1) / 2))
-    return np.asarray(skewed / 2 * (angle / sine if sine > 1e-9 else 1.0))
-
-
 def turned(tip: TipPose, rotation: Vector | None, axis: Vector | None = None) -> float:
     """Angle between a tip and an orientation or a direction of its z axis [rad]; 0 for neither."""
     if rotation is not None:
-        relative = rotation.T @ tip.rotation
-        skewed = relative - relative.T
-        sine = float(np.linalg.norm([skewed[2, 1], skewed[0, 2], skewed[1, 0]])) / 2
-        return float(np.arctan2(sine, (np.trace(relative) - 1) / 2))
+        return float(np.linalg.norm(log(rotation.T @ tip.rotation)))
     if axis is not None:
         return float(np.arctan2(np.linalg.norm(np.cross(axis, tip.rotation[:, 2])), axis @ tip.rotation[:, 2]))
     return 0.0

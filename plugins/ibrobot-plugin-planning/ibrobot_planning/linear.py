@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import attrs
 import numpy as np
 from ibrobot_kinematics import KinematicModel, Target, UnreachableError, solve
+from ibrobot_kinematics.rotations import exp, log
 
 from ibrobot_core.api import PlanCode, PlanningError, PoseGoal, PositionGoal, Vector
-from ibrobot_planning.goals import Tool, pose_matrix, turned
+from ibrobot_planning.goals import Tool, pose_matrix, turned, unit
 
 _STEP_M = 0.004
 _STEP_RAD = 0.05
@@ -19,6 +20,8 @@ _EXACT_M = 1e-4
 """Allowed distance of the tool from the line at a configuration."""
 _TURN_M = 0.1
 """Distance that corresponds to a rotation of one radian."""
+_NO_SINE = 1e-9
+"""Sine of the angle between two directions below which their cross product has no direction."""
 _LARGEST_JUMP = 0.35
 """A joint that moves further [rad] between two of them would leave the line between."""
 
@@ -86,7 +89,7 @@ def _followed(
         tip, jacobian = model.forward_and_jacobian(q)
         error, rows = [target.position - tip.position], [jacobian[:3, moving]]
         if target.rotation is not None:
-            error.append(weight * _rotation_vector(target.rotation @ tip.rotation.T))
+            error.append(weight * log(target.rotation @ tip.rotation.T))
             rows.append(weight * jacobian[3:, moving])
         elif target.axis is not None:
             axis = tip.rotation[:, 2]
@@ -110,19 +113,21 @@ def _targets(
     targets, lengths = [], []
     for waypoint in waypoints:
         end, end_rotation, axis, angle_tolerance = _end(waypoint)
+        tool.check_reach(end, start)
         away = float(np.linalg.norm(end - position))
-        angle = 0.0
+        turn = np.zeros(3)
         if end_rotation is not None:
-            angle = turned(tip, end_rotation) if rotation is tip.rotation else _angle(rotation, end_rotation)
+            turn = log(rotation.T @ end_rotation)
         elif axis is not None:
-            angle = float(np.arccos(np.clip(axis @ rotation[:, 2], -1, 1)))
+            turn = _between(rotation[:, 2], axis)
+        angle = float(np.linalg.norm(turn))
         number = max(int(np.ceil(away / _STEP_M)), int(np.ceil(angle / _STEP_RAD)), 1)
         for share in np.arange(1, number + 1) / number:
             between = position + share * (end - position)
             if end_rotation is not None:
-                target = Target(between, rotation @ _turn(rotation.T @ end_rotation, share))
+                target = Target(between, rotation @ exp(share * turn))
             elif axis is not None:
-                target = Target(between, axis=_towards(rotation[:, 2], axis, share))
+                target = Target(between, axis=exp(share * turn) @ rotation[:, 2])
             else:
                 target = Target(between)
             targets.append((target, waypoint.position_tolerance, angle_tolerance))
@@ -131,7 +136,7 @@ def _targets(
         if end_rotation is not None:
             rotation = end_rotation
         elif axis is not None:
-            rotation = _with_axis(rotation, axis)
+            rotation = exp(turn) @ rotation
     return targets, lengths
 
 
@@ -151,61 +156,14 @@ def _end(waypoint: PositionGoal | PoseGoal) -> tuple[Vector, Vector | None, Vect
         )
     if waypoint.axis is None:
         return place, None, None, waypoint.axis_tolerance
-    axis = np.array([waypoint.axis.x, waypoint.axis.y, waypoint.axis.z])
-    length = float(np.linalg.norm(axis))
-    if not 1e-9 < length < np.inf:
-        raise PlanningError(
-            "the axis of a waypoint has no length; give a direction, e.g. (0, 0, -1) for down",
-            PlanCode.INVALID_GOAL_CONSTRAINTS,
-        )
-    return place, None, axis / length, waypoint.axis_tolerance
+    return place, None, unit(waypoint.axis), waypoint.axis_tolerance
 
 
-def _rotation_vector(relative: Vector) -> Vector:
-    skewed = relative - relative.T
-    vector = np.array([skewed[2, 1], skewed[0, 2], skewed[1, 0]]) / 2
-    sine = float(np.linalg.norm(vector))
-    angle = float(np.arctan2(sine, (np.trace(relative) - 1) / 2))
-    return np.asarray(vector * (angle / sine if sine > 1e-12 else 1.0))
-
-
-def _angle(a: Vector, b: Vector) -> float:
-    return float(np.arccos(np.clip((np.trace(a.T @ b) - 1) / 2, -1, 1)))
-
-
-def _turn(relative: Vector, share: float) -> Vector:
-    """A share of a rotation, shape (3, 3)."""
-    angle = float(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1)))
-    if angle < 1e-9:
-        return np.eye(3)
-    values, vectors = np.linalg.eigh((relative + relative.T) / 2)
-    axis = vectors[:, int(values.argmax())]
-    skewed = relative - relative.T
-    sense = axis @ np.array([skewed[2, 1], skewed[0, 2], skewed[1, 0]])
-    return _about(axis if sense >= 0 else -axis, share * angle)
-
-
-def _about(axis: Vector, angle: float) -> Vector:
-    x, y, z = axis
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k)
-
-
-def _towards(a: Vector, b: Vector, share: float) -> Vector:
-    """A unit vector a share of the way from one to another."""
+def _between(a: Vector, b: Vector) -> Vector:
+    """The shortest rotation from one unit vector to another, as a rotation vector; of all half turns, any."""
     normal = np.cross(a, b)
     sine = float(np.linalg.norm(normal))
-    angle = float(np.arctan2(sine, a @ b))
-    if sine < 1e-9:
-        return b if angle < 1 or share == 1 else a
-    turned_to = _about(normal / sine, share * angle) @ a
-    return np.asarray(turned_to / np.linalg.norm(turned_to))
-
-
-def _with_axis(rotation: Vector, axis: Vector) -> Vector:
-    """The rotation nearest to a given one whose z axis is `axis`."""
-    normal = np.cross(rotation[:, 2], axis)
-    sine = float(np.linalg.norm(normal))
-    if sine < 1e-9:
-        return rotation
-    return np.asarray(_about(normal / sine, float(np.arctan2(sine, rotation[:, 2] @ axis))) @ rotation)
+    if sine < _NO_SINE:
+        # Perpendicular to the axis of the base that is most so itself.
+        normal = np.cross(a, np.eye(3)[int(np.abs(a).argmin())])
+    return np.asarray(normal * (float(np.arctan2(sine, a @ b)) / np.linalg.norm(normal)))

@@ -44,10 +44,8 @@ from ibrobot_planning.linear import linear_path
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.search import Pace, Space, connect, shortened
 from ibrobot_planning.timing import Motion, timed
-from ibrobot_planning.world import SNAPSHOT, Plane, World, WorldObject
+from ibrobot_planning.world import FLOOR, SNAPSHOT, Plane, World, WorldObject
 
-FLOOR = "floor"
-"""Name of the object that the option `floor` adds."""
 _RESOLUTIONS_M = (0.05, 0.02, 0.005)
 """Maximum motion of the arm between checks of the search; finer ones follow if the timed motion touches."""
 _FINEST_M = 0.0015

@@ -361,24 +361,31 @@ class PlannerSource(SourceWorker):
             self._finish(new, "PLANNING_FAILED", error.code, str(error))
             return True
         if not new.blocked:
-            self._execution.follow(goals)
+            self._following(new, lambda: self._execution.follow(goals))
         return True
 
     def _go_on(self, move: _Move) -> None:
-        try:
-            self._execution.step()
-        except HardwareError as error:
-            move.failures.append(str(error))
-            self._execution.stop(move.number)
+        self._following(move, self._execution.step)
         if not self._execution.under_way:
             self._end_move(move)
+
+    def _following(self, move: _Move, step: Callable[[], None]) -> None:
+        """Go on with a move; where that fails, the arm slows down."""
+        try:
+            step()
+        except (HardwareError, PlanningError) as error:
+            move.failures.append(str(error))
+            self._execution.stop(move.number)
 
     def _watch(self) -> None:
         """Stop a motion that is blocked in the world as it is now."""
         move = self._move
         if move is None or move.dropped or move.blocked:
             return
-        blocked = self._execution.blocked()
+        try:
+            blocked = self._execution.blocked()
+        except PlanningError as error:
+            blocked = f"the motion cannot be checked: {error}"
         if blocked:
             with self._choosing:
                 if move is self._move:

@@ -5,7 +5,7 @@ A plan takes one `World`; changes make a new one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import attrs
@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike
 
 from ibrobot_core.api import NoRequest, PlanCode, PlanningError, Pose, Service, Vector
 
+FLOOR = "floor"
+"""Name of the object that the option `floor` of a planner adds."""
 _LARGEST_M = 100.0
 """Sizes above this are most likely millimetres."""
 
@@ -191,13 +193,19 @@ class World:
         return World({**self.objects, name: thing})
 
     def remove(self, name: str) -> World:
-        """The world without an object.
+        """The world without an object, which no other object may touch any more.
 
         Raises:
             PlanningError: for a name that no object has; so do the methods below.
         """
         self.named(name)
-        return World({key: value for key, value in self.objects.items() if key != name})
+        others = {key: value for key, value in self.objects.items() if key != name}
+        return World(
+            {
+                key: attrs.evolve(value, may_touch=value.may_touch - {name}) if name in value.may_touch else value
+                for key, value in others.items()
+            }
+        )
 
     def move(self, name: str, pose: Pose) -> World:
         """The world with an object at another pose, in the same frame."""
@@ -231,6 +239,32 @@ class World:
         thing = self.named(name)
         carrier = frozenset() if thing.link is None else frozenset({thing.link})
         return World({**self.objects, name: attrs.evolve(thing, may_touch=may_touch | carrier)})
+
+    def check(self, links: Collection[str], others: Collection[str] | None = None) -> None:
+        """Check that the names of the objects, and those that they use, make sense for a robot.
+
+        Args:
+            links: names of the robot's links.
+            others: further names that objects may touch, of objects that come and go; None: any.
+
+        Raises:
+            PlanningError: for an object that is named like a link, or that names an unknown link or object.
+        """
+        for name, thing in self.objects.items():
+            if name in links:
+                raise PlanningError(f"an object has the name of link {name!r}", PlanCode.INVALID_OBJECT_NAME)
+            if thing.link is not None and thing.link not in links:
+                raise PlanningError(
+                    f"object {name!r}: no link {thing.link!r}; the links are: {', '.join(links)}",
+                    PlanCode.INVALID_LINK_NAME,
+                )
+            unknown = [] if others is None else sorted(thing.may_touch.difference(links, self.objects, others))
+            if unknown:
+                raise PlanningError(
+                    f"object {name!r} may touch {unknown[0]!r}, which is neither a link nor an object;"
+                    f" available: {', '.join((*links, *self.objects))}",
+                    PlanCode.INVALID_LINK_NAME,
+                )
 
     def named(self, name: str) -> WorldObject:
         """An object.

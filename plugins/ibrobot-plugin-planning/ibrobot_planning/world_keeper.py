@@ -31,7 +31,7 @@ from ibrobot_core.api import (
     resolve_path,
 )
 from ibrobot_planning.transforms import from_rpy, matrix, pose
-from ibrobot_planning.world import SNAPSHOT, Box, Capsule, Cylinder, Plane, Shape, Sphere, World, WorldObject
+from ibrobot_planning.world import FLOOR, SNAPSHOT, Box, Capsule, Cylinder, Plane, Shape, Sphere, World, WorldObject
 from ibrobot_planning.world_options import Added, Allowed, Attached, Detached, Moved, Named, Touched, WorldOptions
 
 if TYPE_CHECKING:
@@ -48,6 +48,8 @@ ATTACH = Service("/world/attach", Attached, list, "Let a link carry an object fr
 DETACH = Service("/world/detach", Detached, list, "Leave an object where it is." + _ANSWER)
 TOUCH = Service("/world/touch", Touched, list, "Let the hand touch objects, until the next call." + _ANSWER)
 ALLOW = Service("/world/allow", Allowed, list, "State what an object may touch." + _ANSWER)
+_FARTHEST_M = 1000.0
+"""Positions beyond this are no surroundings of an arm."""
 _STILL = 1e-4
 """Smaller changes of an object's position [m] and axes are no motion."""
 
@@ -124,6 +126,8 @@ class WorldKeeper(Component):
             CLEARANCE: self._distance,
         }
         self._near: tuple[World, Clearance] | None = None
+        self._passing = frozenset({FLOOR, *options.clouds})
+        """Names that objects may touch while no object has them."""
 
     @override
     def start(self) -> None:
@@ -131,6 +135,7 @@ class WorldKeeper(Component):
             self._poses[topic] = self._session.bus.subscribe(topic, 1)
         if self._session.config.robot.description.mjcf is not None:
             self._robot()  # reading it takes a moment, which the first service call should not wait for
+        self._check(self._world)
         for service, handler in self._services.items():
             self._session.bus.serve(service, handler, self._mesh_file)
 
@@ -141,6 +146,19 @@ class WorldKeeper(Component):
         for subscription in self._poses.values():
             subscription.close()
         self._poses.clear()
+
+    def _check(self, world: World) -> None:
+        """Refuse a world with which no planner can plan.
+
+        Raises:
+            PlanningError: as `World.check`, or without a model of the robot for an object that a link carries.
+        """
+        carried = any(thing.link is not None for thing in world.objects.values())
+        if carried or self._session.config.robot.description.mjcf is not None:
+            links = self._robot().frames
+            world.check(links, self._passing)
+            if named := sorted(self._passing & set(links)):
+                raise PlanningError(f"a cloud has the name of link {named[0]!r}")
 
     def _snapshot(self) -> World:
         with self._lock:
@@ -184,9 +202,11 @@ class WorldKeeper(Component):
         def handler(wanted: T) -> list[str]:
             with self._lock:
                 try:
-                    self._world = change(self._observed(), wanted)
+                    world = change(self._observed(), wanted)
                 except ValueError as error:
                     raise PlanningError(str(error)) from error
+                self._check(world)
+                self._world = world
                 return list(self._world.objects)
 
         return handler
@@ -194,6 +214,7 @@ class WorldKeeper(Component):
     def _add(self, world: World, it: Added) -> World:
         if it.replace and it.name in world.objects:
             world = world.remove(it.name)
+        _check_position(it.object.position)
         return world.add(it.name, it.object.made())
 
     def _mesh_file(self, text: str) -> Path:
@@ -212,6 +233,7 @@ class WorldKeeper(Component):
         return path
 
     def _move(self, world: World, it: Moved) -> World:
+        _check_position(it.position)
         return world.move(it.name, Pose(Vector3(*it.position), from_rpy(*it.rpy)))
 
     def _attach(self, world: World, it: Attached) -> World:
@@ -265,3 +287,9 @@ class WorldKeeper(Component):
             if self._near is None or self._near[0] != world:
                 self._near = world, Clearance(self._robot(), world)
             return self._near[1](q)
+
+
+def _check_position(position: Sequence[float]) -> None:
+    # Written so that NaN fails it.
+    if not all(abs(each) <= _FARTHEST_M for each in position):
+        raise PlanningError(f"position is {list(position)} m; each number must be within {_FARTHEST_M:g} m of 0")

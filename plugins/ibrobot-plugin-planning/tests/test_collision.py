@@ -189,7 +189,7 @@ def test_unknown_names_are_refused(arm):
             PlanCode.INVALID_LINK_NAME,
         ),
         (
-            lambda: Collisions(arm, World({"a": WorldObject(Sphere(0.1), may_touch={"table"})}), ARM),
+            lambda: World({"a": WorldObject(Sphere(0.1), may_touch={"table"})}).check(arm.frames, ()),
             "object 'a' may touch 'table', which is neither a link nor an object",
             PlanCode.INVALID_LINK_NAME,
         ),
