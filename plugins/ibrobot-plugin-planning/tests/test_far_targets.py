@@ -14,6 +14,7 @@ from ibrobot_planning.goals import Tool
 from ibrobot_planning.linear import linear_path
 from ibrobot_planning.motion import MoveToPose
 from ibrobot_planning.planning_services import CARTESIAN, COMPUTE_IK, PLAN, PLAN_GOAL
+from ibrobot_planning.requests import GoTo
 from ibrobot_planning.source import CMD_POSE, GO_TO, MOVE_ACTION, MOVE_TO_POSE
 from ibrobot_planning.tasks.runner import RUN
 from ibrobot_planning.transforms import pose
@@ -113,7 +114,7 @@ def test_numbers_that_are_none(run: Runtime, yaml: Path, value: str):  # noqa: F
         with pytest.raises(IbrobotError, match=r"finite|number"):
             run.session.bus.call(service, request)
     goal = PositionGoal(Vector3(number, 0, 0))
-    assert finish(run, run.session.bus.call(GO_TO, goal)).code is PlanCode.INVALID_GOAL_CONSTRAINTS
+    assert finish(run, run.session.bus.call(GO_TO, GoTo(goal))).code is PlanCode.INVALID_GOAL_CONSTRAINTS
 
 
 @pytest.mark.parametrize("length", [1e-8, 1.0, 1e200, 1e308])

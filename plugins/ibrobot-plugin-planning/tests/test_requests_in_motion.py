@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from ibrobot_kinematics.clearance import CLEARANCE
@@ -17,7 +18,7 @@ from ibrobot_planning.source import GO_TO, MOVE_TO_CONFIGURATION, MOVE_TO_POSE, 
 from ibrobot_planning.world import SNAPSHOT, World
 from ibrobot_testing.fakes import FakePlanner
 
-from ibrobot_core.api import ComponentFailed, HardwareError, IbrobotError, PlanCode, PlanningError, Runtime
+from ibrobot_core.api import ComponentFailed, HardwareError, IbrobotError, PlanCode, PlanningError, Runtime, Service
 
 from .conftest import Make
 from .table_arm import ARM, JOINTS
@@ -68,7 +69,7 @@ def test_bad_object_is_refused_and_the_motion_goes_on(run: Run, request_: str, t
     runtime, number = moving(run)
     before = runtime.session.bus.call(SNAPSHOT, None)
     with pytest.raises(PlanningError, match=told):
-        runtime.session.bus.call("/world/add", request_)
+        runtime.session.bus.call("/world/add", yaml.safe_load(request_))
     assert runtime.session.bus.call(SNAPSHOT, None) == before
     assert finish(runtime, number).success
     assert finish(runtime, runtime.session.bus.call(GO_TO, "up")).success
@@ -85,13 +86,13 @@ def test_bad_object_is_refused_and_the_motion_goes_on(run: Run, request_: str, t
 def test_bad_change_is_refused(run: Run, service: str, request_: str, told: str):
     runtime = run()
     with pytest.raises(PlanningError, match=told):
-        runtime.session.bus.call(service, request_)
+        runtime.session.bus.call(service, yaml.safe_load(request_))
     assert finish(runtime, runtime.session.bus.call(GO_TO, "left")).success
 
 
 def test_object_that_another_may_touch_can_be_removed(run: Run):
     runtime = run()
-    runtime.session.bus.call("/world/remove", "{name: cup}")
+    runtime.session.bus.call("/world/remove", {"name": "cup"})
     assert runtime.session.bus.call(SNAPSHOT, None).objects["net"].may_touch == frozenset()
     assert finish(runtime, runtime.session.bus.call(GO_TO, "left")).success
 
@@ -110,7 +111,7 @@ def test_object_may_touch_the_floor_and_clouds_that_come_and_go(run: Run):
         world="world: {objects: {cup: {shape: sphere, radius: 0.01, position: [0, -1, 0], may_touch: [floor, top]}},"
         " clouds: {top: {topic: /top/points}}}\n"
     )
-    runtime.session.bus.call("/world/attach", "{name: cup}")
+    runtime.session.bus.call("/world/attach", {"name": "cup"})
     assert finish(runtime, runtime.session.bus.call(GO_TO, "pan=0.2")).code is not PlanCode.INVALID_LINK_NAME
 
 
@@ -198,9 +199,9 @@ WORDS = st.sampled_from(
 POSE = some(
     position=some(x=NUMBERS, y=NUMBERS, z=NUMBERS), orientation=some(x=NUMBERS, y=NUMBERS, z=NUMBERS, w=NUMBERS)
 )
-REQUESTS: dict[str, st.SearchStrategy[Any]] = {
+REQUESTS: dict[Service[Any, Any] | str, st.SearchStrategy[Any]] = {
     GO_TO: WORDS,
-    RESULT: NUMBERS,
+    RESULT: some(number=NUMBERS),
     "/move_action": some(goals=st.lists(GOALS, max_size=2), **SCALINGS),
     "/execute_trajectory": some(joint_names=st.just(list(ARM)), points=st.lists(POINT, max_size=3)),
     "/compute_ik": some(goal=GOALS, start=JOINT_VALUES, avoid_collisions=st.booleans()),
@@ -222,9 +223,9 @@ REQUESTS: dict[str, st.SearchStrategy[Any]] = {
     "/world/detach": some(name=NAMES, may_touch=st.lists(NAMES, max_size=2)),
     "/world/allow": some(name=NAMES, may_touch=st.lists(NAMES, max_size=2)),
     "/world/touch": some(objects=st.lists(NAMES, max_size=2)),
-    CLEARANCE: JOINT_VALUES,
+    CLEARANCE: some(positions=JOINT_VALUES),
 }
-ONE = st.sampled_from(sorted(REQUESTS)).flatmap(
+ONE = st.sampled_from(list(REQUESTS)).flatmap(
     lambda name: st.tuples(st.just(name), st.one_of(*[REQUESTS[name]] * 5, WILD))
 )
 
@@ -235,7 +236,7 @@ def test_no_request_ends_a_run(run: Run, caplog: pytest.LogCaptureFixture):
 
     @settings(max_examples=400, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(asked=ONE, away=st.booleans())
-    def check(asked: tuple[str, Any], away: bool) -> None:
+    def check(asked: tuple[Service[Any, Any] | str, Any], away: bool) -> None:
         caplog.clear()
         service, request = asked
         bus.call(GO_TO, "pan=1.2" if away else "pan=-1.2")
