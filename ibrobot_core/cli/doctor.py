@@ -11,12 +11,14 @@ import sys
 import attrs
 import click
 
+from ibrobot_core.control.realtime import PERMIT
 from ibrobot_core.descriptors import Check
 from ibrobot_core.outside import echo
 from ibrobot_core.plugins import Registry, installed_plugins
 
 MINIMUM_PYTHON = (3, 12)
 LEAST_FREE_BYTES = 2_000_000_000
+_REMEDY = f"run this and log in again: {PERMIT}"
 MLOCK_BYTES = 512 * 1024 * 1024
 """Memory locked by a control process with a simulation, with a margin [bytes]."""
 
@@ -82,8 +84,7 @@ def realtime() -> Check:
         found = f"permitted up to {limit if limit > 0 else 99}"
     else:
         found = "not permitted; the control loop and images may be late under load"
-    remedy = "add '@realtime - rtprio 95' to /etc/security/limits.d/ibrobot.conf, join group realtime, log in again"
-    return Check("real-time priority", os.geteuid() == 0 or limit != 0, found, remedy, matters=False)
+    return Check("real-time priority", os.geteuid() == 0 or limit != 0, found, _REMEDY, matters=False)
 
 
 def memory_lock() -> Check:
@@ -91,8 +92,7 @@ def memory_lock() -> Check:
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     unlimited = os.geteuid() == 0 or limit == resource.RLIM_INFINITY
     found = "unlimited" if unlimited else f"{limit / 1e6:.0f} MB"
-    remedy = "add '@realtime - memlock unlimited' to the same file as the real-time priority"
-    return Check("memory lock", unlimited or limit >= MLOCK_BYTES, found, remedy, matters=False)
+    return Check("memory lock", unlimited or limit >= MLOCK_BYTES, found, _REMEDY, matters=False)
 
 
 def disk(folder: str) -> Check:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import resource
 import shutil
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
 
 from ibrobot_core.cli import doctor
+from ibrobot_core.control import realtime
+from ibrobot_core.control.realtime import PERMIT
 from ibrobot_core.plugins import discover
 
 if TYPE_CHECKING:
@@ -92,7 +96,23 @@ def test_what_is_only_worth_knowing_fails_nothing(ibrobot: Ibrobot, monkeypatch:
 
     assert ran.code == 0
     assert ran.out.startswith("note  real-time priority: not permitted")
-    assert "rtprio 95" in ran.out
+    assert PERMIT in ran.out
+    page = Path(__file__).parents[2] / "docs/how-to/real-time-permissions.md"
+    assert f"$ {PERMIT}\n" in page.read_text(encoding="utf-8")
+
+
+def test_run_and_doctor_give_the_same_command_for_permissions(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    libc = SimpleNamespace(mlockall=lambda flags: -1)
+    monkeypatch.setattr(realtime, "os", SimpleNamespace(**{**vars(os), "sched_setscheduler": refuse}))
+    monkeypatch.setattr(realtime, "gc", SimpleNamespace(collect=int, freeze=int, disable=int))
+    monkeypatch.setattr(realtime, "ctypes", SimpleNamespace(CDLL=lambda *_, **__: libc, get_errno=lambda: errno.ENOMEM))
+    [line] = realtime.go_real_time(60)
+    refused = "no real-time priority (Operation not permitted), memory is not locked (Cannot allocate memory)"
+    assert line.startswith(refused)
+    assert line.endswith(f"run this and log in again: {PERMIT}")
 
 
 def _as_user(monkeypatch: pytest.MonkeyPatch, *, rtprio: int, memlock: int) -> None:
