@@ -18,6 +18,7 @@ from typing import Any
 
 import aiohttp
 from ibrobot_web.link import FIRST_PICTURE, STATE, STATUS
+from ibrobot_web.messages import clock_ms
 
 IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
 _START_S = 60.0
@@ -81,6 +82,8 @@ class PageClient:
         """Channel, stamp [ns] and time of arrival [ns] of all pictures."""
         self.status: Mapping[str, Any] = {}
         self.answers: dict[int, Mapping[str, Any]] = {}
+        self.press_ms = 0
+        """When the deadman's present press began."""
 
     async def start(self, address: str) -> None:
         """Sign in and connect."""
@@ -88,6 +91,7 @@ class PageClient:
             assert answer.status == 200
         base = self._base = str(answer.url).rstrip("/")
         self.drive = await self._browser.ws_connect(f"{base}/drive")
+        self.line = await self._browser.ws_connect(f"{base}/stop")
         self.stream = await self._browser.ws_connect(f"{base}/stream", max_msg_size=0)
         self._tasks = [asyncio.create_task(self._receive()), asyncio.create_task(self._listen())]
 
@@ -129,7 +133,8 @@ class PageClient:
         """
         self._number += 1
         number = self._number
-        await self.drive.send_json({"id": number, "do": do, **facts})
+        stops = self.states[-1]["stops"] if self.states else None
+        await self.drive.send_json({"id": number, "do": do, "stops": stops, **facts})
         async with asyncio.timeout(20):
             while number not in self.answers:
                 await asyncio.sleep(0.005)
@@ -144,11 +149,35 @@ class PageClient:
             while not met():
                 await asyncio.sleep(0.01)
 
-    async def jog(self, seconds: float, press: int, **motion: Any) -> None:
-        """Hold the deadman for a time."""
+    async def estop(self) -> float:
+        """Stop the robot; return the time to the confirmation [s].
+
+        Raises:
+            RuntimeError: if it is not confirmed.
+        """
+        self._number += 1
+        begun_s = time.monotonic()
+        await self.line.send_str(str(self._number))
+        while (answer := await self.line.receive_json(timeout=20)).get("id") != self._number:
+            pass
+        if "error" in answer:
+            raise RuntimeError(answer["error"])
+        return time.monotonic() - begun_s
+
+    def press(self) -> None:
+        """Press the deadman anew."""
+        self.press_ms = max(self.press_ms + 1, clock_ms())
+
+    async def beat(self, **motion: Any) -> None:
+        """Say once that the deadman is held."""
+        await self.drive.send_json({"do": "jog", "at": clock_ms(), "press": self.press_ms, **motion})
+
+    async def jog(self, seconds: float, **motion: Any) -> None:
+        """Press the deadman and hold it for a time."""
         end = time.monotonic() + seconds
+        self.press()
         while time.monotonic() < end:
-            await self.drive.send_json({"do": "jog", "press": press, **motion})
+            await self.beat(**motion)
             await asyncio.sleep(0.04)
 
     async def close(self) -> None:
@@ -156,12 +185,12 @@ class PageClient:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self.drive.close()
-        await self.stream.close()
+        for socket in (self.drive, self.line, self.stream):
+            await socket.close()
 
     def cut(self) -> None:
         """Break the connections, as a killed browser does."""
-        for socket in (self.drive, self.stream):
+        for socket in (self.drive, self.line, self.stream):
             connection = socket._response.connection
             assert connection is not None
             assert connection.transport is not None

@@ -6,15 +6,42 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
-from ibrobot_core.api import IbrobotError, PlanningError, Session, error_text, seconds
-from ibrobot_web.teleop import JOG, RELEASE, Jog
+import attrs
+
+from ibrobot_core.api import IbrobotError, PlanningError, Session, error_text, ns, seconds
+from ibrobot_web.messages import (
+    BeginEpisode,
+    Cancel,
+    DiscardEpisode,
+    EndEpisode,
+    Finish,
+    GoTo,
+    Intervene,
+    Jog,
+    Preview,
+    Release,
+    Reset,
+    RunCommand,
+    Sent,
+    SetMode,
+    SetSmoothing,
+    clock_ms,
+)
+from ibrobot_web.teleop import JOG, RELEASE, Released
+from ibrobot_web.teleop import Jog as JogRequest
 
 Reply = Callable[[Mapping[str, Any]], None]
-Handler = Callable[[Session, Mapping[str, Any]], Any]
-_AT_ONCE = frozenset({"jog", "release"})
-"""Commands that are carried out in the thread that receives them: they only leave a note for the teleop."""
+Handler = Callable[[Session, Any], Any]
+_LATE_MS = 200
+"""Age from which on messages of the deadman are refused [ms]."""
+_AHEAD_MS = 5
+"""How far a page's estimate of the time may be ahead [ms]."""
+_ALWAYS = Finish | Reset | Preview
+"""Commands that may be older than an emergency stop: a reset says which stops it clears, the others move nothing."""
+_STOPPED = "an emergency stop came after this command was sent, so it is not carried out; reset, then send it again"
 _PREVIEW_ROWS = 40
 _log = logging.getLogger("ibrobot.web")
 
@@ -22,68 +49,142 @@ _log = logging.getLogger("ibrobot.web")
 class Commands:
     """Carries out commands, in order, in a thread; the emergency stop has its own, and waits for no other command.
 
+    An emergency stop empties the queue of the others.
+
     Args:
         session: the run.
+        finish: ends the run.
         reply: sends the reply to a command.
+        on_failure: called if one of the threads ends by an error: it is deaf from then on.
     """
 
-    def __init__(self, session: Session, reply: Reply) -> None:
+    def __init__(
+        self, session: Session, finish: Callable[[], None], reply: Reply, on_failure: Callable[[Exception], None]
+    ) -> None:
         self._session = session
+        self._finish = finish
         self._reply = reply
-        self._queues = {name: queue.SimpleQueue[Mapping[str, Any] | None]() for name in ("stop", "other")}
+        self._on_failure = on_failure
+        self._stops: queue.SimpleQueue[int | None] = queue.SimpleQueue()
+        self._others: queue.SimpleQueue[Sent[RunCommand] | None] = queue.SimpleQueue()
         self._threads = [
-            threading.Thread(target=self._work, args=(each,), name=f"web {name}", daemon=True)
-            for name, each in self._queues.items()
+            threading.Thread(target=self._guarded, args=(work,), name=f"web {name}", daemon=True)
+            for name, work in (("stop", self._work_on_stops), ("other", self._work_on_others))
         ]
         for thread in self._threads:
             thread.start()
 
-    def take(self, message: Mapping[str, Any]) -> None:
+    def stop(self, number: int) -> None:
+        """Stop the robot, and refuse the commands that wait."""
+        for sent in _waiting(self._others):
+            self._refuse(sent, _STOPPED)
+        self._stops.put(number)
+
+    def take(self, sent: Sent[RunCommand]) -> None:
         """Carry out a command, now or as soon as its turn comes."""
-        if message["do"] in _AT_ONCE:
-            self._carry_out(message)
+        if isinstance(sent.command, Jog | Release):  # which only leave a note for the teleop
+            self._carry_out(sent)
         else:
-            self._queues["stop" if message["do"] == "estop" else "other"].put(message)
+            self._others.put(sent)
 
     def close(self, timeout_s: float) -> None:
         """End the threads; a command that is being carried out is given `timeout_s` [s]."""
-        for each in self._queues.values():
-            each.put(None)
+        self._stops.put(None)
+        self._others.put(None)
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(timeout_s)
 
-    def _work(self, waiting: queue.SimpleQueue[Mapping[str, Any] | None]) -> None:
-        while (message := waiting.get()) is not None:
-            self._carry_out(message)
-
-    def _carry_out(self, message: Mapping[str, Any]) -> None:
-        reply: dict[str, Any] = {"reply": message["id"]} if "id" in message else {}
+    def _guarded(self, work: Callable[[], None]) -> None:
         try:
-            reply["ok"] = _outcome(self._execute(message))
+            work()
+        except Exception as error:  # noqa: BLE001 - reported to the run, which ends: this thread hears nothing more
+            self._on_failure(error)
+
+    def _work_on_stops(self) -> None:
+        """Stop the robot once for all stops that wait."""
+        while (first := self._stops.get()) is not None:
+            numbers = [first, *_waiting(self._stops)]
+            reply = self._outcome_of(self._session.emergency_stop)
+            for number in numbers:
+                if number is not None:
+                    self._reply({"reply": number, **reply})
+            if None in numbers:
+                return
+
+    def _work_on_others(self) -> None:
+        while (sent := self._others.get()) is not None:
+            self._carry_out(sent)
+
+    def _carry_out(self, sent: Sent[RunCommand]) -> None:
+        if self._is_older_than_a_stop(sent):
+            self._refuse(sent, _STOPPED)
+            return
+        reply = self._outcome_of(partial(self._execute, sent))
+        if sent.number is not None:
+            self._reply({"reply": sent.number, **reply})
+
+    def _is_older_than_a_stop(self, sent: Sent[RunCommand]) -> bool:
+        if isinstance(sent.command, Jog | Release | _ALWAYS):
+            return False
+        return sent.stops is None or sent.stops < self._session.stops
+
+    def _refuse(self, sent: Sent[RunCommand] | None, why: str) -> None:
+        if sent is not None and sent.number is not None:
+            self._reply({"reply": sent.number, "error": why})
+
+    def _outcome_of(self, execute: Callable[[], Any]) -> dict[str, Any]:
+        try:
+            return {"ok": _outcome(execute())}
         except (IbrobotError, ValueError, TypeError) as error:
-            reply["error"] = str(error) or type(error).__name__
+            return {"error": str(error) or type(error).__name__}
         except Exception as error:  # noqa: BLE001 - contained: a page must not end the run
-            reply["error"] = error_text(error)
             _log.exception("a command of the page failed")
-        self._reply(reply)
+            return {"error": error_text(error)}
 
-    def _execute(self, message: Mapping[str, Any]) -> Any:
-        handler = _HANDLERS.get(message["do"])
-        if handler is None:
-            raise ValueError(f"unknown command {message['do']!r}; known: {', '.join(_HANDLERS)}")
-        return handler(self._session, message)
+    def _execute(self, sent: Sent[RunCommand]) -> Any:
+        if isinstance(sent.command, Finish):
+            return self._finish()
+        return _HANDLERS[type(sent.command)](self._session, sent)
 
 
-def _jog(session: Session, message: Mapping[str, Any]) -> None:
+def _waiting[T](waiting: queue.SimpleQueue[T]) -> list[T]:
+    """All items of a queue."""
+    found = []
+    while True:
+        try:
+            found.append(waiting.get_nowait())
+        except queue.Empty:
+            return found
+
+
+def _jog(session: Session, sent: Sent[Jog]) -> None:
     if not session.bus.serves(JOG):
         raise IbrobotError("this mode does not jog from the page: enter a mode whose teleop is of type web")
-    session.bus.call(JOG, Jog.read(message))
+    jog, now_ms = sent.command, clock_ms()
+    if jog.at > now_ms + _AHEAD_MS:
+        raise IbrobotError("the page's time is wrong; press again")
+    if now_ms - jog.at > _LATE_MS:
+        raise IbrobotError(f"the connection is too slow to jog: {(now_ms - jog.at) / 1e3:.1f} s")
+    facts = attrs.asdict(jog, filter=lambda field, _: field.name not in ("at", "press"))
+    session.bus.call(JOG, JogRequest(_run_time(session, jog.at), _run_time(session, jog.press), **facts))
 
 
-def _release(session: Session, message: Mapping[str, Any]) -> None:
+def _release(session: Session, sent: Sent[Release]) -> None:
     if session.bus.serves(RELEASE):
-        session.bus.call(RELEASE)
+        at = sent.command.at
+        session.bus.call(RELEASE, Released(None if at is None else _run_time(session, at)))
+
+
+def _run_time(session: Session, at_ms: int) -> int:
+    """A time of `clock_ms` by the run's clock [ns]; the present for a later one."""
+    return session.clock.now_ns() - ns(max(0, clock_ms() - at_ms) / 1e3)
+
+
+def _reset(session: Session, sent: Sent[Reset]) -> Any:
+    if sent.stops is None:
+        raise IbrobotError("this page has seen no state of the robot yet")
+    return session.bus.call("/reset", {"stops": sent.stops})
 
 
 def _joints_of(session: Session, pose: str) -> dict[str, float]:
@@ -96,14 +197,12 @@ def _joints_of(session: Session, pose: str) -> dict[str, float]:
     return {joint: values[joint] for each in executors if each.goals == "trajectory" for joint in each.joints}
 
 
-def _preview(session: Session, message: Mapping[str, Any]) -> Mapping[str, Any]:
+def _preview(session: Session, sent: Sent[Preview]) -> Mapping[str, Any]:
     """The path to a goal, planned and not executed: joints by index, and rows of positions [rad]."""
-    goal = message.get("goal")
-    if not isinstance(goal, Mapping):
-        raise ValueError('goal must be an object, e.g. {"pose": "home"}')
-    if "pose" in goal:
-        goal = {"joints": _joints_of(session, str(goal["pose"]))}
-    answer = session.bus.call("/plan_kinematic_path", {"goals": [dict(goal)]})
+    goal = sent.command.goal
+    joints = goal.joints if goal.pose is None else _joints_of(session, goal.pose)
+    target = {"xyz": list(goal.xyz)} if goal.xyz is not None else {"joints": dict(joints or {})}
+    answer = session.bus.call("/plan_kinematic_path", {"goals": [target]})
     if answer.trajectory is None:
         raise PlanningError(answer.message)
     points = answer.trajectory.points
@@ -115,38 +214,21 @@ def _preview(session: Session, message: Mapping[str, Any]) -> Mapping[str, Any]:
     }
 
 
-def _service(name: str, argument: str | None = None) -> Handler:
-    """Calls a service with a text of the message, or with None."""
-    return lambda session, message: session.bus.call(name, _text(message, argument) if argument is not None else None)
-
-
-_HANDLERS: Mapping[str, Handler] = {
-    "estop": _service("/estop"),
-    "reset": _service("/reset"),
-    "mode": _service("/set_mode", "mode"),
-    "jog": _jog,
-    "release": _release,
-    "episode_start": lambda session, message: session.bus.call(
-        "/record_episode/start", _text(message, "prompt") or None
-    ),
-    "episode_stop": _service("/record_episode/stop", "outcome"),
-    "episode_discard": _service("/record_episode/discard"),
-    "smoothing": lambda session, message: session.bus.call(
-        "/action_dispatcher/toggle_smoothing", message.get("enabled") is True
-    ),
-    "intervene": lambda session, message: session.bus.call("/intervene", message.get("take") is True),
-    "preview": _preview,
-    "goal": _service("/planning/go_to", "goal"),
-    "cancel": _service("/planning/cancel"),
+_HANDLERS: Mapping[type[RunCommand], Handler] = {
+    Jog: _jog,
+    Release: _release,
+    Reset: _reset,
+    SetMode: lambda session, sent: session.bus.call("/set_mode", sent.command.mode),
+    BeginEpisode: lambda session, sent: session.bus.call("/record_episode/start", sent.command.prompt or None),
+    EndEpisode: lambda session, sent: session.bus.call("/record_episode/stop", sent.command.outcome),
+    DiscardEpisode: lambda session, sent: session.bus.call("/record_episode/discard"),
+    SetSmoothing: lambda session, sent: session.bus.call("/action_dispatcher/toggle_smoothing", sent.command.enabled),
+    Intervene: lambda session, sent: session.bus.call("/intervene", sent.command.take),
+    Preview: _preview,
+    GoTo: lambda session, sent: session.bus.call("/planning/go_to", sent.command.goal),
+    Cancel: lambda session, sent: session.bus.call("/planning/cancel"),
 }
 
 
 def _outcome(value: Any) -> Any:
     return value if isinstance(value, str | int | float | bool | Mapping) else None
-
-
-def _text(message: Mapping[str, Any], name: str) -> str:
-    value = message.get(name)
-    if not isinstance(value, str):
-        raise ValueError(f"{name} must be a text")
-    return value

@@ -18,6 +18,8 @@ PICTURE_HEAD = struct.Struct("<qHHB")
 """Before a picture's bytes: stamp [ns], width and height [px], encoding."""
 JPEG, RGB, PNG = 0, 1, 2
 """Encodings of pictures."""
+ALIVE_S = 0.5
+"""Period of the server's signs of life [s]."""
 _HEAD = struct.Struct("<IB")
 _LARGEST = 256 << 20
 """Largest frame [bytes]."""

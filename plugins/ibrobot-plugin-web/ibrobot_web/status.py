@@ -67,7 +67,8 @@ def state_json(state: ControlState) -> dict[str, Any]:
     """A joint state."""
     return {
         "stamp": state.stamp_ns, "tick": state.tick, "late_us": round(state.late_ns / 1e3, 1), "estop": state.estop,
-        "stale": state.stale, "position": _numbers(state.position), "command": _numbers(state.command),
+        "stops": state.stops, "stale": state.stale, "position": _numbers(state.position),
+        "command": _numbers(state.command),
     }  # fmt: skip
 
 

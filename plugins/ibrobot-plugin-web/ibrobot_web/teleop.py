@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 from types import NoneType
-from typing import Any, override
+from typing import override
 
 import attrs
 import numpy as np
@@ -14,87 +14,58 @@ from ibrobot_kinematics import JogArm, JogMotion, VelocityJog
 from ibrobot_core.api import (
     Context,
     JointReading,
-    NoRequest,
     Service,
     Teleop,
     TeleopCommand,
     TeleopError,
     Vector,
+    documented,
     ns,
+    option,
     seconds,
 )
+from ibrobot_web.messages import within_one
 from ibrobot_web.options import WebTeleopOptions
 
 _LONGEST_STEP_S = 0.1
 """Longest motion of one command [s], so that the robot does not jump after a pause of the host."""
 
 
-def _fractions(size: int, values: Any, name: str) -> Vector:
-    """A vector of numbers from -1 to 1, shape (size,)."""
-    vector = np.asarray(values, dtype=float)
-    if vector.shape != (size,) or not (np.abs(vector) <= 1.0).all():
-        raise ValueError(f"{name} must be {size} numbers from -1 to 1")
-    return vector
-
-
-@attrs.frozen(eq=False)
+@documented
+@attrs.frozen
 class Jog:
-    """The motion that a page requests while its deadman is held. Speeds are fractions of those in the options."""
+    """A request to `/web_teleop/jog`: the motion while a page's deadman is held, as fractions of the top speeds."""
 
-    joints: Mapping[str, float] = attrs.field(factory=dict)
-    """Joint -> speed, -1 to 1."""
-    targets: Mapping[str, float] = attrs.field(factory=dict)
-    """Joint -> position that it approaches [rad]."""
-    linear: Vector = attrs.field(factory=lambda: np.zeros(3))
-    """Velocity of the tool in the base frame, each component -1 to 1."""
-    turn: Vector = attrs.field(factory=lambda: np.zeros(3))
-    """Angular velocity about the tool's own axes, each component -1 to 1."""
-    pose: str = ""
-    """Named pose that all joints approach; empty for none."""
-    press: int = 0
-    """Number of the press of the deadman: a press that began before a reset or a new mode moves nothing."""
-
-    @classmethod
-    def read(cls, message: Mapping[str, Any]) -> Jog:
-        """The request in a page's message.
-
-        Raises:
-            ValueError: for values of a wrong type or range.
-        """
-        parts: dict[str, dict[str, float]] = {}
-        for name in ("joints", "targets"):
-            given = message.get(name, {})
-            if not isinstance(given, dict):
-                raise ValueError(f"{name} must map joints to numbers")
-            parts[name] = {str(joint): _number(value) for joint, value in given.items()}
-        if any(abs(speed) > 1.0 for speed in parts["joints"].values()):
-            raise ValueError("the speed of a joint must lie between -1 and 1")
-        pose, press = message.get("pose", ""), message.get("press", 0)
-        if not isinstance(pose, str) or not isinstance(press, int):
-            raise ValueError("pose must be a name, press a whole number")
-        try:
-            linear = _fractions(3, message.get("linear", (0, 0, 0)), "linear")
-            turn = _fractions(3, message.get("turn", (0, 0, 0)), "turn")
-        except TypeError:
-            raise ValueError("linear and turn must be lists of numbers") from None
-        return cls(parts["joints"], parts["targets"], linear, turn, pose, press)
+    made_ns: int = option(unit="ns", help="when the page made it, by the run's clock")
+    began_ns: int = option(unit="ns", help="when the present press of the deadman began")
+    joints: Mapping[str, float] = option(factory=dict, validator=within_one, help="joint -> speed, -1 to 1")
+    targets: Mapping[str, float] = option(factory=dict, unit="rad", help="joint -> position that it approaches")
+    linear: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), validator=within_one, help="velocity of the tool in the base frame, each -1 to 1"
+    )
+    turn: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), validator=within_one, help="angular velocity about the tool's own axes, each -1 to 1"
+    )
+    pose: str = option("", help="named pose that all joints approach")
 
 
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise ValueError(f"{value!r} is not a finite number")
-    return float(value)
+@documented
+@attrs.frozen
+class Released:
+    """A request to `/web_teleop/release`."""
+
+    at_ns: int | None = option(None, unit="ns", help="when; presses that began earlier count no more. By default now")
 
 
 JOG = Service("/web_teleop/jog", Jog, NoneType, "Move the robot until the next call, or for the timeout.")
-RELEASE = Service("/web_teleop/release", NoRequest, NoneType, "Release the deadman.")
+RELEASE = Service("/web_teleop/release", Released, NoneType, "Release the deadman.")
 
 
 class WebTeleop(Teleop):
-    """Moves as the newest `Jog` says, for at most `timeout` after its arrival.
+    """Moves as the newest `Jog` says, for at most `timeout` after the page made it.
 
-    The arrival counts by the run's clock. A page that is closed, hidden or out of reach sends nothing more, so its
-    deadman is released after the timeout at the latest.
+    A page that is closed, hidden, stopped or out of reach sends nothing in time, and its press counts no more: the next
+    one must begin later.
     """
 
     def __init__(self, options: WebTeleopOptions, ctx: Context) -> None:
@@ -105,12 +76,8 @@ class WebTeleop(Teleop):
         self._jog = VelocityJog(self._arm, options.follow)
         self._lock = threading.Lock()
         self._request: Jog | None = None
-        self._until_ns = 0
-        """When the deadman counts as released [ns]."""
-        self._refused = 0
-        """The last press that a reset or a new mode ended."""
-        self._seen = 0
-        """The newest press."""
+        self._released_ns = -1
+        """The end of the last press [ns]: one that began earlier counts no more."""
         self._moved_ns: int | None = None
         """When the last setpoint was computed [ns]; None while the deadman is released."""
         self._setpoint: Vector | None = None
@@ -125,31 +92,39 @@ class WebTeleop(Teleop):
         if self._tool:
             self._arm.load_model("robot.description.mjcf")
         self._ctx.bus.serve(JOG, self.take)
-        self._ctx.bus.serve(RELEASE, lambda _: self.take(None))
+        self._ctx.bus.serve(RELEASE, self.take)
         self._connected = True
 
-    def take(self, request: Jog | None) -> None:
-        """Accept a request; None releases the deadman. Thread-safe.
+    def take(self, request: Jog | Released) -> None:
+        """Accept a request. Thread-safe.
 
         Raises:
             TeleopError: for an unknown joint or pose, or for the tool of a robot without a model.
         """
-        if request is not None:
-            self._check(request)
+        now_ns = self._ctx.clock.now_ns()
+        if isinstance(request, Released):
+            with self._lock:
+                self._end_press(now_ns if request.at_ns is None else min(request.at_ns, now_ns))
+                self.deadman.report(False, now_ns)
+            return
+        self._check(request)
         with self._lock:
-            if request is None:
-                self._request = None
+            if request.began_ns <= self._released_ns:
                 return
-            self._seen = max(self._seen, request.press)
-            if request.press > self._refused:
-                self._request = request
-                self._until_ns = self._ctx.clock.now_ns() + ns(self._options.timeout)
+            if self._request is None or request.began_ns > self._request.began_ns:
+                self.deadman.report(False, request.began_ns)
+            self.deadman.report(True, request.made_ns)
+            self._request = request
+
+    def _end_press(self, at_ns: int) -> None:
+        self._request = None
+        self._released_ns = max(at_ns, self._released_ns)
 
     @override
     def activate(self, measured: JointReading) -> None:
         with self._lock:
-            self._request = None
-            self._refused = self._seen
+            self._end_press(self._ctx.clock.now_ns())
+        self.deadman.disarm(self._ctx.clock.now_ns())
         self._moved_ns = self._setpoint = None
         self._jog.restart(measured.position)
 
@@ -157,9 +132,13 @@ class WebTeleop(Teleop):
     def read(self, measured: JointReading) -> TeleopCommand:
         if not self._connected:
             raise TeleopError(f"{self._ctx.name}: teleop web is not connected: call connect before read")
+        clock_ns = self._ctx.clock.now_ns()
         with self._lock:
-            if self._request is not None and self._ctx.clock.now_ns() >= self._until_ns:
-                self._request = None
+            allowed = self.deadman.allows(clock_ns)
+            request = self._request
+            if request is not None and not (allowed and clock_ns - request.made_ns < ns(self._options.timeout)):
+                self._end_press(clock_ns)
+                self.deadman.disarm(clock_ns)
             request = self._request
         now_ns = measured.stamp_ns
         if request is None:
@@ -192,7 +171,7 @@ class WebTeleop(Teleop):
                 raise TeleopError(f"no joint {joint!r}; the joints are: {', '.join(robot.joint_names)}")
         if request.pose and request.pose not in robot.description.poses:
             raise TeleopError(f"no pose {request.pose!r}; the poses are: {', '.join(robot.description.poses)}")
-        if not self._tool and (request.linear.any() or request.turn.any()):
+        if not self._tool and (any(request.linear) or any(request.turn)):
             raise TeleopError("moving the tool needs robot.description.mjcf: set it")
 
     def _motion(self, request: Jog, setpoint: Vector, dt: float) -> JogMotion:
@@ -207,4 +186,5 @@ class WebTeleop(Teleop):
             index = robot.indices((joint,))
             wanted = (target - setpoint[index]) / dt if dt > 0 else 0.0
             velocity[index] = np.clip(wanted, -options.joint_speed, options.joint_speed)
-        return JogMotion(velocity, request.linear * options.tool_speed, request.turn * options.turn_speed)
+        linear, turn = np.asarray(request.linear), np.asarray(request.turn)
+        return JogMotion(velocity, linear * options.tool_speed, turn * options.turn_speed)

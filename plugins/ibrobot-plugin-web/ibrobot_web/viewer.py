@@ -22,10 +22,12 @@ from ibrobot_core.api import (
     Session,
     Subscription,
     Viewer,
+    error_text,
 )
 from ibrobot_web.commands import Commands
 from ibrobot_web.desktop import has_desktop
 from ibrobot_web.link import FIRST_PICTURE, PLAN, SAMPLES, STATE, STATUS, FrameSender
+from ibrobot_web.messages import Pages, Release, Sent, StopRun, from_server
 from ibrobot_web.objects import SceneObjects, mounts
 from ibrobot_web.options import WebOptions
 from ibrobot_web.pictures import to_payload
@@ -35,6 +37,8 @@ _MODULE = "ibrobot_web.server.process"
 _START_S = 30.0
 _END_S = 3.0
 _POLL_S = 0.1
+_SILENT_S = 5.0
+"""Time without a sign of life of the server after which the run ends [s]."""
 _STATUS_S, _SAMPLES_S, _TOPICS_S = 0.25, 0.1, 1.0
 """Periods of the status, of samples of topics, and of looking for new topics with pictures."""
 _PICTURES = (Image.ros_type, CompressedImage.ros_type)
@@ -80,11 +84,10 @@ class WebViewer(Viewer):
             self._child = Child(_MODULE, self._order(session), far.fileno())
         self._frames = FrameSender(own)
         try:
-            ready = self._await_ready(self._child)
+            self.url, self.watch_url = self._await_ready(self._child)
         except BaseException:
             self.close()
             raise
-        self.url, self.watch_url = str(ready["url"]), str(ready["watch_url"])
         self._log = LogLines()
         self._ctx.log.parent.addHandler(self._log) if self._ctx.log.parent else None
         self._states = session.watch_states()
@@ -93,7 +96,8 @@ class WebViewer(Viewer):
         self._samples: dict[str, Subscription] = {}
         self._due: dict[int, float] = {}
         self._next_s = 0.0
-        self._commands = Commands(session, self._child.channel.send)
+        self._alive_s = time.monotonic()
+        self._commands = Commands(session, self.finish, self._child.channel.send, self._fail)
         self._thread = threading.Thread(target=self._receive, args=(self._child,), name="web commands", daemon=True)
         self._thread.start()
         if self._options.browser and has_desktop():
@@ -103,9 +107,11 @@ class WebViewer(Viewer):
     def update(self) -> bool:
         if self._child is None or self._finish.is_set():
             return False
-        if self._dead:
-            raise ComponentFailed(f"the page's server died: {self._dead}")
         now_s = time.monotonic()
+        if not self._dead and now_s - self._alive_s > _SILENT_S:
+            self._dead = f"the page's server has been silent for {_SILENT_S:g} s: its STOP would not be heard"
+        if self._dead:
+            raise ComponentFailed(self._dead)
         if now_s < self._next_s:
             self._frames.flush()
             return True
@@ -160,7 +166,7 @@ class WebViewer(Viewer):
         }  # fmt: skip
 
     @staticmethod
-    def _await_ready(child: Child) -> Mapping[str, Any]:
+    def _await_ready(child: Child) -> tuple[str, str]:
         deadline_s = time.monotonic() + _START_S
         while time.monotonic() < deadline_s:
             try:
@@ -169,35 +175,51 @@ class WebViewer(Viewer):
                 raise IbrobotError(child.cause(_END_S)) from None
             if child.failure is not None:
                 raise IbrobotError(child.failure.error)
-            if message is not None and message["event"] == "ready":
-                return message
+            match message:
+                case {"url": str() as url, "watch_url": str() as watch_url}:
+                    return url, watch_url
         raise ComponentFailed(f"the page's server was not ready after {_START_S:g} s")
 
     def _receive(self, child: Child) -> None:
-        """Pass on commands until the server or the viewer ends."""
-        while not child.channel.closed:
-            try:
-                if not select.select([child.channel.fileno()], [], [], _POLL_S)[0]:
-                    continue
-                messages = child.receive()
-            except (OSError, ValueError):  # closed meanwhile
-                return
-            for message in messages:
-                if message.get("event") == "pages":
-                    self._set_pages(message)
-                elif message.get("do") == "finish":
-                    self.finish()
-                    child.channel.send({"reply": message["id"], "ok": None})
-                else:
-                    self._commands.take(message)
+        """Take messages until the server or the viewer ends. Without this thread the page's STOP would be deaf."""
+        try:
+            while not child.channel.closed and self._child is child:
+                self._take(child)
+        except Exception as error:  # noqa: BLE001 - reported to the run, which ends
+            self._fail(error)
         if self._child is child:
-            self._commands.take({"do": "release"})
-            self._dead = child.cause(_END_S)
+            self._commands.take(Sent(None, None, Release()))
+            self._dead = self._dead or f"the page's server died: {child.cause(_END_S)}"
 
-    def _set_pages(self, message: Mapping[str, Any]) -> None:
-        wanted = message["wanted"]
-        self._wanted = None if wanted is None else frozenset(wanted)
-        self.pages = int(message["count"])
+    def _take(self, child: Child) -> None:
+        """Wait for messages of the server, and take them."""
+        try:
+            if not select.select([child.channel.fileno()], [], [], _POLL_S)[0]:
+                return
+            messages = child.receive()
+        except (OSError, ValueError):  # closed meanwhile
+            return
+        self._alive_s = time.monotonic()
+        for each in messages:
+            try:
+                message = from_server(each)
+            except (ValueError, IbrobotError) as error:
+                self._ctx.log.warning("the page's server sent what is no message, which was dropped: %s", error)
+                continue
+            match message:
+                case Pages():
+                    self._set_pages(message)
+                case StopRun(number):
+                    self._commands.stop(number)
+                case Sent():
+                    self._commands.take(message)
+
+    def _fail(self, error: Exception) -> None:
+        """End the run, whose page can no longer stop the robot."""
+        self._dead = f"the page can no longer stop the robot: {error_text(error)}"
+
+    def _set_pages(self, pages: Pages) -> None:
+        self._wanted, self.pages = pages.wanted, pages.count
         self._due = {}
 
     def _shows(self, channel: int) -> bool:

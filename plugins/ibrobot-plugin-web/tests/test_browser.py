@@ -127,15 +127,31 @@ def test_a_held_button_moves_a_joint_and_leaving_the_page_stops_it(tab: Tab) -> 
     assert tab.ask("ibrobot.deadman.held") is False
 
 
-def test_the_space_bar_stops_the_robot_wherever_the_focus_is(tab: Tab) -> None:
-    for focused in ("#theme", "[role=tab]", "#view canvas", ".joint input"):
-        tab.until(lambda: tab.ask("!ibrobot.state.estop && Boolean(ibrobot.jogs)"))
-        tab.page.locator(focused).first.focus()
-        tab.page.keyboard.press("Space")
+def test_escape_stops_the_robot_whatever_the_page_shows_and_wherever_the_focus_is(tab: Tab) -> None:
+    assert tab.text("#stop") == "STOP Esc"
+    for place in ("#theme", "[role=tab]", "#view canvas", ".joint input", "#prompt", "dialog button", "mode"):
+        tab.until(lambda: tab.ask("!ibrobot.state.estop && Boolean(ibrobot.operating)"))
+        if place == "mode":
+            tab.page.get_by_role("button", name="moveit_planning").click()
+            tab.until(lambda: tab.ask("ibrobot.status.mode === 'moveit_planning'"))
+            tab.page.locator("#goal").focus()
+        elif place == "dialog button":
+            tab.page.get_by_role("button", name="End the run").click()
+        elif place == "#prompt":
+            tab.ask(
+                "document.body.append(Object.assign(document.createElement('input'), {id: 'prompt', type: 'text'}))"
+            )
+        if place != "mode":
+            tab.page.locator(place).first.focus()
+        tab.page.keyboard.press("Escape")
         tab.until(lambda: tab.ask("ibrobot.state.estop && ibrobot.status.faults.length > 0"))
         assert "emergency stop" in tab.text("#faults")
+        tab.ask("document.getElementById('dialog').close()")
         tab.page.locator("#faults button").first.click()
         tab.until(lambda: tab.ask("!ibrobot.state.estop"))
+        assert tab.text("#stop") == "STOP Esc"
+    tab.page.get_by_role("button", name="web teleoperation by web").click()
+    tab.until(lambda: tab.ask("ibrobot.status.mode === 'web'"))
 
 
 def test_dragging_the_ball_moves_the_tool(tab: Tab) -> None:

@@ -1,47 +1,98 @@
-"""The commands of pages: each calls its service of the run, and a failure is its answer."""
+"""The commands of pages: each calls its service of the run, and a failure is its answer; the emergency stop."""
 
 from __future__ import annotations
 
 import queue
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import pytest
 from ibrobot_testing import make_session, stand_in
+from ibrobot_web import messages
 from ibrobot_web.commands import Commands
+from ibrobot_web.messages import RunCommand, Sent
 
-from ibrobot_core.api import IbrobotError
+from ibrobot_core.api import IbrobotError, Session
 
 _WAIT_S = 60.0
-SERVICES: dict[str, tuple[dict[str, Any], Any]] = {
-    "/estop": ({"do": "estop"}, None),
-    "/reset": ({"do": "reset"}, None),
-    "/set_mode": ({"do": "mode", "mode": "web"}, "web"),
-    "/record_episode/start": ({"do": "episode_start", "prompt": "pick"}, "pick"),
-    "/record_episode/stop": ({"do": "episode_stop", "outcome": "failure"}, "failure"),
-    "/record_episode/discard": ({"do": "episode_discard"}, None),
-    "/action_dispatcher/toggle_smoothing": ({"do": "smoothing", "enabled": False}, False),
-    "/intervene": ({"do": "intervene", "take": True}, True),
-    "/planning/go_to": ({"do": "goal", "goal": "home"}, "home"),
-    "/planning/cancel": ({"do": "cancel"}, None),
+SERVICES: dict[str, tuple[RunCommand, Any]] = {
+    "/reset": (messages.Reset(), {"stops": 0}),
+    "/set_mode": (messages.SetMode("web"), "web"),
+    "/record_episode/start": (messages.BeginEpisode("pick"), "pick"),
+    "/record_episode/stop": (messages.EndEpisode("failure"), "failure"),
+    "/record_episode/discard": (messages.DiscardEpisode(), None),
+    "/action_dispatcher/toggle_smoothing": (messages.SetSmoothing(enabled=False), False),
+    "/intervene": (messages.Intervene(take=True), True),
+    "/planning/go_to": (messages.GoTo("home"), "home"),
+    "/planning/cancel": (messages.Cancel(), None),
 }
 """Service -> the command that calls it, and its argument."""
 
 
-def answers(commands: Mapping[str, Any], *messages: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The replies to messages in a run that serves some services."""
-    session = make_session()
-    for name, handler in commands.items():
-        session.bus.unserve(name)
-        session.bus.serve(stand_in(name), handler)
-    replies: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
-    carried_out = Commands(session, replies.put)
+class Control:
+    """What a run knows of control: the number of emergency stops."""
+
+    def __init__(self) -> None:
+        self.stops = 0
+        self.running = True
+        self.called = threading.Event()
+        self.may_answer = threading.Event()
+        self.may_answer.set()
+
+    def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
+        assert do == "estop"
+        self.called.set()
+        assert self.may_answer.wait(_WAIT_S)
+        self.stops += 1
+        return {}
+
+
+class Rig:
+    """The commands of a page, in a run that serves some services."""
+
+    def __init__(self, services: Mapping[str, Callable[[Any], Any]]) -> None:
+        self.session: Session = make_session()
+        self.control: Any = Control()
+        self.session.control = self.control
+        for name, handler in services.items():
+            self.session.bus.unserve(name)
+            self.session.bus.serve(stand_in(name), handler)
+        self.replies: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+        self.failures: queue.SimpleQueue[Exception] = queue.SimpleQueue()
+        self.finished = threading.Event()
+        self.commands = Commands(self.session, self.finished.set, self.replies.put, self.failures.put)
+
+    def send(self, *commands: RunCommand, stops: int | None = 0, first: int = 0) -> None:
+        for number, command in enumerate(commands, first):
+            self.commands.take(Sent(number, stops, command))
+
+    def answers(self, count: int) -> list[Mapping[str, Any]]:
+        return sorted((self.replies.get(timeout=_WAIT_S) for _ in range(count)), key=lambda reply: int(reply["reply"]))
+
+
+@pytest.fixture
+def rig() -> Iterator[Callable[..., Rig]]:
+    made: list[Rig] = []
+
+    def make(services: Mapping[str, Callable[[Any], Any]]) -> Rig:
+        made.append(Rig(services))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.control.may_answer.set()
+        each.commands.close(_WAIT_S)
+
+
+def answers(services: Mapping[str, Any], *commands: RunCommand) -> list[Mapping[str, Any]]:
+    """The replies to commands in a run that serves some services."""
+    found = Rig(services)
     try:
-        for number, message in enumerate(messages):
-            carried_out.take({"id": number, **message})
-        return sorted((replies.get(timeout=_WAIT_S) for _ in messages), key=lambda reply: int(reply["reply"]))
+        found.send(*commands)
+        return found.answers(len(commands))
     finally:
-        carried_out.close(_WAIT_S)
+        found.commands.close(_WAIT_S)
 
 
 @pytest.mark.parametrize("service", SERVICES)
@@ -60,14 +111,92 @@ def test_a_failure_is_the_answer_and_harms_no_other_command() -> None:
 
     found = answers(
         {"/record_episode/start": fails, "/reset": breaks, "/planning/cancel": lambda _: "cancelled"},
-        {"do": "episode_start", "prompt": ""},
-        {"do": "reset"},
-        {"do": "fly"},
-        {"do": "mode", "mode": 3},
-        {"do": "cancel"},
+        messages.BeginEpisode(),
+        messages.Reset(),
+        messages.Cancel(),
     )
     assert found[0]["error"] == "the disk is full"
     assert "KeyError" in found[1]["error"]
-    assert found[2]["error"].startswith("unknown command 'fly'; known: estop")
-    assert found[3]["error"] == "mode must be a text"
-    assert found[4]["ok"] == "cancelled"
+    assert found[2]["ok"] == "cancelled"
+
+
+def test_a_stop_waits_for_no_command_and_empties_the_queue(rig: Callable[..., Rig]) -> None:
+    recovering, may_go_on = threading.Event(), threading.Event()
+    ran: list[str] = []
+
+    def recovers(_: object) -> str:
+        recovering.set()
+        assert may_go_on.wait(_WAIT_S)
+        return "recovered"
+
+    found = rig({"/reset": recovers, "/planning/go_to": ran.append, "/set_mode": ran.append})
+    found.send(messages.Reset(), messages.GoTo("home"), messages.SetMode("web"))
+    assert recovering.wait(_WAIT_S)
+    found.commands.stop(3)
+    stopped = found.answers(3)
+    may_go_on.set()
+    assert [each["reply"] for each in stopped] == [1, 2, 3]
+    assert all("an emergency stop came after" in each["error"] for each in stopped[:2])
+    assert stopped[2] == {"reply": 3, "ok": None}
+    assert found.answers(1) == [{"reply": 0, "ok": "recovered"}]
+    assert ran == []
+
+
+def test_what_was_sent_before_a_stop_and_arrives_after_it_is_refused(rig: Callable[..., Rig]) -> None:
+    ran: list[Any] = []
+    found = rig(
+        dict.fromkeys(("/reset", "/planning/go_to", "/set_mode", "/intervene", "/record_episode/start"), ran.append)
+    )
+    found.commands.stop(0)
+    found.answers(1)
+    sent = (messages.GoTo("home"), messages.SetMode("web"), messages.Intervene(take=False), messages.BeginEpisode())
+    for stops in (0, None):
+        found.send(*sent, stops=stops)
+        assert all("an emergency stop came after" in each["error"] for each in found.answers(len(sent)))
+    assert ran == []
+    found.send(messages.Reset(), stops=0)
+    found.answers(1)
+    assert ran == [{"stops": 0}], "control refuses a reset that has not seen the stop"
+    found.send(messages.Reset(), messages.GoTo("home"), stops=1)
+    assert all("ok" in each for each in found.answers(2))
+    assert ran == [{"stops": 0}, {"stops": 1}, "home"]
+
+
+def test_many_stops_are_one_for_the_run_and_each_is_answered(rig: Callable[..., Rig]) -> None:
+    found = rig({})
+    found.control.may_answer.clear()
+    found.commands.stop(0)
+    assert found.control.called.wait(_WAIT_S)
+    for number in range(1, 1001):
+        found.commands.stop(number)
+    found.control.may_answer.set()
+    assert found.answers(1001) == [{"reply": number, "ok": None} for number in range(1001)]
+    assert found.control.stops == 2, "the one that was on its way, and one for all that came meanwhile"
+
+
+def test_a_stop_that_control_does_not_confirm_is_an_error(rig: Callable[..., Rig]) -> None:
+    def call(do: str) -> None:
+        raise IbrobotError("control did not answer")
+
+    found = rig({})
+    found.control.call = call
+    found.commands.stop(0)
+    assert found.answers(1) == [{"reply": 0, "error": "control did not answer"}]
+
+
+def test_a_thread_that_ends_by_an_error_is_reported(rig: Callable[..., Rig]) -> None:
+    found = rig({})
+
+    def fails(reply: Mapping[str, Any]) -> None:
+        raise RuntimeError("a bug")
+
+    found.commands._reply = fails
+    found.commands.stop(0)
+    assert str(found.failures.get(timeout=_WAIT_S)) == "a bug"
+
+
+def test_the_page_can_end_the_run(rig: Callable[..., Rig]) -> None:
+    found = rig({})
+    found.send(messages.Finish(), stops=None)
+    assert found.answers(1) == [{"reply": 0, "ok": None}]
+    assert found.finished.is_set()

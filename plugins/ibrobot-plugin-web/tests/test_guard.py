@@ -11,28 +11,33 @@ from typing import Any
 import aiohttp
 import pytest
 from aiohttp import web
+from ibrobot_web.messages import LARGEST_MESSAGE, Jog, Release, RunCommand, Sent, SetMode, clock_ms
 from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
-from ibrobot_web.server.drive import LARGEST_MESSAGE, Drive
+from ibrobot_web.server.drive import Drive
 from ibrobot_web.server.guard import Guard
 
 Reply = Callable[[Mapping[str, Any]], None]
 
 
 class Server:
-    """A server whose run answers every command with the command."""
+    """A server whose run answers every command with its name."""
 
     def __init__(self, password: str | None = None) -> None:
         self.guard = Guard(("127.0.0.1", "localhost"), secure=False, password=password)
-        self.executed: list[Mapping[str, Any]] = []
-        self.released = 0
+        self.executed: list[RunCommand] = []
+        self.released = self.stopped = 0
         self.broadcast = Broadcast(lambda: None, frozenset({1}))
-        self.drive = Drive(self._execute, self._release)
+        self.drive = Drive(self._execute, self._stop, self._release)
         self.base = ""
 
-    def _execute(self, message: Mapping[str, Any], answer: Reply) -> None:
-        self.executed.append(message)
-        answer({"ok": message["do"]})
+    def _execute(self, sent: Sent[RunCommand], answer: Reply) -> None:
+        self.executed.append(sent.command)
+        answer({"ok": type(sent.command).__name__})
+
+    def _stop(self, answer: Reply) -> None:
+        self.stopped += 1
+        answer({"ok": None})
 
     def _release(self) -> None:
         self.released += 1
@@ -79,8 +84,12 @@ async def call(socket: aiohttp.ClientWebSocketResponse, **message: Any) -> dict[
             return answer
 
 
+def jog() -> dict[str, Any]:
+    return {"do": "jog", "at": 2, "press": 1}
+
+
 MALFORMED = 10_000
-PATHS = ("/", "/api/session", "/api/scene", "/stream", "/drive", "/static/app.js", "/login", "/nothing")
+PATHS = ("/", "/api/session", "/api/scene", "/stream", "/drive", "/stop", "/static/app.js", "/login", "/nothing")
 
 
 def test_nothing_is_served_without_a_session() -> None:
@@ -133,7 +142,7 @@ def test_requests_of_other_sites_are_refused(headers: dict[str, str]) -> None:
     async def test(server: Server) -> None:
         async with server.browser() as browser:
             await server.signed_in(browser)
-            for path in ("/", "/api/session", "/drive", "/stream", server.guard.path("drive")):
+            for path in ("/", "/api/session", "/drive", "/stop", "/stream", server.guard.path("drive")):
                 async with browser.get(path, headers=headers) as answer:
                     assert answer.status == 403
             with pytest.raises(aiohttp.WSServerHandshakeError):
@@ -219,8 +228,8 @@ def test_malformed_messages_are_refused_and_harm_nobody() -> None:
                         pass
                 await socket.close()
                 if sent % 1000 < 20:  # it also answers the server's pings
-                    assert (await call(operator, do="mode"))["ok"] == "mode"
-        assert {each["do"] for each in server.executed} == {"mode"}
+                    assert (await call(operator, do="mode", mode="a"))["ok"] == "SetMode"
+        assert set(server.executed) == {SetMode("a")}
         assert server.drive.refused > 50
 
     run(test)
@@ -234,17 +243,16 @@ def test_only_the_operator_commands_and_taking_over_is_explicit() -> None:
             await server.signed_in(watcher, "watch")
             one, two = await first.ws_connect("/drive"), await second.ws_connect("/drive")
             three = await watcher.ws_connect("/drive")
-            assert (await call(one, do="mode", mode="a"))["ok"] == "mode"
+            assert (await call(one, do="mode", mode="a"))["ok"] == "SetMode"
             assert "take over first" in (await call(two, do="mode", mode="b"))["error"]
-            assert (await call(two, do="estop"))["ok"] == "estop"
             assert "take over explicitly" in (await call(two, do="operate"))["error"]
-            for command in ("estop", "jog", "operate", "mode"):
-                assert "watching only" in (await call(three, do=command, take_over=True))["error"]
+            for command in ({"do": "cancel"}, jog(), {"do": "operate", "take_over": True}, {"do": "mode", "mode": "a"}):
+                assert "watching only" in (await call(three, **command))["error"]
             released = server.released
             assert "ok" in await call(two, do="operate", take_over=True)
             assert server.released == released + 1
-            assert "take over first" in (await call(one, do="jog"))["error"]
-            assert (await call(two, do="jog"))["ok"] == "jog"
+            assert "take over first" in (await call(one, **jog()))["error"]
+            assert (await call(two, **jog()))["ok"] == "Jog"
             released = server.released
             await two.close()
             await asyncio.sleep(0.05)
@@ -255,17 +263,59 @@ def test_only_the_operator_commands_and_taking_over_is_explicit() -> None:
     run(test)
 
 
-def test_presses_of_pages_with_other_clocks_count_up() -> None:
+def test_every_page_that_may_drive_stops_the_robot_by_a_connection_of_its_own_or_a_request() -> None:
     async def test(server: Server) -> None:
-        async with server.browser() as first, server.browser() as second:
+        async with server.browser() as first, server.browser() as second, server.browser() as watcher:
             for browser in (first, second):
                 await server.signed_in(browser)
-            one, two = await first.ws_connect("/drive"), await second.ws_connect("/drive")
-            for press in (9000, 9000, 9001):
-                await call(one, do="jog", press=press)
-            await call(two, do="operate", take_over=True)
-            await call(two, do="jog", press=5)
-        assert [each["press"] for each in server.executed] == [1, 1, 2, 3]
+            await server.signed_in(watcher, "watch")
+            await first.ws_connect("/drive")
+            for count, browser in enumerate((first, second), 1):
+                line = await browser.ws_connect("/stop")
+                await line.send_str("7")
+                assert await line.receive_json(timeout=60) == {"id": 7, "ok": None}
+                async with browser.post("/api/stop") as answer:
+                    assert (answer.status, await answer.json()) == (200, {"ok": None})
+                assert server.stopped == 2 * count
+            line = await watcher.ws_connect("/stop")
+            await line.send_str("7")
+            assert "watching only" in (await line.receive_json(timeout=60))["error"]
+            async with watcher.post("/api/stop") as answer:
+                assert answer.status == 400
+            for headers in ({"Origin": "http://evil.example"}, {"Sec-Fetch-Site": "cross-site"}):
+                async with second.post("/api/stop", headers=headers) as answer:
+                    assert answer.status == 403
+            assert server.stopped == 4
+
+    run(test)
+
+
+@pytest.mark.parametrize("text", ["", "estop", '{"do": "estop"}', "-1", "1.5", "1" * 16, "²", "1 "])
+def test_what_is_no_stop_is_refused_and_the_next_stop_works(text: str) -> None:
+    async def test(server: Server) -> None:
+        async with server.browser() as browser:
+            await server.signed_in(browser)
+            line = await browser.ws_connect("/stop")
+            await line.send_str(text)
+            assert await line.receive_json(timeout=60) == {"error": "expected a whole number"}
+            await line.send_str("1")
+            assert (await line.receive_json(timeout=60))["id"] == 1
+            assert server.stopped == 1
+
+    run(test)
+
+
+def test_answers_say_the_time_that_messages_of_the_deadman_are_stamped_with() -> None:
+    async def test(server: Server) -> None:
+        async with server.browser() as browser:
+            await server.signed_in(browser)
+            socket = await browser.ws_connect("/drive")
+            before = clock_ms()
+            answer = await call(socket, do="time")
+            assert before <= answer["now"] <= clock_ms()
+            assert (await call(socket, **jog()))["now"] >= answer["now"]
+            await call(socket, do="release", at=5)
+        assert server.executed == [Jog(2, 1), Release(5)]
 
     run(test)
 

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import itertools
+from collections.abc import Callable
 from typing import Any, override
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from ibrobot_testing import TeleopSuite, check_descriptor, host_context
 from ibrobot_web import ibrobot_teleop
 from ibrobot_web.options import WebTeleopOptions
-from ibrobot_web.teleop import JOG, Jog, WebTeleop
+from ibrobot_web.teleop import JOG, Jog, Released, WebTeleop
 
 from ibrobot_core.api import Context, JointReading, Teleop, TeleopError, ns
 
-PRESSES = itertools.count(1)
+
+def press(teleop: WebTeleop, **motion: Any) -> Jog:
+    """A new press of the page's deadman."""
+    clock = teleop._ctx.clock
+    clock.sleep_until(clock.now_ns() + 1)
+    return Jog(clock.now_ns(), clock.now_ns(), **motion)
 
 
 class TestConformance(TeleopSuite):
@@ -27,17 +30,17 @@ class TestConformance(TeleopSuite):
     @override
     def engage(self, teleop: Teleop) -> None:
         assert isinstance(teleop, WebTeleop)
-        teleop.take(Jog(press=next(PRESSES)))
+        teleop.take(press(teleop))
 
     @override
     def operate(self, teleop: Teleop) -> None:
         assert isinstance(teleop, WebTeleop)
-        teleop.take(Jog({"shoulder_pan": 1.0}, press=next(PRESSES)))
+        teleop.take(press(teleop, joints={"shoulder_pan": 1.0}))
 
     @override
     def release(self, teleop: Teleop) -> None:
         assert isinstance(teleop, WebTeleop)
-        teleop.take(None)
+        teleop.take(Released())
 
 
 class Rig:
@@ -62,11 +65,20 @@ class Rig:
         self.position = np.array([positions[joint] for joint in self.ctx.robot.joint_names])
         return True
 
-    def jog(self, seconds: float, **request: Any) -> None:
-        press = next(PRESSES)
+    def press(self) -> int:
+        """Press the deadman; return when [ns]."""
+        self.ctx.clock.sleep_until(self.ctx.clock.now_ns() + ns(0.001))
+        return self.ctx.clock.now_ns()
+
+    def hold(self, began_ns: int, age_s: float = 0.0, **motion: Any) -> bool:
+        """Say that the deadman is held, and go on by a tick; return whether the robot moves."""
+        self.teleop.take(Jog(self.ctx.clock.now_ns() - ns(age_s), began_ns, **(motion or {"joints": {"gripper": 1.0}})))
+        return self.tick()
+
+    def jog(self, seconds: float, **motion: Any) -> None:
+        began_ns = self.press()
         for _ in range(round(seconds / 0.01)):
-            self.teleop.take(Jog(press=press, **request))
-            self.tick()
+            self.hold(began_ns, **motion)
 
 
 def test_descriptor() -> None:
@@ -107,42 +119,96 @@ def test_a_pose_is_approached() -> None:
     np.testing.assert_allclose(rig.position, rig.ctx.robot.pose("rest"), atol=1e-6)
 
 
-def test_a_press_from_before_a_reset_moves_nothing() -> None:
-    rig = Rig()
-    press = next(PRESSES)
-    rig.teleop.take(Jog({"shoulder_pan": 1.0}, press=press))
-    assert rig.tick()
+def silence(rig: Rig, began_ns: int) -> None:
+    for _ in range(40):
+        rig.tick()
+
+
+def late(rig: Rig, began_ns: int) -> None:
+    for _ in range(40):
+        rig.hold(began_ns, age_s=0.4)
+
+
+def host_paused(rig: Rig, began_ns: int) -> None:
+    rig.tick(2.0)
+
+
+def reset(rig: Rig, began_ns: int) -> None:
     rig.teleop.activate(rig.measured())
-    rig.teleop.take(Jog({"shoulder_pan": 1.0}, press=press))
-    assert not rig.tick()
-    rig.teleop.take(Jog({"shoulder_pan": 1.0}, press=next(PRESSES)))
-    assert rig.tick()
+
+
+def replaced(rig: Rig, began_ns: int) -> None:
+    rig.teleop.disconnect()
+    rig.teleop.connect()
+    rig.teleop.activate(rig.measured())
+
+
+def lost_control(rig: Rig, began_ns: int) -> None:
+    rig.teleop.take(Released())
+
+
+def released(rig: Rig, began_ns: int) -> None:
+    rig.teleop.take(Released(rig.ctx.clock.now_ns()))
+
+
+EVENTS = (silence, late, host_paused, reset, replaced, lost_control, released)
+
+
+@pytest.mark.parametrize("event", EVENTS, ids=lambda event: str(event.__name__))
+def test_after_any_event_only_a_press_that_began_later_moves(event: Callable[[Rig, int], None]) -> None:
+    rig = Rig()
+    old = rig.press()
+    assert rig.hold(old)
+    event(rig, old)
+    assert not any(rig.hold(old) for _ in range(100)), "the same press, held all the time"
+    for _ in range(20):
+        rig.tick()
+    new = rig.press()
+    assert rig.hold(new)
+    rig.hold(old)
+    assert rig.hold(new)
+
+
+def test_a_press_that_the_page_made_before_a_reset_and_sent_after_it_moves_nothing() -> None:
+    rig = Rig()
+    began_ns = rig.press()
+    rig.tick()
+    rig.teleop.activate(rig.measured())
+    assert not rig.hold(began_ns)
+
+
+def test_motion_ends_soon_after_the_last_message_was_made_however_late_it_arrives() -> None:
+    rig = Rig()
+    began_ns = rig.press()
+    rig.tick(0.06)
+    ticks = 0
+    for _ in range(10):
+        assert rig.hold(began_ns, age_s=0.05)
+    while rig.tick():
+        ticks += 1
+    assert ticks <= 15
+
+
+def test_requests_of_a_page_that_another_one_replaced_do_not_renew_its_press() -> None:
+    rig = Rig()
+    first = rig.press()
+    assert rig.hold(first)
+    rig.teleop.take(Released())
+    second = rig.press()
+    assert rig.hold(second)
+    rig.teleop.take(Released())
+    assert not rig.hold(first)
+    assert not rig.hold(second)
 
 
 def test_requests_that_fit_no_robot_are_refused() -> None:
     rig = Rig()
     assert rig.ctx.bus is not None
     for request, why in (
-        (Jog({"shoulder": 1.0}), "no joint 'shoulder'; the joints are: shoulder_pan"),
-        (Jog(pose="hom"), "no pose 'hom'; the poses are: home, rest"),
-        (Jog(linear=np.ones(3)), "moving the tool needs robot.description.mjcf"),
+        (Jog(1, 1, {"shoulder": 1.0}), "no joint 'shoulder'; the joints are: shoulder_pan"),
+        (Jog(1, 1, pose="hom"), "no pose 'hom'; the poses are: home, rest"),
+        (Jog(1, 1, linear=(1.0, 1.0, 1.0)), "moving the tool needs robot.description.mjcf"),
     ):
         with pytest.raises(TeleopError, match=why):
             rig.ctx.bus.call(JOG, request)
     assert not rig.tick()
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-)
-
-
-@given(st.dictionaries(st.sampled_from(["joints", "targets", "linear", "turn", "pose", "press"]), JSON))
-def test_any_message_is_a_request_or_a_clear_error(message: dict[str, Any]) -> None:
-    try:
-        request = Jog.read(message)
-    except ValueError:
-        return
-    assert all(np.isfinite([*request.joints.values(), *request.targets.values(), *request.linear, *request.turn]))
-    assert all(abs(speed) <= 1 for speed in (*request.joints.values(), *request.linear, *request.turn))

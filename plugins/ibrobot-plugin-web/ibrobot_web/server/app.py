@@ -7,8 +7,9 @@ from pathlib import Path
 
 from aiohttp import web
 
+from ibrobot_web.messages import LARGEST_MESSAGE
 from ibrobot_web.server.broadcast import Broadcast
-from ibrobot_web.server.drive import LARGEST_MESSAGE, Drive
+from ibrobot_web.server.drive import Drive
 from ibrobot_web.server.guard import Guard
 
 STATIC = Path(__file__).parents[1] / "static"
@@ -48,7 +49,7 @@ def make_app(
     Args:
         guard: admits requests.
         broadcast: streams to pages.
-        drive: handles commands of pages.
+        drive: handles commands and emergency stops of pages.
         scene: returns the robot's shapes, as `ibrobot_web.scene` makes them.
     """
     app = web.Application(middlewares=[guard.middleware], client_max_size=LARGEST_MESSAGE)
@@ -75,11 +76,22 @@ def make_app(
         await drive.serve(socket, guard.session(request).role, request.remote or "?")
         return socket
 
+    async def stop_line(request: web.Request) -> web.StreamResponse:
+        socket = await _socket(request)
+        await drive.serve_stop(socket, guard.session(request).role)
+        return socket
+
+    async def stop(request: web.Request) -> web.StreamResponse:
+        reply = await drive.stop_now(guard.session(request).role)
+        return web.json_response(dict(reply), status=400 if "error" in reply else 200)
+
     app.router.add_get("/", index)
     app.router.add_get("/api/session", session)
     app.router.add_get("/api/scene", shapes)
     app.router.add_get("/stream", stream)
     app.router.add_get("/drive", commands)
+    app.router.add_get("/stop", stop_line)
+    app.router.add_post("/api/stop", stop)
     app.router.add_get("/static/{path:.*}", files.serve)
     return app
 

@@ -1,11 +1,13 @@
-"""Commands of pages: one operator at a time, limits, and replies.
+"""Commands of pages: one operator at a time, limits, and replies; and the emergency stop, which has its own way.
 
-Commands have a WebSocket of their own, so that they never wait behind pictures.
+Commands have a WebSocket of their own, so that they never wait behind pictures. The emergency stop has another one,
+on which nothing else is sent.
 """
 
 from __future__ import annotations
 
 import asyncio
+import functools
 import itertools
 import json
 from collections.abc import Callable, Mapping
@@ -14,10 +16,22 @@ from typing import Any
 import attrs
 from aiohttp import WSMsgType, web
 
+from ibrobot_web.messages import (
+    AskTime,
+    Jog,
+    MalformedMessage,
+    Operate,
+    PageCommand,
+    Release,
+    Resign,
+    RunCommand,
+    Sent,
+    clock_ms,
+    from_page,
+    stop_from_page,
+)
 from ibrobot_web.server.guard import Role
 
-LARGEST_MESSAGE = 65536
-"""Largest message of a page [bytes]."""
 _MALFORMED = 20
 """Malformed messages after which a page is disconnected."""
 _PER_SECOND = 100
@@ -25,8 +39,11 @@ _PER_SECOND = 100
 _BURST = 200
 _OPEN_COMMANDS = 32
 """Commands of a page that may wait for their replies."""
-OPEN_TO_ALL = frozenset({"estop", "release"})
-"""Commands of every page that may drive, not of the operator alone."""
+_STOP_S = 5.0
+"""Longest wait for the confirmation of a stop that was sent as a request [s]."""
+
+Answer = Callable[[Mapping[str, Any]], None]
+"""Called with `ok` or `error`."""
 
 
 class CommandRefused(Exception):
@@ -43,8 +60,6 @@ class Driver:
     socket: web.WebSocketResponse
     open: int = 0
     malformed: int = 0
-    press: Any = None
-    """The page's number of the deadman's last press."""
     allowance: float = _BURST
     counted_s: float = 0.0
     replies: asyncio.Queue[Mapping[str, Any]] = attrs.field(factory=lambda: asyncio.Queue(1024))
@@ -55,28 +70,27 @@ class Drive:
 
     Args:
         execute: sends a command to the run, and calls back with its reply.
+        stop: sends an emergency stop to the run, and calls back with its reply.
         release: releases the deadman of the operator.
     """
 
     def __init__(
-        self,
-        execute: Callable[[Mapping[str, Any], Callable[[Mapping[str, Any]], None]], None],
+        self, execute: Callable[[Sent[RunCommand], Answer], None], stop: Callable[[Answer], None],
         release: Callable[[], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._execute = execute
+        self._stop = stop
         self._release = release
         self._drivers: dict[int, Driver] = {}
         self._numbers = itertools.count(1)
-        self._presses = 0
-        """Presses of the deadman on all pages, whose own numbers cannot be compared."""
         self.operator: Driver | None = None
         self.refused = 0
         """Number of refused messages."""
 
-    def announce(self, **facts: Any) -> None:
-        """Tell all pages who the operator is, with further facts."""
+    def announce(self) -> None:
+        """Tell all pages who the operator is."""
         for driver in self._drivers.values():
-            self._reply(driver, {"event": "operator", **self._facts(driver), **facts})
+            self._reply(driver, {"event": "operator", **self._facts(driver)})
 
     def _facts(self, driver: Driver) -> dict[str, Any]:
         operator = self.operator
@@ -112,23 +126,60 @@ class Drive:
             await asyncio.gather(sending, return_exceptions=True)
             await socket.close(code=1008 if driver.malformed >= _MALFORMED else 1000)
 
+    async def serve_stop(self, socket: web.WebSocketResponse, role: Role) -> None:
+        """Pass on the emergency stops of a page until it is gone; each message is one, a number for its reply."""
+        replies: asyncio.Queue[Mapping[str, Any]] = asyncio.Queue()
+        sending = asyncio.create_task(_send_all(socket, replies))
+        malformed = 0
+        try:
+            async for message in socket:
+                try:
+                    number = stop_from_page(message.data if message.type is WSMsgType.TEXT else "")
+                except MalformedMessage as error:
+                    malformed += 1
+                    replies.put_nowait({"error": str(error)})
+                    if malformed >= _MALFORMED:
+                        break
+                    continue
+                self._stop_run(role, functools.partial(_put, replies, number))
+        finally:
+            sending.cancel()
+            await asyncio.gather(sending, return_exceptions=True)
+            await socket.close()
+
+    async def stop_now(self, role: Role) -> Mapping[str, Any]:
+        """Pass on an emergency stop, and return the run's reply."""
+        replied: asyncio.Future[Mapping[str, Any]] = asyncio.get_running_loop().create_future()
+        self._stop_run(role, lambda reply: None if replied.done() else replied.set_result(reply))
+        try:
+            return await asyncio.wait_for(replied, _STOP_S)
+        except TimeoutError:
+            return {"error": f"the run did not confirm the stop within {_STOP_S:g} s"}
+
+    def _stop_run(self, role: Role, answer: Answer) -> None:
+        if role == "drive":
+            self._stop(answer)
+        else:
+            answer({"error": "this link is for watching only"})
+
     async def _send(self, driver: Driver) -> None:
         while True:
-            await driver.socket.send_str(json.dumps(await driver.replies.get(), separators=(",", ":")))
+            reply = {**await driver.replies.get(), "now": clock_ms()}
+            await driver.socket.send_str(json.dumps(reply, separators=(",", ":")))
 
     def _take(self, driver: Driver, text: str) -> bool:
         """Handle a message; return whether to keep the page."""
-        number: Any = None
+        number: int | None = None
         try:
-            message = _parse(text)
-            number = message.get("id")
             self._allow(driver)
-            self._handle(driver, message, number)
+            sent = from_page(text)
+            number = sent.number
+            self._handle(driver, sent)
         except CommandRefused as error:
             self._refuse(driver, number, str(error))
-        except ValueError as error:
+        except MalformedMessage as error:
             driver.malformed += 1
-            self._refuse(driver, number, str(error))
+            self._refuse(driver, error.number, str(error))
         return driver.malformed < _MALFORMED
 
     def _allow(self, driver: Driver) -> None:
@@ -136,46 +187,43 @@ class Drive:
         driver.allowance = min(_BURST, driver.allowance + (now_s - driver.counted_s) * _PER_SECOND)
         driver.counted_s = now_s
         if driver.allowance < 1.0:
-            raise ValueError(f"more than {_PER_SECOND} commands per second")
+            raise MalformedMessage(f"more than {_PER_SECOND} commands per second")
         driver.allowance -= 1.0
 
-    def _handle(self, driver: Driver, message: Mapping[str, Any], number: Any) -> None:
-        do = message["do"]
+    def _handle(self, driver: Driver, sent: Sent[PageCommand]) -> None:
         if driver.role != "drive":
             raise CommandRefused("this link is for watching only")
-        if do == "operate":
-            self._operate(driver, take_over=message.get("take_over") is True)
-            self._reply(driver, {"id": number, "ok": None})
-            return
-        if do == "resign":
-            if self.operator is driver:
-                self.operator = None
-                self._release()
-                self.announce()
-            self._reply(driver, {"id": number, "ok": None})
-            return
-        if do not in OPEN_TO_ALL and self.operator is not driver:
+        match sent.command:
+            case AskTime():
+                self._reply(driver, {"id": sent.number, "ok": None})
+            case Operate(take_over):
+                self._operate(driver, take_over=take_over)
+                self._reply(driver, {"id": sent.number, "ok": None})
+            case Resign():
+                self._resign(driver)
+                self._reply(driver, {"id": sent.number, "ok": None})
+            case Release() if self.operator is not driver:
+                return
+            case command:
+                self._pass_on(driver, Sent(sent.number, sent.stops, command))
+
+    def _pass_on(self, driver: Driver, sent: Sent[RunCommand]) -> None:
+        if self.operator is not driver:
             operator = self.operator.name if self.operator is not None else "nobody"
             raise CommandRefused(f"this page only watches; the operator is {operator}: take over first")
-        if do == "release" and self.operator is not driver:
+        if sent.number is None:
+            self._execute(sent, lambda reply: None)
             return
-        if do == "jog":
-            if message.get("press") != driver.press:
-                driver.press = message.get("press")
-                self._presses += 1
-            message = {**message, "press": self._presses}
-        if driver.open >= _OPEN_COMMANDS:
+        # The deadman's messages have a place beside the others, which may all wait.
+        if driver.open >= _OPEN_COMMANDS and not isinstance(sent.command, Jog | Release):
             raise CommandRefused("too many commands are waiting for their answers")
-        if number is None:
-            self._execute(message, lambda reply: None)
-            return
         driver.open += 1
 
         def answer(reply: Mapping[str, Any]) -> None:
             driver.open -= 1
-            self._reply(driver, {**reply, "id": number})
+            self._reply(driver, {**reply, "id": sent.number})
 
-        self._execute(message, answer)
+        self._execute(sent, answer)
 
     def _operate(self, driver: Driver, *, take_over: bool) -> None:
         if self.operator is driver:
@@ -186,7 +234,13 @@ class Drive:
         self._release()
         self.announce()
 
-    def _refuse(self, driver: Driver, number: Any, why: str) -> None:
+    def _resign(self, driver: Driver) -> None:
+        if self.operator is driver:
+            self.operator = None
+            self._release()
+            self.announce()
+
+    def _refuse(self, driver: Driver, number: int | None, why: str) -> None:
         self.refused += 1
         self._reply(driver, {"id": number, "error": why})
 
@@ -198,22 +252,10 @@ class Drive:
             driver.malformed = _MALFORMED
 
 
-def _parse(text: str) -> Mapping[str, Any]:
-    """A page's message.
-
-    Raises:
-        ValueError: if it is malformed.
-    """
-    try:
-        message = json.loads(text, parse_constant=_no_constant)
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise ValueError(f"not JSON: {error}") from None
-    if not isinstance(message, dict) or not isinstance(message.get("do"), str):
-        raise ValueError("expected an object with a text `do`")
-    if not isinstance(message.get("id"), int | None):
-        raise ValueError("id must be a whole number")
-    return message
+def _put(replies: asyncio.Queue[Mapping[str, Any]], number: int, reply: Mapping[str, Any]) -> None:
+    replies.put_nowait({**reply, "id": number})
 
 
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number in JSON")
+async def _send_all(socket: web.WebSocketResponse, replies: asyncio.Queue[Mapping[str, Any]]) -> None:
+    while True:
+        await socket.send_str(json.dumps(await replies.get(), separators=(",", ":")))

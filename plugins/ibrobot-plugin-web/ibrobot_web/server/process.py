@@ -1,8 +1,8 @@
 """The process of the page's server: `python -m ibrobot_web.server.process CHANNEL STREAM`, started by the viewer.
 
-Its order has the options of the viewer; it answers `{"event": "ready", "url": …}`. Later messages:
+Its order has the options of the viewer; it answers `{"url": …, "watch_url": …}`. Later messages:
 
-- to the run: `{"event": "pages", "count": N, "wanted": [CHANNEL, …] | null}`, and commands `{"id": N, "do": …}`;
+- to the run: what `ibrobot_web.messages.to_run` makes;
 - to the server: `{"reply": N, "ok": … | "error": …}`.
 
 States and pictures arrive on STREAM, as `ibrobot_web.link` defines. It ends when the run closes the channel.
@@ -18,18 +18,20 @@ import logging
 import socket
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import attrs
 from aiohttp import web
 
 from ibrobot_core.api import Channel, Failure, IbrobotError, open_parent
-from ibrobot_web.link import FIRST_PICTURE, STATUS, receive_frame
+from ibrobot_web.link import ALIVE_S, FIRST_PICTURE, STATUS, receive_frame
+from ibrobot_web.messages import Alive, FromServer, Pages, Release, RunCommand, Sent, StopRun, to_run
 from ibrobot_web.pictures import as_jpeg
 from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
-from ibrobot_web.server.drive import Drive
+from ibrobot_web.server.drive import Answer, Drive
 from ibrobot_web.server.guard import Guard
 from ibrobot_web.server.listening import host_names, listen, tls_of
 
@@ -51,11 +53,11 @@ class RunLink:
         self._channel = channel
         self._order = order
         self._numbers = itertools.count(1)
-        self._answers: dict[int, Callable[[Mapping[str, Any]], None]] = {}
+        self._answers: dict[int, Answer] = {}
         self._scene: asyncio.Future[bytes] | None = None
         self.ended = asyncio.Event()
         self.broadcast = Broadcast(self._pages_changed, frozenset({STATUS}))
-        self.drive = Drive(self._execute, lambda: self._send({"do": "release"}))
+        self.drive = Drive(self._execute, self._stop, lambda: self._send(Sent(None, None, Release())))
 
     async def scene(self) -> bytes:
         """The robot's shapes, made once, in a thread that does not delay the end."""
@@ -74,9 +76,11 @@ class RunLink:
     def receive(self) -> None:
         """Handle the messages of the run."""
         for message in self._channel.receive():
-            answer = self._answers.pop(message.get("reply", 0), None)
-            if answer is not None:
-                answer({name: message[name] for name in ("ok", "error") if name in message})
+            match message:
+                case {"reply": int() as number, "ok": value} if number in self._answers:
+                    self._answers.pop(number)({"ok": value})
+                case {"reply": int() as number, "error": str() as why} if number in self._answers:
+                    self._answers.pop(number)({"error": why})
         if self._channel.closed:
             self.ended.set()
 
@@ -94,19 +98,29 @@ class RunLink:
         finally:
             writer.close()
 
-    def _execute(self, message: Mapping[str, Any], answer: Callable[[Mapping[str, Any]], None]) -> None:
-        number = next(self._numbers)
-        if "id" in message and message["id"] is not None:
+    def _execute(self, sent: Sent[RunCommand], answer: Answer) -> None:
+        number = None
+        if sent.number is not None:
+            number = next(self._numbers)
             self._answers[number] = answer
-        self._send({**message, "id": number})
+        self._send(attrs.evolve(sent, number=number))
+
+    def _stop(self, answer: Answer) -> None:
+        number = next(self._numbers)
+        self._answers[number] = answer
+        self._send(StopRun(number))
 
     def _pages_changed(self) -> None:
-        wanted = self.broadcast.wanted
-        count = len(self.broadcast.pages)
-        self._send({"event": "pages", "count": count, "wanted": None if wanted is None else sorted(wanted)})
+        self._send(Pages(len(self.broadcast.pages), self.broadcast.wanted))
 
-    def _send(self, message: Mapping[str, Any]) -> None:
-        self._channel.send(message)
+    async def live(self) -> None:
+        """Tell the run again and again that the server is alive."""
+        while True:
+            self._send(Alive())
+            await asyncio.sleep(ALIVE_S)
+
+    def _send(self, message: FromServer) -> None:
+        self._channel.send(to_run(message))
 
 
 async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any]) -> None:
@@ -132,15 +146,16 @@ async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any
         await site.start()
         loop.add_reader(channel.fileno(), link.receive)
         relaying = asyncio.create_task(link.relay(stream))
+        living = asyncio.create_task(link.live())
         scene = asyncio.create_task(link.scene())  # so that the first page does not wait for it
         base = f"{'https' if tls else 'http'}://{names[0]}:{port}"
         links = {"url": base + guard.path("drive"), "watch_url": base + guard.path("watch")}
-        channel.send({"event": "ready", **links})
+        channel.send(links)
         await link.ended.wait()
         loop.remove_reader(channel.fileno())
-        for task in (relaying, scene):
+        for task in (relaying, living, scene):
             task.cancel()
-        await asyncio.gather(relaying, scene, return_exceptions=True)
+        await asyncio.gather(relaying, living, scene, return_exceptions=True)
     finally:
         await runner.cleanup()
 

@@ -2,7 +2,7 @@
 
 import { h, refresh, say, toast } from "./dom.js";
 import { Deadman } from "./hold.js";
-import { Drive, Stream } from "./link.js";
+import { Drive, StopLine, Stream } from "./link.js";
 import { View3D, isDark } from "./view3d.js";
 import { Cameras } from "./cameras.js";
 import { Joints } from "./joints.js";
@@ -13,14 +13,14 @@ import { PlotsPanel } from "./panels/plots.js";
 import { HealthPanel } from "./panels/health.js";
 import { LogPanel } from "./panels/log.js";
 
-const STILL_RAD_S = 0.02;
 const STALE_MS = 1500;
+const CONFIRMED_MS = 300;
 const $ = (id) => document.getElementById(id);
 
 // What all parts of the page share.
 const page = {
-  stream: new Stream(), drive: new Drive(), status: null, state: null, links: {}, role: "watch",
-  moved: 0, arrived: 0,
+  stream: new Stream(), drive: new Drive(), line: new StopLine(), status: null, state: null, links: {}, role: "watch",
+  arrived: 0, unconfirmed: "",
   get operating() { return this.drive.facts.operating; },
   get mode() { return this.status?.robot.modes.find((mode) => mode.name === this.status.mode); },
   // Whether the operator can jog from this page now.
@@ -28,7 +28,7 @@ const page = {
   // Carries out a command, and shows its error.
   async command(name, facts = {}, done = "") {
     try {
-      const answer = await this.drive.call(name, facts);
+      const answer = await this.drive.command(name, facts);
       if (done || typeof answer === "string") toast(done || answer);
       return true;
     } catch (error) {
@@ -54,29 +54,44 @@ page.cameras = new Cameras($("cameras"), page);
 const parts = [page.cameras, new Joints($("joints"), page), new Thumb($("thumb"), page)];
 const panels = [DrivePanel, EpisodesPanel, PlotsPanel, HealthPanel, LogPanel].map((Panel) => new Panel(page));
 
-function stop() {
+// Stops the robot. The button says so at once, and an alarm names other ways while the run has not confirmed it.
+let stopping = 0;
+async function stop() {
+  const number = ++stopping;
+  const confirmed = page.line.stop();
   page.deadman.release();
-  page.command("estop");
+  page.unconfirmed = "";
+  say($("stop"), "stopping …");
+  const alarm = (why) => {
+    if (number !== stopping) return;
+    page.unconfirmed = why;
+    showFaults();
+  };
+  const timer = setTimeout(() => {
+    alarm(`no answer within ${CONFIRMED_MS / 1000} s`);
+    page.line.request().then(done, () => {});
+  }, CONFIRMED_MS);
+  function done() {
+    clearTimeout(timer);
+    if (number !== stopping) return;
+    page.unconfirmed = "";
+    $("stop").replaceChildren("STOP ", h("kbd", {}, "Esc"));
+    showFaults();
+  }
+  confirmed.then(done, (error) => { clearTimeout(timer); alarm(error.message); });
 }
 
-function isMoving() {
-  return page.deadman.held || performance.now() - page.moved < 400;
-}
-
-// Space stops the robot wherever the focus is; in a text field it types a space while the robot stands still.
-document.addEventListener("keydown", (event) => {
-  if (event.key !== " ") return;
-  const types = event.target.matches?.("input[type=text], textarea") && !isMoving();
-  if (types) return;
+// Esc stops the robot, whatever the page shows and wherever the focus is.
+window.addEventListener("keydown", (event) => {
+  if (event.key !== "Escape" || page.role === "watch") return;
   event.preventDefault();
   event.stopImmediatePropagation();
   if (!event.repeat) stop();
 }, true);
-document.addEventListener("keyup", (event) => {
-  if (event.key === " " && event.target.matches?.("button, summary, [role=tab]")) event.preventDefault();
-}, true);
 $("stop").addEventListener("pointerdown", stop);
-$("stop").addEventListener("keydown", (event) => { if (event.key === "Enter") stop(); });
+$("stop").addEventListener("keydown", (event) => {
+  if (["Enter", " "].includes(event.key) && !event.repeat) stop();
+});
 
 $("operate").addEventListener("click", () => {
   if (page.operating) page.command("resign");
@@ -153,9 +168,12 @@ function showFaults() {
   const held = status?.held ?? "", failure = status?.failure ?? "";
   const absent = status?.absent ?? [], conditions = status?.conditions ?? [];
   const lost = page.connected === false;
-  refresh($("faults"), { lost, estop, faults, held, failure, absent, conditions, operating: page.operating }, () => {
+  const unconfirmed = page.unconfirmed ?? "";
+  refresh($("faults"), { lost, unconfirmed, estop, faults, held, failure, absent, conditions, operating: page.operating }, () => {
     const reset = () => h("button", { onclick: () => page.command("reset"), disabled: !page.operating }, "Reset");
     return [
+      unconfirmed ? h("div", { class: "fault alarm" }, h("strong", {}, "The robot may not have stopped: "), h("span", {},
+        `STOP is not confirmed (${unconfirmed}). Press Esc in the terminal of the run, or switch off the robot's power.`)) : null,
       lost ? h("div", { class: "fault" }, h("strong", {}, "No connection to the run. "), h("span", {},
         "It has ended, or the network is down. STOP on this page has no effect. The page keeps trying.")) : null,
       ...faults.map(({ text, remedy }) => h("div", { class: "fault" },
@@ -183,13 +201,8 @@ function showConnection() {
 page.stream.addEventListener("state", ({ detail: state }) => {
   const before = page.state;
   page.state = state;
+  page.drive.stops = state.stops;
   page.arrived = performance.now();
-  if (before) {
-    const seconds = Math.max(1e-3, (state.stamp - before.stamp) / 1e9);
-    if (state.command.some((value, i) => Math.abs(value - before.command[i]) / seconds > STILL_RAD_S)) {
-      page.moved = performance.now();
-    }
-  }
   view.tell({ do: "state", state });
   for (const part of [...parts, ...panels]) part.state?.(state);
   if (before?.estop !== state.estop) showFaults();

@@ -1,13 +1,14 @@
-// The deadman: the robot moves while something is held, and a message says so 25 times a second. Letting go, leaving the
-// page, hiding it, or losing the connection releases it; the run releases it by itself if messages stay away.
+// The deadman: the robot moves while something is held, and a message says so up to 25 times a second. Letting go, leaving
+// the page, hiding it, a stall of the page or of the connection, or losing it releases it. The run counts only messages
+// that are young, and after a release of any kind only a press that began later.
 
 const PERIOD_MS = 40;
+const STALL_MS = 200;
 
 export class Deadman {
   constructor(drive) {
     this.drive = drive;
     this.request = null;
-    this.press = Date.now();
     this.timer = null;
     this.listeners = new Set();
     const release = () => this.release();
@@ -16,7 +17,6 @@ export class Deadman {
     document.addEventListener("visibilitychange", () => { if (document.hidden) this.release(); });
     window.addEventListener("contextmenu", release);
     drive.addEventListener("operator", () => { if (!drive.facts.operating) this.release(); });
-    drive.addEventListener("refused", release);
   }
 
   get held() { return this.request !== null; }
@@ -24,23 +24,50 @@ export class Deadman {
   // `request` is a function that returns the present motion: {joints, targets, linear, turn, pose}.
   hold(request) {
     if (!this.drive.facts.operating || document.hidden) return;
-    this.press = Math.max(this.press + 1, Date.now());
+    this.press = this.drive.clock.now();
+    if (this.press === null) return;
     this.request = request;
+    this.alive = performance.now();
+    this.asked = null;
     this.send();
     clearInterval(this.timer);
-    this.timer = setInterval(() => this.send(), PERIOD_MS);
+    this.timer = setInterval(() => this.beat(), PERIOD_MS);
     this.notify();
   }
 
-  send() {
-    if (this.request) this.drive.tell("jog", { ...this.request(), press: this.press });
+  beat() {
+    const now = performance.now();
+    const stalled = now - this.alive > STALL_MS;
+    const slow = this.asked !== null && now - this.asked > STALL_MS;
+    this.alive = now;
+    if (stalled || slow) this.refuse(stalled ? "this page stalled" : "the connection is too slow to jog");
+    else this.send();
+  }
+
+  // One message at a time is on its way, so that none queues in a slow network, where it would arrive late.
+  async send() {
+    if (!this.request || this.asked !== null || !this.drive.idle) return;
+    const { press } = this;
+    this.asked = performance.now();
+    try {
+      await this.drive.call("jog", { at: this.drive.clock.now(), press, ...this.request() });
+      if (this.press === press) this.asked = null;
+    } catch (error) {
+      if (this.press === press) this.refuse(error.message);
+    }
+  }
+
+  refuse(why) {
+    if (!this.request) return;
+    this.release();
+    this.drive.emit("refused", `${why}: released; press again`);
   }
 
   release() {
     if (!this.request) return;
     this.request = null;
     clearInterval(this.timer);
-    this.drive.tell("release");
+    this.drive.tell("release", { at: this.drive.clock.now() });
     this.notify();
   }
 

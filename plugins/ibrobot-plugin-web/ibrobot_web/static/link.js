@@ -63,17 +63,50 @@ export class Stream extends EventTarget {
   emit(name, detail) { this.dispatchEvent(new CustomEvent(name, { detail })); }
 }
 
+const WINDOW_MS = 10000; // clocks drift: the offset is measured anew after one to two windows
+const ASK_MS = 2000;
+
+// The robot's time, by what its server says. The least that it can be now: a message takes time to arrive, so what the
+// page stamps by it may be younger than its stamp says, never older.
+class Clock {
+  constructor() { this.last = 0; this.reset(); }
+
+  reset() { this.offsets = []; }
+
+  hear(now) {
+    const here = performance.now();
+    if (!this.offsets.length || here > this.until) {
+      this.offsets = [-Infinity, ...this.offsets.slice(0, 1)];
+      this.until = here + WINDOW_MS;
+    }
+    this.offsets[0] = Math.max(this.offsets[0], now - here);
+  }
+
+  // Milliseconds, always later than the last time; null while it is unknown.
+  now() {
+    if (!this.offsets.length) return null;
+    this.last = Math.max(this.last + 1, Math.floor(performance.now() + Math.max(...this.offsets)));
+    return this.last;
+  }
+}
+
 // Emits operator and connection. `call` resolves with the run's answer and rejects with its error.
 export class Drive extends EventTarget {
   constructor() {
     super();
     this.number = 0;
     this.waiting = new Map();
+    this.clock = new Clock();
+    this.stops = null; // number of emergency stops that the page has seen
     this.facts = { operating: false, operator: "", role: "watch", pages: 0 };
     this.connect();
+    setInterval(() => this.call("time").catch(() => {}), ASK_MS);
   }
 
   get open() { return this.socket.readyState === WebSocket.OPEN; }
+
+  // Whether everything that was sent has left the page.
+  get idle() { return this.open && this.socket.bufferedAmount === 0; }
 
   connect() {
     this.socket = new WebSocket(address("/drive"));
@@ -83,6 +116,7 @@ export class Drive extends EventTarget {
       this.facts = { ...this.facts, operating: false, operator: "" };
       for (const { reject } of this.waiting.values()) reject(new Error("the connection to the robot was lost"));
       this.waiting.clear();
+      this.clock.reset();
       this.emit("operator", this.facts);
       this.emit("connection", { open: false });
       setTimeout(() => this.connect(), 1000);
@@ -90,6 +124,7 @@ export class Drive extends EventTarget {
   }
 
   take(message) {
+    if (message.now) this.clock.hear(message.now);
     if (message.event === "operator") {
       this.facts = message;
       this.emit("operator", message);
@@ -110,10 +145,48 @@ export class Drive extends EventTarget {
     return new Promise((resolve, reject) => this.waiting.set(id, { resolve, reject }));
   }
 
-  // Without a reply, for messages that repeat.
+  // As `call`, for what an emergency stop that the page has not seen makes void.
+  command(name, facts = {}) { return this.call(name, { stops: this.stops, ...facts }); }
+
+  // Without a reply.
   tell(command, facts = {}) {
     if (this.open) this.socket.send(JSON.stringify({ do: command, ...facts }));
   }
 
   emit(name, detail) { this.dispatchEvent(new CustomEvent(name, { detail })); }
+}
+
+// The emergency stop, on a connection of its own, on which nothing else waits.
+export class StopLine {
+  constructor() {
+    this.number = 0;
+    this.waiting = new Map();
+    this.connect();
+  }
+
+  connect() {
+    this.socket = new WebSocket(address("/stop"));
+    this.socket.onmessage = ({ data }) => {
+      const { id, error } = JSON.parse(data);
+      this.waiting.get(id)?.(error);
+      this.waiting.delete(id);
+    };
+    this.socket.onclose = () => setTimeout(() => this.connect(), 1000);
+  }
+
+  // Resolves once the run has confirmed the stop; rejects with what it says.
+  stop() {
+    const id = ++this.number;
+    if (this.socket.readyState !== WebSocket.OPEN) return this.request();
+    this.socket.send(String(id));
+    return new Promise((resolve, reject) => {
+      this.waiting.set(id, (error) => (error ? reject(new Error(error)) : resolve()));
+    });
+  }
+
+  // By another connection, if this one is lost or says nothing.
+  async request() {
+    const answer = await fetch("/api/stop", { method: "POST", keepalive: true });
+    if (!answer.ok) throw new Error((await answer.json()).error);
+  }
 }

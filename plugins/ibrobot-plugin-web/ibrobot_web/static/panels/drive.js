@@ -116,7 +116,7 @@ export class DrivePanel {
     const { page } = this;
     if (!page.status.services.includes("preview")) return;
     try {
-      const plan = await page.drive.call("preview", { goal: parsed(this.goal ?? "") });
+      const plan = await page.drive.command("preview", { goal: parsed(this.goal ?? "") });
       page.view.tell({ do: "plan", plan, positions: page.state.position, kept: true });
       toast(`The path takes ${plan.duration_s} s.`);
     } catch (error) {

@@ -1,0 +1,333 @@
+"""Messages of pages, and what travels between the page's server and the run.
+
+A page sends JSON objects. The server makes an object of a class of this module of each, or refuses it, and only such
+objects go on to the run. Their envelopes are written by the server: nothing that a page sends can pass for one. The run
+reads them as strictly as the server reads the page's.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import attrs
+
+from ibrobot_core.api import IbrobotError, RequestError, RequestLimits, Service, option
+
+LARGEST_MESSAGE = 16_384
+"""Largest message of a page [bytes]."""
+_CLOCK = time.CLOCK_BOOTTIME if sys.platform == "linux" else time.CLOCK_MONOTONIC
+_LIMITS = RequestLimits(values=300, text=1000, depth=4)
+_LARGEST = 2**53
+"""Numbers of commands and times are smaller, so that JavaScript can count them."""
+
+
+def clock_ms() -> int:
+    """The time that pages stamp their messages with, the same in the server and in the run [ms].
+
+    It goes on while the machine is suspended, where the system can say so.
+    """
+    return time.clock_gettime_ns(_CLOCK) // 1_000_000
+
+
+def within_one(instance: object, attribute: object, values: Mapping[str, float] | tuple[float, ...]) -> None:
+    """Check speeds, which are fractions; a validator of attrs.
+
+    Raises:
+        ValueError: for a speed beyond.
+    """
+    given = values.values() if isinstance(values, Mapping) else values
+    if not all(abs(value) <= 1.0 for value in given):
+        raise ValueError("a speed must lie between -1 and 1")
+
+
+@attrs.frozen
+class Jog:
+    """Moves the robot while the page's deadman is held: at most until the next one, and for a fraction of a second.
+
+    Times are those of `clock_ms`. The page stamps with the earliest that its message can have by it, so that a message
+    is never younger than it seems.
+    """
+
+    at: int = option(ge=0, lt=_LARGEST, unit="ms", help="when the page made this message")
+    press: int = option(ge=0, lt=_LARGEST, unit="ms", help="when the present press of the deadman began")
+    joints: Mapping[str, float] = option(
+        factory=dict, validator=within_one, help="joint -> fraction of its speed, -1 to 1"
+    )
+    targets: Mapping[str, float] = option(factory=dict, unit="rad", help="joint -> position that it approaches")
+    linear: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), validator=within_one, help="fraction of the tool's speed along the axes of the base"
+    )
+    turn: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), validator=within_one, help="fraction of the tool's speed of turning about its own axes"
+    )
+    pose: str = option("", help="named pose that all joints approach")
+
+
+@attrs.frozen
+class Release:
+    """Releases the deadman: presses that began before it count no more."""
+
+    at: int | None = option(None, ge=0, lt=_LARGEST, unit="ms", help="when; by default now")
+
+
+@attrs.frozen
+class Reset:
+    """Clears faults and the emergency stops that the page has seen."""
+
+
+@attrs.frozen
+class SetMode:
+    """Enters a mode."""
+
+    mode: str = option(help="its name")
+
+
+@attrs.frozen
+class BeginEpisode:
+    """Begins an episode."""
+
+    prompt: str = option("", help="the task; empty: as before")
+
+
+@attrs.frozen
+class EndEpisode:
+    """Ends the episode."""
+
+    outcome: Literal["success", "failure", "unknown"] = option(help="how it went")
+
+
+@attrs.frozen
+class DiscardEpisode:
+    """Ends the episode and deletes it."""
+
+
+@attrs.frozen
+class SetSmoothing:
+    """Switches the blending of action chunks."""
+
+    enabled: bool = option(help="whether to blend")
+
+
+@attrs.frozen
+class Intervene:
+    """Takes the robot from the policy, or gives it back."""
+
+    take: bool = option(help="whether to take it")
+
+
+@attrs.frozen
+class Target:
+    """Where to move: one of these."""
+
+    pose: str | None = option(None, help="named pose")
+    xyz: tuple[float, float, float] | None = option(None, unit="m", help="position of the tool")
+    joints: Mapping[str, float] | None = option(None, unit="rad", help="joint -> position")
+
+    def __attrs_post_init__(self) -> None:
+        if sum(each is not None for each in (self.pose, self.xyz, self.joints)) != 1:
+            raise ValueError("a goal is one of pose, xyz and joints")
+
+
+@attrs.frozen
+class Preview:
+    """Plans a motion without executing it."""
+
+    goal: Target = option(help="where to")
+
+
+@attrs.frozen
+class GoTo:
+    """Plans a motion and executes it."""
+
+    goal: str = option(help="pose, joint=rad,… or xyz=x,y,z")
+
+
+@attrs.frozen
+class Cancel:
+    """Ends the planned motion."""
+
+
+@attrs.frozen
+class Finish:
+    """Ends the run."""
+
+
+@attrs.frozen
+class Operate:
+    """Makes the page the operator."""
+
+    take_over: bool = option(False, help="whether to take over from another page")
+
+
+@attrs.frozen
+class Resign:
+    """Makes the operator's page one that watches."""
+
+
+@attrs.frozen
+class AskTime:
+    """Asks for the time of `clock_ms`, which every answer has."""
+
+
+RunCommand = (
+    Jog | Release | Reset | SetMode | BeginEpisode | EndEpisode | DiscardEpisode | SetSmoothing | Intervene | Preview
+    | GoTo | Cancel | Finish
+)  # fmt: skip
+"""Commands that the run carries out."""
+PageCommand = RunCommand | Operate | Resign | AskTime
+"""Commands that pages may send."""
+_COMMANDS: Mapping[str, Service[Any, None]] = {
+    name: Service(name, kind, type(None), limits=_LIMITS)
+    for name, kind in {
+        "jog": Jog, "release": Release, "reset": Reset, "mode": SetMode, "episode_start": BeginEpisode,
+        "episode_stop": EndEpisode, "episode_discard": DiscardEpisode, "smoothing": SetSmoothing,
+        "intervene": Intervene, "preview": Preview, "goal": GoTo, "cancel": Cancel, "finish": Finish,
+        "operate": Operate, "resign": Resign, "time": AskTime,
+    }.items()
+}  # fmt: skip
+_NAMES = {service.request: name for name, service in _COMMANDS.items()}
+
+
+@attrs.frozen
+class Sent[C]:
+    """A command, as its sender numbers it."""
+
+    number: int | None
+    """Number for the answer; None: no answer is wanted."""
+    stops: int | None
+    """Number of emergency stops that the sender had seen; None if it has seen no state of the robot."""
+    command: C
+
+
+@attrs.frozen
+class StopRun:
+    """An emergency stop, on its way to the run."""
+
+    number: int
+
+
+@attrs.frozen
+class Pages:
+    """How many pages there are, and which channels they show."""
+
+    count: int
+    wanted: frozenset[int] | None
+    """None for all."""
+
+
+@attrs.frozen
+class Alive:
+    """A sign of life of the server."""
+
+
+FromServer = Sent[RunCommand] | StopRun | Pages | Alive
+"""What the server sends to the run."""
+
+
+def from_page(text: str) -> Sent[PageCommand]:
+    """The command in a message of a page.
+
+    Raises:
+        MalformedMessage: if it is none, with its number if that is known.
+    """
+    message = _object(text)
+    number = _whole(message, "id")
+    try:
+        stops = _whole(message, "stops")
+        if not isinstance(name := message.get("do"), str):
+            raise ValueError("expected an object with a text `do`")
+        facts = {key: value for key, value in message.items() if key not in ("id", "stops", "do")}
+        return Sent(number, stops, _read(name, facts))
+    except (ValueError, IbrobotError) as error:
+        raise MalformedMessage(str(error), number) from None
+
+
+def stop_from_page(text: str) -> int:
+    """The number of an emergency stop in a message of a page, which is nothing else, so that it needs no time.
+
+    Raises:
+        MalformedMessage: if it is none.
+    """
+    if not (text.isascii() and text.isdecimal() and len(text) <= 15):
+        raise MalformedMessage("expected a whole number")
+    return int(text)
+
+
+def to_run(message: FromServer) -> dict[str, Any]:
+    """A message of the server for its channel."""
+    match message:
+        case Sent(number, stops, command):
+            facts = attrs.asdict(command)
+            return {"command": _NAMES[type(command)], "number": number, "stops": stops, "facts": facts}
+        case StopRun(number):
+            return {"stop": number}
+        case Pages(count, wanted):
+            return {"pages": count, "wanted": None if wanted is None else sorted(wanted)}
+        case Alive():
+            return {"alive": True}
+
+
+def from_server(message: Mapping[str, Any]) -> FromServer:
+    """A message of the server, in the run.
+
+    Raises:
+        ValueError: if it is none.
+        RequestError: for a command that is none.
+    """
+    match dict(message):
+        case {"command": str() as name, "facts": dict() as facts, "number": _, "stops": _, **more} if not more:
+            command = _read(name, facts)
+            if not isinstance(command, RunCommand):
+                raise ValueError(f"{name} is not for the run")
+            return Sent(_whole(message, "number"), _whole(message, "stops"), command)
+        case {"stop": int() as number, **more} if not more:
+            return StopRun(number)
+        case {"pages": int() as count, "wanted": list() | None as wanted, **more} if not more:
+            channels = {each for each in wanted or () if isinstance(each, int)}
+            return Pages(count, None if wanted is None else frozenset(channels))
+        case {"alive": True, **more} if not more:
+            return Alive()
+    raise ValueError(f"no message of the page's server: {', '.join(map(str, message))[:80]}")
+
+
+class MalformedMessage(IbrobotError):
+    """A page has sent what is no command.
+
+    Attributes:
+        number: the page's number of it, if that is known.
+    """
+
+    def __init__(self, why: str, number: int | None = None) -> None:
+        super().__init__(why)
+        self.number = number
+
+
+def _object(text: str) -> dict[str, Any]:
+    try:
+        message = json.loads(text, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise MalformedMessage(f"not JSON: {error}") from None
+    if not isinstance(message, dict):
+        raise MalformedMessage("expected an object with a text `do`")
+    return message
+
+
+def _read(name: str, facts: Mapping[str, Any]) -> Any:
+    if (service := _COMMANDS.get(name)) is None:
+        raise RequestError(f"unknown command {name[:40]!r}; known: {', '.join(_COMMANDS)}")
+    return service.read(facts)
+
+
+def _whole(message: Mapping[str, Any], name: str) -> int | None:
+    value = message.get(name)
+    if value is None or (isinstance(value, int) and not isinstance(value, bool) and 0 <= value < _LARGEST):
+        return value
+    raise MalformedMessage(f"{name} must be a whole number")
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a number in JSON")
