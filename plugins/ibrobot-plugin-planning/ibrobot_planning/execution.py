@@ -8,8 +8,20 @@ from functools import cached_property
 from typing import Any
 
 import attrs
+import numpy as np
 
-from ibrobot_core.api import HardwareError, JointTrajectory, Planner, Session, Vector, ns, seconds, trajectory_goal
+from ibrobot_core.api import (
+    HardwareError,
+    Header,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    Planner,
+    Session,
+    Vector,
+    ns,
+    seconds,
+    trajectory_goal,
+)
 from ibrobot_planning.blend import Limits, braking, cut, joined, motion_of, trajectory_of
 from ibrobot_planning.timing import Motion
 
@@ -181,6 +193,20 @@ class Execution:
             if track.trajectory is not None:
                 passed_ns = 0 if track.begin_ns is None else max(0, state.stamp_ns - track.begin_ns)
                 if touched := self._planner.blocked(track.trajectory, others, passed_ns):
+                    return touched
+        return ""
+
+    def touched(self) -> str:
+        """What the arm touches, or is too near to, where it stands; empty if nothing."""
+        session, position = self._session, self.commanded()
+        robot = session.config.robot
+        others = dict(zip(robot.joint_names, position.tolist(), strict=True))
+        for name in session.config.control_modes[session.mode].executors:
+            executor = session.config.executors[name]
+            if executor.goals == "trajectory":
+                here, rest = position[robot.indices(executor.joints)], np.zeros(len(executor.joints))
+                points = tuple(JointTrajectoryPoint(stamp, here, rest, rest) for stamp in (0, ns(0.01)))
+                if touched := self._planner.blocked(JointTrajectory(Header(), executor.joints, points), others):
                     return touched
         return ""
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Literal
+from weakref import WeakKeyDictionary
 
 import attrs
 
-from ibrobot_core.api import Header, JointState, PlanCode, Pose, Vector, documented, option
+from ibrobot_core.api import Header, JointState, PlanCode, PlanningError, Pose, Session, Vector, documented, option
 
 type Outcome = Literal["SUCCEEDED", "REJECTED", "PLANNING_FAILED", "EXECUTION_FAILED", "CANCELLED"]
 
@@ -62,3 +64,54 @@ class MoveResult:
     """Fraction of a straight path that was planned."""
     alternative: int = 0
     """Index of the goal that was chosen, of several."""
+
+
+class Results:
+    """Numbers and results of the goals of a run, whatever its mode. Methods may be called from several threads."""
+
+    KEPT = 100
+    """Number of results kept."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._newest = 0
+        self._moving: set[int] = set()
+        self._ended: dict[int, MoveResult] = {}
+
+    def number(self) -> int:
+        """A number for a new goal."""
+        with self._lock:
+            self._newest += 1
+            self._moving.add(self._newest)
+            return self._newest
+
+    def end(self, number: int, result: MoveResult) -> None:
+        """Keep the result of a goal."""
+        with self._lock:
+            self._moving.discard(number)
+            self._ended[number] = result
+            while len(self._ended) > self.KEPT:
+                del self._ended[next(iter(self._ended))]
+
+    def of(self, number: int) -> MoveResult | None:
+        """The result of a goal; None before it has ended.
+
+        Raises:
+            PlanningError: for a goal that there was not, or whose result is no longer kept.
+        """
+        with self._lock:
+            if number in self._moving:
+                return None
+            if number in self._ended:
+                return self._ended[number]
+            if 0 < number <= self._newest:
+                raise PlanningError(f"the result of goal {number} is no longer kept, only the last {self.KEPT} are")
+            raise PlanningError(f"no goal {number}; /planning/go_to answers with the number of a goal")
+
+
+_RESULTS: WeakKeyDictionary[Session, Results] = WeakKeyDictionary()
+
+
+def results_of(session: Session) -> Results:
+    """The results of a run, which its modes share: a number means one goal, also after a switch of the mode."""
+    return _RESULTS.setdefault(session, Results())

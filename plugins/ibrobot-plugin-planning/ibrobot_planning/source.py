@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import queue
 import threading
@@ -42,7 +41,7 @@ from ibrobot_core.api import (
 from ibrobot_planning.execution import Execution
 from ibrobot_planning.goal_plans import GoalPlans
 from ibrobot_planning.goal_text import Target, target
-from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Outcome
+from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Outcome, results_of
 from ibrobot_planning.planning_services import PlanningServices
 from ibrobot_planning.requests import Execute, GoTo, MoveRequest, Numbered
 
@@ -81,11 +80,9 @@ _BUSY_S = 0.01
 """Longest wait of a unit of work while the robot moves [s]."""
 _WATCH_S = 0.02
 """Interval at which a motion is checked against the present world [s]."""
-_ENDED = MoveResult(False, "the mode or the run ended", 0.0, "CANCELLED", PlanCode.PREEMPTED)
+_ENDED = MoveResult(False, "the mode or the run ended, or control was reset", 0.0, "CANCELLED", PlanCode.PREEMPTED)
 _STILL_RAD = 1e-4
 """Commands that change less between two checks are at rest."""
-_KEPT = 100
-"""Number of results kept for `RESULT`."""
 _NEARLY_ONE = 1e-3
 """Allowed deviation of a quaternion's length from 1."""
 _POLICIES: tuple[OrientationPolicy, ...] = ("keep_axis", "arm_plane", "current", "free")
@@ -126,12 +123,11 @@ class PlannerSource(SourceWorker):
         super().__init__(session, mode, f"planner {mode.planner.type}")
         self._component = mode.planner
         self._plans = GoalPlans(session, mode)
-        self._numbers = itertools.count(1)
+        self._results = results_of(session)
         self._inbox: queue.SimpleQueue[Mapping[str, Any] | _Move | None] = queue.SimpleQueue()
         """Events of executors; goals that replace others; None to cancel."""
         self._queue: deque[_Move] = deque()
         self._move: _Move | None = None
-        self._moves: dict[int, _Move] = {}
         self._status = ""
         self._status_ns = 0
         self._worker = 0
@@ -184,6 +180,7 @@ class PlannerSource(SourceWorker):
         if self._move is not None:
             self._finish(self._move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, "control was reset")
         self._poses.drain()
+        self._forget()
         for service, handler in self._services.items():
             self.session.bus.serve(service, handler)
         self._show("idle")
@@ -192,6 +189,19 @@ class PlannerSource(SourceWorker):
     def end_mode(self) -> None:
         for service in self._services:
             self.session.bus.unserve(service)
+        self._forget()
+        if self._move is not None and not self._move.asked:
+            self._finish(self._move, "CANCELLED", PlanCode.PREEMPTED, _ENDED.message)
+
+    def _forget(self) -> None:
+        """End the goals of services that wait: a mode that is entered again moves to no goal of an earlier time."""
+        while not self._inbox.empty():
+            item = self._inbox.get()
+            if isinstance(item, _Move):
+                self._queue.append(item)
+        for move in [each for each in self._queue if not each.asked]:
+            self._queue.remove(move)
+            self._finish(move, "CANCELLED", PlanCode.PREEMPTED, _ENDED.message)
 
     @override
     def take_goal(self, event: Mapping[str, Any]) -> None:
@@ -245,14 +255,14 @@ class PlannerSource(SourceWorker):
     def _new(self, goal: str | Goal | Target, velocity_scaling: float = 1.0, *, asked: bool = False) -> _Move:
         parsed = target(goal, self.session.config.robot, velocity_scaling)
         self._plans.check(parsed)
-        return _Move(next(self._numbers), parsed, asked)
+        return _Move(self._results.number(), parsed, asked)
 
     def _submit(self, goal: str | Goal | Target, velocity_scaling: float = 1.0) -> _Move:
         """Replace all goals by this one."""
         return self._submitted(self._new(goal, velocity_scaling))
 
     def _submitted(self, move: _Move) -> _Move:
-        self._inbox.put(self._known(move))
+        self._inbox.put(move)
         return move
 
     def _move_action(self, wanted: MoveRequest) -> int:
@@ -263,19 +273,10 @@ class PlannerSource(SourceWorker):
     def _execute(self, request: Execute) -> int:
         parsed = Target("trajectory", trajectory=request.trajectory())
         self._plans.check(parsed)
-        return self._submitted(_Move(next(self._numbers), parsed)).number
-
-    def _known(self, move: _Move) -> _Move:
-        """Keep a goal for `RESULT`."""
-        self._moves[move.number] = move
-        while len(self._moves) > _KEPT:
-            self._moves.pop(next(iter(self._moves)))
-        return move
+        return self._submitted(_Move(self._results.number(), parsed)).number
 
     def _result(self, request: Numbered) -> MoveResult | None:
-        if request.number not in self._moves:
-            raise PlanningError(f"no goal {request.number}; {GO_TO.name} answers with the number of a goal")
-        return self._moves[request.number].result
+        return self._results.of(request.number)
 
     def _move_to_pose(self, wanted: MoveToPose) -> MoveResult:
         try:
@@ -321,7 +322,7 @@ class PlannerSource(SourceWorker):
                     f"takes geometry_msgs/msg/PoseStamped or Pose, got {message.ros_type}",
                     PlanCode.UNRECOGNIZED_GOAL_TYPE,
                 )
-            self._replace(self._known(self._new(_nearest(message))))
+            self._replace(self._new(_nearest(message)))
         except PlanningError as error:
             self.session.log.error("%s: %s: %s", CMD_POSE, error.code.name, error)
             self._show("failed")
@@ -435,7 +436,7 @@ class PlannerSource(SourceWorker):
         """Report the outcome of a move whose executors have ended."""
         if move.blocked:
             code = PlanCode.MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE
-            self._finish(move, "EXECUTION_FAILED", code, f"stopped before an obstacle: {move.blocked}")
+            self._finish(move, "EXECUTION_FAILED", code, self._stopped(move))
         elif move.dropped:
             self._finish(move, "CANCELLED", PlanCode.PREEMPTED, move.dropped)
         elif move.failures:
@@ -444,6 +445,16 @@ class PlannerSource(SourceWorker):
             self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, why)
         else:
             self._finish(move, "SUCCEEDED", PlanCode.SUCCESS, "")
+
+    def _stopped(self, move: _Move) -> str:
+        """Where the arm came to rest whose way was blocked."""
+        try:
+            touched = self._execution.touched()
+        except PlanningError as error:
+            return f"stopped: {move.blocked}; the place cannot be checked: {error}"
+        if touched:
+            return f"stopped too late for an obstacle within the braking distance: {touched}; ahead: {move.blocked}"
+        return f"stopped before an obstacle: {move.blocked}"
 
     def _finish(self, move: _Move, outcome: Outcome, code: PlanCode, message: str) -> None:
         session, success = self.session, outcome == "SUCCEEDED"
@@ -456,6 +467,7 @@ class PlannerSource(SourceWorker):
             (plan.position_error, plan.orientation_error, plan.fraction, plan.alternative) if plan is not None else ()
         )
         move.result = MoveResult(success, message, duration, outcome, code, *facts)
+        self._results.end(move.number, move.result)
         move.ended.set()
         if success:
             session.log.info("goal %s reached", move.target.text)
@@ -479,9 +491,6 @@ class PlannerSource(SourceWorker):
         """End all goals, so that no caller waits for them."""
         self.end()
         self._over = True
-        for move in self._moves.values():
-            move.result = move.result or _ENDED
-            move.ended.set()
 
 
 def _nearest(pose: Pose) -> AnyGoal:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose
-from ibrobot_planning.requests import GoTo
+from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Results
+from ibrobot_planning.requests import GoTo, Numbered
 from ibrobot_planning.source import (
     CANCEL,
     CMD_POSE,
@@ -351,3 +351,47 @@ def test_goals_of_the_request_that_are_cancelled_end_the_run(run):
             break
     assert runtime.session.finished.is_set()
     assert runtime.summary()["goals_failed"] == 2
+
+
+def test_number_of_a_goal_means_one_goal_also_after_a_switch_of_the_mode(run):
+    runtime = run(mode="joint")
+    first = runtime.session.bus.call(GO_TO, "up")
+    reached = finish(runtime, first)
+    under_way = runtime.session.bus.call(GO_TO, "left")
+    for _ in range(20):
+        runtime.step()
+    runtime.switch_mode("plan")
+    left = runtime.session.bus.call(RESULT, Numbered(under_way))
+    assert (left.outcome, left.message) == ("CANCELLED", "the mode or the run ended, or control was reset")
+    third = runtime.session.bus.call(GO_TO, "up")
+    assert len({first, under_way, third}) == 3
+    assert finish(runtime, third).success
+    assert runtime.session.bus.call(RESULT, Numbered(first)) is reached
+    assert runtime.session.bus.call(RESULT, Numbered(under_way)) is left
+
+
+def test_goal_that_waits_when_its_mode_ends_is_dropped(run):
+    """Nothing moves later, when the mode is entered again."""
+    runtime = run(mode="joint")
+    number = runtime.session.bus.call(GO_TO, "left")
+    runtime.switch_mode("idle")
+    runtime.switch_mode("joint")
+    before = command(runtime)
+    for _ in range(100):
+        runtime.step()
+    np.testing.assert_allclose(command(runtime), before, atol=1e-3)
+    assert runtime.session.bus.call(RESULT, Numbered(number)).outcome == "CANCELLED"
+
+
+def test_old_result_is_told_from_a_goal_that_there_was_not(run):
+    runtime = run(mode="joint")
+    first = runtime.session.bus.call(GO_TO, "up")
+    for _ in range(Results.KEPT):
+        last = runtime.session.bus.call(GO_TO, "up")
+    finish(runtime, last)
+    with pytest.raises(PlanningError) as failure:
+        runtime.session.bus.call(RESULT, Numbered(first))
+    assert str(failure.value) == f"the result of goal {first} is no longer kept, only the last 100 are"
+    assert runtime.session.bus.call(RESULT, Numbered(first + 1)).outcome == "CANCELLED"
+    with pytest.raises(PlanningError, match=f"no goal {last + 1}; "):
+        runtime.session.bus.call(RESULT, Numbered(last + 1))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ibrobot_kinematics import robot_model
 from ibrobot_planning.arm import robot_arm
 from ibrobot_planning.blend import Limits, joined
 from ibrobot_planning.collision import Collisions
@@ -176,6 +177,28 @@ def test_obstacle_that_appears_stops_the_arm_before_it(run):
     assert clearance(runtime) > PADDING
     runtime.session.bus.call("/world/remove", {"name": "crate"})
     assert finish(runtime, runtime.session.bus.call(GO_TO, "left"), commands).success
+
+
+@pytest.mark.parametrize("ahead", [0.03, 0.012], ids=["in the way of braking", "at the arm"])
+def test_obstacle_within_the_braking_distance_is_reported_as_such(run, ahead: float):
+    """The arm cannot stop before it: the result says where it stands, and not that all is well."""
+    runtime = run()
+    number = runtime.session.bus.call(GO_TO, "pan=1.5,lift=1.2")
+    for _ in range(500):
+        runtime.step()
+        if runtime.session.state.velocity[0] > 1.0:
+            break
+    robot = runtime.session.config.robot
+    tip = robot_model(robot).forward(runtime.session.state.position)
+    x, y = tip.position[0] - ahead * np.sin(runtime.session.state.position[0]), tip.position[1] + ahead
+    size = {"shape": "box", "size": [0.3, 0.004, 0.5], "position": [x, y, 0.2]}
+    runtime.session.bus.call("/world/add", {"name": "crate", "object": size})
+    result = finish(runtime, number)
+    assert result.code is PlanCode.MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE
+    step(runtime, 20)
+    assert clearance(runtime) < PADDING, "it could not stop before"
+    assert result.message.startswith("stopped too late for an obstacle within the braking distance: ")
+    assert "crate" in result.message
 
 
 def test_obstacle_elsewhere_does_not_stop_the_arm(run):
