@@ -270,7 +270,7 @@ class TestReadOnlyFolder:
         assert run("episodes", "info", path).code == 0
         done = run("episodes", "repair", path)
         assert done.code == 1
-        assert f"cannot be repaired: {ONLY_READ}" in done.err
+        assert f"cannot be locked: {ONLY_READ}" in done.err
 
 
 class TestTruncatedChunk:

@@ -8,10 +8,16 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 from uuid import UUID
 
+import attrs
+
 from ibrobot_core.api import DatasetError, EpisodeReader, EpisodeSummary
 
 UUID_KEY = "uuid"
 """Key of the metadata. The value is random for a live recording, and derived from the other metadata in lockstep."""
+
+
+TRIMMED_FROM = "trimmed_from"
+"""Key of the metadata of a part of an episode: the recordings of which it is a part, see `recording_of`."""
 
 
 def identity(reader: EpisodeReader, summary: EpisodeSummary) -> str:
@@ -30,6 +36,36 @@ def identity(reader: EpisodeReader, summary: EpisodeSummary) -> str:
     return hashlib.sha256(known.encode()).hexdigest()
 
 
+def recording_of(metadata: Mapping[str, str], identity: str) -> str:
+    """How the parts of an episode name it: by its UUID, or without a random one by its identity."""
+    return _random_uuid(metadata) or identity
+
+
+@attrs.frozen
+class _Known:
+    """An episode in a dataset."""
+
+    source: str
+    outcome: str
+    identity: str
+    recording: str
+    trimmed_from: frozenset[str]
+    """The recordings of which it is a part."""
+
+    @classmethod
+    def of(cls, kept: Mapping[str, Any]) -> _Known:
+        """From what the dataset stores about an episode."""
+        recorded, identity = kept.get("recorded", {}), kept.get("identity", "")
+        parts = frozenset(recorded.get(TRIMMED_FROM, "").split())
+        return cls(kept["source"], kept.get("outcome", ""), identity, recording_of(recorded, identity), parts)
+
+    def is_of(self, source: str, recording: str, trimmed_from: frozenset[str]) -> bool:
+        """Whether both are of one recording: one is a part of the other, or both are parts under one name."""
+        if self.recording in {recording, *trimmed_from} or recording in self.trimmed_from:
+            return True
+        return source == self.source and not self.trimmed_from.isdisjoint(trimmed_from)
+
+
 class KnownEpisodes:
     """The episodes in a dataset.
 
@@ -39,8 +75,7 @@ class KnownEpisodes:
 
     def __init__(self, kept: Iterable[Mapping[str, Any]] = ()) -> None:
         episodes = list(kept)
-        self._identities = {each["identity"]: each["source"] for each in episodes if each.get("identity")}
-        self._uuids = {uuid: each["source"] for each in episodes if (uuid := _random_uuid(each.get("recorded", {})))}
+        self._known = [_Known.of(each) for each in episodes if each.get("identity")]
         self._names = {(each["source"], each["start_ns"]) for each in episodes if not each.get("identity")}
         self._empty = not episodes
 
@@ -48,20 +83,31 @@ class KnownEpisodes:
         """Why the episode need not be added; empty if it is new.
 
         Raises:
-            DatasetError: when the dataset has the episode in another state.
+            DatasetError: when the dataset has the episode in another state, or with another outcome.
             RecorderError: when it cannot be read.
         """
         if self._empty:
             return ""
         if (source, summary.start_ns) in self._names:
             return "already in the dataset, by its name and start: the dataset is older than episodes' identities"
-        if identity(reader, summary) in self._identities:
+        present = identity(reader, summary)
+        for known in self._known:
+            if known.identity != present:
+                continue
+            if known.outcome != summary.outcome:
+                raise DatasetError(
+                    f"the dataset has this episode, as {known.source}, with the outcome {known.outcome}; now it is "
+                    f"{summary.outcome}: convert into a new dataset"
+                )
             return "already in the dataset"
-        if (known := self._uuids.get(_random_uuid(summary.metadata))) is not None:
-            raise DatasetError(
-                f"the dataset has another state of this episode, as {known}: it was converted before it was finished, "
-                "repaired or changed; convert into a new dataset"
-            )
+        recording = recording_of(summary.metadata, present)
+        trimmed_from = frozenset(summary.metadata.get(TRIMMED_FROM, "").split())
+        for known in self._known:
+            if known.is_of(source, recording, trimmed_from):
+                raise DatasetError(
+                    f"the dataset has another state of this episode, as {known.source}: it was converted before it was "
+                    "finished, repaired, trimmed or changed; convert into a new dataset"
+                )
         return ""
 
 

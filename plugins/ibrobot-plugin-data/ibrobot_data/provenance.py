@@ -21,12 +21,17 @@ def conversion(request: ConversionRequest) -> dict[str, Any]:
     """The settings that must be equal for all episodes of a dataset."""
     options = attrs.asdict(request.options)
     labels = {"labels": True} if request.labels else {}
-    settings = {"writer": request.type, "options": options, "norm_mode": request.norm_mode, "success": request.success}
+    settings = {
+        "writer": request.type, "options": options, "norm_mode": request.norm_mode, "success": request.success,
+        "missing": request.missing,
+    }  # fmt: skip
     return settings | labels
 
 
-def provenance(request: ConversionRequest, old: DatasetSummary | None, units: Sequence[Unit]) -> dict[str, Any]:
-    """Provenance of the dataset: contract, robots, calibrations, and the source of each episode."""
+def provenance(
+    request: ConversionRequest, old: DatasetSummary | None, units: Sequence[Unit], failed: Sequence[str]
+) -> dict[str, Any]:
+    """Provenance of the dataset: contract, robots, calibrations, the source of each episode, and what was left out."""
     before: Mapping[str, Any] = old.metadata if old is not None else {}
     calibrations, configs = dict(before.get("calibrations", {})), dict(before.get("configs", {}))
     episodes = list(before.get("episodes", ()))
@@ -36,13 +41,27 @@ def provenance(request: ConversionRequest, old: DatasetSummary | None, units: Se
         kept["recorded"] = {name: value for name, value in unit.recorded.items() if name not in _KEPT_ONCE}
         kept["calibration"] = _file(calibrations, unit.calibration)
         kept["config"] = _file(configs, unit.document)
-        episodes += [kept | {"stretch": list(each)} for each in kept.pop("stretches")]
+        cuts = kept.pop("cuts")
+        episodes += [
+            kept | {"stretch": [first, count], "cuts": _cuts_within(cuts, first, count)}
+            for first, count in kept.pop("stretches")
+        ]
     contract = before.get("contract", units[0].contract)
+    run = {
+        "episodes": len(episodes) - len(before.get("episodes", ())), "only": request.only, "context": request.context,
+        "outcomes": list(request.outcomes), "prompt": request.prompt,
+        "calibration": _file(calibrations, request.calibration or {}), "failed": list(failed),
+    }  # fmt: skip
     return {
         "robot_type": before.get("robot_type", units[0].robot_type), "contract": contract,
         "fingerprint": Contract.from_canonical(contract).fingerprint(), "conversion": conversion(request),
-        "calibrations": calibrations, "configs": configs, "episodes": episodes,
+        "runs": [*before.get("runs", ()), run], "calibrations": calibrations, "configs": configs, "episodes": episodes,
     }  # fmt: skip
+
+
+def _cuts_within(cuts: Sequence[Sequence[int]], first: int, count: int) -> list[list[int]]:
+    """The cuts within a stretch of a recording's rows, with the row numbers of the stretch."""
+    return [[row - first, ticks] for row, ticks in cuts if first < row < first + count]
 
 
 def _file(kept: dict[str, Any], document: Mapping[str, Any]) -> str:

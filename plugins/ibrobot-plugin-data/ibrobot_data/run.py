@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
+import itertools
 import multiprocessing
 import os
 import re
@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import forkserver
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -29,6 +29,7 @@ from ibrobot_core.api import (
     DatasetSummary,
     EpisodeAddress,
     IbrobotError,
+    Ownership,
     end_signals,
     installed_plugins,
     seconds,
@@ -45,12 +46,17 @@ from ibrobot_data.episode import (
     unexpected,
     unit_key,
 )
-from ibrobot_data.identity import KnownEpisodes
+from ibrobot_data.identity import KnownEpisodes, identity
 from ibrobot_data.provenance import conversion, provenance
 from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
 
 STAGING = ".staging"
 """Folder within the dataset for converted episodes until the merge."""
+_LOCK = "lock"
+_FIRST = "first"
+"""File within the staging folder: these episodes make a new dataset. It is removed last, so that after an interruption
+the same command goes on even if the dataset is there."""
+_THERE = "{}: already has a dataset; --append adds to it"
 _POLL_S = 0.2
 _END_S = 5.0
 """A converting process that takes longer to end after Ctrl-C is killed."""
@@ -103,56 +109,83 @@ def convert(
     begin = time.monotonic()
     with _staging(request) as (staging, old):
         request = _with_labels(request, episodes, old)
+        goes_on = request.append or (staging / _FIRST).exists()
         if old is not None:
-            _check_old(request, old)
+            _check_old(request, old, goes_on)
         plan = _Plan(request, staging, old, episodes)
+        if old is not None and not goes_on and plan.adds(old):
+            raise DatasetError(_THERE.format(request.out))
         reports = plan.run(watch)
         units = [unit for unit in plan.units() if not reports[unit.report.source].error]
         reports |= _refuse_misfits(units, old)
-        reports |= _pass_over_copies([unit for unit in units if not reports[unit.report.source].error])
         units = [unit for unit in units if reports[unit.report.source].kept]
+        if units and old is not None and not goes_on:
+            raise DatasetError(_THERE.format(request.out))
         if units:
-            metadata = provenance(request, old, units)
-            make_writer(request).merge(request.out, [unit.dataset for unit in units], metadata)
-            shutil.rmtree(staging)
+            _merge(request, staging, old, units, [source for source in plan.sources if reports[source].error])
+        clear_staging(staging)
     size = sum(path.stat().st_size for path in request.out.rglob("*") if path.is_file()) if request.out.exists() else 0
     ordered = tuple(reports[source] for source in plan.sources)
     return Report(request.out, ordered, size, time.monotonic() - begin, plan.resumed)
 
 
+def _merge(
+    request: ConversionRequest, staging: Path, old: DatasetSummary | None, units: Sequence[Unit], failed: Sequence[str]
+) -> None:
+    """Add the units to the dataset."""
+    if old is None:
+        (staging / _FIRST).touch()
+    writer = make_writer(request)
+    if writer.summary(request.out) != old:
+        raise DatasetError(f"{request.out}: was changed by another program meanwhile; run the same command again")
+    writer.merge(request.out, [unit.dataset for unit in units], provenance(request, old, units, failed))
+
+
+def clear_staging(staging: Path) -> None:
+    """Remove all but the lock from a staging folder."""
+    for path in sorted(staging.iterdir(), key=lambda path: path.name == _FIRST):
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != _LOCK:
+            path.unlink()
+
+
 @contextmanager
 def _staging(request: ConversionRequest) -> Iterator[tuple[Path, DatasetSummary | None]]:
-    """The staging folder, locked for this conversion, and the existing dataset."""
-    out = request.out
+    """The staging folder, owned by this conversion, and the existing dataset."""
+    out, staging = request.out, request.out / STAGING
     try:
-        if out.exists() and not (out / STAGING).exists() and any(out.iterdir()):
-            if (old := make_writer(request).summary(out)) is None:
-                raise DatasetError(f"{out} is not empty and has no dataset of writer {request.type!r}")
-        else:
+        with own_staging(out):
             old = make_writer(request).summary(out)
-        if old is not None and not request.append:
-            raise DatasetError(f"{out}: already has a dataset; --append adds to it")
-        (out / STAGING).mkdir(parents=True, exist_ok=True)
-        with (out / STAGING / "lock").open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise DatasetError(f"{out}: another conversion into this folder is running") from None
-            try:
-                yield out / STAGING, old
-            finally:
-                _tidy(out)
+            others = [path for path in out.iterdir() if path != staging]
+            if old is None and others and all(path.name == _LOCK for path in staging.iterdir()):
+                raise DatasetError(f"{out} is not empty and has no dataset of writer {request.type!r}")
+            yield staging, old
     except OSError as error:
         raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
 
 
-def _tidy(out: Path) -> None:
-    """Remove folders that stayed empty."""
+@contextmanager
+def own_staging(out: Path) -> Iterator[None]:
+    """A context in which nobody else converts into `out`; afterwards, folders that stayed empty are removed.
+
+    Raises:
+        InUse: if another conversion into it is running.
+        OSError: if it cannot be written.
+    """
     staging = out / STAGING
-    if staging.is_dir() and all(path.name == "lock" for path in staging.iterdir()):
-        shutil.rmtree(staging)
-    if out.is_dir() and not any(out.iterdir()):
-        out.rmdir()
+    owned = None
+    while owned is None:
+        staging.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):  # another conversion ended, and removed the folder
+            owned = Ownership(out, "is being written", file=staging / _LOCK)
+    try:
+        yield
+    finally:
+        owned.close()
+        with suppress(OSError):  # not empty
+            staging.rmdir()
+            out.rmdir()
 
 
 def _with_labels(request: ConversionRequest, episodes: Sequence[Path], old: DatasetSummary | None) -> ConversionRequest:
@@ -173,11 +206,15 @@ def _says_who_commanded(episode: Path) -> bool:
         return False
 
 
-def _check_old(request: ConversionRequest, old: DatasetSummary) -> None:
+def _check_old(request: ConversionRequest, old: DatasetSummary, goes_on: bool) -> None:
+    """Check that episodes fit into the dataset; `goes_on` if they may be added."""
     known = old.metadata.get("conversion")
+    if not goes_on and known != conversion(request):
+        raise DatasetError(_THERE.format(request.out))
     if known is None:
         raise DatasetError(f"{request.out}: not made by ibrobot convert; convert into another folder")
     asked = conversion(request)
+    known = {"missing": asked["missing"]} | known  # older datasets do not have it
     wrong = [f"{name} {known.get(name)}, now {asked[name]}" for name in asked if known.get(name) != asked[name]]
     if wrong:
         raise DatasetError(f"{request.out}: was made with other settings: {'; '.join(wrong)}")
@@ -194,14 +231,19 @@ class _Plan:
         self._jobs: dict[str, Job] = {}
         self._expected: dict[str, int] = {}
         """Source -> number of frames, estimated from its length."""
+        self._copies: dict[str, str] = {}
+        """Source -> the source of which it is a copy; not converted unless that one fails."""
+        self._alike: dict[Any, list[str]] = {}
+        """What copies have in common, as far as summaries tell -> sources."""
         self.resumed = 0
         self.sources: list[str] = []
         known = KnownEpisodes(old.metadata["episodes"] if old is not None else ())
         for path in episodes:
             source = _source(path, self.sources)
             self.sources.append(source)
-            mark = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
-            self._add(Job(request, path, source, staging / f"{path.name}-{mark}"), known)
+            unit = hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:32]
+            self._add(Job(request, path, source, staging / unit), known)
+        self._find_copies()
 
     def _add(self, job: Job, known: KnownEpisodes) -> None:
         source, report = job.source, EpisodeReport(job.source)
@@ -225,10 +267,28 @@ class _Plan:
             self._reports[source] = attrs.evolve(report, passed_over=f"its outcome is {summary.outcome}")
         else:
             self._jobs[source] = job
+            self._reports[source] = report
+            counts = tuple((topic, each.count) for topic, each in sorted(summary.topics.items()))
+            self._alike.setdefault((summary.start_ns, summary.end_ns, counts), []).append(source)
             text = summary.metadata.get("contract", "")
             rate = re.search(r'"rate_hz": ([0-9.]+)', text)
             rate_hz = self._request.contract.rate_hz if self._request.contract else float(rate[1]) if rate else 30.0
             self._expected[source] = round(seconds(summary.end_ns - summary.start_ns) * rate_hz) + 1
+
+    def adds(self, old: DatasetSummary) -> bool:
+        """Whether there are episodes to convert that an earlier run did not have to leave out."""
+        failed = {source for run in old.metadata.get("runs", ()) for source in run["failed"]}
+        return not failed.issuperset(self._jobs)
+
+    def _find_copies(self) -> None:
+        """Find copies before they are converted; only episodes that look alike are compared by their content."""
+        for sources in self._alike.values():
+            originals: dict[str, str] = {}
+            for source in sources if len(sources) > 1 else ():
+                with suppress(IbrobotError, OSError):  # its conversion will report it
+                    original = originals.setdefault(_identity(self._jobs[source].episode), source)
+                    if original != source:
+                        self._copies[source] = original
 
     def units(self) -> list[Unit]:
         """The staged units, in the order of the episodes."""
@@ -237,11 +297,22 @@ class _Plan:
 
     def run(self, watch: Watch) -> dict[str, EpisodeReport]:
         """Convert the episodes that are not staged yet; returns source -> report."""
+        self._convert([source for source in self._jobs if source not in self._copies], watch)
+        for source, original in self._copies.items():
+            if self._reports[original].error:  # of the copies, the first one that can be converted is kept
+                self._convert([source], watch)
+                self._copies |= {each: source for each, of in self._copies.items() if of == original and each != source}
+            else:
+                del self._jobs[source]
+                self._reports[source] = attrs.evolve(self._reports[source], passed_over=f"is a copy of {original}")
+        return self._reports
+
+    def _convert(self, sources: Sequence[str], watch: Watch) -> None:
         todo = []
-        for source, job in self._jobs.items():
+        for job in (self._jobs[source] for source in sources):
             unit = read_unit(job.unit)
             if unit is not None and unit.key == unit_key(job):
-                self._reports[source] = unit.report
+                self._reports[job.source] = unit.report
                 self.resumed += 1
             else:
                 shutil.rmtree(job.unit, ignore_errors=True)
@@ -249,7 +320,14 @@ class _Plan:
         total = sum(self._expected[job.source] for job in todo)
         for report in _run_in_processes(todo, self._request.jobs, lambda done, report: watch(done, total, report)):
             self._reports[report.source] = report
-        return self._reports
+
+
+def _identity(episode: Path) -> str:
+    reader = installed_plugins().open_episode(episode)
+    try:
+        return identity(reader, reader.summary())
+    finally:
+        reader.close()
 
 
 _done: Any = None
@@ -381,23 +459,14 @@ def _refuse_misfits(units: Sequence[Unit], old: DatasetSummary | None) -> dict[s
     return refused
 
 
-def _pass_over_copies(units: Sequence[Unit]) -> dict[str, EpisodeReport]:
-    """Reports of the units that are copies of others."""
-    first: dict[str, str] = {}
-    copies = {}
-    for unit in units:
-        report = unit.report
-        original = first.setdefault(report.identity, report.source)
-        if original != report.source:
-            copies[report.source] = attrs.evolve(report, frames=0, passed_over=f"is a copy of {original}")
-    return copies
-
-
 def _source(path: Path, taken: Sequence[str]) -> str:
     """A short name of an episode: `DATASET/EPISODE` for ibrobot's own, else its folder or file."""
     path = path.resolve()
     name = f"{path.parent.parent.name}/{path.name}" if path.parent.name == "episodes" else path.name
-    return name if name not in taken else f"{name} ({len(taken) + 1})"
+    name = os.fsencode(name).decode("utf-8", "backslashreplace")  # a name in another encoding
+    if name not in taken:
+        return name
+    return next(each for number in itertools.count(2) if (each := f"{name} ({number})") not in taken)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -23,6 +23,7 @@ from ibrobot_core.api import (
     EpisodeStart,
     EpisodeSummary,
     IbrobotError,
+    Ownership,
     Recorder,
     RecorderError,
     Robot,
@@ -32,9 +33,8 @@ from ibrobot_core.api import (
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_start import episode_folder
 from ibrobot_data.request import EpisodeReport, Report
+from ibrobot_data.run import STAGING, clear_staging, own_staging
 
-_STAGING = ".staging"
-"""Folder within the output for episodes until they are complete."""
 _DIGEST = "source_digest"
 """Key of the metadata: hash that identifies the dataset's episode."""
 _PROGRESS_EVERY = 30
@@ -70,14 +70,23 @@ def convert_to_bags(request: BagRequest, watch: Watch = lambda done, total, repo
     Existing ones are passed over, so an interrupted conversion can continue.
 
     Raises:
+        InUse: when another conversion into `request.out` is running.
         PluginError: when the recorder is not installed.
         RecorderError: when nothing can be written at `request.out`.
     """
     begin = time.monotonic()
     try:
-        (request.out / _STAGING).mkdir(parents=True, exist_ok=True)
+        with own_staging(request.out):
+            clear_staging(request.out / STAGING)
+            reports = _convert_all(request, watch)
     except OSError as error:
         raise RecorderError(f"{request.out}: cannot be written: {error.strerror}") from error
+    files = [path for path in request.out.rglob("*") if path.is_file()] if request.out.exists() else []
+    size = sum(path.stat().st_size for path in files)
+    return Report(request.out, tuple(reports), size, time.monotonic() - begin, resumed=0)
+
+
+def _convert_all(request: BagRequest, watch: Watch) -> list[EpisodeReport]:
     reports: list[EpisodeReport] = []
     done = 0
     for number in request.numbers:
@@ -90,12 +99,7 @@ def convert_to_bags(request: BagRequest, watch: Watch = lambda done, total, repo
         done += report.frames
         watch(done, done, report)
         reports.append(report)
-    shutil.rmtree(request.out / _STAGING, ignore_errors=True)
-    if request.out.is_dir() and not any(request.out.iterdir()):
-        request.out.rmdir()
-    files = [path for path in request.out.rglob("*") if path.is_file()] if request.out.exists() else []
-    size = sum(path.stat().st_size for path in files)
-    return Report(request.out, tuple(reports), size, time.monotonic() - begin, resumed=0)
+    return reports
 
 
 class _Job:
@@ -105,7 +109,7 @@ class _Job:
         self._request = request
         self._path = request.dataset.with_name(f"{request.dataset.name}:{number}")
         self._target = episode_folder(request.out, number + 1)
-        self._making = request.out / _STAGING / self._target.name
+        self._making = request.out / STAGING / self._target.name
 
     def run(self, progress: Callable[[int], None]) -> EpisodeReport:
         """Convert the episode. After a fault, the report has the error and no files remain."""
@@ -116,16 +120,19 @@ class _Job:
             summary = reader.summary()
             prompt = summary.metadata.get("prompt") or self._request.prompt
             report = attrs.evolve(report, outcome=summary.outcome, prompt=prompt, start_ns=summary.start_ns)
-            if self._target.exists():
-                return attrs.evolve(report, passed_over=self._known(summary, reader.digest()))
-            contract = self._check(summary)
-            frames = self._write(reader, summary, contract, prompt, progress)
+            self._target.parent.mkdir(parents=True, exist_ok=True)
+            with Ownership(self._target, "is being written"):
+                if self._target.exists():
+                    return attrs.evolve(report, passed_over=self._known(summary, reader.digest()))
+                frames = self._write(reader, summary, self._check(summary), prompt, progress)
         except (IbrobotError, OSError) as error:
             return attrs.evolve(report, error=str(error))
         finally:
             if reader is not None:
                 reader.close()
             shutil.rmtree(self._making, ignore_errors=True)
+            with suppress(OSError):  # not empty
+                self._target.parent.rmdir()
         return attrs.evolve(report, frames=frames)
 
     def _known(self, summary: EpisodeSummary, digest: str) -> str:
@@ -180,7 +187,6 @@ class _Job:
                 recorder.close()
             raise
         EpisodeDataset(self._request.out).join(contract, metadata.get("robot", ""), metadata.get("robot_type", ""))
-        self._target.parent.mkdir(parents=True, exist_ok=True)
         self._making.rename(self._target)
         return max(counts.values(), default=0)
 

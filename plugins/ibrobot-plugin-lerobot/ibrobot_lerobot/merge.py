@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ibrobot_core.api import DatasetError
+from ibrobot_core.api import DatasetError, Ownership
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.arrow import table_of, to_array, to_numpy
 from ibrobot_lerobot.episode import counter_stats, plain
@@ -24,6 +26,9 @@ _MERGING = ".merging"
 """Folder of a merge in progress; discarded after an interruption."""
 _MERGED = ".merged"
 """Folder of a complete merge, whose files only need to be moved."""
+_LOCK = ".merge.lock"
+_WAIT_S = 10.0
+"""How long to wait for another process that merges [s]."""
 _EPISODES_AT_ONCE = 64
 _MIB = 1 << 20
 
@@ -32,53 +37,94 @@ def complete(root: Path) -> None:
     """Finish a complete merge whose move was interrupted.
 
     Raises:
+        InUse: if another process merges into the dataset, and takes long.
         DatasetError: if a file cannot be moved.
     """
-    merged = root / _MERGED
-    if not merged.is_dir():
-        return
-    try:
-        # `info.json` marks a complete dataset, so it comes last.
-        files = sorted((p for p in merged.rglob("*") if p.is_file()), key=lambda p: (p == merged / layout.INFO, p))
-        for path in files:
-            target = root / path.relative_to(merged)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            path.replace(target)
-        shutil.rmtree(merged)
-    except OSError as error:
-        raise DatasetError(f"{root}: the merge cannot be completed: {error}") from error
+    if (root / _MERGED).is_dir():
+        with _owning(root):
+            _complete(root)
 
 
 def adopt(root: Path, part: Path) -> None:
     """Move the dataset `part`, in a folder below `root`, to `root`, which has no dataset yet.
 
     Raises:
+        InUse: if another process merges into the dataset.
         DatasetError: if a file cannot be moved.
     """
-    try:
-        part.rename(root / _MERGED)
-    except OSError as error:
-        raise DatasetError(f"{part}: cannot be moved: {error}") from error
-    complete(root)
+    with _owning(root):
+        try:
+            part.rename(root / _MERGED)
+        except OSError as error:
+            raise DatasetError(f"{part}: cannot be moved: {error}") from error
+        _complete(root)
 
 
 def merge(root: Path, parts: Sequence[Path], metadata: Mapping[str, Any]) -> None:
     """Append the episodes of `parts` to the dataset at `root`; see `DatasetWriter.merge`."""
-    complete(root)
-    old = layout.open_dataset(root)
     if not parts:
         raise DatasetError(f"{root}: nothing to merge")
-    merging = root / _MERGING
+    with _owning(root):
+        _complete(root)
+        old = layout.open_dataset(root)
+        merging = root / _MERGING
+        try:
+            shutil.rmtree(merging, ignore_errors=True)
+            merging.mkdir()
+            _Merge(merging, old).run(parts, metadata)
+            _sync(merging)  # the parts may be deleted afterwards
+            merging.rename(root / _MERGED)
+        except (OSError, pa.ArrowException) as error:
+            raise DatasetError(f"{root}: cannot be merged: {error}") from error
+        finally:
+            shutil.rmtree(merging, ignore_errors=True)
+        _complete(root)
+
+
+@contextmanager
+def _owning(root: Path) -> Iterator[None]:
+    """A context in which no other process merges into the dataset."""
     try:
-        shutil.rmtree(merging, ignore_errors=True)
-        merging.mkdir(parents=True)
-        _Merge(merging, old).run(parts, metadata)
-        merging.rename(root / _MERGED)
-    except (OSError, pa.ArrowException) as error:
-        raise DatasetError(f"{root}: cannot be merged: {error}") from error
+        root.mkdir(parents=True, exist_ok=True)
+        owned = Ownership(root, "is being merged", file=root / _LOCK, wait_s=_WAIT_S)
+    except OSError as error:
+        raise DatasetError(f"{root}: cannot be written: {error.strerror}") from error
+    with owned:
+        yield
+
+
+def _complete(root: Path) -> None:
+    merged = root / _MERGED
+    if not merged.is_dir():
+        return
+    try:
+        # `info.json` marks a complete dataset, so it comes last.
+        files = sorted((p for p in merged.rglob("*") if p.is_file()), key=lambda p: (p == merged / layout.INFO, p))
+        folders = {root}
+        for path in files:
+            target = root / path.relative_to(merged)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            path.replace(target)
+            folders |= {folder for folder in target.parents if folder.is_relative_to(root)}
+        for folder in folders:
+            _fsync(folder)
+        shutil.rmtree(merged)
+    except OSError as error:
+        raise DatasetError(f"{root}: the merge cannot be completed: {error}") from error
+
+
+def _sync(folder: Path) -> None:
+    """Flush a folder with all its files to the disk."""
+    for path in (folder, *folder.rglob("*")):
+        _fsync(path)
+
+
+def _fsync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
     finally:
-        shutil.rmtree(merging, ignore_errors=True)
-    complete(root)
+        os.close(descriptor)
 
 
 @attrs.define

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
@@ -41,14 +41,19 @@ class Encoder:
     """Its description in `info.json`, with LeRobot's names."""
 
 
-def choose_encoder(options: LeRobotOptions) -> Encoder:
+def choose_encoder(options: LeRobotOptions, shapes: Collection[Sequence[int]] = ()) -> Encoder:
     """The encoder selected by the options.
 
+    Args:
+        options: the codec and its settings.
+        shapes: of the images, (H, W, 3).
+
     Raises:
-        DatasetError: if it is not available on this machine.
+        DatasetError: if it is not available on this machine, or cannot encode images of these sizes.
     """
     if options.codec == "auto":
-        found = (encoder for codec in _GPU if _opens(encoder := _encoder(codec, options)) is None)
+        encoders = (_encoder(codec, options) for codec in _GPU)
+        found = (each for each in encoders if _opens(each) is None and not _misfits(each, shapes))
         return next(found, None) or _encoder("libsvtav1", options)
     encoder = _encoder(options.codec, options)
     if (reason := _opens(encoder)) is not None:
@@ -56,7 +61,18 @@ def choose_encoder(options: LeRobotOptions) -> Encoder:
             f"codec {encoder.codec} is not available: {reason}; codec: auto uses the first available one, "
             "libsvtav1 needs no GPU"
         )
+    if misfits := _misfits(encoder, shapes):
+        raise DatasetError(
+            f"codec {encoder.codec} cannot encode images of {' and '.join(misfits)}: it needs even sizes; use "
+            "libsvtav1, or resize the images (contract.observations: image.resize)"
+        )
     return encoder
+
+
+def _misfits(encoder: Encoder, shapes: Collection[Sequence[int]]) -> list[str]:
+    """Odd image sizes that an encoder cannot encode, found with small images of such sizes."""
+    odd = [(height, width) for height, width, *_ in shapes if height % 2 or width % 2]
+    return [f"{w}x{h}" for h, w in odd if _opens(encoder, 256 + h % 2, 256 + w % 2) is not None]
 
 
 def _encoder(codec: str, options: LeRobotOptions) -> Encoder:
@@ -86,16 +102,16 @@ def _encoder(codec: str, options: LeRobotOptions) -> Encoder:
     return Encoder(codec, settings, described)
 
 
-def _opens(encoder: Encoder) -> str | None:
-    """The reason why an encoder does not work on this machine; None if it works."""
+def _opens(encoder: Encoder, height: int = 256, width: int = 256) -> str | None:
+    """The reason why an encoder does not work on this machine, for images of this size; None if it works."""
     try:
         context: Any = av.CodecContext.create(encoder.codec, "w")
-        context.width, context.height, context.pix_fmt = 256, 256, PIXEL_FORMAT
+        context.width, context.height, context.pix_fmt = width, height, PIXEL_FORMAT
         context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
         context.options = encoder.options
         with _same_priority():
             context.open()
-        context.encode(av.VideoFrame(256, 256, PIXEL_FORMAT))
+        context.encode(av.VideoFrame(width, height, PIXEL_FORMAT))
         context.encode(None)
     except (av.error.FFmpegError, ValueError) as error:
         return str(error)

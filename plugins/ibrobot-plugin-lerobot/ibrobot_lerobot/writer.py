@@ -45,8 +45,8 @@ class LeRobotDatasetWriter(DatasetWriter):
         if fps != int(fps) or fps < 1:
             raise DatasetError(f"LeRobot needs a whole number of frames per second; contract.rate_hz is {fps:g}")
         stored = layout.columns(features, videos=options.videos)
-        videos = any(column.storage == "video" for column in stored.values())
-        encoder = choose_encoder(options) if videos else None
+        videos = [column.feature.shape for column in stored.values() if column.storage == "video"]
+        encoder = choose_encoder(options, videos) if videos else None
         robot_type = str(metadata.get("robot_type", ""))
         info = layout.new_info(stored, int(fps), robot_type, options.table_file_mb, options.video_file_mb)
         try:

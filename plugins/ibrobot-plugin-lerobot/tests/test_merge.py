@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +15,9 @@ from ibrobot_lerobot import merge as merging
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
 
-from ibrobot_core.api import DatasetError, Feature
+from ibrobot_core.api import DatasetError, Feature, InUse
 
-from .conftest import CAMERA, FPS, STATE, check, episodes, values, write
+from .conftest import CAMERA, FPS, STATE, check, episodes, rows, values, write
 
 FEATURES = {"observation.state": STATE, "observation.images.top": CAMERA}
 
@@ -165,3 +167,73 @@ def test_statistics_of_episodes_have_their_places(tmp_path: Path) -> None:
     assert second["stats/index/min"] == [4.0]
     assert second["stats/episode_index/mean"] == [1.0]
     assert second["stats/task_index/max"] == [1.0]
+
+
+def test_merges_at_once_lose_no_episode_and_double_none(tmp_path: Path) -> None:
+    found = parts(tmp_path / "parts", (5, 3, 4, 2), {"observation.state": STATE})
+    threads = [threading.Thread(target=merging.merge, args=(tmp_path / "set", [part], {})) for part in found]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    there = episodes(tmp_path / "set")
+    assert sorted(row["length"] for row in there) == [2, 3, 4, 5]
+    assert [row["index"] for row in rows(tmp_path / "set")] == list(range(14))
+    assert not list((tmp_path / "set").glob(".*"))
+
+
+def test_nobody_completes_a_merge_that_another_process_is_completing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = parts(tmp_path / "parts", (4, 3), {"observation.state": STATE})
+    root = tmp_path / "set"
+    merging.merge(root, [first], {})
+    real, refused = Path.replace, []
+
+    def beside(self: Path, target: Path) -> Path:
+        """Another process looks at the dataset between the moves of two files."""
+        with pytest.raises(InUse, match=f"is being merged by process {os.getpid()}") as caught:
+            LeRobotDatasetWriter(LeRobotOptions()).summary(root)
+        refused.append(caught.value)
+        return real(self, target)
+
+    monkeypatch.setattr(merging, "_WAIT_S", 0.0)
+    monkeypatch.setattr(Path, "replace", beside)
+    merging.merge(root, [second], {})
+    assert len(refused) > 3
+    assert [row["length"] for row in episodes(root)] == [4, 3]
+
+
+def test_what_was_merged_is_on_the_disk_before_the_parts_may_be_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (part,) = parts(tmp_path / "parts", (4,))
+    synced: set[int] = set()
+    real_sync, real_rename, real_remove = os.fsync, Path.rename, shutil.rmtree
+
+    def sync(descriptor: int) -> None:
+        synced.add(os.fstat(descriptor).st_ino)
+        real_sync(descriptor)
+
+    def rename(self: Path, target: Path) -> Path:
+        if self.name == ".merging":
+            assert {path.stat().st_ino for path in self.rglob("*")} <= synced, "before it counts as merged"
+            synced.clear()
+        return real_rename(self, target)
+
+    def remove(path: Path, **more: Any) -> None:
+        if path.name == ".merged":
+            folders = {path.parent, *(each.parent for each in content_paths(path.parent))}
+            assert {folder.stat().st_ino for folder in folders} <= synced, "their new names, too"
+        real_remove(path, **more)
+
+    monkeypatch.setattr(os, "fsync", sync)
+    monkeypatch.setattr(Path, "rename", rename)
+    monkeypatch.setattr(shutil, "rmtree", remove)
+    merging.merge(tmp_path / "set", [part], {})
+    check(tmp_path / "set", FEATURES, (4,))
+
+
+def content_paths(root: Path) -> list[Path]:
+    """The files of a dataset, hidden ones left out."""
+    return [path for path in root.rglob("*") if path.is_file() and "/." not in str(path.relative_to(root.parent))]

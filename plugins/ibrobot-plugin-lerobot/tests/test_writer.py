@@ -183,3 +183,22 @@ def test_a_full_disk_is_reported_and_no_thread_waits(tmp_path: Path) -> None:
         writer.add_frame({"observation.images.top": picture(1)}, "task")
     writer.finalize()
     assert not (tmp_path / "set/meta").exists()
+
+
+@pytest.mark.parametrize("codec", ["h264", "hevc", "libsvtav1"])
+def test_sizes_that_an_encoder_cannot_encode_are_refused_before_it_begins(tmp_path: Path, codec: str) -> None:
+    features = {"observation.images.top": Feature("image", (65, 97, 3))}
+    writer = LeRobotDatasetWriter(LeRobotOptions(codec=codec))
+    if codec != "libsvtav1":
+        with pytest.raises(
+            DatasetError, match=f"codec {codec} cannot encode images of 97x65: it needs even sizes; use libs"
+        ):
+            writer.create(tmp_path / "set", 30, features, {})
+        assert not (tmp_path / "set").exists()
+        return
+    writer.create(tmp_path / "set", 30, features, {})
+    for _ in range(3):
+        writer.add_frame({"observation.images.top": np.zeros((65, 97, 3), np.uint8)}, "look")
+    writer.save_episode()
+    writer.finalize()
+    assert len(rows(tmp_path / "set")) == 3

@@ -150,7 +150,8 @@ class Storage:
             raise RecorderError(f"{self._directory}: cannot be removed: {error.strerror}") from error
 
     def _open_file(self) -> BagFile:
-        path = self._directory / f"{self._directory.name}_{len(self._files)}.mcap"
+        name = os.fsencode(self._directory.name).decode("utf-8", "replace")  # `metadata.yaml` lists it
+        path = self._directory / f"{name}_{len(self._files)}.mcap"
         file = BagFile(path, self._options, self._facts(self._episode.metadata))
         self._files[path.name] = file.counted
         self._inodes[path] = path.stat()

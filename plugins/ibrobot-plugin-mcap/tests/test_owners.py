@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 from ibrobot_mcap import trash
 from ibrobot_mcap.commands import episodes
+from killed_process import KILLED, killing
 
 from ibrobot_core.api import InUse, Ownership, RecorderError
 
 from .conftest import Bench, read, summary
-
-KILLED = Path(__file__).parent / "killed_process.py"
 
 
 @pytest.fixture
@@ -125,24 +121,10 @@ def test_discarding_a_recording_removes_nothing_else(tmp_path, bench, episode):
     assert len(read(made.path)) == 100
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def killed():
-    """Runs a command that dies at its n-th change of the file system; returns whether it did."""
-    with subprocess.Popen(
-        [sys.executable, str(KILLED)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-
-        def run_and_kill(point, *command):
-            process.stdin.write(json.dumps([point, *map(str, command)]) + "\n")
-            process.stdin.flush()
-            code = int(process.stdout.readline())
-            assert code in (0, 9)
-            return code == 9
-
+    with killing() as run_and_kill:
         yield run_and_kill
-        process.stdin.close()
 
 
 def originals(folder):
@@ -167,7 +149,7 @@ def test_wherever_a_change_is_killed_nothing_is_lost_and_the_next_command_finish
     for point in range(1, 40):
         shutil.rmtree(tmp_path / "pick")
         shutil.copytree(tmp_path / "kept", episode)
-        died = killed(point, *COMMANDS[name](episode))
+        code, _ = killed(point, "episodes", *COMMANDS[name](episode))
         listed = CliRunner().invoke(episodes, ["list", str(tmp_path)])
         shown = "episode_000001" in listed.output
         assert shown or ".trash" in os.listdir(episode.parent), (point, listed.output)
@@ -178,7 +160,7 @@ def test_wherever_a_change_is_killed_nothing_is_lost_and_the_next_command_finish
         if episode.exists():
             assert summary(episode).finished
             assert len(read(episode)) in (100, 51)
-        if not died:
+        if code != KILLED:
             break
     assert point > 4, "it was killed at some points"
-    assert not died
+    assert code == 0

@@ -24,7 +24,7 @@ from rosbags.interfaces import ConnectionExtRosbag2
 
 from ibrobot_core.api import NS_PER_S, Image, JointState, RecorderError, String
 
-from .conftest import CAMERA, JOINTS, joints, picture, read, stamp, summary
+from .conftest import CAMERA, JOINTS, Bench, joints, picture, read, stamp, summary
 
 MIB = 1 << 20
 
@@ -366,3 +366,12 @@ def test_a_sync_that_the_disk_refuses_ends_the_recording(bench, monkeypatch):
     made.write(1)
     with pytest.raises(RecorderError, match="cannot be written: Input/output error; it stays unfinished"):
         made.end()
+
+
+def test_a_folder_whose_name_is_not_utf8_is_recorded_into(tmp_path):
+    made = Bench(tmp_path)
+    made.path = tmp_path / os.fsdecode(b"caf\xe9")
+    made.begin()
+    made.write(10)
+    made.end()
+    assert len(read(made.path)) == 10
