@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import run_here
 from ibrobot_data import run as run_module
+from ibrobot_data.episode import make_writer
 from ibrobot_data.run import STAGING
 from ibrobot_lerobot.layout import open_dataset
 from killed_process import KILLED, killing
@@ -130,13 +131,12 @@ def test_of_two_conversions_into_one_folder_the_second_finds_the_first_ones_data
     bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, first, second = tmp_path / "set", *sorted((bags / "episodes").iterdir())
-    real = run_module.Ownership
 
     def beside(*arguments: Any, **more: Any) -> Ownership:
         """Between the second one's first look at the folder and its lock, the first one begins and ends."""
-        monkeypatch.setattr(run_module, "Ownership", real)
+        monkeypatch.setattr(run_module, "Ownership", Ownership)
         assert convert(first, "--out", out).returncode == 0
-        return real(*arguments, **more)
+        return Ownership(*arguments, **more)
 
     monkeypatch.setattr(run_module, "Ownership", beside)
     refused = convert(second, "--out", out)
@@ -325,7 +325,6 @@ def test_a_conversion_does_not_write_into_what_changed_meanwhile(
 ) -> None:
     out, (first, second) = tmp_path / "set", sorted((bags / "episodes").iterdir())
     assert convert(first, "--out", out).returncode == 0
-    real = run_module.make_writer
     calls = 0
 
     class Changed:
@@ -341,7 +340,7 @@ def test_a_conversion_does_not_write_into_what_changed_meanwhile(
             found = self._writer.summary(root)
             return found if calls == 1 else attrs.evolve(found, episodes=found.episodes + 1)
 
-    monkeypatch.setattr(run_module, "make_writer", lambda request: Changed(real(request)))
+    monkeypatch.setattr(run_module, "make_writer", lambda request: Changed(make_writer(request)))
     done = convert(second, "--out", out, "--append")
     assert done.returncode == 2
     assert "was changed by another program meanwhile; run the same command again" in done.stderr

@@ -13,7 +13,7 @@ from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_service import DISCARD, START, STATUS, STOP, EpisodeService
 
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import DiskFull, InUse, NotSupported, RecorderError, RequestError
+from ibrobot_core.errors import DiskFull, IbrobotError, InUse, NotSupported, RecorderError, RequestError
 from ibrobot_core.ownership import Ownership
 
 if TYPE_CHECKING:
@@ -221,3 +221,29 @@ def test_the_first_episodes_of_two_runs_agree_on_one_contract(runs: Runs, monkey
         thread.join()
     (message,) = refused
     assert "its episodes have another contract" in message
+
+
+NO_TEXT = {
+    "mapping": {"task": "pick"}, "list": ["pick"], "number": 3, "nan": float("nan"), "surrogate": "pick \ud800",
+    "zero": "pick\0", "long": "x" * 200_000,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("prompt", NO_TEXT.values(), ids=NO_TEXT)
+def test_a_prompt_that_no_file_can_hold_is_refused_and_no_episode_is_lost(run: Runtime, runs: Runs, prompt: object):
+    for request in (prompt, {"prompt": prompt}):
+        with pytest.raises(IbrobotError):
+            run.session.bus.call(START, request)
+    if isinstance(prompt, str):
+        service = run.session.episodes
+        assert isinstance(service, EpisodeService)
+        with pytest.raises(RecorderError, match="the prompt has "):
+            service.start(prompt)
+        with pytest.raises(RecorderError, match="the prompt has ") as refused:
+            runs.make(RECORDING, mode="teleop", by_operator=True, prompt=prompt)
+        assert refused.value.exit_code == 2
+    run.session.bus.call(START, {"prompt": "pick the cube"})
+    ticks(run, 2)
+    run.session.bus.call(STOP, {"outcome": "success"})
+    run.stop()
+    assert folders(runs) == ["episode_000001"]

@@ -29,6 +29,7 @@ from ibrobot_core.api import (
     with_closed_ends,
     wrong_input,
 )
+from ibrobot_data.prompt import check_prompt
 from ibrobot_data.request import MISSING, ONLY, OUTCOMES, ConversionRequest, EpisodeReport, Report
 from ibrobot_data.words import plural
 
@@ -120,6 +121,7 @@ def convert(context: click.Context, /, to: str, as_json: bool, events: bool, **a
         raise click.UsageError(f"{option} has no meaning for --to {to}")
     try:
         with wrong_input():
+            check_prompt(asked["prompt"])
             progress = _events if events else partial(_progress, quiet=as_json)
             report = (_to_bags if to == "bag" else _to_dataset)(progress=progress, **asked)
     except KeyboardInterrupt:

@@ -26,6 +26,7 @@ from ibrobot_core.api import (
 )
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_start import is_kept
+from ibrobot_data.prompt import check_prompt
 
 if TYPE_CHECKING:
     from ibrobot_data.recording_worker import RecordingWorker
@@ -86,6 +87,7 @@ class EpisodeService(Episodes):
         self._dataset = EpisodeDataset(self.folder)
         contract = Contract.from_config(session.config)
         with wrong_input():  # the cause is `recording.root` or `recording.dataset`
+            check_prompt(self.prompt)
             self._dataset.check_writable()
             self._dataset.check(contract)
         left_out = [topic for topic in contract.topics if not is_kept(topic, config, contract)]
@@ -132,7 +134,8 @@ class EpisodeService(Episodes):
             prompt: description of the task; None repeats the last prompt.
 
         Raises:
-            RecorderError: if an episode is being recorded, or topics of the contract are silent; names them.
+            RecorderError: if an episode is being recorded, topics of the contract are silent (names them), or no file
+                can hold the prompt.
             DiskFull: if the disk has no room for an episode of `contract.max_duration_s` at present rates.
             NotSupported: if the mode begins episodes itself.
         """
@@ -147,7 +150,7 @@ class EpisodeService(Episodes):
                 )
                 raise RecorderError(f"not recording: the contract's topics are silent: {topics}")
             self._check_space()
-            self.prompt = self.last_prompt if prompt is None else prompt
+            self.prompt = self.last_prompt if prompt is None else check_prompt(prompt)
             self.begin()
             if self.prompt:
                 self._dataset.prompt = self.prompt

@@ -45,6 +45,7 @@ class Storage:
         self._waits_since_s: float | None = None
         """Wall time at which the oldest unwritten message arrived [s]."""
         self._broken: RecorderError | None = None
+        _check_text(episode)
         self._check_space(self._directory.parent)
         try:
             self._directory.mkdir()
@@ -217,3 +218,13 @@ class Storage:
             f"{self._directory}: cannot be written: {error.strerror}; it stays unfinished, with what was written before"
         )
         raise self._broken from error
+
+
+def _check_text(episode: EpisodeStart) -> None:
+    """Check that the metadata can be written, and read again."""
+    for key, value in episode.metadata.items():
+        try:
+            value.encode()
+        except UnicodeEncodeError as error:
+            place = f"U+{ord(value[error.start]):04X} at character {error.start + 1}"
+            raise RecorderError(f"{episode.directory}: {key} has half of a character, {place}") from None

@@ -375,3 +375,14 @@ def test_a_folder_whose_name_is_not_utf8_is_recorded_into(tmp_path):
     made.write(10)
     made.end()
     assert len(read(made.path)) == 10
+
+
+def test_metadata_that_could_not_be_read_again_are_refused_before_anything_is_written(tmp_path):
+    made = Bench(tmp_path)
+    with pytest.raises(RecorderError, match=r"prompt has half of a character, U\+D800 at character 6"):
+        made.begin(prompt="pick \ud800")
+    assert list(tmp_path.iterdir()) == []
+    made.begin(prompt="pick it: \U0001f9ca, \"é\", 'x', \t, 1e3, ~, {a}")
+    made.write(1)
+    made.end()
+    assert summary(made.path).metadata["prompt"] == "pick it: \U0001f9ca, \"é\", 'x', \t, 1e3, ~, {a}"

@@ -1,0 +1,25 @@
+"""What a prompt may be: it goes into YAML and JSON files, into datasets, and to policies."""
+
+from __future__ import annotations
+
+import re
+
+from ibrobot_core.api import RecorderError
+
+_LONGEST = 1000
+"""As of a text in a request to a service."""
+_UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+
+
+def check_prompt(prompt: str) -> str:
+    """The prompt, if every file can hold it.
+
+    Raises:
+        RecorderError: if it is too long, or has control characters or halves of characters.
+    """
+    if len(prompt) > _LONGEST:
+        raise RecorderError(f"the prompt has {len(prompt)} characters; at most {_LONGEST} are allowed")
+    if found := _UNPRINTABLE.search(prompt):
+        place = f"U+{ord(found[0]):04X} at character {found.start() + 1}"
+        raise RecorderError(f"the prompt has a character that no file can hold: {place}")
+    return prompt
