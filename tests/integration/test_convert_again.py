@@ -189,7 +189,8 @@ def test_a_label_that_changed_after_the_conversion_is_reported(bags: Path, tmp_p
 @pytest.mark.parametrize("uuid", [UUID.format(1), ""], ids=["random", "none"])
 def test_a_trimmed_episode_is_another_state_of_the_one_in_the_dataset(tmp_path: Path, uuid: str) -> None:
     episode, out = tmp_path / "blocks/episodes/episode_000001", tmp_path / "set"
-    record(episode, 1, 0.9, "sort", **({"uuid": uuid} if uuid else {}))
+    named: dict[str, Any] = {"uuid": uuid} if uuid else {}
+    record(episode, 1, 0.9, "sort", **named)
     assert convert(episode, "--out", out).returncode == 0
 
     def refused() -> None:
@@ -236,7 +237,8 @@ def test_names_that_collide_lose_no_episode(tmp_path: Path) -> None:
 
 def test_copies_are_found_before_they_are_encoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for number, uuid in ((1, UUID.format(1)), (2, "")):  # by UUID, and by content
-        record(tmp_path / f"bags/{number}", number, 0.4, **({"uuid": uuid} if uuid else {}))
+        named: dict[str, Any] = {"uuid": uuid} if uuid else {}
+        record(tmp_path / f"bags/{number}", number, 0.4, **named)
         shutil.copytree(tmp_path / f"bags/{number}", tmp_path / f"bags/{number}_copy")
     record(tmp_path / "bags/3", 3, 0.4)
     converted: list[str] = []
