@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from ibrobot_core import ownership
 from ibrobot_core.errors import InUse, wrong_input
 from ibrobot_core.ownership import Ownership, lock_file
 
@@ -112,12 +111,12 @@ def test_what_nobody_can_change_needs_no_owner_to_be_read(tmp_path: Path, monkey
             raise OSError(errno.EROFS, os.strerror(errno.EROFS))
         return real(path, flags, mode)
 
-    monkeypatch.setattr(ownership.os, "open", read_only)
+    monkeypatch.setattr(os, "open", read_only)
     Ownership(tmp_path / "episode", "is being converted", shared=True).close()
     with pytest.raises(OSError, match="Read-only file system"):
         Ownership(tmp_path / "episode", "is being trimmed")
     monkeypatch.undo()
     with Ownership(tmp_path / "episode", "is being recorded"):
-        monkeypatch.setattr(ownership.os, "open", read_only)
+        monkeypatch.setattr(os, "open", read_only)
         with pytest.raises(InUse, match="is being recorded"):
             Ownership(tmp_path / "episode", "is being converted", shared=True, wait_s=0.0)

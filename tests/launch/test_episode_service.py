@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import attrs
 import pytest
@@ -230,7 +230,7 @@ NO_TEXT = {
 
 
 @pytest.mark.parametrize("prompt", NO_TEXT.values(), ids=NO_TEXT)
-def test_a_prompt_that_no_file_can_hold_is_refused_and_no_episode_is_lost(run: Runtime, runs: Runs, prompt: object):
+def test_a_prompt_that_no_file_can_hold_is_refused_and_no_episode_is_lost(run: Runtime, runs: Runs, prompt: Any):
     for request in (prompt, {"prompt": prompt}):
         with pytest.raises(IbrobotError):
             run.session.bus.call(START, request)
