@@ -5,10 +5,10 @@
 Two 640x480 cameras at 30 Hz, joint states and actions at 100 Hz, recorded as raw bags; synthetic pictures with texture,
 motion and sensor noise. `--lerobot` is an interpreter that has `lerobot[dataset]`; by default this one. In one run:
 
-- `ibrobot convert` of two episodes, its reading of the bags included;
+- `ibrobot convert` of two episodes that differ, its reading of the bags included, with its own choice of `--jobs`;
 - LeRobot's `LeRobotDataset` as `lerobot-record` uses it by default (pictures as PNG files, encoded at the end of an
   episode) and streaming, fed with the same pictures from memory. Streaming is fed no faster than it encodes, since it
-  drops pictures otherwise.
+  drops pictures otherwise. Both may use all cores.
 
 Three times in turn; printed are medians, and those of the paired ratios. Frames a second leave out what the two
 commands import (not what the converting processes of ours do), and so does LeRobot's CPU time; all else is of the whole
@@ -35,6 +35,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 
@@ -44,12 +45,13 @@ JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_ro
 ENOUGH, GROWTH = 3.0, 1.25
 
 
-def pictures(camera: int, count: int) -> Iterator[np.ndarray[Any, np.dtype[np.uint8]]]:
+def pictures(stream: int, count: int) -> Iterator[np.ndarray[Any, np.dtype[np.uint8]]]:
     """A table with the spectrum of natural pictures behind a lens, a thing that moves over it, and a sensor's noise.
 
-    An amplitude of 1/f^1.4 makes them as costly as a webcam's: about 30 kB each in AV1 at crf 30.
+    An amplitude of 1/f^1.4 makes them as costly as a webcam's: about 30 kB each in AV1 at crf 30. Each stream has
+    others.
     """
-    rng = np.random.default_rng(camera)
+    rng = np.random.default_rng(stream)
     frequency = np.hypot(np.fft.fftfreq(HEIGHT)[:, None], np.fft.rfftfreq(WIDTH)[None, :])
     frequency[0, 0] = np.inf
     field = np.fft.irfft2(
@@ -59,13 +61,22 @@ def pictures(camera: int, count: int) -> Iterator[np.ndarray[Any, np.dtype[np.ui
     noise = rng.normal(0, 1.5, (8, HEIGHT, WIDTH, 3))
     for i in range(count):
         picture = table + noise[i % len(noise)]
-        x = int((0.5 + 0.4 * np.sin(i / 20 + camera)) * (WIDTH - 80))
+        x = int((0.5 + 0.4 * np.sin(i / 20 + stream)) * (WIDTH - 80))
         picture[200:280, x : x + 80] = (220, 40, 60)
         yield picture.clip(0, 255).astype(np.uint8)
 
 
-def record(folder: Path, frames: int) -> None:
-    """An episode as `ibrobot record` leaves it."""
+def uuid_of(episode: int) -> str:
+    return str(UUID(int=episode, version=4))
+
+
+def streams(episode: int, frames: int) -> list[Iterator[np.ndarray[Any, np.dtype[np.uint8]]]]:
+    """The pictures of each camera in an episode; those of two episodes differ."""
+    return [pictures(episode * len(CAMERAS) + camera, frames) for camera in range(len(CAMERAS))]
+
+
+def record(folder: Path, frames: int, episode: int) -> None:
+    """An episode as `ibrobot record` leaves it, with its own time, pictures and UUID."""
     from ibrobot_mcap.options import McapOptions
     from ibrobot_mcap.recorder import McapRecorder
     from ibrobot_testing.contexts import host_context
@@ -76,7 +87,7 @@ def record(folder: Path, frames: int) -> None:
     from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
     from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
 
-    recorder_clock = SteppedClock(start_ns := 1_700_000_000_000_000_000)
+    recorder_clock = SteppedClock(start_ns := 1_700_000_000_000_000_000 + episode * 60_000_000_000)
     state = "sensor_msgs/msg/JointState"
     select = tuple(f"position.{joint}" for joint in JOINTS)
     parts = [
@@ -92,11 +103,11 @@ def record(folder: Path, frames: int) -> None:
     metadata = {
         "robot_type": "so101_follower", "prompt": "push the block", "contract": json.dumps(contract.canonical()),
         "fingerprint": contract.fingerprint(), "config": "{}", "calibration": "{}",
+        "uuid": uuid_of(episode),
     }  # fmt: skip
     folder.parent.mkdir(parents=True, exist_ok=True)
     recorder.begin(EpisodeStart(folder, start_ns, contract.topics, metadata))
-    streams = [pictures(number, frames) for number in range(len(CAMERAS))]
-    for i, images in enumerate(zip(*streams, strict=True)):
+    for i, images in enumerate(zip(*streams(episode, frames), strict=True)):
         for sub in range(3):
             t_ns = start_ns + (3 * i + sub) * contract.step_ns // 3
             position = np.sin(np.arange(6) + t_ns % 10**10 / 1e9)
@@ -159,6 +170,7 @@ def ours(episodes: Path, out: Path, *more: str) -> dict[str, float]:
     program = "from ibrobot_core.cli.main import main; main()"
     command = [sys.executable, "-c", program, "convert", str(episodes), "--out", str(out), "--json", *more]
     found = measure(command)
+    assert not found["passed_over"], "the episodes differ"
     return found | {"frames_s": found["frames"] / found["seconds"]}
 
 
@@ -172,20 +184,20 @@ def lerobot(mode: str, out: Path, frames: int, episodes: int) -> None:
     features |= {f"observation.images.{camera}": video for camera in CAMERAS}
     # As lerobot-record makes it: four threads a camera write the PNG files.
     options = {"streaming_encoding": True} if mode == "streaming" else {"image_writer_threads": 4 * len(CAMERAS)}
-    stored = [np.stack(list(pictures(number, frames))) for number in range(len(CAMERAS))]
+    stored = [[np.stack(list(stream)) for stream in streams(episode, frames)] for episode in range(1, episodes + 1)]
     dataset = LeRobotDataset.create("local/benchmark", FPS, features, root=out, robot_type="so101", **options)
     begin, cpu = time.monotonic(), _cpu()
-    for _ in range(episodes):
+    for pixels in stored:
         for i in range(frames):
             if mode == "streaming":
                 _wait_for_encoders(dataset)
             row: dict[str, Any] = {"observation.state": np.full(6, i, np.float32), "action": np.zeros(6, np.float32)}
-            row |= {f"observation.images.{camera}": stored[n][i] for n, camera in enumerate(CAMERAS)}
+            row |= {f"observation.images.{camera}": pixels[n][i] for n, camera in enumerate(CAMERAS)}
             dataset.add_frame(row | {"task": "push the block"})
         dataset.save_episode()
     dataset.finalize()
     measured = {"measured": mode, "seconds": time.monotonic() - begin, "cpu_s": _cpu() - cpu}
-    pictures_mib = sum(each.nbytes for each in stored) / 2**20
+    pictures_mib = sum(each.nbytes for pixels in stored for each in pixels) / 2**20
     print(json.dumps(measured | {"frames": frames * episodes, "pictures_mib": pictures_mib}))
 
 
@@ -214,7 +226,7 @@ def speed(python: str, folder: Path, frames: int, times: int) -> bool:
     """Ours and LeRobot's, the same pictures, one after the other."""
     source = folder / "two"
     for number in (1, 2):
-        record(source / f"episode_{number:06d}", frames)
+        record(source / f"episode_{number:06d}", frames, number)
     runs = {
         "ibrobot convert": lambda: ours(source, folder / "ours"),
         "LeRobot, streaming": lambda: theirs(python, "streaming", folder / "lerobot", frames),
@@ -240,10 +252,14 @@ def speed(python: str, folder: Path, frames: int, times: int) -> bool:
 def memory(folder: Path) -> bool:
     """Whether memory depends on the length or the number of episodes."""
     found = {}
-    record(folder / "short" / "episode_000001", 60)
-    record(folder / "long" / "episode_000001", 600)
+    record(folder / "short" / "episode_000001", 60, 1)
+    record(folder / "long" / "episode_000001", 600, 1)
     for number in range(2, 51):
-        shutil.copytree(folder / "short/episode_000001", folder / f"short/episode_{number:06d}", copy_function=os.link)
+        copy = folder / f"short/episode_{number:06d}"
+        shutil.copytree(folder / "short/episode_000001", copy, copy_function=os.link)
+        metadata = (copy / "metadata.yaml").read_text()
+        (copy / "metadata.yaml").unlink()  # a link
+        (copy / "metadata.yaml").write_text(metadata.replace(uuid_of(1), uuid_of(number)))  # copies are passed over
     for count in (1, 10, 50):
         some = folder / f"some_{count}"
         for number in range(1, count + 1):

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from command_line import run_here
+from convert import record as record_benchmark
 from ibrobot_data import run as run_module
 from ibrobot_data.episode import make_writer
 from ibrobot_data.run import STAGING
@@ -23,7 +24,7 @@ from ibrobot_lerobot.layout import open_dataset
 from killed_process import KILLED, killing
 from recordings import record
 
-from ibrobot_core.api import Ownership
+from ibrobot_core.api import Ownership, installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 
@@ -349,3 +350,31 @@ def test_a_conversion_does_not_write_into_what_changed_meanwhile(
     monkeypatch.undo()
     again = report(second, "--out", out, "--append")
     assert (again["episodes"], again["resumed"]) == (1, 1)
+
+
+def test_the_episodes_of_the_benchmark_differ(tmp_path: Path) -> None:
+    """Copies are not converted, and so would make it look twice as slow."""
+    digests = set()
+    for number in (1, 2):
+        record_benchmark(tmp_path / f"two/episode_{number:06d}", 3, number)
+        reader = installed_plugins().open_episode(tmp_path / f"two/episode_{number:06d}")
+        digests.add(reader.digest())
+        reader.close()
+    assert len(digests) == 2
+    found = report(tmp_path / "two", "--out", tmp_path / "set")
+    assert (found["code"], found["episodes"], found["passed_over"]) == (0, 2, 0), found["err"]
+
+
+def test_by_default_all_cores_convert(bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    jobs: list[int] = []
+    real = run_module.convert
+
+    def noted(request: Any, *more: Any) -> Any:
+        jobs.append(request.jobs)
+        return real(attrs.evolve(request, jobs=1), *more)
+
+    monkeypatch.setattr(run_module, "convert", noted)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {1, 2, 5}, raising=False)
+    assert convert(bags, "--out", tmp_path / "default").returncode == 0
+    assert convert(bags, "--out", tmp_path / "given", "--jobs", "2").returncode == 0
+    assert jobs == [3, 2]

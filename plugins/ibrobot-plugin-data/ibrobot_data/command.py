@@ -102,7 +102,7 @@ def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
     "--jobs",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Episodes in parallel; by default half the CPU cores.",
+    help="Episodes in parallel; by default one for each CPU core.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 @click.option("--events", is_flag=True, help="Print the progress as JSON lines, and the report as the last one.")
@@ -152,7 +152,7 @@ def _to_dataset(
     type_ = type_ or installed_plugins().default("dataset")
     request = ConversionRequest(
         out, _options("dataset", type_, (*overrides, *sets)), type_,
-        outcomes=outcomes or OUTCOMES, jobs=jobs or _jobs(), norm_mode=norm_mode or "radians",
+        outcomes=outcomes or OUTCOMES, jobs=jobs or cores(), norm_mode=norm_mode or "radians",
         **_given(config, calibration), **asked,
     )  # fmt: skip
     found = find_episodes(episodes)
@@ -209,9 +209,9 @@ def _numbers(text: str | None, total: int) -> tuple[int, ...]:
     return tuple(sorted(found))
 
 
-def _jobs() -> int:
-    """One for every two CPU cores: a job decodes images while others are encoded."""
-    return max(1, (os.cpu_count() or 1) // 2)
+def cores() -> int:
+    """Number of CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:

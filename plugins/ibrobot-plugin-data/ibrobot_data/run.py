@@ -53,9 +53,6 @@ from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
 STAGING = ".staging"
 """Folder within the dataset for converted episodes until the merge."""
 _LOCK = "lock"
-_FIRST = "first"
-"""File within the staging folder: these episodes make a new dataset. It is removed last, so that after an interruption
-the same command goes on even if the dataset is there."""
 _THERE = "{}: already has a dataset; --append adds to it"
 _POLL_S = 0.2
 _END_S = 5.0
@@ -109,20 +106,20 @@ def convert(
     begin = time.monotonic()
     with _staging(request) as (staging, old):
         request = _with_labels(request, episodes, old)
-        goes_on = request.append or (staging / _FIRST).exists()
         if old is not None:
-            _check_old(request, old, goes_on)
+            _check_old(request, old)
         plan = _Plan(request, staging, old, episodes)
-        if old is not None and not goes_on and plan.adds(old):
+        # Without --append nothing may be added, but the same command may have been killed when it had merged.
+        if old is not None and not request.append and plan.adds(old):
             raise DatasetError(_THERE.format(request.out))
         reports = plan.run(watch)
         units = [unit for unit in plan.units() if not reports[unit.report.source].error]
         reports |= _refuse_misfits(units, old)
         units = [unit for unit in units if reports[unit.report.source].kept]
-        if units and old is not None and not goes_on:
+        if units and old is not None and not request.append:
             raise DatasetError(_THERE.format(request.out))
         if units:
-            _merge(request, staging, old, units, [source for source in plan.sources if reports[source].error])
+            _merge(request, old, units, [source for source in plan.sources if reports[source].error])
         clear_staging(staging)
     size = sum(path.stat().st_size for path in request.out.rglob("*") if path.is_file()) if request.out.exists() else 0
     ordered = tuple(reports[source] for source in plan.sources)
@@ -130,11 +127,9 @@ def convert(
 
 
 def _merge(
-    request: ConversionRequest, staging: Path, old: DatasetSummary | None, units: Sequence[Unit], failed: Sequence[str]
+    request: ConversionRequest, old: DatasetSummary | None, units: Sequence[Unit], failed: Sequence[str]
 ) -> None:
     """Add the units to the dataset."""
-    if old is None:
-        (staging / _FIRST).touch()
     writer = make_writer(request)
     if writer.summary(request.out) != old:
         raise DatasetError(f"{request.out}: was changed by another program meanwhile; run the same command again")
@@ -143,7 +138,7 @@ def _merge(
 
 def clear_staging(staging: Path) -> None:
     """Remove all but the lock from a staging folder."""
-    for path in sorted(staging.iterdir(), key=lambda path: path.name == _FIRST):
+    for path in list(staging.iterdir()):
         if path.is_dir():
             shutil.rmtree(path)
         elif path.name != _LOCK:
@@ -206,10 +201,10 @@ def _says_who_commanded(episode: Path) -> bool:
         return False
 
 
-def _check_old(request: ConversionRequest, old: DatasetSummary, goes_on: bool) -> None:
-    """Check that episodes fit into the dataset; `goes_on` if they may be added."""
+def _check_old(request: ConversionRequest, old: DatasetSummary) -> None:
+    """Check that the dataset was made with the same settings."""
     known = old.metadata.get("conversion")
-    if not goes_on and known != conversion(request):
+    if not request.append and known != conversion(request):
         raise DatasetError(_THERE.format(request.out))
     if known is None:
         raise DatasetError(f"{request.out}: not made by ibrobot convert; convert into another folder")
