@@ -28,6 +28,7 @@ from ibrobot_core.descriptors import (
 from ibrobot_core.options import (
     NoOptions as NoOptions,
     OptionFault as OptionFault,
+    OptionName as OptionName,
     did_you_mean as did_you_mean,
     documented as documented,
     not_empty as not_empty,
@@ -266,7 +267,13 @@ from ibrobot_core.config.schema import (
     RecordingConfig as RecordingConfig,
     TransportConfig as TransportConfig,
 )
-from ibrobot_core.config.models import ModelError as ModelError, XmlElement as XmlElement, read_xml as read_xml
+from ibrobot_core.config.models import (
+    DescriptionModel as DescriptionModel,
+    ModelError as ModelError,
+    XmlElement as XmlElement,
+    read_mjcf as read_mjcf,
+    read_xml as read_xml,
+)
 from ibrobot_core.config.expand import resolve_path as resolve_path
 from ibrobot_core.config.overrides import apply_overrides as apply_overrides, single_options as single_options
 from ibrobot_core.config.show import dump_yaml as dump_yaml
@@ -286,7 +293,7 @@ from ibrobot_core.signals import end_signals as end_signals, on_signals as on_si
 from ibrobot_core.outside import LogFormatter as LogFormatter, echo as echo
 from ibrobot_core.ownership import Ownership as Ownership
 from ibrobot_core.screen import Screen as Screen, styled as styled
-from ibrobot_core.terminal import KeyReader as KeyReader
+from ibrobot_core.terminal import KeyReader as KeyReader, check_key as check_key
 
 __all__: list[str]
 

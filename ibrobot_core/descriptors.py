@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
-from ibrobot_core.options import NoOptions, OptionFault
+from ibrobot_core.options import NoOptions, OptionFault, OptionName
 
 if TYPE_CHECKING:
     import click
@@ -51,6 +51,10 @@ class Descriptor[T]:
     component owns, or all joints if its kind owns none. Opens no device, and imports nothing heavy."""
     devices: Callable[[Any], Mapping[str, str]] = attrs.field(default=lambda options: {}, kw_only=True)
     """Maps options to devices that only one component can open at a time, in a canonical form."""
+    peripherals: Callable[[Any], Iterable[OptionName]] = attrs.field(default=lambda options: (), kw_only=True)
+    """The peripherals of the robot YAML that options name."""
+    publishes: Callable[[Any], Iterable[OptionName]] = attrs.field(default=lambda options: (), kw_only=True)
+    """The topics that options name and the component publishes, which nothing else may publish."""
     default: bool = attrs.field(default=False, kw_only=True)
     """Whether commands use this type by default; at most one type of each kind."""
 

@@ -33,6 +33,13 @@ def _uint8s(value: ArrayLike) -> NDArray[np.uint8]:
     return np.asarray(value, dtype=np.uint8)
 
 
+JOINT_STATES = "/joint_states"
+ROBOT_STATUS = "/robot_status"
+DIAGNOSTICS = "/diagnostics"
+RUN_TOPICS = (JOINT_STATES, ROBOT_STATUS, DIAGNOSTICS)
+"""The topics that every run publishes."""
+
+
 @attrs.frozen
 class Message:
     """Base of all messages; `ros_type` is the full ROS 2 name."""

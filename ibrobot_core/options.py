@@ -28,6 +28,10 @@ class OptionFault:
     """The model of `robot.description` that the component needs and the robot lacks, e.g. `mjcf`."""
 
 
+type OptionName = tuple[tuple[str | int, ...], str]
+"""An option, as in `OptionFault`, and the name that it gives, e.g. of a topic."""
+
+
 def did_you_mean(word: str, known: Sequence[str], what: str) -> str:
     """A hint for a misspelt `word`: the closest of `known`, or all of them."""
     close = get_close_matches(word, known, 1)

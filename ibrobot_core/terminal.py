@@ -31,10 +31,23 @@ _NUMBERS = {
 }  # fmt: skip
 """First parameter of a sequence that ends with `~` -> key."""
 
+KEY_NAMES = tuple(dict.fromkeys((*_NAMED.values(), "esc", *_LETTERS.values(), *_NUMBERS.values())))
+"""The keys with a name; every other key is the character that it types."""
+
 _SEQUENCE = re.compile(rb"\x1b(?:\[\[([A-E])|\[([0-?]*)[ -/]*([@-Z\\-~])|O([A-Za-z]))")
 """An escape sequence: f1 to f5 of the Linux console, a control sequence, or a key in application mode."""
 _BEGINNING = re.compile(rb"\x1b(?:\[(?:\[|[0-?]*[ -/]*)|O)?")
 """An incomplete escape sequence."""
+
+
+def check_key(key: str) -> None:
+    """Check the name of a key.
+
+    Raises:
+        ValueError: if no key has it.
+    """
+    if key not in KEY_NAMES and not (len(key) == 1 and key.isprintable() and key not in _NAMED):
+        raise ValueError(f"{key!r} is not a key: give the character that it types, or a name: {', '.join(KEY_NAMES)}")
 
 
 def decode(typed: bytes, *, final: bool) -> tuple[list[str], bytes]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import attrs
@@ -26,6 +28,7 @@ from ibrobot_core.options import OptionFault
 from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Joint, Robot
 from ibrobot_core.run_hooks import RUN_KEYS
+from ibrobot_core.terminal import check_key
 from ibrobot_core.units import radians
 
 _SLACK = 0.01
@@ -168,10 +171,18 @@ class Checks:
                     self._fault(part.key, fault)
                 if isinstance(part.descriptor, TeleopDescriptor):
                     keys |= part.descriptor.keys(part.component.options, seen)
+            for key in keys:
+                self._key(key, part.key)
             for key, does in keys.items():
                 if does != (always := RUN_KEYS.get(key, does)):
                     message = f"key {key!r} is both {does} and, in every run, {always}; choose another key"
                     self.document.add(_place_of(key, part.key, self.document.get(*part.key)), message)
+
+    def _key(self, key: str, at: Key) -> None:
+        try:
+            check_key(key)
+        except ValueError as error:
+            self.document.add(_place_of(key, at, self.document.get(*at)), str(error))
 
     def _fault(self, key: Key, fault: OptionFault) -> None:
         """Report a fault of a component; one that needs a model that is not installed counts as missing itself."""
@@ -364,7 +375,17 @@ class Checks:
             message = f"nothing uses {part.descriptor.type!r}: no mode has an execution_mode that needs a transport"
             self.document.add((*part.key, "type"), message)
 
+    def _folder(self, key: Key, folder: Path) -> None:
+        """Check that a folder exists or can be made."""
+        nearest = _nearest(folder.absolute())
+        if not nearest.is_dir():
+            self.document.add(key, f"{nearest} is a file, not a folder")
+        elif not os.access(nearest, os.W_OK | os.X_OK):
+            self.document.add(key, f"{nearest} is not writable for this user")
+
     def _recording(self) -> None:
+        if self.sections.recording is not None:
+            self._folder(("recording", "root"), Path(self.sections.recording.component.root))
         topics: Any = self.sections.recording.component.topics if self.sections.recording else ()
         if isinstance(topics, str) and topics not in ("contract", "all"):
             self.document.add(("recording", "topics"), f"{topics!r} is not one of: contract, all, or a list of topics")
@@ -376,6 +397,11 @@ class Checks:
             if not topic.startswith("/"):
                 message = f"{topic!r} is not a full topic name, did you mean '/{topic}'?"
                 self.document.add(("recording", "topics", i), message)
+
+
+def _nearest(path: Path) -> Path:
+    """The innermost existing part of a path."""
+    return next(each for each in (path, *path.parents) if each.exists())
 
 
 def streams(part: ParsedComponent[Any]) -> bool:

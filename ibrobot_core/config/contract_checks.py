@@ -18,7 +18,6 @@ from ibrobot_core.executor_options import StreamOptions
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.selection import Selection
 
-JOINT_STATES = "/joint_states"
 PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
     "camera": ("/camera/{name}/image_raw", messages.Image)
 }
@@ -42,7 +41,7 @@ def completed(spec: ObservationSpec, kind: str = "") -> ObservationSpec:
     if spec.peripheral is not None and kind in PERIPHERAL_TOPICS:
         topic, message_type = PERIPHERAL_TOPICS[kind]
         return attrs.evolve(spec, topic=topic.format(name=spec.peripheral), type=message_type.ros_type)
-    if spec.topic == JOINT_STATES and not spec.type:
+    if spec.topic == messages.JOINT_STATES and not spec.type:
         return attrs.evolve(spec, type=messages.JointState.ros_type)
     return spec
 
@@ -104,8 +103,10 @@ class ContractChecks:
             remark = did_you_mean(spec.type, sorted(messages.MESSAGE_TYPES), "known")
             hint = "(set `foreign: true` for a type that only bags define)"
             self.document.add((*key, "type"), f"unknown message type {spec.type!r}{remark} {hint}")
-        elif spec.topic == JOINT_STATES and spec.type != messages.JointState.ros_type:
-            self.document.add((*key, "type"), f"{JOINT_STATES} carries {messages.JointState.ros_type}, not {spec.type}")
+        elif spec.topic == messages.JOINT_STATES and spec.type != messages.JointState.ros_type:
+            self.document.add(
+                (*key, "type"), f"{messages.JOINT_STATES} carries {messages.JointState.ros_type}, not {spec.type}"
+            )
         else:
             self._fits(key, spec)
         return spec
@@ -163,7 +164,7 @@ class ContractChecks:
                 return
             robot = self.sections.plain.get("robot")
             joints = list(robot.joint_names) if robot is not None else [joint]
-            if spec.topic == JOINT_STATES:
+            if spec.topic == messages.JOINT_STATES:
                 self.document.refer(key, joint, joints, "joint")
         self._size(key, spec.type, (path,))
 

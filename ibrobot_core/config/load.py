@@ -13,6 +13,7 @@ import ibrobot_core
 from ibrobot_core.config.checks import Checks
 from ibrobot_core.config.contract_checks import ContractChecks
 from ibrobot_core.config.missing import split
+from ibrobot_core.config.name_checks import check_names
 from ibrobot_core.config.overrides import apply_overrides, put
 from ibrobot_core.config.schema import ComponentConfig, ContractConfig, PeripheralConfig, RobotConfig
 from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_secrets
@@ -129,6 +130,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
     simulated = document.get("simulation", "default_control_mode") if sections.simulated else None
     entered = simulated or sections.plain.get("default_control_mode")
     Checks(document, sections, communicates).run()
+    check_names(document, sections)
     unavailable = split(document, sections.plain, sections.missing, entered, everything=communicates)
     contract_checks = ContractChecks(document, sections)
     contract = contract_checks.run()

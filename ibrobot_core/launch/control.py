@@ -16,7 +16,7 @@ from ibrobot_core.control.link import ControlState
 from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.launch.session import Session
-from ibrobot_core.messages import Float64MultiArray, Header, JointState
+from ibrobot_core.messages import JOINT_STATES, Float64MultiArray, Header, JointState
 
 
 class ControlComponent(Component):
@@ -82,7 +82,7 @@ class ControlComponent(Component):
         if not state.stale:  # what was not measured is missing, not repeated
             header = Header(state.stamp_ns)
             effort = state.effort if np.isfinite(state.effort).all() else np.empty(0)
-            bus.publish("/joint_states", JointState(header, self._joints, state.position, state.velocity, effort))
+            bus.publish(JOINT_STATES, JointState(header, self._joints, state.position, state.velocity, effort))
         for topic, columns in self._actions[session.mode]:
             bus.publish(topic, Float64MultiArray(state.command[columns]))
         begin = 0

@@ -84,6 +84,7 @@ def test_show_fills_in_the_defaults_and_loads_again(ibrobot: Ibrobot, robot: Pat
         "stop": "hold",
         "priority": 60,
         "state_timeout": 0.1,
+        "peer_timeout": 0.3,
         "following_error": {"distance": 0.25, "timeout": 2.0},
         "load_shedding": {"after": 60.0, "pose": ""},
     }

@@ -7,7 +7,15 @@ from typing import Any, override
 
 from ibrobot_core.interfaces import Severity
 from ibrobot_core.launch.session import Session, SessionWorker
-from ibrobot_core.messages import DiagnosticArray, DiagnosticStatus, Header, KeyValue, RobotStatus
+from ibrobot_core.messages import (
+    DIAGNOSTICS,
+    ROBOT_STATUS,
+    DiagnosticArray,
+    DiagnosticStatus,
+    Header,
+    KeyValue,
+    RobotStatus,
+)
 from ibrobot_core.units import NS_PER_S
 
 _PERIOD_NS = NS_PER_S // 5
@@ -34,8 +42,8 @@ class Status(SessionWorker):
         now_ns = session.clock.now_ns()
         if now_ns >= self._next_ns:
             self._next_ns = now_ns + _PERIOD_NS
-            session.bus.publish("/robot_status", self._status(now_ns))
-            session.bus.publish("/diagnostics", self._diagnostics(now_ns))
+            session.bus.publish(ROBOT_STATUS, self._status(now_ns))
+            session.bus.publish(DIAGNOSTICS, self._diagnostics(now_ns))
         if timeout_s > 0:
             self.pause(timeout_s)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import RUN_KEYS, OptionFault, TeleopDescriptor, documented, installed_plugins, option
+from ibrobot_core.api import RUN_KEYS, OptionFault, TeleopDescriptor, check_key, documented, installed_plugins, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import RobotConfig
@@ -21,8 +21,7 @@ PLANNER = "planner"
 
 
 def _check_key(_: object, __: object, key: str) -> None:
-    if not key:
-        raise ValueError("is empty; name a key, e.g. enter")
+    check_key(key)
 
 
 @documented

@@ -106,6 +106,9 @@ def control_map(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> Co
 def check_mapping(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> Iterator[OptionFault]:
     """Each joint has an axis, each control one meaning in each mode, and the tool a model."""
     gripper, arm = _parts(options, robot)
+    if options.gripper != "gripper" and options.gripper not in robot.groups:
+        message = f"unknown group {options.gripper!r}{did_you_mean(options.gripper, tuple(robot.groups), 'known')}"
+        yield OptionFault(("gripper",), message)
     if options.cartesian and robot.description.mjcf is None:
         yield OptionFault(("cartesian",), "tool jog needs robot.description.mjcf: set it, or cartesian: false", "mjcf")
     if options.start == "tool" and not options.cartesian:

@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 from ibrobot_core.api import (
     Command,
     ExecutorDescriptor,
+    ModelError,
     NoOptions,
     OptionFault,
     PlannerDescriptor,
     SectionDescriptor,
     SourceDescriptor,
+    did_you_mean,
     hookimpl,
+    read_mjcf,
 )
 from ibrobot_planning.engines import find_engines
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
@@ -130,6 +133,31 @@ def _tasks(options: NoOptions, session: Session) -> Component:
     return TaskRunner(session)
 
 
+def _unknown_names(options: WorldOptions, robot: Robot) -> Iterable[OptionFault]:
+    """Faults of names that are neither a link of the robot's model nor an object."""
+    mjcf = robot.description.mjcf
+    if mjcf is None:
+        return
+    try:
+        model = read_mjcf(mjcf)
+    except ModelError:
+        return  # core reports it
+    prefixes = tuple(robot.description.arms) or ("",)
+    links = [prefix + name for prefix in prefixes for name in ("world", *model.links, *model.frames)]
+    known = [*links, *options.objects, *options.clouds]
+    for name, thing in options.objects.items():
+        if name in links:
+            yield OptionFault(("objects", name), f"a link of {mjcf.name} has this name already")
+        if thing.link is not None and thing.link not in links:
+            yield OptionFault(
+                ("objects", name, "link"), f"unknown link {thing.link!r}{did_you_mean(thing.link, links, 'known')}"
+            )
+        for i, other in enumerate(thing.may_touch):
+            if other not in known:
+                message = f"unknown link or object {other!r}{did_you_mean(other, known, 'known')}"
+                yield OptionFault(("objects", name, "may_touch", i), message)
+
+
 def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
     """Check that the objects have sensible sizes and that meshes can be read."""
     for name, thing in options.objects.items():
@@ -137,6 +165,7 @@ def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -
             thing.made()
         except ValueError as error:
             yield OptionFault(("objects", name), str(error))
+    yield from _unknown_names(options, robot)
     for name in options.clouds:
         if name in options.objects:
             yield OptionFault(("clouds", name), f"there is an object {name!r} already; clouds need names of their own")

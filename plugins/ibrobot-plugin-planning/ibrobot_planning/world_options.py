@@ -13,6 +13,8 @@ from ibrobot_core.api import documented, option
 if TYPE_CHECKING:
     from ibrobot_planning.world import WorldObject
 
+FURTHEST = 1000.0
+"""The largest number of a position [m] or an angle [rad] that can be meant."""
 _KEYS = {
     "box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "height"), "capsule": ("radius", "height"),
     "plane": (), "mesh": ("file",),
@@ -48,6 +50,9 @@ class ObjectOptions:
             if key not in needed and value is not None:
                 takes = f"it takes {' and '.join(needed)}" if needed else "it takes no size"
                 raise ValueError(f"a {self.shape} has no {key}; {takes}")
+        for key, numbers in (("position", self.position), ("rpy", self.rpy), ("size", self.size or ())):
+            if any(abs(number) > FURTHEST for number in numbers):
+                raise ValueError(f"{key} is {list(numbers)}, must be numbers from -{FURTHEST:g} to {FURTHEST:g}")
         if self.size is not None and min(self.size) <= 0:
             raise ValueError(f"size is {list(self.size)}, must be three lengths above 0")
 

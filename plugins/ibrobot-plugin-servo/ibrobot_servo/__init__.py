@@ -62,5 +62,6 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """The section `tool_pose`."""
     yield SectionDescriptor(
         type="tool_pose", options=ToolPoseOptions, make=_pose, check_options=_check_pose, without_section=_has_model,
+        publishes=lambda options: [(("topic",), options.topic)],
         summary="the tool's pose in the base frame, on /robot_status/ee_pose",
     )  # fmt: skip

@@ -31,6 +31,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """Drive the tool with a hand in space."""
     yield TeleopDescriptor(
         type="webxr", options=WebxrOptions, make=_make, check_options=_check, events=_events,
+        peripherals=lambda options: [(("cameras", i), name) for i, name in enumerate(options.cameras)],
         summary="moves the tool with a phone, a VR controller or a hand, through a web page",
     )  # fmt: skip
 

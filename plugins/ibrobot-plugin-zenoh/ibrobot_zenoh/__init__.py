@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import Command, DecoderDescriptor, PanelDescriptor, TransportDescriptor, hookimpl
-from ibrobot_zenoh.options import Share, ZenohOptions, server_options
+from ibrobot_zenoh.options import Share, ZenohOptions, check_files, server_options
 
 if TYPE_CHECKING:
     import click
@@ -31,7 +31,8 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
     """Between machines."""
     yield TransportDescriptor(
         type="zenoh", options=ZenohOptions, make=_zenoh, default=True, listen=server_options, components=_components,
-        used=lambda options: options.share != Share(),
+        used=lambda options: options.share != Share(), check_options=check_files,
+        publishes=lambda options: [(("share", "subscribe", i), it) for i, it in enumerate(options.share.subscribe)],
         summary="between machines, including ROS 2 nodes with rmw_zenoh",
     )  # fmt: skip
 

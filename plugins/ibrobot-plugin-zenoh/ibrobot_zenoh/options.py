@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import OptionFault, Robot, documented, option
 
 MIB = 1024 * 1024
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
@@ -20,6 +20,7 @@ _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls|quic|unixsock-stream)/(?P<address>
 _ENCRYPTED = ("tls", "quic")
 
 
+_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _ROBOT = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
@@ -74,20 +75,23 @@ class Tls:
     robots: Path | None = option(None, help="to listen: a file of admitted robots, one name per line")
 
 
+def _check_name(what: str, name: str, given: tuple[str, ...]) -> None:
+    if not name.startswith("/"):
+        raise ValueError(f"{name!r} is not a full {what}, did you mean '/{name}'?")
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"{name!r} is not a {what}: it has letters, digits and _ between slashes, and no wildcards")
+    if given.count(name) > 1:
+        raise ValueError(f"{name} is listed twice")
+
+
 def _check_topics(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
     for topic in value:
-        if not topic.startswith("/"):
-            raise ValueError(f"{topic!r} is not a full topic name, did you mean '/{topic}'?")
-        if value.count(topic) > 1:
-            raise ValueError(f"{topic} is listed twice")
+        _check_name("topic name", topic, value)
 
 
 def _check_services(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
     for service in value:
-        if not service.startswith("/"):
-            raise ValueError(f"{service!r} is not a full name of a service, did you mean '/{service}'?")
-        if value.count(service) > 1:
-            raise ValueError(f"{service} is listed twice")
+        _check_name("name of a service", service.removesuffix("/"), tuple(each.removesuffix("/") for each in value))
 
 
 @documented
@@ -178,3 +182,14 @@ class ZenohOptions:
                     )
         if not re.fullmatch(r"(/?[A-Za-z_][A-Za-z0-9_]*)*", self.namespace or ""):
             raise ValueError(f"namespace {self.namespace!r} is not a ROS 2 name, e.g. robot1 or lab/robot1")
+
+
+def check_files(options: ZenohOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+    """Check that the files in the options exist."""
+    files: dict[tuple[str, ...], Path | None] = {("settings",): options.settings, ("users",): options.users}
+    if (tls := options.tls) is not None:
+        files |= {("tls", "ca"): tls.ca, ("tls", "certificate"): tls.certificate, ("tls", "key"): tls.key}
+        files[("tls", "robots")] = tls.robots
+    for key, path in files.items():
+        if path is not None and not path.is_file():
+            yield OptionFault(key, f"no such file: {path}")

@@ -1,0 +1,33 @@
+"""Checks of names that options give: topics that two components would publish, and peripherals that do not exist."""
+
+from __future__ import annotations
+
+from ibrobot_core.config.contract_checks import PERIPHERAL_TOPICS
+from ibrobot_core.config.schema import ContractConfig
+from ibrobot_core.config.structure import ParsedSections
+from ibrobot_core.config.yaml_nodes import Document
+from ibrobot_core.messages import RUN_TOPICS
+
+
+def check_names(document: Document, sections: ParsedSections) -> None:
+    """Add a fault for each topic that something else publishes, and for each unknown peripheral."""
+    publishers = _publishers(sections)
+    peripherals = [str(item.get("name")) for _, item in document.items("peripherals")]
+    for part in (*sections.active(), *sections.teleoperation.values()):
+        for option, topic in part.descriptor.publishes(part.component.options):
+            if topic in publishers:
+                document.add((*part.key, *option), f"{topic} is published by {publishers[topic]} already")
+            publishers.setdefault(topic, document.dotted(part.key))
+        for option, name in part.descriptor.peripherals(part.component.options):
+            document.refer((*part.key, *option), name, peripherals, "peripheral")
+
+
+def _publishers(sections: ParsedSections) -> dict[str, str]:
+    """Topic -> what publishes it, whatever the options of plugins say."""
+    contract: ContractConfig | None = sections.plain.get("contract")
+    found = dict.fromkeys(RUN_TOPICS, "every run")
+    found |= {spec.topic: "the actions of the contract" for spec in (contract.actions if contract else ())}
+    for name, part in sections.peripherals.items():
+        if part.component.kind in PERIPHERAL_TOPICS:
+            found[PERIPHERAL_TOPICS[part.component.kind][0].format(name=name)] = f"peripheral {name}"
+    return found
