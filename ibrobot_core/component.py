@@ -28,7 +28,11 @@ class Component(ABC):
         name: unique within the run, e.g. `sensor:top`.
         needs: names of the components that must be ready before this one starts.
         summary: one line for `--dry-run`.
+        sends_stops: whether an operator can send an emergency stop by it; at the end of the run it stops only after
+            the robot.
     """
+
+    sends_stops = False
 
     def __init__(self, name: str, summary: str, needs: tuple[str, ...] = ()) -> None:
         self.name = name

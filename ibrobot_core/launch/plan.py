@@ -157,6 +157,8 @@ def build_plan(session: Session) -> LaunchPlan:
         components.append(ViewerWorker(session, config.viewer, (CONTROL,)))
     if link is not None:
         components += shared
+        for each in (link, *shared):
+            each.sends_stops = True
     simulated = None
     if session.simulates_episodes:
         simulated = SimulatedEpisodes(session, (added.components()[-1].name,))

@@ -40,7 +40,7 @@ class Reset:
 SET_MODE = Service("/set_mode", SetMode, NoneType, "Enter another control mode.", alone="mode")
 RESET = Service("/reset", Reset, str, "Clear faults and the emergency stop; answers with what the robot does now.")
 ESTOP = Service("/estop", NoRequest, NoneType, "Stop the robot at once, and hold until a reset.")
-_CHANGE_S = 10.0
+_CHANGE_S = 2.0
 """How long the end of a run waits for a mode switch or reset under way [s]."""
 _GLANCE_S, _GLANCES = 0.1, 100
 """Timeout [s] and number of waits for the first joint state; several, since time passes for a stopped process too."""
@@ -243,7 +243,10 @@ class Runtime:
         session.log.info("mode %s goes on", session.mode)
 
     def stop(self) -> None:
-        """Stop every component in reverse starting order. Errors are logged, so that all are stopped."""
+        """Stop every component in reverse starting order, and the robot before those that can send emergency stops.
+
+        Errors are logged, so that all are stopped.
+        """
         session = self.session
         session.finish()
         for service in (SET_MODE, RESET):
@@ -252,18 +255,20 @@ class Runtime:
             self._started.remove(worker)
             self._stop_all([worker])
         session.episodes.end("unknown")
-        self._halt()
         changing = session.changing.acquire(timeout=_CHANGE_S)
         try:
             started, self._started = self._started, []
-            self._stop_all(started)
+            last = [each for each in started if each.sends_stops or isinstance(each, ControlComponent)]
+            self._stop_all([each for each in started if each not in last])
+            self._halt()
+            self._stop_all(last)
         finally:
             if changing:
                 session.changing.release()
             session.bus.unserve(ESTOP)
 
     def _halt(self) -> None:
-        """Let control carry out the stop behaviour while everything that can send an emergency stop still runs."""
+        """Let control carry out the stop behaviour, while the components that can send an emergency stop still run."""
         session, stops = self.session, self.session.stops
         if not session.has_control:
             return

@@ -251,7 +251,7 @@ class TestInterrupt:
         assert errors_in(error) == []
         np.testing.assert_allclose(run.commands()[1][-1], REST, atol=1e-4)
 
-    def test_the_second_ends_the_host_at_once_and_the_arm_stops_all_the_same(self, launch):
+    def test_the_second_ends_the_host_at_once_and_the_arm_brakes_on_its_way_to_the_pose(self, launch):
         run = launch("control.stop=pose far")
         run.host.send_signal(signal.SIGINT)
         count = len(run.log)
@@ -261,7 +261,23 @@ class TestInterrupt:
         assert run.host.wait(PATIENCE_S) == 130
         assert is_alive(run.control)
         wait_for(lambda: not is_alive(run.control), "the control process exits")
-        np.testing.assert_allclose(run.commands()[1][-1], FAR, atol=1e-4)
+        commands = run.commands()[1]
+        np.testing.assert_array_equal(commands[-1], commands[-2])
+        assert np.abs(commands[-1] - FAR).max() > 0.1
+
+    def test_a_second_sigterm_brakes_the_arm_on_its_way_to_the_pose_and_ends_in_order(self, launch):
+        run = launch("control.stop=pose far")
+        run.host.send_signal(signal.SIGTERM)
+        count = len(run.log)
+        wait_for(lambda: len(run.log) > count + 20, "the arm is on its way to the pose")
+        run.host.send_signal(signal.SIGTERM)
+        status, error = run.end()
+
+        assert status == 0
+        assert "emergency stop: the robot holds where it is, and the run ends" in error
+        commands = run.commands()[1]
+        np.testing.assert_array_equal(commands[-1], commands[-2])
+        assert np.abs(commands[-1] - FAR).max() > 0.1
 
 
 class TestDeath:

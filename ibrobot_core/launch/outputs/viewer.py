@@ -15,6 +15,8 @@ _RATE_HZ = 30.0
 class ViewerWorker(SessionWorker):
     """Updates a viewer 30 times a second; closing the window ends the run."""
 
+    sends_stops = True
+
     def __init__(self, session: Session, component: ComponentConfig, needs: tuple[str, ...]) -> None:
         super().__init__(session, "viewer", component.type, needs)
         self._component = component

@@ -20,6 +20,8 @@ class TeleopSource(SourceWorker):
     device again.
     """
 
+    sends_stops = True
+
     def __init__(self, session: Session, mode: ControlMode) -> None:
         self._devices = OperatorDevices(session, mode.devices)
         super().__init__(session, mode, f"teleop {self._devices}")
@@ -53,8 +55,12 @@ class TeleopSource(SourceWorker):
             command = self._devices.read(session.measured())
         except TeleopError as error:
             self.end()
+            if session.finished.is_set():
+                return
             session.control.call("fault", fault=str(error))
             return
+        if session.finished.is_set():
+            return  # from here on, only emergency stops count
         if command.positions:
             setpoint = np.array([list(command.positions.values())])
             session.send_plan(session.clock.now_ns(), 1, tuple(command.positions), setpoint)

@@ -96,6 +96,8 @@ class _Move:
     target: Target
     asked: bool = False
     """Whether the run ends after all such goals."""
+    stops: int = 0
+    """Number of emergency stops before it was requested."""
     failures: list[str] = attrs.field(factory=list)
     begun_ns: int | None = None
     planned: PlanResult | None = None
@@ -230,6 +232,7 @@ class PlannerSource(SourceWorker):
                 self._watch()
             if self._move is not None:
                 self._go_on(self._move)
+            self._drop_stopped()
             if self._move is None and self._queue and self._at_rest():
                 self._begin(self._queue.popleft())
             if self._move is not None and self.session.clock.now_ns() - self._status_ns >= _STATUS_NS:
@@ -262,7 +265,7 @@ class PlannerSource(SourceWorker):
         return self._submitted(self._new(goal, velocity_scaling))
 
     def _submitted(self, move: _Move) -> _Move:
-        self._inbox.put(move)
+        self._inbox.put(self._accepted(move))
         return move
 
     def _move_action(self, wanted: MoveRequest) -> int:
@@ -274,6 +277,17 @@ class PlannerSource(SourceWorker):
         parsed = Target("trajectory", trajectory=request.trajectory())
         self._plans.check(parsed)
         return self._submitted(_Move(self._results.number(), parsed)).number
+
+    def _accepted(self, move: _Move) -> _Move:
+        """A goal that may be followed.
+
+        Raises:
+            PlanningError: while the robot is stopped, since a goal must not wait for the reset.
+        """
+        if self.session.faults:
+            raise PlanningError(f"refused before a reset: {self.session.faults[-1]}", PlanCode.CONTROL_FAILED)
+        move.stops = self.session.stops
+        return move
 
     def _result(self, request: Numbered) -> MoveResult | None:
         return self._results.of(request.number)
@@ -322,7 +336,7 @@ class PlannerSource(SourceWorker):
                     f"takes geometry_msgs/msg/PoseStamped or Pose, got {message.ros_type}",
                     PlanCode.UNRECOGNIZED_GOAL_TYPE,
                 )
-            self._replace(self._new(_nearest(message)))
+            self._replace(self._accepted(self._new(_nearest(message))))
         except PlanningError as error:
             self.session.log.error("%s: %s: %s", CMD_POSE, error.code.name, error)
             self._show("failed")
@@ -343,6 +357,13 @@ class PlannerSource(SourceWorker):
         if move is None or move.target.trajectory is not None or not self._hand_over(old, move):
             old.dropped = why
             self._execution.stop(old.number)
+
+    def _drop_stopped(self) -> None:
+        """Fail the goals that were requested before an emergency stop."""
+        stopped = [move for move in self._queue if move.stops < self.session.stops]
+        for move in stopped:
+            self._queue.remove(move)
+            self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, "an emergency stop came after it")
 
     def _hand_over(self, old: _Move, new: _Move) -> bool:
         """Plan to the next goal while the robot moves; return False if it must stop first."""

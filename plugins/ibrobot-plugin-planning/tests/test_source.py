@@ -97,6 +97,37 @@ def test_emergency_stop_fails_the_goal_under_way(start: Make):
     assert runtime.summary()["goals_failed"] == 1
 
 
+def test_goals_requested_before_an_emergency_stop_do_not_begin_after_the_reset(start: Make):
+    runtime = start(mode="plan", goals=("up", "pan=-0.3"))
+    seconds(runtime, 0.1)
+    runtime.session.control.call("estop")
+    for _ in range(30):  # it brakes, and the source has no time to notice
+        runtime.session.clock.advance(20_000_000)
+        runtime.session.control.step()
+    runtime.reset()
+    seconds(runtime, 0.1)
+    resting = position(runtime)
+    seconds(runtime, 2.0)
+
+    assert position(runtime) == pytest.approx(resting, abs=1e-3)
+    assert runtime.summary()["goals_failed"] == 2
+
+
+def test_goal_sent_while_the_robot_is_stopped_is_refused(start: Make):
+    runtime = start(mode="plan")
+    runtime.session.control.call("estop")
+    seconds(runtime, 0.1)
+    with pytest.raises(PlanningError, match="refused before a reset: emergency stop"):
+        runtime.session.bus.call(GO_TO, "up")
+    runtime.reset()
+    resting = position(runtime)
+    seconds(runtime, 1.0)
+    assert position(runtime) == pytest.approx(resting, abs=1e-3)
+    runtime.session.bus.call(GO_TO, "up")
+    seconds(runtime, 2.0)
+    assert position(runtime)[0] == pytest.approx(0.4, abs=0.03)
+
+
 def test_status_of_an_earlier_goal_does_not_end_the_present_one(start: Make):
     runtime = start(mode="plan", goals=("up",))
     seconds(runtime, 0.1)

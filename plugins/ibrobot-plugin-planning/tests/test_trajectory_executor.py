@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_planning.executors.options import TrajectoryOptions
 from ibrobot_planning.executors.trajectory import TrajectoryExecutor
+from ibrobot_planning.executors.trajectory_goal import parse_goal
 
 from ibrobot_core.api import (
     Context,
@@ -526,3 +528,32 @@ def test_what_is_given_out_is_the_callers_to_change() -> None:
     for time_s in (0.5, 1.0, 1.1, 1.2):
         arm.executor.update(JointReading(ns(time_s), np.array([1.0, 0.0]), np.zeros(2), np.zeros(2)))[:] = 9.0
     assert arm.at(1.3) == [1.0, 0.0]
+
+
+HUGE = 10**400
+"""A whole number that no float can hold, which JSON may have."""
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [
+        ({"goal_time": 1e300}, "goal_time is 1e+300; it must be at most 1e+09"),
+        ({"goal_time": HUGE}, "goal_time is 1000"),
+        ({"path_tolerance": HUGE}, "path_tolerance is 1000"),
+        ({"goal_tolerance": {"pan": -HUGE}}, "goal_tolerance is -1000"),
+    ],
+    ids=["goal_time", "huge goal_time", "path_tolerance", "goal_tolerance"],
+)
+def test_numbers_that_no_clock_can_hold_are_refused(goal: dict[str, Any], message: str) -> None:
+    with pytest.raises(GoalRejected, match=re.escape(message)):
+        parse_goal({"trajectory": {"joint_names": ["pan"], "points": [POINT]}, **goal}, ["pan"], TrajectoryOptions())
+
+
+POINT = {"time_from_start_ns": 1_000_000_000, "positions": [0.1]}
+
+
+@pytest.mark.parametrize("field", ["positions", "velocities", "accelerations"])
+def test_points_with_numbers_that_no_float_can_hold_are_refused(field: str) -> None:
+    point = {**POINT, "velocities": [0.0], "accelerations": [0.0], field: [HUGE]}
+    with pytest.raises(GoalRejected, match=f"among its {field}; each must be a finite number"):
+        parse_goal({"trajectory": {"joint_names": ["pan"], "points": [point]}}, ["pan"], TrajectoryOptions())

@@ -162,9 +162,10 @@ def _tolerance(goal: Mapping[str, Any], name: str, default: float, joints: Seque
 
 def _setting(value: Any, default: float, name: str, highest: float = sys.float_info.max) -> float:
     """0 stands for the default, -1 for none (returned as 0)."""
-    if not _is_finite(value) or (value < 0 and value != -1) or value > highest:
-        up_to = "" if highest == sys.float_info.max else f" and at most {highest:g}"
-        raise GoalRejected(f"{name} is {value!r}; it must be above 0{up_to}, or 0 for the default, or -1 for none")
+    if not _is_finite(value) or (value < 0 and value != -1):
+        raise GoalRejected(f"{name} is {value!r}; it must be above 0, or 0 for the default, or -1 for none")
+    if value > highest:
+        raise GoalRejected(f"{name} is {value!r}; it must be at most {highest:g}")
     return default if value == 0 else max(float(value), 0.0)
 
 
