@@ -258,10 +258,11 @@ class Runtime:
         changing = session.changing.acquire(timeout=_CHANGE_S)
         try:
             started, self._started = self._started, []
-            last = [each for each in started if each.sends_stops or isinstance(each, ControlComponent)]
-            self._stop_all([each for each in started if each not in last])
+            control = next((i for i, each in enumerate(started) if isinstance(each, ControlComponent)), -1)
+            first = [each for each in started[control + 1 :] if not each.sends_stops]
+            self._stop_all(first)
             self._halt()
-            self._stop_all(last)
+            self._stop_all([each for each in started if each not in first])
         finally:
             if changing:
                 session.changing.release()

@@ -1,0 +1,391 @@
+"""Emergency stops of a run: they reach control at any time, and no request made before them undoes them."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import attrs
+import numpy as np
+import pytest
+
+from ibrobot_core.cli.run import _Panel
+from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, TeleopError, TransportError
+from ibrobot_core.launch.runtime import ESTOP, RESET, SET_MODE, Runtime
+from ibrobot_core.run_hooks import RunHooks
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from tests.launch.conftest import Runs
+
+PATIENCE_S = 30.0
+AFTER = "refused, an emergency stop came after it was requested"
+
+
+def steps(run: Runtime, count: int = 30) -> None:
+    for _ in range(count):
+        run.step()
+
+
+def stop(run: Runtime) -> None:
+    """Stop the robot, and wait until it has braked."""
+    run.session.bus.call(ESTOP, None)
+    steps(run)
+
+
+def is_stopped(run: Runtime) -> bool:
+    run.step()
+    assert run.session.state is not None
+    return run.session.state.estop
+
+
+@pytest.fixture
+def teleop(runs: Runs) -> Runtime:
+    """A robot that its operator moves."""
+    runtime = runs.start("control_modes.teleop.teleop=lever", mode="teleop")
+    lever = runs.parts.MADE["lever"]
+    lever.velocity, lever.deadman = 0.5, True
+    steps(runtime)
+    return runtime
+
+
+class TestReset:
+    def test_knows_of_all_stops_at_the_time_of_the_request(self, teleop: Runtime):
+        stop(teleop)
+        teleop.reset()
+        assert not is_stopped(teleop)
+
+    def test_of_a_sender_that_did_not_know_of_the_last_stop_is_refused(self, teleop: Runtime):
+        stop(teleop)
+        with pytest.raises(HardwareError, match=f"reset: {AFTER}"):
+            teleop.session.bus.call(RESET, {"stops": 0})
+        assert is_stopped(teleop)
+        teleop.session.bus.call(RESET, {"stops": teleop.session.stops})
+        assert not is_stopped(teleop)
+
+    def test_does_not_erase_a_stop_that_comes_while_a_device_recovers(self, teleop: Runtime, monkeypatch):
+        stop(teleop)
+        monkeypatch.setattr(teleop.session.command_source, "recover", teleop.session.emergency_stop)
+        with pytest.raises(HardwareError, match=f"reset: {AFTER}"):
+            teleop.reset()
+        assert is_stopped(teleop)
+
+    def test_after_which_the_mode_cannot_begin_leaves_the_robot_stopped(self, teleop: Runtime, monkeypatch):
+        stop(teleop)
+
+        def begin(seed: int) -> None:
+            raise TeleopError("the lever is gone")
+
+        with monkeypatch.context() as patched:
+            patched.setattr(teleop.session.command_source, "begin", begin)
+            with pytest.raises(TeleopError):
+                teleop.reset()
+        steps(teleop)
+        assert teleop.session.faults == ("mode teleop does not start over: the lever is gone",)
+        teleop.reset()
+        assert teleop.session.faults == ()
+
+    def test_that_control_refuses_does_not_end_a_mode_that_moves(self, teleop: Runtime, monkeypatch):
+        monkeypatch.setattr(teleop.session, "command", lambda do, **_: (_ for _ in ()).throw(HardwareError("not now")))
+        with pytest.raises(HardwareError, match="not now"):
+            teleop.reset()
+        assert teleop.session.command_source.active
+
+
+class TestModes:
+    def test_are_refused_while_the_robot_is_stopped(self, teleop: Runtime):
+        stop(teleop)
+        with pytest.raises(HardwareError, match="mode idle: refused before a reset: emergency stop"):
+            teleop.session.bus.call(SET_MODE, "idle")
+
+    def test_that_load_while_a_stop_comes_are_not_entered(self, runs: Runs, monkeypatch):
+        runtime = runs.start(mode="teleop")
+        monkeypatch.setattr(runs.parts.Net, "load", lambda net: runtime.session.emergency_stop())
+        with pytest.raises(HardwareError, match="refused before a reset: emergency stop"):
+            runtime.switch_mode("policy")
+        assert runtime.session.mode == "teleop"
+
+
+def concurrently(*acts: Callable[[], object]) -> list[str]:
+    """What several threads raised; the second begins once the first is under way."""
+    raised: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def act(each: Callable[[], object]) -> None:
+        try:
+            each()
+        except Exception as error:  # noqa: BLE001 - the test compares all that was raised
+            raised.put(str(error))
+
+    threads = [threading.Thread(target=act, args=(each,)) for each in acts]
+    for thread in threads:
+        thread.start()
+        time.sleep(0.02)
+    for thread in threads:
+        thread.join(PATIENCE_S)
+        assert not thread.is_alive()
+    found = []
+    while not raised.empty():
+        found.append(raised.get())
+    return found
+
+
+class TestOneAtATime:
+    @pytest.fixture
+    def slow(self, runs: Runs, monkeypatch) -> Runtime:
+        """A run whose policy takes a while to load."""
+        runtime = runs.start(mode="teleop")
+        monkeypatch.setattr(runs.parts.Net, "load", lambda net: time.sleep(0.2))
+        return runtime
+
+    def test_mode_switches_wait_for_one_another(self, slow: Runtime):
+        assert concurrently(lambda: slow.switch_mode("policy"), lambda: slow.switch_mode("plan")) == []
+        assert slow.session.mode == "plan"
+        assert slow.session.control._core.mode == "plan"
+        slow.switch_mode("teleop")
+        assert slow.session.mode == "teleop"
+        slow.reset()
+
+    def test_two_switches_to_the_same_mode_are_one(self, slow: Runtime, runs: Runs):
+        assert concurrently(lambda: slow.switch_mode("policy"), lambda: slow.switch_mode("policy")) == []
+        assert slow.session.mode == "policy"
+        assert [event for event in runs.parts.EVENTS if event[0] == "mode"] == [("mode", "teleop", "policy")]
+
+    def test_a_reset_waits_for_a_mode_switch(self, slow: Runtime):
+        assert concurrently(lambda: slow.switch_mode("policy"), slow.reset) == []
+        assert slow.session.mode == "policy"
+
+    def test_what_waits_when_a_stop_comes_is_refused(self, slow: Runtime):
+        raised = concurrently(
+            lambda: slow.switch_mode("policy"),
+            slow.reset,
+            lambda: slow.switch_mode("plan"),
+            slow.session.emergency_stop,
+        )
+        assert sorted(raised) == [
+            f"mode plan: {AFTER}", f"reset: {AFTER}", "switch_mode: refused before a reset: emergency stop",
+        ]  # fmt: skip
+        assert is_stopped(slow)
+        assert slow.session.mode == "teleop"
+
+    def test_what_waits_when_the_run_ends_is_refused(self, slow: Runtime):
+        raised = concurrently(lambda: slow.switch_mode("policy"), slow.reset, slow.session.finish)
+        assert raised == ["reset: refused, the run ends"]
+
+    def test_an_emergency_stop_waits_for_nobody(self, slow: Runtime):
+        with slow.session.changing:
+            thread = threading.Thread(target=lambda: slow.session.bus.call(ESTOP, None))
+            thread.start()
+            thread.join(PATIENCE_S)
+            assert slow.session.stops == 1
+
+
+class TestEpisodes:
+    def test_the_next_one_does_not_clear_a_stop_that_comes_just_before(self, runs: Runs, monkeypatch):
+        runtime = runs.start(episodes=3)
+        steps(runtime, 10)
+        session = runtime.session
+        real = session.control.call
+
+        def call(do: str, **arguments: Any) -> Any:
+            if do == "reset_episode" and not session.stops:
+                real("estop")  # after the check of the host
+            return real(do, **arguments)
+
+        monkeypatch.setattr(session.control, "call", call)
+        steps(runtime, 60)  # the first ends
+
+        assert session.stops == 1
+        assert is_stopped(runtime)
+        assert [event[0] for event in runs.parts.EVENTS] == ["started", "ended", "fault"]
+        assert not session.finished.is_set()
+
+    def test_none_begins_while_the_state_of_the_run_changes(self, runs: Runs):
+        runtime = runs.start(episodes=3)
+        changes, done = threading.Event(), threading.Event()
+
+        def change() -> None:
+            with runtime.session.changing:
+                changes.set()
+                done.wait(PATIENCE_S)
+
+        thread = threading.Thread(target=change)
+        thread.start()
+        changes.wait(PATIENCE_S)
+        steps(runtime, 10)
+        assert runs.parts.EVENTS == []
+        done.set()
+        thread.join()
+        steps(runtime, 10)
+        assert [event[0] for event in runs.parts.EVENTS] == ["started"]
+
+
+class TestDevices:
+    def test_a_stop_pressed_on_one_counts_when_another_fails(self, runs: Runs):
+        runtime = runs.start("control_modes.teleop.teleop={arm: lever, gripper: stick}", mode="teleop")
+        lever, stick = runs.parts.MADE["lever"], runs.parts.MADE["stick"]
+        read = lever.read
+
+        def gone(measured: object) -> None:
+            raise TeleopError("the stick is gone")
+
+        lever.read = lambda measured: pressed(read(measured))
+        stick.read = gone
+        steps(runtime, 2)
+        assert runtime.session.stops >= 1
+        assert is_stopped(runtime)
+
+    def test_one_can_stop_the_robot_on_its_way_to_the_stop_pose(self, runs: Runs):
+        runtime = runs.start("control_modes.teleop.teleop=lever", "control.stop=pose up", mode="teleop")
+        lever = runs.parts.MADE["lever"]
+        source = runtime.session.command_source
+        read = lever.read
+        lever.read = lambda measured: pressed(read(measured))
+        runtime.session.finish()
+        runtime.session.control.step()
+        source.step(runtime.session.clock.now_ns())
+
+        assert runtime.session.stops == 1
+
+
+def pressed(command: Any) -> Any:
+    """A command with its emergency stop pressed."""
+    return attrs.evolve(command, estop=True)
+
+
+class TestServed:
+    def test_from_before_control_runs_and_then_the_run_ends(self, runs: Runs, caplog):
+        runtime = runs.make(mode="policy")
+
+        def load(net: object) -> None:
+            runtime.session.bus.call(ESTOP, None)
+
+        runs.parts.Net.load, real = load, runs.parts.Net.load
+        try:
+            runtime.start()
+        finally:
+            runs.parts.Net.load = real
+        assert runtime.session.finished.is_set()
+        assert "emergency stop while nothing commands the robot: the run ends" in caplog.text
+
+    def test_while_other_components_start(self, runs: Runs, monkeypatch):
+        runtime = runs.make(mode="policy")
+        monkeypatch.setattr(runs.parts.Camera, "open", lambda camera: runtime.session.bus.call(ESTOP, None))
+        runtime.start()
+        assert is_stopped(runtime)
+        assert runtime.session.stops == 2
+        assert runs.parts.EVENTS[0] == ("fault", "emergency stop")
+
+    def test_on_the_way_to_the_startup_pose_which_brakes_and_ends_the_start(self, runs: Runs):
+        runtime = runs.make("control.startup=pose up", mode="teleop")
+        commands = recorded(runtime, stop_at=10)
+        with pytest.raises(ComponentFailed, match=r"^control: control\.startup: pose up: emergency stop$"):
+            runtime.start()
+        assert_braked(commands)
+
+    def test_on_the_way_to_the_stop_pose_which_brakes(self, runs: Runs, caplog):
+        runtime = runs.start("control.stop=pose up", mode="teleop")
+        steps(runtime, 5)
+        commands = recorded(runtime, stop_at=10)
+        runtime.stop()
+        assert_braked(commands)
+        assert "emergency stop: the robot holds where it is, and the run ends" in caplog.text
+        with pytest.raises(TransportError):
+            runtime.session.bus.call(ESTOP, None)
+
+    def test_no_other_request_is_taken_at_the_end(self, runs: Runs):
+        runtime = runs.start(mode="teleop")
+        runtime.session.finish()
+        for act in (runtime.reset, lambda: runtime.switch_mode("idle")):
+            with pytest.raises(NotSupported, match="the run ends"):
+                act()
+
+
+def recorded(runtime: Runtime, stop_at: int) -> list[Any]:
+    """The commands from now on; at one of them, the emergency stop is pressed."""
+    commands: list[Any] = []
+
+    def take(state: Any) -> None:
+        commands.append(state.command)
+        if len(commands) == stop_at:
+            runtime.session.bus.call(ESTOP, None)
+
+    runtime.session.on_state.append(take)
+    return commands
+
+
+def assert_braked(commands: list[Any]) -> None:
+    """The commands end at rest, before the pose, and stay within the limits of the robot at 50 Hz."""
+    steps = np.diff(commands, axis=0)
+    assert np.abs(steps[8]).max() > 0.004
+    np.testing.assert_array_equal(steps[-1], 0.0)
+    assert np.abs(np.diff(steps, axis=0)).max() <= 10.0 * 0.02**2 * (1 + 1e-9)
+    assert np.abs(commands[-1] - [0.4, 0.2]).max() > 0.05
+
+
+class Typed(queue.SimpleQueue[str]):
+    """Keys; after `end`, the thread that waits for them ends."""
+
+    def get(self, *arguments: Any) -> str:
+        if (key := super().get(*arguments)) == "end":
+            raise SystemExit
+        return key
+
+
+class Keys:
+    """Keys of a terminal, typed by a test, and the panel that takes them."""
+
+    def __init__(self, run: Runtime) -> None:
+        self.typed = Typed()
+        self.panel = _Panel.__new__(_Panel)
+        self.panel._runtime, self.panel._hooks, self.panel._pressed = run, RunHooks(), queue.SimpleQueue()
+        self.thread = threading.Thread(target=self.panel._listen, args=(self.typed,), daemon=True)
+        self.thread.start()
+
+    def close(self) -> None:
+        self.typed.put("end")
+        self.thread.join(PATIENCE_S)
+
+    def press(self, *keys: str) -> None:
+        """Press keys, and wait until they were received."""
+        for key in keys:
+            self.typed.put(key)
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not self.typed.empty():
+            assert time.monotonic() < deadline_s
+            time.sleep(0.001)
+        time.sleep(0.02)
+
+    def handle(self) -> None:
+        """Handle the pressed keys, as the panel does when it is drawn."""
+        while not self.panel._pressed.empty():
+            self.panel._handle_key(*self.panel._pressed.get())
+
+
+class TestKeys:
+    @pytest.fixture
+    def keys(self, teleop: Runtime) -> Iterator[Keys]:
+        keys = Keys(teleop)
+        yield keys
+        keys.close()
+
+    def test_pressed_before_escape_do_nothing_after_it(self, teleop: Runtime, keys: Keys, caplog):
+        stop(teleop)
+        keys.press("f10", "f6", "esc")
+        keys.handle()
+        steps(teleop)
+        assert is_stopped(teleop)
+        assert teleop.session.mode == "teleop"
+        assert "f10 was pressed before the emergency stop, which cancels it" in caplog.text
+        keys.press("f10")
+        keys.handle()
+        assert not is_stopped(teleop)
+
+    def test_pressed_before_a_stop_of_another_person_do_nothing_after_it(self, teleop: Runtime, keys: Keys):
+        stop(teleop)
+        keys.press("f10")
+        teleop.session.bus.call(ESTOP, None)
+        keys.handle()
+        assert is_stopped(teleop)
