@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import attrs
@@ -109,77 +110,107 @@ class TestModes:
         assert runtime.session.mode == "teleop"
 
 
-def concurrently(*acts: Callable[[], object]) -> list[str]:
-    """What several threads raised; the second begins once the first is under way."""
-    raised: queue.SimpleQueue[str] = queue.SimpleQueue()
+class Turns:
+    """The lock of a run, which counts those who have asked for it."""
 
-    def act(each: Callable[[], object]) -> None:
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self.asked = 0
+        self.acquire, self.release = self._lock.acquire, self._lock.release
+
+    def __enter__(self) -> None:
+        self.asked += 1
+        self._lock.acquire()
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
+
+
+@attrs.define
+class Slow:
+    """A run whose policy loads until a test lets it go on."""
+
+    run: Runtime
+    turns: Turns = attrs.field(factory=Turns)
+    loaded: threading.Event = attrs.field(factory=threading.Event)
+    raised: queue.SimpleQueue[str] = attrs.field(factory=queue.SimpleQueue)
+
+    def concurrently(self, *acts: Callable[[], object], meanwhile: Callable[[], object] = lambda: None) -> list[str]:
+        """Let threads act, each after the one before has asked for its turn; returns what was raised."""
+        self.run.session.changing = self.turns
+        threads = [threading.Thread(target=self._act, args=(each,)) for each in acts]
+        deadline_s = time.monotonic() + PATIENCE_S
+        for number, thread in enumerate(threads, 1):
+            thread.start()
+            while self.turns.asked < number:
+                assert time.monotonic() < deadline_s
+                time.sleep(0.001)
+        meanwhile()
+        self.loaded.set()
+        for thread in threads:
+            thread.join(PATIENCE_S)
+            assert not thread.is_alive()
+        found = []
+        while not self.raised.empty():
+            found.append(self.raised.get())
+        return found
+
+    def _act(self, act: Callable[[], object]) -> None:
         try:
-            each()
+            act()
         except Exception as error:  # noqa: BLE001 - the test compares all that was raised
-            raised.put(str(error))
-
-    threads = [threading.Thread(target=act, args=(each,)) for each in acts]
-    for thread in threads:
-        thread.start()
-        time.sleep(0.02)
-    for thread in threads:
-        thread.join(PATIENCE_S)
-        assert not thread.is_alive()
-    found = []
-    while not raised.empty():
-        found.append(raised.get())
-    return found
+            self.raised.put(str(error))
 
 
 class TestOneAtATime:
     @pytest.fixture
-    def slow(self, runs: Runs, monkeypatch) -> Runtime:
-        """A run whose policy takes a while to load."""
-        runtime = runs.start(mode="teleop")
-        monkeypatch.setattr(runs.parts.Net, "load", lambda net: time.sleep(0.2))
-        return runtime
+    def slow(self, runs: Runs, monkeypatch) -> Slow:
+        slow = Slow(runs.start(mode="teleop"))
+        monkeypatch.setattr(runs.parts.Net, "load", lambda net: slow.loaded.wait(PATIENCE_S))
+        return slow
 
-    def test_mode_switches_wait_for_one_another(self, slow: Runtime):
-        assert concurrently(lambda: slow.switch_mode("policy"), lambda: slow.switch_mode("plan")) == []
-        assert slow.session.mode == "plan"
-        assert slow.session.control._core.mode == "plan"
-        slow.switch_mode("teleop")
-        assert slow.session.mode == "teleop"
-        slow.reset()
+    def test_mode_switches_wait_for_one_another(self, slow: Slow):
+        run = slow.run
+        assert slow.concurrently(lambda: run.switch_mode("policy"), lambda: run.switch_mode("plan")) == []
+        assert run.session.mode == "plan"
+        assert run.session.control._core.mode == "plan"
+        run.switch_mode("teleop")
+        assert run.session.mode == "teleop"
+        run.reset()
 
-    def test_two_switches_to_the_same_mode_are_one(self, slow: Runtime, runs: Runs):
-        assert concurrently(lambda: slow.switch_mode("policy"), lambda: slow.switch_mode("policy")) == []
-        assert slow.session.mode == "policy"
+    def test_two_switches_to_the_same_mode_are_one(self, slow: Slow, runs: Runs):
+        run = slow.run
+        assert slow.concurrently(lambda: run.switch_mode("policy"), lambda: run.switch_mode("policy")) == []
+        assert run.session.mode == "policy"
         assert [event for event in runs.parts.EVENTS if event[0] == "mode"] == [("mode", "teleop", "policy")]
 
-    def test_a_reset_waits_for_a_mode_switch(self, slow: Runtime):
-        assert concurrently(lambda: slow.switch_mode("policy"), slow.reset) == []
-        assert slow.session.mode == "policy"
+    def test_a_reset_waits_for_a_mode_switch(self, slow: Slow):
+        assert slow.concurrently(lambda: slow.run.switch_mode("policy"), slow.run.reset) == []
+        assert slow.run.session.mode == "policy"
 
-    def test_what_waits_when_a_stop_comes_is_refused(self, slow: Runtime):
-        raised = concurrently(
-            lambda: slow.switch_mode("policy"),
-            slow.reset,
-            lambda: slow.switch_mode("plan"),
-            slow.session.emergency_stop,
-        )
+    def test_what_waits_when_a_stop_comes_is_refused(self, slow: Slow):
+        run = slow.run
+        raised = slow.concurrently(
+            lambda: run.switch_mode("policy"), run.reset, lambda: run.switch_mode("plan"),
+            meanwhile=run.session.emergency_stop,
+        )  # fmt: skip
         assert sorted(raised) == [
             f"mode plan: {AFTER}", f"reset: {AFTER}", "switch_mode: refused before a reset: emergency stop",
         ]  # fmt: skip
-        assert is_stopped(slow)
-        assert slow.session.mode == "teleop"
+        assert is_stopped(run)
+        assert run.session.mode == "teleop"
 
-    def test_what_waits_when_the_run_ends_is_refused(self, slow: Runtime):
-        raised = concurrently(lambda: slow.switch_mode("policy"), slow.reset, slow.session.finish)
+    def test_what_waits_when_the_run_ends_is_refused(self, slow: Slow):
+        run = slow.run
+        raised = slow.concurrently(lambda: run.switch_mode("policy"), run.reset, meanwhile=run.session.finish)
         assert raised == ["reset: refused, the run ends"]
 
-    def test_an_emergency_stop_waits_for_nobody(self, slow: Runtime):
-        with slow.session.changing:
-            thread = threading.Thread(target=lambda: slow.session.bus.call(ESTOP, None))
+    def test_an_emergency_stop_waits_for_nobody(self, teleop: Runtime):
+        with teleop.session.changing:
+            thread = threading.Thread(target=lambda: teleop.session.bus.call(ESTOP, None))
             thread.start()
             thread.join(PATIENCE_S)
-            assert slow.session.stops == 1
+            assert teleop.session.stops == 1
 
 
 class TestEpisodes:
@@ -328,7 +359,11 @@ def assert_braked(commands: list[Any]) -> None:
 class Typed(queue.SimpleQueue[str]):
     """Keys; after `end`, the thread that waits for them ends."""
 
+    taken = 0
+    """Number of keys that were handled: it asks for the next one."""
+
     def get(self, *arguments: Any) -> str:
+        self.taken += 1
         if (key := super().get(*arguments)) == "end":
             raise SystemExit
         return key
@@ -341,8 +376,14 @@ class Keys:
         self.typed = Typed()
         self.panel = _Panel.__new__(_Panel)
         self.panel._runtime, self.panel._hooks, self.panel._pressed = run, RunHooks(), queue.SimpleQueue()
-        self.thread = threading.Thread(target=self.panel._listen, args=(self.typed,), daemon=True)
+        self.thread = threading.Thread(target=self._listen)
         self.thread.start()
+        while not self.typed.taken:
+            time.sleep(0.001)
+
+    def _listen(self) -> None:
+        with suppress(SystemExit):
+            self.panel._listen(self.typed)
 
     def close(self) -> None:
         self.typed.put("end")
@@ -350,13 +391,13 @@ class Keys:
 
     def press(self, *keys: str) -> None:
         """Press keys, and wait until they were received."""
+        wanted = self.typed.taken + len(keys)
         for key in keys:
             self.typed.put(key)
         deadline_s = time.monotonic() + PATIENCE_S
-        while not self.typed.empty():
+        while self.typed.taken < wanted:
             assert time.monotonic() < deadline_s
             time.sleep(0.001)
-        time.sleep(0.02)
 
     def handle(self) -> None:
         """Handle the pressed keys, as the panel does when it is drawn."""
