@@ -9,9 +9,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-import attrs
-
-from ibrobot_core.api import IbrobotError, PlanningError, Session, error_text, ns, seconds
+from ibrobot_core.api import IbrobotError, PlanningError, Session, error_text, seconds
 from ibrobot_web.messages import (
     BeginEpisode,
     Cancel,
@@ -28,7 +26,7 @@ from ibrobot_web.messages import (
     Sent,
     SetMode,
     SetSmoothing,
-    clock_ms,
+    clock_ns,
 )
 from ibrobot_web.teleop import JOG, RELEASE, Released
 from ibrobot_web.teleop import Jog as JogRequest
@@ -43,6 +41,7 @@ _ALWAYS = Finish | Reset | Preview
 """Commands that may be older than an emergency stop: a reset says which stops it clears, the others move nothing."""
 _STOPPED = "an emergency stop came after this command was sent, so it is not carried out; reset, then send it again"
 _PREVIEW_ROWS = 40
+_NS_PER_MS = 1_000_000
 _log = logging.getLogger("ibrobot.web")
 
 
@@ -161,24 +160,25 @@ def _waiting[T](waiting: queue.SimpleQueue[T]) -> list[T]:
 def _jog(session: Session, sent: Sent[Jog]) -> None:
     if not session.bus.serves(JOG):
         raise IbrobotError("this mode does not jog from the page: enter a mode whose teleop is of type web")
-    jog, now_ms = sent.command, clock_ms()
+    jog, now_ms = sent.command, clock_ns() / _NS_PER_MS
     if jog.at > now_ms + _AHEAD_MS:
         raise IbrobotError("the page's time is wrong; press again")
     if now_ms - jog.at > _LATE_MS:
         raise IbrobotError(f"the connection is too slow to jog: {(now_ms - jog.at) / 1e3:.1f} s")
-    facts = attrs.asdict(jog, filter=lambda field, _: field.name not in ("at", "press"))
-    session.bus.call(JOG, JogRequest(_run_time(session, jog.at), _run_time(session, jog.press), **facts))
+    made_ns, began_ns = _run_times(session, jog.at, jog.press)
+    session.bus.call(JOG, JogRequest(made_ns, began_ns, jog.joints, jog.targets, jog.linear, jog.turn, jog.pose))
 
 
 def _release(session: Session, sent: Sent[Release]) -> None:
     if session.bus.serves(RELEASE):
         at = sent.command.at
-        session.bus.call(RELEASE, Released(None if at is None else _run_time(session, at)))
+        session.bus.call(RELEASE, Released(None if at is None else _run_times(session, at)[0]))
 
 
-def _run_time(session: Session, at_ms: int) -> int:
-    """A time of `clock_ms` by the run's clock [ns]; the present for a later one."""
-    return session.clock.now_ns() - ns(max(0, clock_ms() - at_ms) / 1e3)
+def _run_times(session: Session, *times_ms: int) -> list[int]:
+    """Times of `clock_ms` by the run's clock [ns], in the same order; the present for later ones."""
+    now_ns, page_ns = session.clock.now_ns(), clock_ns()
+    return [now_ns - max(0, page_ns - time_ms * _NS_PER_MS) for time_ms in times_ms]
 
 
 def _reset(session: Session, sent: Sent[Reset]) -> Any:

@@ -20,6 +20,7 @@ from ibrobot_core.api import IbrobotError, RequestError, RequestLimits, Service,
 LARGEST_MESSAGE = 16_384
 """Largest message of a page [bytes]."""
 _CLOCK = time.CLOCK_BOOTTIME if sys.platform == "linux" else time.CLOCK_MONOTONIC
+_NS_PER_MS = 1_000_000
 _LIMITS = RequestLimits(values=300, text=1000, depth=4)
 _LARGEST = 2**53
 """Numbers of commands and times are smaller, so that JavaScript can count them."""
@@ -30,7 +31,12 @@ def clock_ms() -> int:
 
     It goes on while the machine is suspended, where the system can say so.
     """
-    return time.clock_gettime_ns(_CLOCK) // 1_000_000
+    return clock_ns() // _NS_PER_MS
+
+
+def clock_ns() -> int:
+    """As `clock_ms` [ns]."""
+    return time.clock_gettime_ns(_CLOCK)
 
 
 def within_one(instance: object, attribute: object, values: Mapping[str, float] | tuple[float, ...]) -> None:

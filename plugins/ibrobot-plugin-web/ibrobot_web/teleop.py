@@ -27,6 +27,8 @@ from ibrobot_core.api import (
 from ibrobot_web.messages import within_one
 from ibrobot_web.options import WebTeleopOptions
 
+_SAME_PRESS_NS = 500_000
+"""Two presses begin further apart [ns]; the begin of one may differ by less from message to message."""
 _LONGEST_STEP_S = 0.1
 """Longest motion of one command [s], so that the robot does not jump after a pause of the host."""
 
@@ -111,7 +113,7 @@ class WebTeleop(Teleop):
         with self._lock:
             if request.began_ns <= self._released_ns:
                 return
-            if self._request is None or request.began_ns > self._request.began_ns:
+            if self._request is None or request.began_ns > self._request.began_ns + _SAME_PRESS_NS:
                 self.deadman.report(False, request.began_ns)
             self.deadman.report(True, request.made_ns)
             self._request = request

@@ -200,3 +200,21 @@ def test_the_page_can_end_the_run(rig: Callable[..., Rig]) -> None:
     found.send(messages.Finish(), stops=None)
     assert found.answers(1) == [{"reply": 0, "ok": None}]
     assert found.finished.is_set()
+
+
+@pytest.mark.parametrize(
+    ("age_ms", "why"), [(0, ""), (100, ""), (300, "the connection is too slow to jog: 0.3 s"), (-100, "time is wrong")]
+)
+def test_a_message_of_the_deadman_counts_while_it_is_young(rig: Callable[..., Rig], age_ms: int, why: str) -> None:
+    taken: list[Any] = []
+    found = rig({"/web_teleop/jog": taken.append})
+    now_ns, at = found.session.clock.now_ns(), messages.clock_ms() - age_ms
+    found.send(messages.Jog(at, at, {"gripper": 0.5}))
+    (answer,) = found.answers(1)
+    if why:
+        assert why in answer["error"]
+        assert taken == []
+    else:
+        assert taken[0].joints == {"gripper": 0.5}
+        assert taken[0].made_ns == taken[0].began_ns, "which the deadman would otherwise take for an old press"
+        assert taken[0].made_ns == pytest.approx(now_ns - age_ms * 1_000_000, abs=5_000_000)

@@ -7,6 +7,8 @@ from typing import Any, override
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from ibrobot_testing import TeleopSuite, check_descriptor, host_context
 from ibrobot_web import ibrobot_teleop
 from ibrobot_web.options import WebTeleopOptions
@@ -212,3 +214,11 @@ def test_requests_that_fit_no_robot_are_refused() -> None:
         with pytest.raises(TeleopError, match=why):
             rig.ctx.bus.call(JOG, request)
     assert not rig.tick()
+
+
+@given(st.lists(st.integers(-100_000, 100_000), min_size=30, max_size=30))
+def test_a_press_whose_begin_is_known_to_a_tenth_of_a_millisecond_stays_one(errors_ns: list[int]) -> None:
+    rig = Rig()
+    began_ns = rig.press()
+    assert rig.hold(began_ns)
+    assert all(rig.hold(began_ns + error_ns) for error_ns in errors_ns)

@@ -40,7 +40,8 @@ export class Deadman {
     const stalled = now - this.alive > STALL_MS;
     const slow = this.asked !== null && now - this.asked > STALL_MS;
     this.alive = now;
-    if (stalled || slow) this.refuse(stalled ? "this page stalled" : "the connection is too slow to jog");
+    if (stalled) this.refuse("this page stalled");
+    else if (slow) this.refuse("the connection is too slow to jog");
     else this.send();
   }
 
@@ -59,15 +60,20 @@ export class Deadman {
 
   refuse(why) {
     if (!this.request) return;
-    this.release();
+    this.end();
     this.drive.emit("refused", `${why}: released; press again`);
   }
 
   release() {
     if (!this.request) return;
+    // Behind a message that is still on its way it would come after the run's own limit, and delay a STOP.
+    if (this.asked === null || performance.now() - this.asked < STALL_MS) this.drive.tell("release", { at: this.drive.clock.now() });
+    this.end();
+  }
+
+  end() {
     this.request = null;
     clearInterval(this.timer);
-    this.drive.tell("release", { at: this.drive.clock.now() });
     this.notify();
   }
 
