@@ -73,7 +73,15 @@ def _part(holder: Any, word: str) -> str | int:
     raise ValueError(f"the list has no such item{did_you_mean(word, known, 'items')}")
 
 
-def single_options[T](kind: type[T], overrides: Sequence[str], name: str, flag: str = "--set", text: str = "{}") -> T:
+def single_options[T](
+    kind: type[T],
+    overrides: Sequence[str],
+    name: str,
+    flag: str = "--set",
+    text: str = "{}",
+    *,
+    expands: bool = True,
+) -> T:
     """An options class, or another attrs class such as a message, checked like a section of a robot YAML.
 
     Args:
@@ -82,11 +90,12 @@ def single_options[T](kind: type[T], overrides: Sequence[str], name: str, flag: 
         name: name of the component in errors.
         flag: the command line's option for overrides.
         text: initial YAML, e.g. `{data: true}`.
+        expands: whether `${NAME}` and `~/` in the text are expanded; see `parse_yaml`.
 
     Raises:
         ConfigError: with all faults.
     """
-    document = parse_yaml(text, name)
+    document = parse_yaml(text, name, expands=expands)
     apply_overrides(document, overrides, flag)
     document.raise_problems()
     try:

@@ -205,8 +205,14 @@ def is_text(text: str) -> bool:
         return False
 
 
-def parse_yaml(text: str, file: str) -> Document:
+def parse_yaml(text: str, file: str, *, expands: bool = True) -> Document:
     """Read one YAML document. The result contains faults, except for text that is not valid YAML.
+
+    Args:
+        text: the YAML.
+        file: its name in faults.
+        expands: whether `${NAME}` and `~/` are expanded; False for text from elsewhere, which must not read the
+            environment of this machine.
 
     Raises:
         ConfigError: e.g. an unclosed bracket.
@@ -216,7 +222,7 @@ def parse_yaml(text: str, file: str) -> Document:
         raise ConfigError([Problem(file, 0, "", f"too long: a robot YAML has at most {MAX_BYTES // 1024} kB")])
     try:
         node = _compose(text)
-        document.root = None if node is None else _Constructor(document).value(node, ())
+        document.root = None if node is None else _Constructor(document, expands).value(node, ())
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 0
@@ -243,6 +249,7 @@ def _reason(error: yaml.MarkedYAMLError) -> str:
 @attrs.define
 class _Constructor:
     document: Document
+    _expands: bool
     _open: set[int] = attrs.field(factory=set)
     """Constructs plain values from nodes; a node met again while under construction is an alias to its own block."""
     _values: int = 0
@@ -288,7 +295,7 @@ class _Constructor:
     def scalar(self, node: ScalarNode, key: Key) -> Any:
         self.refuse_tag(node, key)
         try:
-            text = expand(node.value)
+            text = expand(node.value) if self._expands else node.value
             if text != node.value:
                 self.document.references[key] = node.value
             return scalar(text) if not node.style else text

@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import JointTrajectory, PlanCode, PlanningError, Robot, Vector, ns, seconds
 from ibrobot_planning.blend import motion_of, trajectory_of
-from ibrobot_planning.timing import Motion
+from ibrobot_planning.timing import LONGEST_S, Motion
 
 START_RAD = 0.01
 """Allowed distance between the start of a trajectory and the robot, that of MoveIt."""
 MOST_POINTS = 2000
 """Points of a given trajectory, at most: the control process reads them between two ticks."""
-LONGEST_S = 300.0
-"""Duration of a given trajectory, at most."""
 _SAME_RAD = 1e-6
 """A start this near to the robot needs no motion to it."""
 _STILL = 1e-6

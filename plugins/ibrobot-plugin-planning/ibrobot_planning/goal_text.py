@@ -25,6 +25,7 @@ from ibrobot_core.api import (
     Vector3,
 )
 from ibrobot_planning.poses import named_pose
+from ibrobot_planning.timing import scaling_fault
 from ibrobot_planning.transforms import from_rpy
 
 POLICIES: tuple[str, ...] = get_args(OrientationPolicy)
@@ -59,16 +60,15 @@ def target(goal: str | Goal | Target, robot: Robot, velocity_scaling: float = 1.
             `axis=X,Y,Z` (or `down`, `up`), with `rpy=R,P,Y` [rad] or with `quat=X,Y,Z,W`. Joints that do not move the
             tool may stand beside a position.
         robot: the robot.
-        velocity_scaling: fraction of the velocity limits, in (0, 1].
+        velocity_scaling: fraction of the velocity limits, from `LEAST_SCALING` to 1.
 
     Raises:
         PlanningError: for a goal that makes no sense for this robot.
     """
     if isinstance(goal, Target):
         return goal
-    # Written so that NaN fails it.
-    if not 0 < velocity_scaling <= 1:
-        raise _invalid(f"velocity_scaling is {velocity_scaling}, must be above 0 and at most 1")
+    if fault := scaling_fault("velocity_scaling", velocity_scaling):
+        raise _invalid(fault)
     if isinstance(goal, str):
         try:
             tool, joints = _parsed(goal.strip(), robot)

@@ -26,6 +26,7 @@ from ibrobot_core.api import (
 )
 from ibrobot_planning.options import JointPlannerOptions
 from ibrobot_planning.profile import RestToRest
+from ibrobot_planning.timing import check_duration, scaling_fault
 
 _SHORTEST_PHASE_S = 1e-5
 """Shorter phases of the profile get no point of their own: interpolation would divide by their time."""
@@ -74,6 +75,7 @@ class JointPlanner(Planner):
             along([joint.max_acceleration * acceleration for joint in joints]),
             self._options.max_jerk,
         )
+        check_duration(profile.ends[-1])
         direction = delta / distance
         points = tuple(
             JointTrajectoryPoint(stamp, request.start + way * direction, speed * direction, rate * direction)
@@ -129,8 +131,8 @@ class JointPlanner(Planner):
 
 
 def _fraction(name: str, value: float) -> float:
-    if not 0 < value <= 1:
-        raise PlanningError(f"{name} is {value}, must be above 0 and at most 1")
+    if fault := scaling_fault(name, value):
+        raise PlanningError(fault)
     return value
 
 

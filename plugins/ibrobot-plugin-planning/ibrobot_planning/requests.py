@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import attrs
@@ -32,6 +32,7 @@ from ibrobot_core.api import (
     option,
 )
 from ibrobot_planning.goal_text import Target
+from ibrobot_planning.timing import LEAST_SCALING
 from ibrobot_planning.transforms import from_rpy
 
 _NEARLY_ONE = 1e-3
@@ -93,8 +94,18 @@ class GoalOptions:
         )
 
 
+def _few(most: int) -> Callable[[object, attrs.Attribute[Any], Sequence[object]], None]:
+    """A validator of the number of items."""
+
+    def check(instance: object, attribute: attrs.Attribute[Any], value: Sequence[object]) -> None:
+        if len(value) > most:
+            raise ValueError(f"{len(value)} are too many, at most {most} are planned for")
+
+    return check
+
+
 def _scaling(what: str) -> Any:
-    return option(1.0, gt=0, le=1, help=f"fraction of the {what} limits")
+    return option(1.0, ge=LEAST_SCALING, le=1, help=f"fraction of the {what} limits")
 
 
 @documented
@@ -102,7 +113,7 @@ def _scaling(what: str) -> Any:
 class MoveRequest:
     """A request to `/move_action`: move to the first of several goals that can be reached."""
 
-    goals: tuple[GoalOptions, ...] = option(help="alternatives, in order of preference")
+    goals: tuple[GoalOptions, ...] = option(validator=_few(20), help="alternatives, in order of preference")
     velocity_scaling: float = _scaling("velocity")
     acceleration_scaling: float = _scaling("acceleration")
 
@@ -120,7 +131,7 @@ class MoveRequest:
 class PlanQuery:
     """A request to `/plan_kinematic_path`: plan to the first of several goals that can be reached, and stay."""
 
-    goals: tuple[GoalOptions, ...] = option(help="alternatives, in order of preference")
+    goals: tuple[GoalOptions, ...] = option(validator=_few(20), help="alternatives, in order of preference")
     start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints are where they are")
     velocity_scaling: float = _scaling("velocity")
     acceleration_scaling: float = _scaling("acceleration")
@@ -156,7 +167,9 @@ class Numbered:
 class CartesianQuery:
     """A request to `/compute_cartesian_path`: plan straight lines of the tool through waypoints."""
 
-    waypoints: tuple[GoalOptions, ...] = option(help="positions of the tool, with or without axis or orientation")
+    waypoints: tuple[GoalOptions, ...] = option(
+        validator=_few(100), help="positions of the tool, with or without axis or orientation"
+    )
     least_fraction: float = option(1.0, gt=0, le=1, help="fraction of the path that must be possible")
     start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints are where they are")
     velocity_scaling: float = _scaling("velocity")
@@ -195,7 +208,9 @@ class FkQuery:
     """A request to `/compute_fk`: poses of links."""
 
     joints: Mapping[str, float] = option(factory=dict, unit="rad", help="positions; other joints are where they are")
-    links: tuple[str, ...] = option((), help="links of the MJCF or the URDF, or the tip; only the tip if empty")
+    links: tuple[str, ...] = option(
+        (), validator=_few(100), help="links of the MJCF or the URDF, or the tip; only the tip if empty"
+    )
 
 
 @attrs.frozen(eq=False)

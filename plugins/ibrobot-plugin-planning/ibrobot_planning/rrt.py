@@ -43,7 +43,7 @@ from ibrobot_planning.goals import Candidate, Tool, joint_target
 from ibrobot_planning.linear import linear_path
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.search import Pace, Space, connect, shortened
-from ibrobot_planning.timing import Motion, timed
+from ibrobot_planning.timing import Motion, scaling_fault, timed
 from ibrobot_planning.world import FLOOR, SNAPSHOT, Plane, World, WorldObject
 
 _RESOLUTIONS_M = (0.05, 0.02, 0.005)
@@ -161,8 +161,8 @@ class RrtConnectPlanner(Planner):
                 PlanCode.INVALID_ROBOT_STATE,
             )
         for name, scaling in (("velocity", request.velocity_scaling), ("acceleration", request.acceleration_scaling)):
-            if not 0 < scaling <= 1:
-                raise PlanningError(f"{name}_scaling is {scaling}, must be above 0 and at most 1")
+            if fault := scaling_fault(f"{name}_scaling", scaling):
+                raise PlanningError(fault)
         for name, value in zip(request.joints, start.tolist(), strict=True):
             joint = robot.joints[robot.joint_names.index(name)]
             if not np.isfinite(value):

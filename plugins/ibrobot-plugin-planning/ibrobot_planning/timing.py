@@ -15,7 +15,7 @@ from itertools import pairwise
 import attrs
 import numpy as np
 
-from ibrobot_core.api import Vector
+from ibrobot_core.api import PlanningError, Vector
 
 _GRID = 0.02
 """Greatest distance [rad] between grid points on straight parts."""
@@ -23,6 +23,10 @@ _BLEND_POINTS = 8
 """Grid intervals in a blend."""
 _SAMPLE_S = 0.001
 """Time between samples of the motion before it is averaged."""
+LEAST_SCALING = 0.01
+"""Least fraction of the limits of velocity and acceleration that a goal may ask for."""
+LONGEST_S = 300.0
+"""Duration of a motion, at most: it is computed, checked and sent in samples."""
 _STILL = 1e-9
 """Shorter segments [rad] are left out."""
 _PEAKS = 20
@@ -146,6 +150,9 @@ def timed(
 
     Returns:
         From the first to the last waypoint, both at rest.
+
+    Raises:
+        PlanningError: for limits so low that the motion would take longer than `LONGEST_S`.
     """
     path, blends = _without_repeats(np.asarray(path, dtype=float), blends)
     if len(path) == 1:
@@ -180,6 +187,31 @@ def _without_repeats(path: Vector, blends: Vector) -> tuple[Vector, Vector]:
     return path[kept], blends[kept][1:-1]
 
 
+def scaling_fault(name: str, scaling: float) -> str:
+    """Why a fraction of the limits cannot be planned with; empty if it can.
+
+    Args:
+        name: its name, e.g. `velocity_scaling`.
+        scaling: the fraction.
+    """
+    if LEAST_SCALING <= scaling <= 1:  # NaN is no such number
+        return ""
+    return f"{name} is {scaling}, must be from {LEAST_SCALING} to 1"
+
+
+def check_duration(duration: float) -> None:
+    """Check a motion's duration [s] before it is computed in samples.
+
+    Raises:
+        PlanningError: if it is above `LONGEST_S`.
+    """
+    if not duration <= LONGEST_S:  # written so that NaN fails it
+        raise PlanningError(
+            f"the motion would take {duration:.3g} s, at most {LONGEST_S:g} s are planned: "
+            "raise velocity_scaling or acceleration_scaling"
+        )
+
+
 def _fastest(path: Vector, blends: Vector, max_velocity: Vector, max_acceleration: Vector) -> Vector:
     """Positions [rad] every millisecond of the fastest motion along a path with parabolic corners, shape (N, J)."""
     s, positions, slopes, bends = _grid(path, blends)
@@ -193,7 +225,9 @@ def _fastest(path: Vector, blends: Vector, max_velocity: Vector, max_acceleratio
     )
     slower = np.sqrt(max(1.0, (np.abs([begins, ends]) / max_acceleration).max()))
     slower = max(slower, (np.abs(slopes) * speeds[:, None] / max_velocity).max())
-    times = np.append(np.arange(0.0, slower * stamps[-1], _SAMPLE_S), slower * stamps[-1]) / slower
+    duration = float(slower * stamps[-1])
+    check_duration(duration)
+    times = np.append(np.arange(0.0, duration, _SAMPLE_S), duration) / slower
     at = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(s) - 2)
     t = times - stamps[at]
     ahead = speeds[at] * t + rates[at] * t * t / 2

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from ibrobot_planning.clearance import Clearance
 
 SECTION = "world"
+MOST_OBJECTS = 200
+"""Objects that requests can bring the world to."""
 _MESHES = (".stl", ".obj", ".ply")
 _ANSWER = " Answers with the names of all objects."
 ADD = Service("/world/add", Added, list, "Add an object." + _ANSWER)
@@ -215,6 +217,8 @@ class WorldKeeper(Component):
         if it.replace and it.name in world.objects:
             world = world.remove(it.name)
         _check_position(it.object.position)
+        if len(world.objects) >= MOST_OBJECTS:
+            raise PlanningError(f"there are {MOST_OBJECTS} objects already, more are not checked in time")
         return world.add(it.name, it.object.made())
 
     def _mesh_file(self, text: str) -> Path:

@@ -22,6 +22,9 @@ _KEYS = {
 """Shape -> the keys that it needs."""
 
 
+_LONGEST_NAME = 100
+
+
 @documented
 @attrs.frozen
 class ObjectOptions:
@@ -121,12 +124,17 @@ class WorldOptions:
     scene: bool = option(False, help="whether a simulation adds the objects of its scene, at their present poses")
 
 
+def _short(instance: object, attribute: attrs.Attribute[str], value: str) -> None:
+    if not 0 < len(value) <= _LONGEST_NAME:
+        raise ValueError(f"a name has 1 to {_LONGEST_NAME} characters, got {len(value)}")
+
+
 @documented
 @attrs.frozen
 class Added:
     """A request to `/world/add`."""
 
-    name: str = option(help="a name that no object has")
+    name: str = option(validator=_short, help="a name that no object has")
     object: ObjectOptions = option(help="the object, as in the YAML")
     replace: bool = option(False, help="whether to replace an object of this name")
 

@@ -120,8 +120,8 @@ def test_text_that_makes_no_sense(robot, goal: str, message: str):
             1.0,
             "goal of joint pan is nan, must be an angle in radians",
         ),
-        ("up", 0.0, "velocity_scaling is 0.0, must be above 0 and at most 1"),
-        ("up", math.nan, "velocity_scaling is nan, must be above 0 and at most 1"),
+        ("up", 0.0, "velocity_scaling is 0.0, must be from 0.01 to 1"),
+        ("up", math.nan, "velocity_scaling is nan, must be from 0.01 to 1"),
     ],
 )
 def test_value_that_makes_no_sense(robot, goal, scaling: float, message: str):

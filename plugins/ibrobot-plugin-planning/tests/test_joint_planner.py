@@ -185,11 +185,11 @@ REFUSED = {
     "start not a number": (request([0, math.nan, 0], {"a": 1.0}), "start of joint b is nan, must be finite"),
     "speed above all": (
         request([0, 0, 0], {"a": 1.0}, velocity_scaling=1.5),
-        "velocity_scaling is 1.5, must be above 0 and at most 1",
+        "velocity_scaling is 1.5, must be from 0.01 to 1",
     ),
     "no acceleration": (
         request([0, 0, 0], {"a": 1.0}, acceleration_scaling=0.0),
-        "acceleration_scaling is 0.0, must be above 0 and at most 1",
+        "acceleration_scaling is 0.0, must be from 0.01 to 1",
     ),
 }
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import threading
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,12 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Results
+from ibrobot_planning.planning_services import CARTESIAN, COMPUTE_FK, PLAN
 from ibrobot_planning.requests import GoTo, Numbered
 from ibrobot_planning.source import (
     CANCEL,
     CMD_POSE,
     GO_TO,
     MOTION_STATUS,
+    MOVE_ACTION,
     MOVE_TO_CONFIGURATION,
     MOVE_TO_POSE,
     RESULT,
@@ -229,7 +233,7 @@ def test_request_that_makes_no_sense_is_rejected(run):
     result = call(runtime, MOVE_TO_CONFIGURATION, MoveToConfiguration(state))
     assert (result.outcome, result.message) == ("REJECTED", f"no joint 'tilt'; the joints are: {', '.join(JOINTS)}")
     result = call(runtime, MOVE_TO_POSE, MoveToPose(Pose(), 1.5))
-    assert result.message == "velocity_scaling is 1.5, must be above 0 and at most 1"
+    assert result.message == "velocity_scaling is 1.5, must be from 0.01 to 1"
     result = call(runtime, MOVE_TO_POSE, MoveToPose(Pose(Vector3(0.2, 0.0, 0.1), Quaternion(w=0.0))))
     assert (result.outcome, result.message) == ("REJECTED", "the orientation is a quaternion of length 0, must be 1")
 
@@ -395,3 +399,54 @@ def test_old_result_is_told_from_a_goal_that_there_was_not(run):
     assert runtime.session.bus.call(RESULT, Numbered(first + 1)).outcome == "CANCELLED"
     with pytest.raises(PlanningError, match=f"no goal {last + 1}; "):
         runtime.session.bus.call(RESULT, Numbered(last + 1))
+
+
+SCALINGS = (1e-300, 1e-5, 0.0, -1.0, 1.0000001, 1e300)
+
+
+@pytest.mark.parametrize("scaling", SCALINGS)
+@pytest.mark.parametrize("name", ["velocity_scaling", "acceleration_scaling"])
+def test_scalings_that_cannot_be_planned_with_are_refused_at_once(run, name: str, scaling: float):
+    bus = run().session.bus
+    goals = {"joints": {"pan": 0.5}}
+    for service, request in (
+        (MOVE_ACTION, {"goals": [goals]}),
+        (PLAN, {"goals": [goals]}),
+        (CARTESIAN, {"waypoints": [{"xyz": [0.2, 0, 0.1]}]}),
+    ):
+        with pytest.raises(RequestError, match=rf"^{service.name}: {name}: \S+ is too (small|large), must be at"):
+            bus.call(service, request | {name: scaling})
+
+
+def test_the_slowest_scaling_is_planned_within_bounds(run):
+    bus = run().session.bus
+    request = {"goals": [{"joints": {"pan": 0.2}}], "velocity_scaling": 0.01, "acceleration_scaling": 0.01}
+    tracemalloc.start()
+    answer = bus.call(PLAN, request)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert answer.code is PlanCode.SUCCESS, answer.message
+    assert most < 200e6
+
+
+@pytest.mark.parametrize("planner", ["plan", "joint"])
+def test_motion_that_would_take_too_long_is_refused(make: Make, tmp_path: Path, planner: str):
+    slow = robot_yaml(tmp_path).replace(f"max_velocity: {VELOCITY}", "max_velocity: 1.0e-4")
+    runtime = make(text=slow, mode=planner)
+    runtime.start()
+    answer = runtime.session.bus.call(PLAN, {"goals": [{"joints": {"pan": 0.5}}]})
+    assert answer.code is PlanCode.PLANNING_FAILED
+    assert re.search(r"the motion would take \S+ s, at most 300 s are planned: raise velocity_scaling", answer.message)
+
+
+def test_long_lists_are_refused(run):
+    bus = run().session.bus
+    goal = {"xyz": [0.2, 0.0, 0.1]}
+    for service, request, told in (
+        (MOVE_ACTION, {"goals": [goal] * 21}, "goals: 21 are too many, at most 20 are planned for"),
+        (PLAN, {"goals": [goal] * 1000}, "the request has more than 2000 values"),
+        (CARTESIAN, {"waypoints": [goal] * 101}, "waypoints: 101 are too many, at most 100 are planned for"),
+        (COMPUTE_FK, {"links": ["hand"] * 101}, "links: 101 are too many, at most 100 are planned for"),
+    ):
+        with pytest.raises(RequestError, match=told):
+            bus.call(service, request)

@@ -324,7 +324,7 @@ MALFORMED = {
         "a goal of the tool needs all joints that move it; not planned: flex, roll",
     ),
     "speed of nothing": (
-        ask(NamedGoal("up"), velocity_scaling=0), PlanCode.PLANNING_FAILED, "velocity_scaling is 0, must be above 0",
+        ask(NamedGoal("up"), velocity_scaling=0), PlanCode.PLANNING_FAILED, "velocity_scaling is 0, must be from 0.01",
     ),
 }  # fmt: skip
 

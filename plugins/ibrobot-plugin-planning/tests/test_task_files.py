@@ -70,7 +70,7 @@ MALFORMED = {
     "no mapping": ("- wait", "task.yaml: expected a mapping, got a list"),
     "broken YAML": ("steps: [", "task.yaml:1: not valid YAML"),
     "no steps": ("name: x", "task.yaml: steps: required key is missing"),
-    "empty steps": ("steps: []", "task.yaml:1: steps: a task has at least one step"),
+    "empty steps": ("steps: []", "task.yaml:1: steps: a task has 1 to 200 steps, got 0"),
     "unknown key": ("step: []\nsteps: []", "task.yaml:1: step: unknown key, did you mean 'steps'?"),
     "unknown kind": ("steps:\n- jump: {}", "task.yaml:2: steps.0.jump: unknown key"),
     "step of no kind": (

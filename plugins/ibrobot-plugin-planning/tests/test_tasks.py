@@ -15,7 +15,7 @@ from ibrobot_planning.tasks.runner import CANCEL, CHECK, RESULT, RUN, STATUS, Ta
 from ibrobot_planning.world import SNAPSHOT
 from ibrobot_testing import SectionSuite
 
-from ibrobot_core.api import ConfigError, PlanningError, Runtime, String
+from ibrobot_core.api import ConfigError, PlanningError, RequestError, Runtime, String
 
 from .conftest import Make
 from .test_motion import RATE_HZ, robot_yaml
@@ -319,3 +319,21 @@ def test_fault_fails_the_step(run):
     runtime.session.control.call("fault", fault="the cable is loose")
     result = finish(runtime, number)
     assert result.message == "step 1 (wait): the robot stopped: the cable is loose"
+
+
+def test_requests_read_nothing_of_the_environment(run, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("IBROBOT_PASSWORD", "hunter2")
+    runtime = run()
+    for step in ('move: {pose: "${IBROBOT_PASSWORD}"}', 'move: {pose: "\\u0024{IBROBOT_PASSWORD}"}'):
+        for service in (CHECK, RUN):
+            with pytest.raises(ConfigError, match="IBROBOT_PASSWORD") as refused:
+                runtime.session.bus.call(service, steps(step))
+            assert "hunter2" not in str(refused.value)
+
+
+def test_long_tasks_are_refused(run):
+    runtime = run()
+    with pytest.raises(ConfigError, match="steps: a task has 1 to 200 steps, got 201"):
+        runtime.session.bus.call(RUN, steps(*["wait: {seconds: 0.1}"] * 201))
+    with pytest.raises(RequestError, match=r"/task/run: a text of \d+ characters, at most 20000 are allowed"):
+        runtime.session.bus.call(RUN, steps(*["wait: {seconds: 0.1}"] * 2000))

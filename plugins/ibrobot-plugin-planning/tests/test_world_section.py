@@ -14,7 +14,7 @@ from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.rrt import RrtConnectPlanner
 from ibrobot_planning.transforms import matrix
 from ibrobot_planning.world import SNAPSHOT, Box, Capsule, Cylinder, Mesh, Plane, Sphere
-from ibrobot_planning.world_keeper import ADD, ATTACH, DETACH, REMOVE, TOUCH, WorldKeeper
+from ibrobot_planning.world_keeper import ADD, ATTACH, DETACH, MOST_OBJECTS, REMOVE, TOUCH, WorldKeeper
 from ibrobot_planning.world_options import WorldOptions
 from ibrobot_testing import SectionSuite, make_session
 
@@ -307,3 +307,13 @@ def test_requests_name_meshes_of_packages_and_of_the_folder_that_the_yaml_allows
             session.bus.call(ADD, mesh("package://ibrobot_planning/part.stl"))
     finally:
         keeper.stop()
+
+
+def test_number_and_names_of_objects_are_limited(run):
+    for i in range(MOST_OBJECTS - 5):
+        run.call(ADD, {"name": f"post {i}", "object": {"shape": "plane"}})
+    with pytest.raises(PlanningError, match=f"there are {MOST_OBJECTS} objects already"):
+        run.call(ADD, {"name": "one more", "object": {"shape": "plane"}})
+    run.call(ADD, {"name": "post 0", "object": {"shape": "plane"}, "replace": True})
+    with pytest.raises(RequestError, match="name: a name has 1 to 100 characters, got 101"):
+        run.call(ADD, {"name": "a" * 101, "object": {"shape": "plane"}})

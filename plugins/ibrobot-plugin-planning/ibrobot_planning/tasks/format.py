@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any, Literal, override
 import attrs
 
 from ibrobot_core.api import OrientationPolicy, documented, option
+from ibrobot_planning.timing import LEAST_SCALING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 Vec3 = tuple[float, float, float]
+MOST_STEPS = 200
 _NEARLY_ONE = 1e-3
 """Allowed deviation of a quaternion's length from 1."""
 
@@ -86,7 +88,7 @@ class MoveStep(GoalOptions):
     any: tuple[GoalOptions, ...] = option((), help="alternatives: the first that can be reached")
     line: tuple[GoalOptions, ...] = option((), help="straight lines of the tool through these positions")
     least_fraction: float = option(1.0, gt=0, le=1, help="fraction of the straight lines that must be possible")
-    speed: float = option(1.0, gt=0, le=1, help="fraction of the velocity limits")
+    speed: float = option(1.0, ge=LEAST_SCALING, le=1, help="fraction of the velocity limits")
     touch: tuple[str, ...] = option((), help="objects that the gripper, and what it carries, may touch on the way")
 
     def __attrs_post_init__(self) -> None:
@@ -219,8 +221,8 @@ class Step:
 
 
 def _some(instance: object, attribute: attrs.Attribute[Any], value: Sequence[object]) -> None:
-    if not value:
-        raise ValueError("a task has at least one step")
+    if not 0 < len(value) <= MOST_STEPS:
+        raise ValueError(f"a task has 1 to {MOST_STEPS} steps, got {len(value)}")
 
 
 def _some_lists(instance: object, attribute: attrs.Attribute[Any], value: Sequence[Sequence[object]] | None) -> None:

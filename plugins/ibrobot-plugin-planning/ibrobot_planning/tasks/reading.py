@@ -42,18 +42,19 @@ def find_task(name: str) -> Path:
     return bundled[name]
 
 
-def read_task(text: str, file: str, parameters: Sequence[str] = ()) -> TaskFile:
+def read_task(text: str, file: str, parameters: Sequence[str] = (), *, expands: bool = True) -> TaskFile:
     """A task from its YAML.
 
     Args:
         text: the YAML.
         file: its name, for errors.
         parameters: `name=value` for parameters of the task.
+        expands: whether `${NAME}` and `~/` are expanded; False for tasks from other machines.
 
     Raises:
         ConfigError: with all faults.
     """
-    raw = parse_yaml(text, file)
+    raw = parse_yaml(text, file, expands=expands)
     declared = raw.root.get("parameters") if isinstance(raw.root, Mapping) else None
     values = dict(declared) if isinstance(declared, Mapping) else {}
     for each in parameters:
@@ -67,11 +68,11 @@ def read_task(text: str, file: str, parameters: Sequence[str] = ()) -> TaskFile:
             )
         values[name] = parse_yaml(value, flag).root
     filled = _PARAMETER.sub(lambda match: _shown(values[match[1]]) if match[1] in values else match[0], text)
-    document = parse_yaml(filled, file)
+    document = parse_yaml(filled, file, expands=expands)
     for key, name in _left(document.root, ()):
         document.add(key, f"no parameter {name!r}{did_you_mean(name, list(values), 'parameters')}")
     document.raise_problems()
-    task = single_options(Task, (), file, text=filled)
+    task = single_options(Task, (), file, text=filled, expands=expands)
     return TaskFile(attrs.evolve(task, name=task.name or Path(file).stem), document)
 
 

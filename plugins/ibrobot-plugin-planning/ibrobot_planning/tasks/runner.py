@@ -43,7 +43,7 @@ class RunTask:
     task: str = option(help="the YAML of a task; it cannot read the environment")
 
 
-_LIMITS = RequestLimits(text=100_000)
+_LIMITS = RequestLimits(text=20_000)
 RUN = Service("/task/run", RunTask, int, "Check a task and begin it; answers with its number.", "task", _LIMITS)
 CHECK = Service("/task/check", RunTask, NoneType, "Check a task; fails as /task/run would.", "task", _LIMITS)
 RESULT: Service[Numbered, TaskResult | None] = Service(
@@ -60,7 +60,7 @@ _STOP_S = 3.0
 
 
 def _read(request: RunTask) -> TaskFile:
-    return read_task(request.task, "the request")
+    return read_task(request.task, "the request", expands=False)
 
 
 @attrs.frozen(eq=False)
