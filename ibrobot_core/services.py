@@ -61,6 +61,8 @@ class Service[Q, A]:
     alone: str = ""
     """The field that a plain request without keys stands for, e.g. `pose` if `home` means `{pose: home}`."""
     limits: RequestLimits = RequestLimits()
+    urgent: bool = False
+    """Whether it must not wait behind other requests, as an emergency stop."""
 
     def __attrs_post_init__(self) -> None:
         if not attrs.has(self.request):

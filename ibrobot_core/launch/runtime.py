@@ -39,7 +39,7 @@ class Reset:
 
 SET_MODE = Service("/set_mode", SetMode, NoneType, "Enter another control mode.", alone="mode")
 RESET = Service("/reset", Reset, str, "Clear faults and the emergency stop; answers with what the robot does now.")
-ESTOP = Service("/estop", NoRequest, NoneType, "Stop the robot at once, and hold until a reset.")
+ESTOP = Service("/estop", NoRequest, NoneType, "Stop the robot at once, and hold until a reset.", urgent=True)
 _CHANGE_S = 2.0
 """How long the end of a run waits for a mode switch or reset under way [s]."""
 _GLANCE_S, _GLANCES = 0.1, 100

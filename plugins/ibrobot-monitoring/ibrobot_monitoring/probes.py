@@ -8,7 +8,7 @@ import re
 import socket
 import threading
 from collections.abc import Callable
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, override
 
 import attrs
@@ -18,6 +18,8 @@ from ibrobot_core.api import IbrobotError
 _HOST = "127.0.0.1"
 _NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
 """Accepted host names in requests; others come from web pages whose name was redirected to this machine."""
+_CLIENTS = 64
+"""Clients at a time, at most; others are turned away."""
 _REQUEST_S = 2.0
 """Time for a client to send its request and read the answer [s]."""
 _TEXT = "text/plain; charset=utf-8"
@@ -27,7 +29,7 @@ _log = logging.getLogger("ibrobot.metrics")
 
 @attrs.frozen(eq=False)
 class Probes:
-    """Answers of a monitoring port. Each function is called in the server's thread."""
+    """Answers of a monitoring port. One function is called at a time, in threads of the server."""
 
     metrics: Callable[[], bytes]
     """Returns all metrics, in Prometheus' text format 0.0.4."""
@@ -38,7 +40,7 @@ class Probes:
 
 
 class ProbeServer:
-    """Answers `GET /metrics`, `/healthz` and `/readyz` on the loopback interface, one client after another.
+    """Answers `GET /metrics`, `/healthz` and `/readyz` on the loopback interface.
 
     Args:
         port: the port; 0 for any free port.
@@ -49,7 +51,7 @@ class ProbeServer:
     """
 
     def __init__(self, port: int, probes: Probes) -> None:
-        handler = type("Handler", (_Handler,), {"probes": probes})
+        handler = type("Handler", (_Handler,), {"probes": probes, "one_at_a_time": threading.Lock()})
         try:
             self._server = _Server((_HOST, port), handler)
         except OSError as error:
@@ -71,7 +73,28 @@ class ProbeServer:
         self._server.server_close()
 
 
-class _Server(HTTPServer):
+class _Server(ThreadingHTTPServer):
+    """One thread for each client, of which there may be a few: a silent one must not delay the others."""
+
+    daemon_threads = False  # so that closing waits for them
+    request_queue_size = _CLIENTS
+
+    @override
+    def server_activate(self) -> None:
+        self._free = threading.BoundedSemaphore(_CLIENTS)
+        super().server_activate()
+
+    @override
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        return self._free.acquire(blocking=False)
+
+    @override
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
     @override
     def handle_error(self, request: Any, client_address: Any) -> None:
         _log.debug("a client left", exc_info=True)
@@ -81,6 +104,7 @@ class _Handler(BaseHTTPRequestHandler):
     """Answers one request per connection."""
 
     probes: Probes
+    one_at_a_time: threading.Lock
     server_version, sys_version = "ibrobot", ""
     timeout = _REQUEST_S
     """Timeout of each read and write [s]; a timer stops clients that send a byte now and then."""
@@ -104,7 +128,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._reply(403, b"only clients on this machine may connect: use localhost or 127.0.0.1\n")
             return
         try:
-            self._reply(*self._answer())
+            with self.one_at_a_time:
+                answer = self._answer()
+            self._reply(*answer)
         except Exception:  # noqa: BLE001 - contained: what fails here must not end the server
             _log.exception("metrics failed")
             self._reply(500, b"failed; see the log\n")

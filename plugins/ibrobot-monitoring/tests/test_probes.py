@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import socket
+import time
 from collections.abc import Iterator
 
 import attrs
@@ -130,3 +131,30 @@ def test_it_listens_on_this_machine_alone_and_a_port_that_is_taken_is_named(serv
         IbrobotError, match=rf"port {port(server)} of 127\.0\.0\.1 cannot be had: Address already in use"
     ):
         ProbeServer(port(server), Probes(bytes, str, str))
+
+
+def test_silent_clients_do_not_delay_the_others(server: ProbeServer, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module._Handler, "timeout", 3600)
+    monkeypatch.setattr(module, "_REQUEST_S", 3600)
+    silent = [socket.create_connection(("127.0.0.1", port(server)), timeout=30) for _ in range(5)]
+    try:
+        assert [ask(server, path)[0] for path in ("/healthz", "/readyz", "/metrics")] == [200] * 3
+    finally:
+        for client in silent:
+            client.close()
+
+
+def test_a_crowd_is_turned_away_until_some_leave(server: ProbeServer):
+    crowd = [socket.create_connection(("127.0.0.1", port(server)), timeout=30) for _ in range(module._CLIENTS)]
+    with socket.create_connection(("127.0.0.1", port(server)), timeout=30) as late:
+        assert late.recv(1) == b""
+    for client in crowd:
+        client.close()
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        try:
+            assert ask(server, "/healthz")[0] == 200
+            return
+        except (OSError, http.client.HTTPException):
+            time.sleep(0.01)
+    pytest.fail("nobody is served after the crowd has left")

@@ -27,6 +27,8 @@ _BATCHES, _RECEIVED_AT_ONCE = 16, 256 << 10
 With Zenoh's defaults, two and 64 kB, its threads wake one another for every piece of a camera image, which takes a
 quarter of a request's time.
 """
+_ACCEPT_MS, _ACCEPTED = 3000, 4000
+"""How long a new connection may take to say who it is [ms], and how many may do so at a time."""
 _CLOSE_WAIT_S = 1.0
 """How long `close` waits for an attempt to connect, which cannot be interrupted [s]."""
 _ASK_WHY_S = 2.0
@@ -71,6 +73,8 @@ def zenoh_config(options: ZenohOptions) -> zenoh.Config:
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
         "timestamping/enabled": True,  # latched topics need it
+        "transport/unicast/accept_timeout": _ACCEPT_MS,
+        "transport/unicast/accept_pending": _ACCEPTED,
         "transport/link/tx/lease": lease_ms,
         "transport/link/rx/max_message_size": options.max_message_size,
         "transport/shared_memory/enabled": options.shared_memory,

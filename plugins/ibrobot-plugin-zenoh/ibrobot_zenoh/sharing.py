@@ -11,6 +11,7 @@ from ibrobot_ros2.services import SERVICES, Answer, decode_call, encode_answer, 
 from ibrobot_core.api import (
     NS_PER_S,
     Component,
+    Handler,
     IbrobotError,
     Message,
     NotSupported,
@@ -28,6 +29,10 @@ from ibrobot_zenoh.ros2 import SharedTopic
 _DEPTH = 10
 """Queue size of a topic for the network; when it is full, the bus drops and counts the oldest message."""
 
+_MOST_BYTES = 1 << 20
+"""Size of a call of a service, at most [bytes]."""
+_URGENT_BYTES = 1000
+"""Size of a call of an urgent service, at most [bytes]."""
 _SILENT_NS = 5 * NS_PER_S
 """A topic without a message for this long after the start is reported once [ns]."""
 
@@ -55,6 +60,12 @@ class TopicTransport(Transport):
         Raises:
             TransportError: if closed.
         """
+
+    def serve_with_urgent(
+        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool]
+    ) -> Callable[[], None]:
+        """Like `serve`; urgent requests have a queue and threads of their own, which no other request delays."""
+        return self.serve(name, handler)
 
     @property
     def namespace(self) -> str:
@@ -191,7 +202,7 @@ class SharedServices(Component):
     @override
     def start(self) -> None:
         transport = _topics(self._link)
-        self._end = transport.serve(endpoint(transport.namespace), self._answer)
+        self._end = transport.serve_with_urgent(endpoint(transport.namespace), self._answer, self._is_urgent)
 
     @override
     def stop(self) -> None:
@@ -199,8 +210,20 @@ class SharedServices(Component):
         if end is not None:
             end()
 
+    def _is_urgent(self, payload: Payload) -> bool:
+        """Whether a request is for an urgent service; reads short ones only, as it delays all others."""
+        if len(payload) > _URGENT_BYTES:
+            return False
+        try:
+            found = self._session.bus.services().get(decode_call(payload).service)
+        except IbrobotError:
+            return False
+        return found is not None and found.urgent
+
     def _answer(self, payload: Payload, sender: str | None) -> bytes:
         try:
+            if len(payload) > _MOST_BYTES:
+                raise NotSupported(f"a call of {len(payload)} bytes is too large, at most {_MOST_BYTES} are read")
             call = decode_call(payload)
             if call.service == SERVICES:
                 return encode_answer(Answer(self._shared()))
@@ -212,6 +235,9 @@ class SharedServices(Component):
             return encode_answer(Answer(self._session.bus.call(call.service, call.request)))
         except IbrobotError as error:
             return encode_answer(Answer(str(error), result=False))
+        except Exception:
+            self._session.log.exception("a service failed")
+            return encode_answer(Answer("the service failed; the robot's log has the cause", result=False))
 
     def _is_shared(self, service: str) -> bool:
         return any(service == name or (name.endswith("/") and service.startswith(name)) for name in self._names)

@@ -32,6 +32,9 @@ SUBSCRIBER_DEPTH = 1000
 """Queue size of a subscriber; when it is full, the oldest payload is dropped."""
 REQUESTS_WAITING = 64
 """Queue size of a server; when it is full, the oldest request fails because the server is overloaded."""
+URGENT_WAITING = 10_000
+"""Queue size for urgent requests."""
+_URGENT_WORKERS = 2
 _FAILED = zenoh.Encoding.TEXT_PLAIN
 """Marks error replies of a server, as opposed to Zenoh's own for a timeout."""
 
@@ -107,6 +110,17 @@ class ZenohTransport(TopicTransport):
 
     @override
     def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
+        return self._serve(name, handler, workers, None)
+
+    @override
+    def serve_with_urgent(
+        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool]
+    ) -> Callable[[], None]:
+        return self._serve(name, handler, HANDLER_THREADS, is_urgent)
+
+    def _serve(
+        self, name: str, handler: Handler, workers: int, is_urgent: Callable[[Payload], bool] | None
+    ) -> Callable[[], None]:
         key, token = _key(f"{SERVICES}/*", name), _key(SERVED, name).join(uuid.uuid4().hex)
 
         def answer(query: zenoh.Query) -> None:
@@ -122,8 +136,13 @@ class ZenohTransport(TopicTransport):
 
         server = Workers(answer, f"the server of {name}", workers, REQUESTS_WAITING)
 
+        # Its queue is long, as a request that waits long in it is followed by as many like it.
+        urgent = Workers(answer, f"the urgent requests of {name}", _URGENT_WORKERS, URGENT_WAITING)
+
         def take(query: zenoh.Query) -> None:
-            turned_away = server.put(query)
+            payload = query.payload
+            first = is_urgent is not None and is_urgent(payload.to_bytes() if payload is not None else b"")
+            turned_away = (urgent if first else server).put(query)
             if turned_away is not None:
                 with turned_away:
                     turned_away.reply_err("it is overloaded, or about to end", encoding=_FAILED)
@@ -141,7 +160,7 @@ class ZenohTransport(TopicTransport):
             with self._lock:
                 self._served.discard(name)
 
-        return self._keep(end, server)
+        return self._keep(self._keep(end, server), urgent)
 
     @override
     def request(self, name: str, payload: Payload, timeout_s: float) -> Payload:

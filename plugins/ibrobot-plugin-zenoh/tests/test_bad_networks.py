@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import socket
 import subprocess
 import sys
 import threading
@@ -10,9 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from ibrobot_zenoh import connection as connection_module
 from ibrobot_zenoh import transport as transport_module
 
-from ibrobot_core.api import TransportError
+from ibrobot_core.api import Payload, TransportError
 
 from .pair import WAIT_S, client, free_endpoint, router, settle, wait_for
 
@@ -154,6 +156,64 @@ def test_large_messages_are_refused_both_ways():
     assert len(lax.request("twice", bytes(50_000), WAIT_S)) == 100_000
     for end in (strict, lax, server):
         end.close()
+
+
+def test_connections_that_say_nothing_keep_nobody_out(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(connection_module, "_ACCEPT_MS", 3_600_000)
+    endpoint = free_endpoint()
+    server = router(endpoint)
+    server.serve("echo", lambda payload, _: payload)
+    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+    silent = [socket.create_connection((host, int(port)), timeout=WAIT_S) for _ in range(300)]
+    try:
+        robot = client(endpoint)
+        settle(robot, server)
+        assert robot.request("echo", b"hello", WAIT_S) == b"hello"
+        robot.close()
+    finally:
+        for each in silent:
+            each.close()
+        server.close()
+
+
+def test_urgent_requests_wait_for_no_others(monkeypatch: pytest.MonkeyPatch):
+    """A stop is answered while a flood keeps every thread busy and fills the queue."""
+    monkeypatch.setattr(transport_module, "HANDLER_THREADS", 2)
+    monkeypatch.setattr(transport_module, "REQUESTS_WAITING", 2)
+    endpoint = free_endpoint()
+    server, robot = router(endpoint), client(endpoint)
+    release, busy = threading.Event(), threading.Semaphore(0)
+
+    def answer(payload: Payload, _: object) -> bytes:
+        if payload != b"stop":
+            busy.release()
+            release.wait(WAIT_S)
+        return b"done"
+
+    server.serve_with_urgent("services", answer, lambda payload: payload == b"stop")
+    settle(robot, server)
+    outcomes: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def ask() -> None:
+        try:
+            outcomes.put(bytes(robot.request("services", b"", WAIT_S)).decode())
+        except TransportError as error:
+            outcomes.put(str(error))
+
+    asking = [threading.Thread(target=ask) for _ in range(8)]
+    for thread in asking:
+        thread.start()
+    for _ in range(2):
+        assert busy.acquire(timeout=WAIT_S)
+    for _ in range(20):
+        assert robot.request("services", b"stop", WAIT_S) == b"done"
+    release.set()
+    told = [outcomes.get(timeout=WAIT_S) for _ in asking]
+    assert any("overloaded" in each for each in told), "the flood was one"
+    for thread in asking:
+        thread.join()
+    robot.close()
+    server.close()
 
 
 def test_a_flood_is_turned_away(monkeypatch: pytest.MonkeyPatch):
