@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, overload
 
@@ -89,9 +89,34 @@ class Bus:
         self._subscriptions: defaultdict[str, list[Subscription]] = defaultdict(list)
         """Subscriptions by topic; the empty key has those of all topics."""
         self._types: dict[str, str] = {}
+        """Type by topic: that of its first message that is not refused."""
+        self._expected: dict[str, frozenset[str]] = {}
+        """Types that the configuration, or what reads a topic, states."""
         self._latched: dict[str, Received] = {}
         self._counts: dict[str, int] = {}
         self._servers: dict[str, _Server[Any, Any]] = {}
+
+    def expect(self, topic: str, *types: str) -> None:
+        """State the types that a topic may carry, for the rest of the run; messages of other types are refused.
+
+        Raises:
+            TransportError: if others were stated before.
+        """
+        with self._lock:
+            before = self._expected.get(topic)
+            found = frozenset(types) & before if before is not None else frozenset(types)
+            if not found:
+                raise TransportError(f"topic {topic} carries {_any(before or types)}, not {_any(types)}")
+            self._expected[topic] = found
+            if self._types.get(topic) not in found:
+                # Messages before were of a type that nobody had stated.
+                self._types.pop(topic, None)
+                self._latched.pop(topic, None)
+
+    def expected(self, topic: str) -> frozenset[str]:
+        """The types that `expect` stated for a topic; empty if nobody has."""
+        with self._lock:
+            return self._expected.get(topic, frozenset())
 
     def publish(self, topic: str, message: Message, *, latched: bool = False) -> None:
         """Deliver `message` to every subscriber of `topic`; a latched one is also delivered to later subscribers.
@@ -100,6 +125,9 @@ class Bus:
             TransportError: if the topic carries another message type.
         """
         with self._lock:
+            expected = self._expected.get(topic)
+            if expected is not None and message.ros_type not in expected:
+                raise TransportError(f"topic {topic} carries {_any(expected)}, not {message.ros_type}")
             known = self._types.setdefault(topic, message.ros_type)
             if known != message.ros_type:
                 raise TransportError(f"topic {topic} carries {known}, not {message.ros_type}")
@@ -110,14 +138,22 @@ class Bus:
             for subscription in (*self._subscriptions.get(topic, ()), *self._subscriptions.get("", ())):
                 subscription._put(item)
 
-    def subscribe(self, topic: str | None, depth: int = 10) -> Subscription:
+    def subscribe(self, topic: str | None, depth: int = 10, *types: type[Message]) -> Subscription:
         """A new queue on `topic` (None: every topic), holding the newest `depth` messages.
+
+        Args:
+            topic: the topic.
+            depth: size of the queue.
+            types: the types that the topic carries from now on, as `expect`; any if there are none.
 
         Raises:
             ValueError: if `depth` is below one.
+            TransportError: if other types were stated before.
         """
         if depth < 1:
             raise ValueError(f"depth must be at least 1, got {depth}")
+        if topic is not None and types:
+            self.expect(topic, *(each.ros_type for each in types))
         with self._lock:
             subscription = Subscription(self, topic or "", depth)
             self._subscriptions[subscription.topic].append(subscription)
@@ -139,7 +175,7 @@ class Bus:
     def topics(self) -> dict[str, tuple[str, int]]:
         """Every published topic -> message type and number of messages."""
         with self._lock:
-            return {topic: (self._types[topic], count) for topic, count in sorted(self._counts.items())}
+            return {topic: (self._types[topic], self._counts[topic]) for topic in sorted(self._types)}
 
     def latched(self) -> dict[str, Received]:
         """Latched topic -> its newest message."""
@@ -209,6 +245,10 @@ class Bus:
         if server is None:
             raise TransportError(f"nobody serves {name}; served: {', '.join(self.services()) or 'nothing'}")
         return server.handler(server.service.read(request, server.files))
+
+
+def _any(types: Iterable[str]) -> str:
+    return " or ".join(sorted(types))
 
 
 def _name(service: Service[Any, Any] | str) -> str:

@@ -161,6 +161,29 @@ def test_what_was_received_by_the_snapshot_is_in_the_queues() -> None:
         assert bisect_right(stamps, now_ns) <= queued
 
 
+def test_a_topic_has_the_stated_type_whatever_came_first(bus: Bus) -> None:
+    bus.publish("/a", String("first"), latched=True)
+    subscription = bus.subscribe("/a", 10, Int32)
+
+    assert subscription.drain() == [], "what came before has another type"
+    with pytest.raises(TransportError, match=r"^topic /a carries std_msgs/msg/Int32, not std_msgs/msg/String$"):
+        bus.publish("/a", String("wrong"))
+    bus.publish("/a", Int32(1))
+
+    assert [item.message for item in subscription.drain()] == [Int32(1)]
+    assert bus.topics() == {"/a": ("std_msgs/msg/Int32", 2)}
+
+
+def test_types_that_are_stated_twice_must_agree(bus: Bus) -> None:
+    bus.expect("/a", Int32.ros_type, String.ros_type)
+    bus.subscribe("/a", 10, String)
+
+    assert bus.expected("/a") == {String.ros_type}
+    with pytest.raises(TransportError, match=r"^topic /a carries std_msgs/msg/String, not std_msgs/msg/Int32$"):
+        bus.subscribe("/a", 10, Int32)
+    assert bus.expected("/b") == frozenset()
+
+
 def test_services_answer_and_their_absence_is_reported(bus: Bus) -> None:
     bus.serve(ADD, lambda request: request.to + 1)
 

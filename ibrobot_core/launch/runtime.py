@@ -12,10 +12,12 @@ import attrs
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.component import Component, Worker, error_line, error_text, exit_code
 from ibrobot_core.config.missing import absent_models, unavailable_modes
+from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, NotSupported, PluginError
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_components
 from ibrobot_core.launch.session import Session
+from ibrobot_core.messages import CompressedImage, Image
 from ibrobot_core.options import documented, option
 from ibrobot_core.services import NoRequest, Service
 from ibrobot_core.units import ns
@@ -42,6 +44,8 @@ RESET = Service("/reset", Reset, str, "Clear faults and the emergency stop; answ
 ESTOP = Service("/estop", NoRequest, NoneType, "Stop the robot at once, and hold until a reset.", urgent=True)
 _CHANGE_S = 2.0
 """How long the end of a run waits for a mode switch or reset under way [s]."""
+_PICTURES = (Image.ros_type, CompressedImage.ros_type)
+"""The contract reads both."""
 _GLANCE_S, _GLANCES = 0.1, 100
 """Timeout [s] and number of waits for the first joint state; several, since time passes for a stopped process too."""
 
@@ -58,6 +62,8 @@ class Runtime:
             remedy = f"--mode {' or --mode '.join(planning)}" if planning else "and this robot has none"
             raise NotSupported(f"--goal needs a mode with a planner: {remedy}")
         self.session = session
+        for topic, type_name in Contract.from_config(session.config).topics.items():
+            session.bus.expect(topic, *(_PICTURES if type_name in _PICTURES else (type_name,)))
         self.plan: LaunchPlan = build_plan(session)
         counted = self.plan.episodes_worker is not None or session.request.by_operator
         if session.request.episodes is not None and not counted:

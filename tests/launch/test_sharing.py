@@ -103,6 +103,32 @@ def test_what_others_publish_comes_in(runs: Runs, network: None, caplog: pytest.
     assert made().callbacks == {}
 
 
+def test_a_wrong_first_message_keeps_no_right_one_out(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):
+    share = "subscribe: {/lamp: std_msgs/msg/Bool}"
+    runtime = runs.start(f"transport={{type: network, share: {{{share}}}}}", lockstep=False)
+    bus = runtime.session.bus
+    seen = bus.subscribe("/lamp")
+    made().callbacks["/lamp"](String("first"))
+    made().callbacks["/lamp"](Bool(True))
+    assert [item.message for item in seen.drain()] == [Bool(True)]
+    assert "from another machine: topic /lamp carries std_msgs/msg/Bool, not std_msgs/msg/String" in caplog.text
+    assert "nothing states the type" not in caplog.text
+    runtime.stop()
+
+
+def test_the_contract_states_types(runs: Runs, network: None):
+    runtime = runs.start("transport={type: network, share: {subscribe: [/joint_states]}}", lockstep=False)
+    with pytest.raises(TransportError, match="topic /joint_states carries sensor_msgs/msg/JointState, not"):
+        runtime.session.bus.publish("/joint_states", String("no state"))
+    runtime.stop()
+
+
+def test_a_topic_of_unknown_type_is_named(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):
+    runtime = runs.start("transport={type: network, share: {subscribe: [/lamp]}}", lockstep=False)
+    assert "nothing states the type of /lamp so far, so its first message does; {/lamp: TYPE} states it" in caplog.text
+    runtime.stop()
+
+
 def test_nothing_comes_in_in_lockstep(runs: Runs, network: None):
     with pytest.raises(NotSupported, match=r"transport\.share\.subscribe: a lockstep run cannot receive"):
         runs.make("transport={type: network, share: {subscribe: [/lamp]}}", lockstep=True)
@@ -171,6 +197,12 @@ def test_nothing_is_answered_in_lockstep(runs: Runs, network: None):
         ("{type: network, share: {publish: [a]}}", "'a' is not a full topic name, did you mean '/a'?"),
         ("{type: network, share: {publish: [/a, /a]}}", "/a is listed twice"),
         ("{type: network, share: {publish: [/a], subscribe: [/a]}}", "/a is both published and subscribed"),
+        ("{type: network, share: {publish: [/a], subscribe: {/a: std_msgs/msg/Bool}}}", "/a is both published and"),
+        ("{type: network, share: {subscribe: {a: std_msgs/msg/Bool}}}", "'a' is not a full topic name"),
+        (
+            "{type: network, share: {subscribe: {/a: std_msgs/msg/Boo}}}",
+            "/a: unknown message type 'std_msgs/msg/Boo'",
+        ),
         ("{type: network, share: {services: [a]}}", "'a' is not a full name of a service, did you mean '/a'?"),
         ("{type: network, share: {services: [/a, /a]}}", "/a is listed twice"),
         ("{type: network, share: {publishes: [/a]}}", "did you mean 'publish'?"),

@@ -119,8 +119,8 @@ class _Cloud:
 
     def open(self) -> None:
         bus, options = self._session.bus, self.options
-        self._messages = bus.subscribe(options.topic, 1)
-        self._infos = bus.subscribe(options.info or f"{options.topic.rpartition('/')[0]}/camera_info", 1)
+        self._messages = bus.subscribe(options.topic, 1, PointCloud2, Image)
+        self._infos = bus.subscribe(options.info or f"{options.topic.rpartition('/')[0]}/camera_info", 1, CameraInfo)
 
     def close(self) -> None:
         self._messages.close()

@@ -12,7 +12,7 @@ class Frames:
     """The newest transforms on a bus."""
 
     def __init__(self, bus: Bus) -> None:
-        self._subscriptions = [bus.subscribe(topic, 10) for topic in ("/tf_static", "/tf")]
+        self._subscriptions = [bus.subscribe(topic, 10, TFMessage) for topic in ("/tf_static", "/tf")]
         self._newest: dict[str, TransformStamped] = {}
 
     def pose(self, frame: str) -> Vector:

@@ -166,7 +166,7 @@ class PlannerSource(SourceWorker):
         self.on_end.callback(planner.close)
         self._plans.planner = planner
         self._execution = Execution(self.session, planner)
-        self._poses = self.session.bus.subscribe(CMD_POSE, 1)
+        self._poses = self.session.bus.subscribe(CMD_POSE, 1, PoseStamped, Pose)
         self.on_end.callback(self._poses.close)
         self.on_end.callback(self._drop_all)
         planner.load()

@@ -134,7 +134,7 @@ class WorldKeeper(Component):
     @override
     def start(self) -> None:
         for topic in {thing.topic for thing in self._moving.values()}:
-            self._poses[topic] = self._session.bus.subscribe(topic, 1)
+            self._poses[topic] = self._session.bus.subscribe(topic, 1, Float64MultiArray)
         if self._session.config.robot.description.mjcf is not None:
             self._robot()  # reading it takes a moment, which the first service call should not wait for
         self._check(self._world)

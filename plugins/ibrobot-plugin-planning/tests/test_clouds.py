@@ -254,7 +254,6 @@ def test_malformed_clouds_are_refused(message: PointCloud2, told: str):
     [
         (CLOUD, cloud([[0.3, 0.2, 0.0]], "map"), "no transform of frame 'map'; peripherals[].transform says where"),
         (CLOUD, attrs.evolve(ONE, fields=()), "world.clouds.lidar: /points: the cloud has no field x"),
-        (CLOUD, TFMessage(()), "needs a PointCloud2, or an Image of 16UC1 or 32FC1; got tf2_msgs/msg/TFMessage"),
         (CLOUD, attrs.evolve(depth_image(np.ones((2, 2))), encoding="rgb8"), "got sensor_msgs/msg/Image rgb8"),
         (CLOUD, depth_image(np.ones((30, 40))), "a depth image needs the CameraInfo of its camera on /camera_info"),
     ],

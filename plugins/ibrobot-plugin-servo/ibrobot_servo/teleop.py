@@ -73,7 +73,7 @@ class TwistTeleop(Teleop):
         self._chain = tuple(model.moving.tolist())
         limits = robot.max_velocity[self._indices], robot.max_acceleration[self._indices]
         self._servo = Servo(model, *limits, self._options, clearance=world_clearance(ctx.bus, self._arm))
-        self._twists = ctx.bus.subscribe(self._options.topic)
+        self._twists = ctx.bus.subscribe(self._options.topic, 10, TwistStamped)
         # Devices may share a topic; one of them serves it.
         self._serves = not ctx.bus.serves(self._options.topic)
         if self._serves:

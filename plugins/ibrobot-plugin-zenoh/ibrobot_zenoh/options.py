@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import ipaddress
 import re
+<<<<<<< HEAD
 from collections.abc import Iterator, Sequence
+=======
+from collections.abc import Mapping, Sequence
+>>>>>>> 36b5ecd (Bus: a topic has the type that the configuration, or what reads it, states)
 from pathlib import Path
 from typing import Any
 
 import attrs
 
+<<<<<<< HEAD
 from ibrobot_core.api import OptionFault, Robot, documented, option
+=======
+from ibrobot_core.api import MESSAGE_TYPES, did_you_mean, documented, option
+>>>>>>> 36b5ecd (Bus: a topic has the type that the configuration, or what reads it, states)
 
 MIB = 1024 * 1024
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
@@ -75,6 +83,7 @@ class Tls:
     robots: Path | None = option(None, help="to listen: a file of admitted robots, one name per line")
 
 
+<<<<<<< HEAD
 def _check_name(what: str, name: str, given: tuple[str, ...]) -> None:
     if not name.startswith("/"):
         raise ValueError(f"{name!r} is not a full {what}, did you mean '/{name}'?")
@@ -85,8 +94,21 @@ def _check_name(what: str, name: str, given: tuple[str, ...]) -> None:
 
 
 def _check_topics(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
+=======
+def _check_topics(instance: Any, attribute: attrs.Attribute[Any], value: tuple[str, ...]) -> None:
+>>>>>>> 36b5ecd (Bus: a topic has the type that the configuration, or what reads it, states)
     for topic in value:
         _check_name("topic name", topic, value)
+
+
+def _check_subscribed(
+    instance: Any, attribute: attrs.Attribute[Any], value: tuple[str, ...] | Mapping[str, str]
+) -> None:
+    _check_topics(instance, attribute, tuple(value))
+    for topic, type_name in value.items() if isinstance(value, Mapping) else ():
+        if type_name not in MESSAGE_TYPES:
+            known = did_you_mean(type_name, list(MESSAGE_TYPES), "the types are")
+            raise ValueError(f"{topic}: unknown message type {type_name!r}{known}")
 
 
 def _check_services(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
@@ -102,8 +124,11 @@ class Share:
     publish: tuple[str, ...] = option(
         (), validator=_check_topics, help="topics of this robot for others, e.g. /joint_states"
     )
-    subscribe: tuple[str, ...] = option(
-        (), validator=_check_topics, help="topics of other machines for this robot's bus, e.g. /force_torque"
+    subscribe: tuple[str, ...] | Mapping[str, str] = option(
+        (),
+        validator=_check_subscribed,
+        help="topics of other machines for this robot's bus, e.g. [/force_torque]; {/lamp: std_msgs/msg/Bool} states "
+        "the type of a topic that nothing else in this file states",
     )
     services: tuple[str, ...] = option(
         (),

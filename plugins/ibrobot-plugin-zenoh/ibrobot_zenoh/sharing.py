@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from typing import override
 
 from ibrobot_ros2.services import SERVICES, Answer, decode_call, encode_answer, endpoint
@@ -152,7 +152,7 @@ class PublishedTopic(SessionWorker):
 class SubscribedTopics(Component):
     """Forwards topics of other machines to the bus."""
 
-    def __init__(self, session: Session, link: TransportLink, topics: tuple[str, ...]) -> None:
+    def __init__(self, session: Session, link: TransportLink, topics: Collection[str] | Mapping[str, str]) -> None:
         super().__init__("share", f"{', '.join(topics)} from other machines", (link.name,))
         self._link = link
         self._session = session
@@ -161,8 +161,17 @@ class SubscribedTopics(Component):
 
     @override
     def start(self) -> None:
-        transport = _topics(self._link)
+        transport, bus = _topics(self._link), self._session.bus
+        for topic, type_name in self._topics.items() if isinstance(self._topics, Mapping) else ():
+            bus.expect(topic, type_name)
         for topic in self._topics:
+            if not bus.expected(topic):
+                self._session.log.warning(
+                    "transport.share.subscribe: nothing states the type of %s so far, so its first message does; "
+                    "{%s: TYPE} states it",
+                    topic,
+                    topic,
+                )
             self._ends.append(transport.subscribe_messages(topic, self._to_bus(topic)))
 
     def _to_bus(self, topic: str) -> Callable[[Message], None]:
