@@ -38,6 +38,7 @@ from ibrobot_core.api import (
     RequestError,
     Runtime,
     String,
+    TransportError,
     Vector,
     Vector3,
 )
@@ -185,7 +186,6 @@ def test_cmd_pose_is_a_goal(run, stamped: bool):
             Pose(Vector3(0.2, 0.0, 0.1), Quaternion(1.0, 0.0, 0.0, 1.0)),
             "INVALID_GOAL_CONSTRAINTS: the orientation is a quaternion of length 1.41, must be 1",
         ),
-        (String("up"), "UNRECOGNIZED_GOAL_TYPE: takes geometry_msgs/msg/PoseStamped or Pose, got std_msgs/msg/String"),
     ],
 )
 def test_wrong_cmd_pose_moves_nothing(run, message, expected: str, caplog: pytest.LogCaptureFixture):
@@ -196,6 +196,11 @@ def test_wrong_cmd_pose_moves_nothing(run, message, expected: str, caplog: pytes
         runtime.step()
     assert f"/cmd_pose: {expected}" in caplog.text
     np.testing.assert_array_equal(command(runtime), before)
+
+
+def test_a_cmd_pose_of_another_type_is_refused(run):
+    with pytest.raises(TransportError, match="topic /cmd_pose carries geometry_msgs/msg/Pose or .*, not std_msgs/msg"):
+        run().session.bus.publish(CMD_POSE, String("up"))
 
 
 def call(runtime: Runtime, service: str, request: object) -> MoveResult:

@@ -4,21 +4,13 @@ from __future__ import annotations
 
 import ipaddress
 import re
-<<<<<<< HEAD
-from collections.abc import Iterator, Sequence
-=======
-from collections.abc import Mapping, Sequence
->>>>>>> 36b5ecd (Bus: a topic has the type that the configuration, or what reads it, states)
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import attrs
 
-<<<<<<< HEAD
-from ibrobot_core.api import OptionFault, Robot, documented, option
-=======
-from ibrobot_core.api import MESSAGE_TYPES, did_you_mean, documented, option
->>>>>>> 36b5ecd (Bus: a topic has the type that the configuration, or what reads it, states)
+from ibrobot_core.api import MESSAGE_TYPES, OptionFault, Robot, did_you_mean, documented, option
 
 MIB = 1024 * 1024
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
@@ -83,7 +75,6 @@ class Tls:
     robots: Path | None = option(None, help="to listen: a file of admitted robots, one name per line")
 
 
-<<<<<<< HEAD
 def _check_name(what: str, name: str, given: tuple[str, ...]) -> None:
     if not name.startswith("/"):
         raise ValueError(f"{name!r} is not a full {what}, did you mean '/{name}'?")
@@ -93,10 +84,7 @@ def _check_name(what: str, name: str, given: tuple[str, ...]) -> None:
         raise ValueError(f"{name} is listed twice")
 
 
-def _check_topics(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
-=======
 def _check_topics(instance: Any, attribute: attrs.Attribute[Any], value: tuple[str, ...]) -> None:
->>>>>>> 36b5ecd (Bus: a topic has the type that the configuration, or what reads it, states)
     for topic in value:
         _check_name("topic name", topic, value)
 
