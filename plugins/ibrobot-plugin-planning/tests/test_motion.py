@@ -199,7 +199,7 @@ def test_wrong_cmd_pose_moves_nothing(run, message, expected: str, caplog: pytes
 
 
 def test_a_cmd_pose_of_another_type_is_refused(run):
-    with pytest.raises(TransportError, match="topic /cmd_pose carries geometry_msgs/msg/Pose or .*, not std_msgs/msg"):
+    with pytest.raises(TransportError, match=r"topic /cmd_pose carries geometry_msgs/msg/Pose or .*, not std_msgs/msg"):
         run().session.bus.publish(CMD_POSE, String("up"))
 
 
