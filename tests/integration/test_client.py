@@ -129,7 +129,7 @@ def test_script_on_the_page_runs(arm: Runtime, endpoint: str):
     )
     here = f'Node("pick", "connect=[{endpoint}]", "shared_memory=false", namespace="arm1")'
     assert 'Node("pick")' in script
-    checked = f"assert moveit2.get_last_execution_error_code().val == 1\n{servo}node.destroy_node()\nrclpy.shutdown()"
+    checked = f"assert moveit2.get_last_execution_error_code().val == 1\n{servo}rclpy.shutdown()"
     codes = arm.session.bus.subscribe("/servo_node/status", 100)
     text = imports + script.replace('Node("pick")', here).replace("rclpy.shutdown()", checked)
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=100, check=False)
@@ -146,3 +146,26 @@ def test_missing_robot_is_an_error(endpoint: str, monkeypatch: pytest.MonkeyPatc
     caplog.set_level(logging.CRITICAL)
     with pytest.raises(TransportError, match="nobody listens there"):
         Node("script", f"connect=[{endpoint}]", "shared_memory=false")
+
+
+@pytest.mark.parametrize(
+    ("end", "code"),
+    [("", 0), ("rclpy.shutdown()", 0), ("node.destroy_node()", 0), ("sys.exit(3)", 3), ("raise ValueError", 1)],
+    ids=["nothing", "shutdown", "destroyed", "exit", "error"],
+)
+def test_script_ends_however_it_ends(arm: Runtime, endpoint: str, end: str, code: int):
+    """With a node that nobody destroys, and a thread that spins."""
+    text = f"""\
+import sys
+from threading import Thread
+from ibrobot_planning.client import rclpy, Node
+node = Node("pick", "connect=[{endpoint}]", "shared_memory=false", namespace="arm1")
+executor = rclpy.executors.MultiThreadedExecutor(2)
+executor.add_node(node)
+Thread(target=executor.spin, daemon=True).start()
+node.call("/get_planning_scene")
+{end}
+"""
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == code, done.stderr
+    assert ("ValueError" in done.stderr) == (code == 1)

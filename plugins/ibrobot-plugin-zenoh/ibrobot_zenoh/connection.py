@@ -114,9 +114,10 @@ def open_connections() -> list[Connection]:
 
 @cache
 def _close_at_the_end() -> None:
-    """Register a handler, once, that closes open sessions at exit, so that the process ends.
+    """Register a handler, once, that closes open sessions when the main thread ends, so that the process ends.
 
-    The interpreter waits for Zenoh's callback threads, which wait for the end of their session.
+    The interpreter waits for Zenoh's callback threads, which wait for the end of their session, and for this thread: a
+    daemon would be killed while it closes one, which aborts the process.
     """
 
     def close_all() -> None:
@@ -124,7 +125,7 @@ def _close_at_the_end() -> None:
         for connection in tuple(_open):
             connection.close()
 
-    threading.Thread(target=close_all, name="zenoh ends", daemon=True).start()
+    threading.Thread(target=close_all, name="zenoh ends").start()
 
 
 class Connection:
