@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import override
 
@@ -35,6 +36,8 @@ class HardwareSuite(Suite[Hardware]):
     """Distance by which the checks move a joint [rad]."""
     tolerance_rad = 0.03
     """Allowed motion of a holding joint [rad]."""
+    quantum_rad = 0.004
+    """Motion between two ticks below which readings may be equal [rad]: a few steps of an encoder."""
 
     @override
     def context(self) -> Context:
@@ -122,6 +125,30 @@ class HardwareSuite(Suite[Hardware]):
             before = hardware.read().position.copy()
             self.elapse(hardware, ctx, self.settle_s)
             np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
+
+    def test_readings_are_new(self) -> None:
+        """While joints move, no reading repeats an older one under a new stamp, and two at one time agree."""
+        with self.connected() as (hardware, ctx):
+            hardware.read()
+            hardware.write(self._target(hardware, ctx))
+            positions = []
+            for _ in range(max(6, round(ns(self.settle_s) / ctx.period_ns / 2))):
+                self.elapse(hardware, ctx, 0.0)
+                first, second = hardware.read().position.copy(), hardware.read().position.copy()
+                positions.append(second)
+                way = np.abs(second - positions[-2]).max() if len(positions) > 1 else self.move_rad
+                assert np.abs(second - first).max() <= max(way / 4, self.quantum_rad), "the first reading was stale"
+            steps = np.abs(np.diff(positions, axis=0)).max(axis=1)
+            moving = np.minimum(steps[:-2], steps[2:]) > self.quantum_rad
+            assert (steps[1:-1][moving] > 0).all(), "a reading repeats the one before under a new stamp"
+
+    def test_reading_fits_into_a_control_period(self) -> None:
+        """`read` and `write` do not block the loop: the quickest of several takes less than a period."""
+        with self.connected() as (hardware, ctx):
+            position = hardware.read().position.copy()
+            for name, call in (("read", hardware.read), ("write", lambda: hardware.write(position))):
+                quickest_s = min(_duration_s(call) for _ in range(5))
+                assert quickest_s < ctx.period_ns / ns(1.0), f"{name} takes {quickest_s:.3f} s"
 
     def test_write_moves_each_joint_towards_its_command(self) -> None:
         """A command for one joint moves this joint, and no other."""
@@ -248,6 +275,22 @@ class HardwareSuite(Suite[Hardware]):
             self.elapse(hardware, ctx, 2 * self.settle_s)
             assert (np.abs(hardware.read().position - goal) < 0.5 * np.abs(goal - start)).all()
 
+    def test_torque_returns_without_a_jump(self) -> None:
+        """`relax` is not supported, or torque comes back where the joints are: a command to stay moves nothing."""
+        with self.connected() as (hardware, ctx):
+            self.moved(hardware, ctx)
+            try:
+                hardware.relax()
+            except NotSupported:
+                pytest.skip("has no torque control")
+            self.elapse(hardware, ctx, 0.0)
+            before = hardware.read().position.copy()
+            for _ in range(max(1, round(ns(self.settle_s) / ctx.period_ns))):
+                hardware.write(before)
+                self.elapse(hardware, ctx, 0.0)
+                away = np.abs(hardware.read().position - before).max()
+                assert away < self.tolerance_rad, f"a joint jumped by {away:.3f} rad when torque came back"
+
     def test_reset_faults_moves_nothing(self) -> None:
         """`reset_faults` on healthy hardware changes nothing."""
         with self.connected() as (hardware, ctx):
@@ -269,6 +312,12 @@ class HardwareSuite(Suite[Hardware]):
                 hardware.read_signal(i, first)
                 hardware.read_signal(i, second)
                 assert not ((first == 1e300) | (second == -1e300)).any(), f"{signal.topic} leaves numbers unwritten"
+
+
+def _duration_s(call: Callable[[], object]) -> float:
+    begun = time.perf_counter()
+    call()
+    return time.perf_counter() - begun
 
 
 class SimulatedHardwareSuite(HardwareSuite):

@@ -137,6 +137,17 @@ class PolicySuite(Suite[Policy]):
             policy.postprocess(policy.infer(policy.preprocess(self.frame(policy, ctx, 2))))
             np.testing.assert_array_equal(chunk, before)
 
+    def test_outputs_of_each_step_stay_as_they_were(self) -> None:
+        """What `preprocess` and `infer` returned does not change with the next request: requests overlap."""
+        with self.loaded() as (policy, ctx):
+            inputs = policy.preprocess(self.frame(policy, ctx, 1))
+            inputs_before = copied_tensors(inputs)
+            outputs = policy.infer(inputs)
+            outputs_before = copied_tensors(outputs)
+            policy.infer(policy.preprocess(self.frame(policy, ctx, 2)))
+            assert _equal(inputs, inputs_before), "preprocess uses its output again"
+            assert _equal(outputs, outputs_before), "infer uses its output again"
+
     def test_pre_and_postprocess_are_pure(self) -> None:
         """The same input gives the same output."""
         with self.loaded() as (policy, ctx):

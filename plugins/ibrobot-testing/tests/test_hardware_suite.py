@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import ClassVar, override
 
 import numpy as np
@@ -227,7 +228,69 @@ class LimitsItself(FakeHardware):
         super().write(position)
 
 
+class TorqueByWayOfZero(FakeHardware):
+    """The goal register has zero while torque is off, and the joints are pulled there until the command arrives."""
+
+    back = 0
+
+    def write(self, position):
+        self.back = 5 if self.relaxed else self.back
+        super().write(position)
+
+    def advance(self, step_ns):
+        command = self._command
+        if self.back:
+            self.back, self._command = self.back - 1, np.zeros_like(command)
+        super().advance(step_ns)
+        self._command = command
+
+
+class RepeatsALostReply(FakeHardware):
+    """Of fast joints, every seventh reading has the positions of the one before, and a new stamp."""
+
+    number = 0
+    last = np.zeros(0)
+
+    def reset(self, episode):
+        super().reset(episode)
+        self.number = 0
+
+    def read(self):
+        r = super().read()
+        self.number += 1
+        if self.number % 14 not in (0, 1) or np.abs(r.velocity).max() < 0.5:
+            self.last = r.position
+        return JointReading(r.stamp_ns, self.last.copy(), r.velocity, r.effort)
+
+
+class AlwaysStale(FakeHardware):
+    """Each reading is that of the tick before, as from a queue that nobody empties."""
+
+    queue = ()
+
+    def read(self):
+        r = super().read()
+        self.queue = (*self.queue, r.position)[-2:]
+        return JointReading(r.stamp_ns, self.queue[0].copy(), r.velocity, r.effort)
+
+
+class BlocksInRead(FakeHardware):
+    def read(self):
+        time.sleep(0.05)
+        return super().read()
+
+
+class BlocksInWrite(FakeHardware):
+    def write(self, position):
+        super().write(position)
+        time.sleep(0.02)
+
+
 WRONG = {
+    TorqueByWayOfZero: "torque_returns_without_a_jump",
+    RepeatsALostReply: "readings_are_new",
+    AlwaysStale: "readings_are_new",
+    BlocksInWrite: "reading_fits_into_a_control_period",
     OtherJoints: "owns_the_joints_it_was_given",
     ShortVelocity: "reading_is_complete",
     NotANumber: "reading_is_complete",
@@ -271,6 +334,35 @@ def test_catches(wrong, caught_by, tmp_path):
             return wrong(ctx)
 
     assert caught_by in failed_checks(Suite, tmp_path)
+
+
+def test_catches_a_read_that_blocks(tmp_path):
+    """Only this check is run: the others would take minutes with it."""
+
+    class Suite(TestSimulatedHardware):
+        @override
+        def make(self, ctx):
+            return BlocksInRead(ctx)
+
+    with pytest.raises(AssertionError, match=r"read takes 0\.05"):
+        Suite().test_reading_fits_into_a_control_period()
+
+
+ALONE = {
+    TorqueByWayOfZero: "torque_returns_without_a_jump",
+    RepeatsALostReply: "readings_are_new",
+    BlocksInWrite: "reading_fits_into_a_control_period",
+}
+
+
+@pytest.mark.parametrize(("wrong", "caught_by"), ALONE.items(), ids=lambda v: getattr(v, "__name__", v))
+def test_no_other_check_catches(wrong, caught_by, tmp_path):
+    class Suite(TestSimulatedHardware):
+        @override
+        def make(self, ctx):
+            return wrong(ctx)
+
+    assert set(failed_checks(Suite, tmp_path)) == {caught_by}
 
 
 def test_every_check_catches_something():
