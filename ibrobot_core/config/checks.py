@@ -117,7 +117,8 @@ class Checks:
             if limits and not joint.beyond_model:
                 self._within(("robot", "joints", i), joint, limits)
         at: Key = ("robot", "description", "tip")
-        if known and self.document.get(*at) is not None:
+        models = {("robot", "description", model) for model in READERS}
+        if known and self.document.get(*at) is not None and not models & self.document.unread:
             frames = [name for each in known for name in each.frames]
             self.document.refer(at, robot.description.tip, frames, " or ".join(each.frame for each in known))
 
@@ -187,6 +188,8 @@ class Checks:
     def _fault(self, key: Key, fault: OptionFault) -> None:
         """Report a fault of a component; one that needs a model that is not installed counts as missing itself."""
         absent = self.sections.absent_models.get(fault.model)
+        if fault.model and ("robot", "description", fault.model) in self.document.unread:
+            return
         if absent is None:
             self.document.add((*key, *fault.option), fault.message)
         else:
@@ -266,7 +269,7 @@ class Checks:
             self.document.add((*key, sources[1]), f"{sources[0]} already drives this mode; make a mode for each")
         elif sources:
             self._drives(key, mode, sources[0])
-        if mode.inference is None and self.document.get(*key, "dispatch") is not None:
+        if self.document.get(*key, "inference") is None and self.document.get(*key, "dispatch") is not None:
             self.document.add((*key, "dispatch"), "applies only to a mode with inference")
 
     def _operated(self, at: Key, given: str | Mapping[str, str] | None, mode: ControlMode, robot: Robot | None) -> None:
@@ -365,7 +368,8 @@ class Checks:
 
     def _transport(self) -> None:
         part = self.sections.transport
-        if part is None or self.communicates or part.descriptor.type == "local":
+        faulty = any(key[:1] == ("transport",) for key in self.document.unread)
+        if part is None or faulty or self.communicates or part.descriptor.type == "local":
             return
         assert isinstance(part.descriptor, TransportDescriptor)
         inference = self.sections.inference.values()

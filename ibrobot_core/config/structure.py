@@ -13,6 +13,7 @@ import attrs
 from ibrobot_core.config import schema
 from ibrobot_core.config.expand import missing_package, resolve_path
 from ibrobot_core.config.missing import Missing
+from ibrobot_core.config.repair import structure_rest
 from ibrobot_core.config.secrets import note
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Converter, Faults, Key, error_message, unknown_key
@@ -163,8 +164,13 @@ class SectionParser:
             elif (entry := self.registry.entries.get(("section", name))) is not None:
                 reason = f"{entry.package} adds a section of this name, which is one of ibrobot's own"
                 faults.add((name,), f"{reason}: rename it there, or pip uninstall {entry.package}")
-        sections.plain = _Outline(self._files).arguments(known, self._with_installed_models(sections), faults)
+        root, outline = self._with_installed_models(sections), _Outline(self._files)
+        sections.plain = outline.arguments(known, root, faults)
         self._report((), faults)
+        for name in (name for name in known if name in root and name not in sections.plain):
+            faulty = [key[1:] for key, _ in faults.found if key[0] == name]
+            rest = structure_rest(name, root[name], known[name].type, faulty, outline)
+            sections.plain |= {name: rest} if rest is not None else {}
 
     def _with_installed_models(self, sections: ParsedSections) -> Mapping[str, Any]:
         """The document without the models whose package is not installed; only what needs these is affected."""
@@ -204,6 +210,7 @@ class SectionParser:
         for inner, message in faults.found:
             middle = ("sim",) if inner and inner[0] in below_sim else ()
             self.document.add((*key, *middle, *inner), message)
+            self.document.unread.add((*key, *middle, *inner))  # other checks do not report it again
 
     def _component[C: schema.ComponentConfig](
         self,
@@ -244,11 +251,16 @@ class SectionParser:
             note(self.document, descriptor.options, value, key)
             options = self._options(descriptor, kind, value, faults)
         self._report(key, faults, below_sim)
-        if faults.found or descriptor is None:
+        if options is None or descriptor is None:
             return None
         named = {} if name is None else {"name": name}
         described = kind.described(descriptor, options)
-        return ParsedComponent(key, kind(**arguments, **named, **described, options=options), descriptor)
+        try:
+            return ParsedComponent(key, kind(**arguments, **named, **described, options=options), descriptor)
+        except TypeError:
+            if not faults.found:
+                raise
+            return None  # without a required key
 
     def _find(
         self, key: Key, kind: type[schema.ComponentConfig], type_: str, needed: bool, faults: Faults
@@ -276,12 +288,11 @@ class SectionParser:
                 faults.add((name,), message if others else unknown_key(name, [*own, *known]))
         before = len(faults.found)
         arguments = self._converter.arguments(known, value, faults)
-        if len(faults.found) > before:
-            return None
-        try:
+        try:  # without faulty options, for the checks of the others
             return descriptor.options(**arguments)
         except (ValueError, TypeError) as error:
-            faults.add((), error_message(error))
+            if len(faults.found) == before:
+                faults.add((), error_message(error))
             return None
 
     def _named[C: schema.NamedComponentConfig](self, section: str, kind: type[C]) -> dict[str, ParsedComponent[C]]:
@@ -354,7 +365,8 @@ class SectionParser:
         """Parse a sensor, or in simulation the simulated sensor of its kind, with the options that both have."""
         before = len(self.document.problems)
         as_is = self._component(key, schema.PeripheralConfig, needed=needed)
-        if as_is is not None and isinstance(as_is.descriptor, SensorDescriptor):
+        sound = len(self.document.problems) == before
+        if sound and as_is is not None and isinstance(as_is.descriptor, SensorDescriptor):
             kind, type_ = as_is.component.kind, as_is.component.type
             if as_is.descriptor.kind != kind:
                 found = as_is.descriptor.kind

@@ -216,6 +216,8 @@ CASES = {
     "execution_mode_option_value": (
         "{model: net}",
         "{model: net, execution_mode: far, server: 5}\n    dispatch: {watermark: 1}",
+        "robot.yaml:26: control_modes.policy.inference.execution_mode: far needs a transport to the server, "
+        "e.g. transport: {type: zenoh, connect: [tcp/127.0.0.1:7447]}\n"
         "robot.yaml:26: control_modes.policy.inference.server: expected text, got 5 (quote it: '5')",
     ),
     "execution_mode_without_a_transport": (

@@ -143,3 +143,30 @@ def test_transport_that_nothing_uses_is_refused(load_text: Load, base: str, regi
     assert faults(load_text, base + "transport: {type: shared}\n") == (
         "robot.yaml:42: transport.type: nothing uses 'shared': no mode has an execution_mode that needs a transport"
     )
+
+
+MISTAKES = (
+    ("{name: pan, lower: -1.0,", "{name: pan, lower: low,"),
+    ("poses: {home: [0, 0, 0]}", "poses: {home: [0, 0]}"),
+    ("hardware: {type: bus, port: /dev/null}", "hardware: {type: bus, port: /dev/null, baudd: 1}"),
+    ("{name: top, kind: camera, type: webcam, fps: 30}", "{name: top, kind: camera, type: webcam, fps: fast}"),
+    ("grip_position: {type: position, group: gripper}", "grip_position: {type: position, group: griper}"),
+    ("plan: {executors: [arm_trajectory]", "plan: {executors: [arm_trajectry]"),
+    ("stick: {type: stick}", "stick: {type: stick, port: /dev/null, inverted: [lyft]}"),
+    ("rate_hz: 30", "rate_hz: often"),
+    ("control: {rate_hz: 100, stop: hold}", "control: {rate_hz: [100], stop: pose hom}"),
+)
+
+
+def test_independent_mistakes_are_reported_at_once(base: str, load_text: Load) -> None:
+    text = base
+    for old, new in MISTAKES:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    found = faults(load_text, text).splitlines()
+    keys = [line.split(": ")[1] for line in found]
+    assert keys == [
+        "robot.joints.pan.lower", "robot.description.poses.home", "hardware.baudd", "peripherals.top.fps",
+        "executors.grip_position.group", "control_modes.plan.executors.0", "teleoperation.stick.port",
+        "teleoperation.stick.inverted.0", "contract.rate_hz", "control.rate_hz", "control.stop",
+    ], found  # fmt: skip
