@@ -43,6 +43,8 @@ class OperatorOptions:
 class ScriptedOperator(Teleop):
     """Watches the cube: not lifted in time, dropped or not delivered in time means that the policy is about to fail."""
 
+    operated = False
+
     def __init__(self, options: OperatorOptions, ctx: Context) -> None:
         assert ctx.bus is not None
         self._options = options

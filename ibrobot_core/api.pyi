@@ -91,7 +91,9 @@ from ibrobot_core.interfaces import (
     Torque as Torque,
     Transport as Transport,
     Viewer as Viewer,
+    begin_operation as begin_operation,
     nan_vector as nan_vector,
+    operate as operate,
     trajectory_goal as trajectory_goal,
 )
 from ibrobot_core.interfaces.policy import copied_tensors as copied_tensors
@@ -162,7 +164,7 @@ from ibrobot_core.messages import (
     Vector3 as Vector3,
 )
 from ibrobot_core.robot import Description as Description, Joint as Joint, Robot as Robot, Vector as Vector
-from ibrobot_core.deadman import Deadman as Deadman
+from ibrobot_core.deadman import HOLD_S as HOLD_S, Deadman as Deadman
 from ibrobot_core.clock import Clock as Clock, RealClock as RealClock, SteppedClock as SteppedClock
 from ibrobot_core.bus import Bus as Bus, Received as Received, Subscription as Subscription
 from ibrobot_core.services import (

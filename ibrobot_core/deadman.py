@@ -42,6 +42,7 @@ class Deadman:
         self._armed = self._pressed = False
         """Whether it was seen released, and then pressed, since then."""
         self._made_ns = 0
+        self._reported = False
         self._ended_ns: int | None = None
         """When a release or a silence ended the last motion [ns]; None if something else did."""
         self._asked_ns: int | None = None
@@ -50,6 +51,11 @@ class Deadman:
     def silence_ns(self) -> int:
         """The silence that disarms at present [ns]."""
         return ns(max(_LEAST_SILENCE_S, HOLD_S - _MARGIN_S - self.braking_s))
+
+    @property
+    def reported(self) -> bool:
+        """Whether the device has ever reported."""
+        return self._reported
 
     @property
     def armed(self) -> bool:
@@ -65,6 +71,7 @@ class Deadman:
             made_ns: when the report was made, or received if the device does not say [ns].
         """
         with self._lock:
+            self._reported = True
             if made_ns < self._made_ns or made_ns <= self._since_ns:
                 return
             if self._pressed and made_ns - self._made_ns > self.silence_ns:

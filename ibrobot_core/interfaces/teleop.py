@@ -5,11 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Literal
+from typing import ClassVar, Literal
 
 import attrs
 
 from ibrobot_core.deadman import Deadman
+from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces.hardware import JointReading
 
 OperatorEvent = Literal["start", "success", "failure", "discard", "intervention"]
@@ -31,11 +32,17 @@ class TeleopCommand:
 
 
 class Teleop(ABC):
-    """A device that commands joint positions. Its first positions after `activate` must be those of the robot."""
+    """A device that commands joint positions. Its first positions after `activate` must be those of the robot.
+
+    The run drops positions that `deadman` does not allow.
+    """
+
+    operated: ClassVar[bool] = True
+    """Whether an operator starts every motion by a deadman. False for a device that moves by itself, e.g. a demo."""
 
     @cached_property
     def deadman(self) -> Deadman:
-        """The device's deadman, to which it reports; it moves the robot only while this allows it."""
+        """The device's deadman: `read` reports each state of it that the device sends, and moves while it allows."""
         return Deadman()
 
     @abstractmethod
@@ -65,7 +72,8 @@ class Teleop(ABC):
     def activate(self, measured: JointReading) -> None:
         """Called when the mode begins and after every reset: start from the measured position.
 
-        Nothing moves until the operator acts again: a deadman that was pressed before counts as released.
+        `deadman` is disarmed already, so that nothing moves until the operator acts again. An emergency stop that the
+        operator has requested is not discarded.
         """
 
     def approach(self, measured: JointReading) -> bool:
@@ -82,3 +90,34 @@ class Teleop(ABC):
     def help(self) -> str:
         """Instructions for the operator, in a few lines: keys, buttons."""
         return ""
+
+
+def begin_operation(device: Teleop, measured: JointReading) -> None:
+    """Let a device start from the measured position, with its deadman disarmed."""
+    device.deadman.disarm(measured.stamp_ns)
+    device.activate(measured)
+
+
+def operate(device: Teleop, measured: JointReading) -> TeleopCommand:
+    """The device's command, without positions that its deadman does not allow.
+
+    Raises:
+        TeleopError: as `Teleop.read`, or if the device commands positions and never reports its deadman.
+    """
+    deadman, now_ns = device.deadman, measured.stamp_ns
+    try:
+        command = device.read(measured)
+    except TeleopError:
+        deadman.disarm(now_ns)
+        raise
+    if command.estop:
+        deadman.disarm(now_ns)
+    allowed = deadman.allows(now_ns) or deadman.brakes(now_ns)
+    if allowed or command.positions is None or not device.operated:
+        return command
+    if not deadman.reported:
+        raise TeleopError(
+            f"{type(device).__name__} commands positions without a deadman: its read must call self.deadman.report, "
+            "or its class say operated = False"
+        )
+    return attrs.evolve(command, positions=None)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.errors import TeleopError
-from ibrobot_core.interfaces import JointReading, Teleop, TeleopCommand
+from ibrobot_core.interfaces import JointReading, Teleop, TeleopCommand, begin_operation, operate
 from ibrobot_core.launch.session import Session
 from ibrobot_core.robot import Robot
 
@@ -84,7 +84,8 @@ class OperatorDevices:
     def activate(self, measured: JointReading) -> None:
         """Let all devices start from the measured position; see `Teleop.activate`."""
         for each in self._connected:
-            each.device.activate(measured.of(each.columns))
+            begin_operation(each.device, measured.of(each.columns))
+            each.device.deadman.disarm(self._session.clock.now_ns())  # reports since the measurement do not count
 
     def approach(self, measured: JointReading) -> bool:
         """Drive devices with motors to the robot's pose; return whether all have arrived. See `Teleop.approach`.
@@ -102,8 +103,10 @@ class OperatorDevices:
         """
         commands, faults = [], []
         for each in self._connected:
+            own = measured.of(each.columns)
+            each.device.deadman.braking_s = self._braking_s(own, each.columns)
             try:
-                command = each.device.read(measured.of(each.columns))
+                command = operate(each.device, own)
                 if strange := set(command.positions or ()) - each.joints:
                     raise TeleopError(
                         f"{each.name}: commands joints that are not its own: {', '.join(sorted(strange))}"
@@ -125,6 +128,13 @@ class OperatorDevices:
     def help(self) -> str:
         """The instructions of all devices."""
         return "\n".join(filter(None, (each.device.help() for each in self._connected)))
+
+    def _braking_s(self, measured: JointReading, columns: NDArray[np.intp]) -> float:
+        """Time that the joints need to stop from their present velocities, and one period [s]."""
+        robot = self._session.config.robot
+        speed = np.nan_to_num(np.abs(measured.velocity), nan=np.inf)
+        slowest = np.minimum(speed, robot.max_velocity[columns]) / robot.max_acceleration[columns]
+        return float(slowest.max()) + 1.0 / self._session.config.control.rate_hz
 
     def _opened(self, name: str, part: Robot) -> Teleop:
         device: Teleop = self._session.make("teleop", self._session.config.teleoperation[name], name, robot=part)

@@ -2,15 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import override
 
 import numpy as np
 
 from ibrobot_core.config.schema import ControlMode
+from ibrobot_core.control.link import ControlState
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.launch.session import Session
 from ibrobot_core.launch.sources.operator_devices import OperatorDevices
 from ibrobot_core.launch.sources.source_worker import SourceWorker
+from ibrobot_core.units import seconds
+
+
+class Braking:
+    """Lets joints that are no longer commanded brake as fast as they may, without a return to their last setpoint."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the joints that were commanded."""
+        self._commanded: frozenset[str] = frozenset()
+        self._before: ControlState | None = None
+
+    def add(self, positions: Mapping[str, float]) -> dict[str, float]:
+        """`positions` [rad] with those where joints stop that were commanded the last time."""
+        before, state = self._before, self._session.state
+        dropped = sorted(self._commanded - set(positions))
+        self._commanded, self._before = frozenset(positions), state
+        if not dropped or before is None or state is None or state.stamp_ns <= before.stamp_ns:
+            return dict(positions)
+        robot = self._session.config.robot
+        columns = robot.indices(tuple(dropped))
+        command = state.command[columns]
+        velocity = (command - before.command[columns]) / seconds(state.stamp_ns - before.stamp_ns)
+        stop = command + velocity * np.abs(velocity) / (2 * robot.max_acceleration[columns])
+        stop = np.clip(stop, np.minimum(robot.lower[columns], command), np.maximum(robot.upper[columns], command))
+        return {**positions, **dict(zip(dropped, stop.tolist(), strict=True))}
 
 
 class TeleopSource(SourceWorker):
@@ -24,6 +55,7 @@ class TeleopSource(SourceWorker):
 
     def __init__(self, session: Session, mode: ControlMode) -> None:
         self._devices = OperatorDevices(session, mode.devices)
+        self._braking = Braking(session)
         super().__init__(session, mode, f"teleop {self._devices}")
 
     @override
@@ -39,6 +71,7 @@ class TeleopSource(SourceWorker):
 
     @override
     def begin_mode(self, seed: int) -> None:
+        self._braking.begin()
         self._devices.activate(self.session.measured())
 
     @override
@@ -61,9 +94,9 @@ class TeleopSource(SourceWorker):
             return
         if session.finished.is_set():
             return  # from here on, only emergency stops count
-        if command.positions:
-            setpoint = np.array([list(command.positions.values())])
-            session.send_plan(session.clock.now_ns(), 1, tuple(command.positions), setpoint)
+        if positions := self._braking.add(command.positions or {}):
+            setpoint = np.array([list(positions.values())])
+            session.send_plan(session.clock.now_ns(), 1, tuple(positions), setpoint)
         for event in command.events:
             if event == "intervention":
                 session.log.warning("%s: mode %s has no policy to take the robot from", event, self.mode.name)

@@ -139,6 +139,11 @@ class JogMotion:
     pose_speed: float = 0.0
     """Speed towards the target [rad/s]."""
 
+    @property
+    def is_rest(self) -> bool:
+        """Whether it requests no motion."""
+        return self.pose is None and not (self.velocity.any() or self.linear.any() or self.turn.any())
+
 
 class VelocityJog:
     """Integrates the velocities of a jog device into setpoints.

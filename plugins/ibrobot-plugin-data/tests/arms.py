@@ -45,6 +45,8 @@ class Scene(FakeHardware):
 class Stick(FakeTeleop):
     """Pushed forward, all the time."""
 
+    operated = False
+
     def __init__(self, ctx: Context) -> None:
         super().__init__(ctx)
         self.velocity = 0.2
@@ -53,7 +55,7 @@ class Stick(FakeTeleop):
     @override
     def activate(self, measured: JointReading) -> None:
         super().activate(measured)
-        self.deadman = True
+        self.pressed = True
 
 
 @hookimpl

@@ -47,6 +47,8 @@ class Controls:
     """Name -> deflection, -1 to 1, triggers 0 to 1."""
     buttons: frozenset[str]
     """The pressed ones."""
+    complete: bool = True
+    """Whether the device has told the state of its buttons since it was connected."""
 
     def value(self, control: str) -> float:
         """Deflection of an axis; 1 for a pressed button; 0 for a control that the device lacks."""

@@ -20,7 +20,13 @@ class DeviceGone(Exception):
 
 
 class Device(ABC):
-    """An open device."""
+    """An open device.
+
+    Attributes:
+        streams: whether it reports continuously, so that silence means that it is lost; others report only changes.
+    """
+
+    streams = False
 
     @abstractmethod
     def poll(self, now_ns: int) -> list[Controls]:

@@ -64,6 +64,7 @@ class HidDevice(Device):
 
     def __init__(self, path: bytes, model: Model) -> None:
         self._model = model
+        self.streams = model.streams
         self._parse = model.start()
         self._heard_ns: int | None = None
         self._asked_ns: int | None = None

@@ -147,6 +147,11 @@ class GamepadOptions(JogOptions):
         choices=("auto", "hid", "sdl"),
         help="how to read the pad: its own reports (hid), SDL's mapping database (sdl), or the first that knows it",
     )
+    trust_link: bool = option(
+        False,
+        help="whether a pad that reports only changes (Xbox, and all by SDL) may be silent while it moves the robot; a "
+        "lost radio link or a frozen pad then ends the motion only when the system notices, which can take seconds",
+    )
     joints: Mapping[str, str] = _joints(PAD)
     tool: Mapping[str, str] = _tool(PAD)
     buttons: Mapping[str, str] = _buttons(PAD)

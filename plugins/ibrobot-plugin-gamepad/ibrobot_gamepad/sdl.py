@@ -92,6 +92,7 @@ class SdlDevice(Device):
             raise OSError("unplugged in the meantime")
         self._controller = sdl2.SDL_GameControllerOpen(index) if sdl2.SDL_IsGameController(index) else None
         self._joystick = sdl2.SDL_JoystickOpen(index)
+        self._last: Controls | None = None
         if not self._joystick:
             raise OSError(sdl2.SDL_GetError().decode(errors="replace"))
 
@@ -102,7 +103,11 @@ class SdlDevice(Device):
         self._sdl2.SDL_GameControllerUpdate()
         if not self._sdl2.SDL_JoystickGetAttached(self._joystick):
             raise DeviceGone("unplugged")
-        return [self._standard() if self._controller else self._numbered()]
+        state = self._standard() if self._controller else self._numbered()
+        if state == self._last:
+            return []
+        self._last = state
+        return [state]
 
     @override
     def close(self) -> None:

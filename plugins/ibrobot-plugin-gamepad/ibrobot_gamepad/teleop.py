@@ -26,6 +26,8 @@ from ibrobot_gamepad.reports import Kind
 
 _LOOK_NS = ns(0.5)
 """Period of the search while no device is connected."""
+_REST_NS = ns(2.0)
+"""Time for which the deadman of a device that reports only changes may be held at rest [ns]."""
 _LONGEST_STEP_S = 0.1
 """Maximum motion of one command [s]: after a pause of the host the robot does not jump."""
 _GRIPPER = ("gripper_open", "gripper_close", "gripper")
@@ -38,6 +40,9 @@ class JogTeleop(Teleop):
 
     Without a device the robot holds. Buttons held when a device connects, or when the mode begins, count as released:
     the operator must press the deadman again before anything moves.
+
+    A device that reports only changes is silent while its controls are still. Its deadman then counts as held for as
+    long as nothing should move, up to two seconds; a motion ends as with any other silent device.
     """
 
     def __init__(self, options: GamepadOptions | SpaceMouseOptions, ctx: Context) -> None:
@@ -46,6 +51,7 @@ class JogTeleop(Teleop):
         self._ctx = ctx
         self._kind: Kind = "gamepad" if isinstance(options, GamepadOptions) else "spacemouse"
         self._via = options.via if isinstance(options, GamepadOptions) else "hid"
+        self._trusts = isinstance(options, GamepadOptions) and options.trust_link
         self._map = control_map(options, robot)
         self._buttons = {**self._map.buttons, **{_POSE + name: button for name, button in self._map.poses.items()}}
         """Function -> button."""
@@ -71,10 +77,11 @@ class JogTeleop(Teleop):
         """Functions whose buttons are pressed; all of them until the device has sent a state."""
         self._rest: dict[str, float] = {}
         """Gripper control -> its first value, for those that have not moved yet."""
+        self._heard_ns = 0
+        """When its last state came [ns]."""
         self._release()
 
     def _release(self) -> None:
-        self._engaged = False
         self._toggle_ns: int | None = None
         """When the toggle button was pressed [ns]; None after the toggle, or while it is released."""
         self._moved_ns: int | None = None
@@ -91,7 +98,8 @@ class JogTeleop(Teleop):
 
     @override
     def activate(self, measured: JointReading) -> None:
-        self._take(self._poll(measured.stamp_ns), measured.stamp_ns)  # discards buttons pressed before
+        # Discards buttons pressed before, except for the emergency stop.
+        self._take(self._poll(measured.stamp_ns), measured.stamp_ns)
         self._release()
         self._jog.restart(measured.position)
 
@@ -106,7 +114,7 @@ class JogTeleop(Teleop):
             self._release()
             return TeleopCommand(None, estop=True, events=events)
         self._toggle_after_long_press(measured)
-        if not self._engaged or self._controls is None:
+        if not self.deadman.allows(now_ns) or self._controls is None:
             self._moved_ns = None
             return TeleopCommand(None, events=events)
         if self._moved_ns is None:
@@ -127,7 +135,9 @@ class JogTeleop(Teleop):
     @override
     def help(self) -> str:
         moves = "the tool" if self._mode == "tool" else "joints"
-        return f"{self._name or f'no {self._kind} yet'}: moves {moves}\n{self._map.help()}"
+        stuck = self._controls is not None and "deadman" in self._pressed and not self.deadman.armed
+        then = "; RELEASE the deadman and press it again" if stuck else ""
+        return f"{self._name or f'no {self._kind} yet'}: moves {moves}{then}\n{self._map.help()}"
 
     def _poll(self, now_ns: int) -> Sequence[Controls]:
         """The new states of the device, if one is connected."""
@@ -146,6 +156,7 @@ class JogTeleop(Teleop):
         except DeviceGone as error:
             self._ctx.log.warning("%s: lost %s (%s); the robot holds", self._ctx.name, self._name, error)
             self._lose()
+            self.deadman.disarm(now_ns)
             return ()
 
     def _is_due(self, now_ns: int) -> bool:
@@ -169,14 +180,15 @@ class JogTeleop(Teleop):
         """Process the new states; returns the operator's events."""
         events: list[OperatorEvent] = []
         if states and self._controls is None:
-            self._ctx.log.info("%s: %s", self._ctx.name, self._name)
+            self._greet()
         for controls in states:
-            self._controls = controls
+            self._controls, self._heard_ns = controls, now_ns
+            if not controls.complete:
+                continue
             before, self._pressed = self._pressed, self._functions(controls)
+            self.deadman.report("deadman" in self._pressed, now_ns)
             for function in sorted(self._pressed - before):
-                if function == "deadman":
-                    self._engaged = True
-                elif function == "toggle":
+                if function == "toggle":
                     self._toggle_ns = now_ns
                 elif function == "gripper":
                     self._opens = not self._opens
@@ -184,11 +196,26 @@ class JogTeleop(Teleop):
                     self._estop = True
                 elif function in EVENTS:
                     events.append(function)
-            if "deadman" not in self._pressed:
-                self._engaged = False
             if "toggle" not in self._pressed:
                 self._toggle_ns = None
+        if not states:
+            self._vouch(now_ns)
         return tuple(events)
+
+    def _greet(self) -> None:
+        self._ctx.log.info("%s: %s", self._ctx.name, self._name)
+        if self._device is not None and not self._device.streams:
+            silence = "its open connection counts as a report" if self._trusts else "a motion ends when it is silent"
+            self._ctx.log.info("%s: it reports only changes, so %s", self._ctx.name, silence)
+
+    def _vouch(self, now_ns: int) -> None:
+        """Report the deadman of a silent device that reports only changes, where this moves nothing."""
+        controls = self._controls
+        if self._device is None or self._device.streams or controls is None or not controls.complete:
+            return
+        held = "deadman" in self._pressed
+        if not held or self._trusts or (now_ns - self._heard_ns <= _REST_NS and self._motion(controls).is_rest):
+            self.deadman.report(held, now_ns)
 
     def _functions(self, controls: Controls) -> frozenset[str]:
         """Functions whose buttons are pressed; those of the gripper only after their controls have moved."""

@@ -9,19 +9,37 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from ibrobot_core.api import Context, JointReading, OperatorEvent, Teleop, TeleopCommand, TeleopError, Vector
+from ibrobot_core.api import (
+    HOLD_S,
+    Context,
+    JointReading,
+    OperatorEvent,
+    Teleop,
+    TeleopCommand,
+    TeleopError,
+    Vector,
+    begin_operation,
+    ns,
+    operate,
+)
 from ibrobot_testing.suite import Suite
 
 
 class TeleopSuite(Suite[Teleop]):
-    """Checks of every `Teleop`. The subclass plays the operator with `engage`, `release`, `operate` and `press`."""
+    """Checks of every `Teleop`. The subclass plays the operator with `engage`, `release`, `operate` and `press`.
+
+    The checks drive the device as a run does, with `begin_operation` and `operate`.
+    """
 
     has_deadman: ClassVar[bool] = True
     """Whether the device has a deadman, which `release` releases."""
     has_operator: ClassVar[bool] = True
-    """Whether an operator starts every motion. False for a device that moves the robot by itself, e.g. a demo."""
+    """Whether an operator starts every motion. False for a device with `operated = False`."""
     tolerance_rad: ClassVar[float] = 1e-6
     """Allowed distance of the first positions from the measured ones [rad]."""
+
+    step_rad: ClassVar[float] = 0.02
+    """Allowed distance of the first positions after a new press from the measured ones [rad]: one step."""
 
     events: ClassVar[tuple[OperatorEvent, ...]] = ()
     """The events for which the device has buttons, which `press` presses."""
@@ -40,6 +58,19 @@ class TeleopSuite(Suite[Teleop]):
     def operate(self, teleop: Teleop) -> None:
         """The operator, with the deadman pressed, commands motion."""
         raise NotImplementedError(f"{type(self).__name__} must define operate(self, teleop)")
+
+    def hold(self, teleop: Teleop) -> None:
+        """One period in which the operator keeps the deadman pressed and commands motion, and the device reports it.
+
+        Calls `operate`; override it where that begins a new press.
+        """
+        self.operate(teleop)
+
+    def freeze(self, teleop: Teleop) -> None:
+        """The device goes silent, e.g. out of range, until the next `hold`, `release` or `engage`.
+
+        Does nothing for devices that report only when these are called.
+        """
 
     @contextmanager
     def connected(self) -> Iterator[tuple[Teleop, Context]]:
@@ -62,9 +93,9 @@ class TeleopSuite(Suite[Teleop]):
         return JointReading(ctx.clock.now_ns(), position.copy(), np.zeros_like(position), np.zeros_like(position))
 
     def _begin(self, teleop: Teleop, ctx: Context, position: Vector) -> TeleopCommand:
-        teleop.activate(self._measure(ctx, position))
+        begin_operation(teleop, self._measure(ctx, position))
         self.engage(teleop)
-        return teleop.read(self._measure(ctx, position))
+        return operate(teleop, self._measure(ctx, position))
 
     def test_begins_where_the_robot_is(self) -> None:
         """The first positions after each `activate` are the measured ones."""
@@ -84,7 +115,7 @@ class TeleopSuite(Suite[Teleop]):
             pose = self.poses(ctx)[0]
             commands = [self._begin(teleop, ctx, pose)]
             self.operate(teleop)
-            commands += [teleop.read(self._measure(ctx, pose)) for _ in range(10)]
+            commands += [operate(teleop, self._measure(ctx, pose)) for _ in range(10)]
             for command in commands:
                 for joint, position in (command.positions or {}).items():
                     assert joint in ctx.robot.joint_names, f"{joint!r} is not a joint of this robot"
@@ -97,7 +128,7 @@ class TeleopSuite(Suite[Teleop]):
             first = self._begin(teleop, ctx, pose).positions or {}
             self.operate(teleop)
             for _ in range(100):
-                positions = teleop.read(self._measure(ctx, pose)).positions or {}
+                positions = operate(teleop, self._measure(ctx, pose)).positions or {}
                 if any(abs(positions[j] - first.get(j, positions[j])) > self.tolerance_rad for j in positions):
                     return
             pytest.fail("the operator asked for motion and none came")
@@ -108,12 +139,12 @@ class TeleopSuite(Suite[Teleop]):
             pytest.skip("has no deadman")
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
-            teleop.activate(self._measure(ctx, pose))
-            assert teleop.read(self._measure(ctx, pose)).positions is None
+            begin_operation(teleop, self._measure(ctx, pose))
+            assert operate(teleop, self._measure(ctx, pose)).positions is None
             self.engage(teleop)
-            assert teleop.read(self._measure(ctx, pose)).positions is not None
+            assert operate(teleop, self._measure(ctx, pose)).positions is not None
             self.release(teleop)
-            commands = [teleop.read(self._measure(ctx, pose)) for _ in range(2)]
+            commands = [operate(teleop, self._measure(ctx, pose)) for _ in range(2)]
             assert commands[-1].positions is None
 
     def test_waits_for_the_operator(self) -> None:
@@ -123,14 +154,78 @@ class TeleopSuite(Suite[Teleop]):
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
             for _ in range(2):
-                teleop.activate(self._measure(ctx, pose))
+                begin_operation(teleop, self._measure(ctx, pose))
                 for _ in range(100):
-                    positions = teleop.read(self._measure(ctx, pose)).positions
+                    positions = operate(teleop, self._measure(ctx, pose)).positions
                     assert positions is None, "it commands positions before the operator has acted"
                 self.engage(teleop)
-                teleop.read(self._measure(ctx, pose))
+                operate(teleop, self._measure(ctx, pose))
                 self.operate(teleop)
-                assert teleop.read(self._measure(ctx, pose)).positions, "no positions once the operator acted"
+                assert operate(teleop, self._measure(ctx, pose)).positions, "no positions once the operator acted"
+
+    def _moving(self, teleop: Teleop, ctx: Context) -> Vector:
+        """A robot that the device moves; returns its pose."""
+        pose = self.poses(ctx)[0]
+        self._begin(teleop, ctx, pose)
+        for _ in range(5):
+            self.hold(teleop)
+            assert operate(teleop, self._measure(ctx, pose)).positions, "no positions with the deadman pressed"
+        return pose
+
+    def _needs_a_new_press(self, teleop: Teleop, ctx: Context, pose: Vector) -> None:
+        """Check that the held deadman moves nothing, and a new press does."""
+        for _ in range(100):
+            self.hold(teleop)
+            positions = operate(teleop, self._measure(ctx, pose)).positions
+            assert positions is None, "it moves again by the same press of the deadman"
+        self.release(teleop)
+        operate(teleop, self._measure(ctx, pose))
+        self.engage(teleop)
+        positions = operate(teleop, self._measure(ctx, pose)).positions
+        assert positions, "a new press moves nothing"
+        for joint, position in positions.items():
+            measured = pose[ctx.robot.joint_names.index(joint)]
+            assert abs(position - measured) <= self.step_rad, f"{joint} jumps from {measured} to {position}"
+
+    def test_a_held_deadman_does_not_survive_an_activation(self) -> None:
+        """A deadman held over a stop, a reset, a mode switch or a change of control must be pressed again."""
+        if not (self.has_deadman and self.has_operator):
+            pytest.skip("has no deadman")
+        with self.connected() as (teleop, ctx):
+            pose = self._moving(teleop, ctx)
+            begin_operation(teleop, self._measure(ctx, pose))
+            self._needs_a_new_press(teleop, ctx, pose)
+
+    def test_silence_ends_motion(self) -> None:
+        """Without reports motion ends within `HOLD_S`, and needs a new press of the deadman when they come again."""
+        if not (self.has_deadman and self.has_operator):
+            pytest.skip("has no deadman")
+        with self.connected() as (teleop, ctx):
+            pose = self._moving(teleop, ctx)
+            begun_ns = ctx.clock.now_ns()
+            self.freeze(teleop)
+            try:
+                while operate(teleop, self._measure(ctx, pose)).positions is not None:
+                    assert ctx.clock.now_ns() - begun_ns <= ns(HOLD_S), "a silent device moves the robot"
+                for _ in range(20):
+                    assert operate(teleop, self._measure(ctx, pose)).positions is None, "it moves again by itself"
+            except TeleopError:
+                return  # a fault, until a reset activates it
+            self._needs_a_new_press(teleop, ctx, pose)
+
+    def test_a_pause_of_the_host_ends_motion(self) -> None:
+        """After two seconds in which nobody read the device, it needs a new press of the deadman."""
+        if not (self.has_deadman and self.has_operator):
+            pytest.skip("has no deadman")
+        with self.connected() as (teleop, ctx):
+            pose = self._moving(teleop, ctx)
+            self.hold(teleop)
+            ctx.clock.sleep_until(ctx.clock.now_ns() + ns(2.0))
+            try:
+                assert operate(teleop, self._measure(ctx, pose)).positions is None, "it goes on after a pause"
+            except TeleopError:
+                return
+            self._needs_a_new_press(teleop, ctx, pose)
 
     def test_each_press_is_one_event(self) -> None:
         """Each press of a button gives its event once, even while the deadman is released."""
@@ -138,11 +233,11 @@ class TeleopSuite(Suite[Teleop]):
             pytest.skip("has no buttons")
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
-            teleop.activate(self._measure(ctx, pose))
-            teleop.read(self._measure(ctx, pose))
+            begin_operation(teleop, self._measure(ctx, pose))
+            operate(teleop, self._measure(ctx, pose))
             for event in (*self.events, *self.events):
                 self.press(teleop, event)
-                found = [each for _ in range(3) for each in teleop.read(self._measure(ctx, pose)).events]
+                found = [each for _ in range(3) for each in operate(teleop, self._measure(ctx, pose)).events]
                 assert found == [event]
 
     def test_approach_arrives(self) -> None:
@@ -158,11 +253,11 @@ class TeleopSuite(Suite[Teleop]):
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
             begin, now = self._measure(ctx, pose), self._measure(ctx, pose)
-            teleop.activate(begin)
+            begin_operation(teleop, begin)
             np.testing.assert_array_equal(begin.position, pose)
             begin.position[:] = 0.0
             self.engage(teleop)
-            positions = teleop.read(now).positions or {}
+            positions = operate(teleop, now).positions or {}
             np.testing.assert_array_equal(now.position, pose)
             for joint, position in positions.items():
                 assert abs(position - pose[ctx.robot.joint_names.index(joint)]) <= self.tolerance_rad
@@ -186,4 +281,4 @@ class TeleopSuite(Suite[Teleop]):
         with self.connected() as (teleop, ctx):
             pass
         with pytest.raises(TeleopError):
-            teleop.read(self._measure(ctx, self.poses(ctx)[0]))
+            operate(teleop, self._measure(ctx, self.poses(ctx)[0]))

@@ -10,7 +10,7 @@ import pytest
 from ibrobot_testing import TeleopSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeTeleop
 
-from ibrobot_core.api import TeleopError
+from ibrobot_core.api import TeleopError, seconds
 
 
 class TestTeleop(TeleopSuite):
@@ -20,15 +20,24 @@ class TestTeleop(TeleopSuite):
 
     @override
     def engage(self, teleop):
-        teleop.deadman = True
+        teleop.silent = False
+        teleop.press()
 
     @override
     def release(self, teleop):
-        teleop.deadman = False
+        teleop.pressed = False
 
     @override
     def operate(self, teleop):
         teleop.velocity = 0.1
+
+    @override
+    def hold(self, teleop):
+        teleop.pressed, teleop.silent, teleop.velocity = True, False, 0.1
+
+    @override
+    def freeze(self, teleop):
+        teleop.silent = True
 
     events = ("success", "intervention")
 
@@ -73,15 +82,36 @@ class NeverMoves(FakeTeleop):
 
 class IgnoresTheDeadman(FakeTeleop):
     def read(self, measured):
-        self.deadman = True
+        self.pressed = True
         return super().read(measured)
 
 
-class StaysPressedOverAReset(FakeTeleop):
-    def activate(self, measured):
-        pressed = self.deadman
-        super().activate(measured)
-        self.deadman = pressed
+class PressesByItself(FakeTeleop):
+    def read(self, measured):
+        self.press()
+        return super().read(measured)
+
+
+class MovesOnWhileItMayNot(FakeTeleop):
+    def read(self, measured):
+        before, since_ns = self._positions, self._last_ns
+        command = super().read(measured)
+        self._positions = before + self.velocity * seconds(measured.stamp_ns - since_ns)
+        return command
+
+
+class RepeatsOldReports(FakeTeleop):
+    def read(self, measured):
+        self.silent = False
+        return super().read(measured)
+
+
+class MakesUpForMissedTicks(FakeTeleop):
+    def read(self, measured):
+        for now_ns in range(max(self._last_ns, measured.stamp_ns - 5_000_000_000), measured.stamp_ns, 10_000_000):
+            self.deadman.report(self.pressed, now_ns)
+            self.deadman.allows(now_ns)
+        return super().read(measured)
 
 
 class KeepsTheMeasurement(FakeTeleop):
@@ -130,7 +160,10 @@ WRONG = {
     NotANumber: "positions_are_of_known_joints",
     NeverMoves: "operating_moves",
     IgnoresTheDeadman: "released_deadman_gives_none",
-    StaysPressedOverAReset: "waits_for_the_operator",
+    PressesByItself: "waits_for_the_operator",
+    MovesOnWhileItMayNot: "a_held_deadman_does_not_survive_an_activation",
+    RepeatsOldReports: "silence_ends_motion",
+    MakesUpForMissedTicks: "a_pause_of_the_host_ends_motion",
     KeepsTheMeasurement: "leaves_the_measurement_alone",
     ChangesTheMeasurement: "leaves_the_measurement_alone",
     StaysPressed: "each_press_is_one_event",

@@ -100,13 +100,15 @@ class Camera(FakeSensor):
 class Stick(FakeTeleop):
     """Pushed forward, all the time."""
 
+    operated = False
+
     def __init__(self, ctx):
         super().__init__(ctx)
         self.velocity = 0.2
 
     def activate(self, measured):
         super().activate(measured)
-        self.deadman = True
+        self.pressed = True
 
     def connect(self):
         CALLS.append("connect stick")

@@ -56,6 +56,8 @@ class ArmOptions:
 class Swing(FakeTeleop):
     """Swings every joint about its start; with `fork`, a child of the host outlives it."""
 
+    operated = False
+
     def __init__(self, options, ctx):
         super().__init__(ctx)
         self._options = options

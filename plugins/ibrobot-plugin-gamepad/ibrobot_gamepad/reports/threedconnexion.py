@@ -20,7 +20,8 @@ class SpaceMouse:
 
     def __init__(self) -> None:
         self._counts = [0] * 6
-        self._buttons: frozenset[str] = frozenset()
+        self._buttons: frozenset[str] | None = None
+        """None until the first report of buttons: they may be held since before the device was connected."""
 
     def __call__(self, report: bytes) -> Controls | None:
         """The state, or None for a report of another kind."""
@@ -39,4 +40,5 @@ class SpaceMouse:
             min(1.0, max(-1.0, count / _FULL_SCALE)) for count in self._counts
         )
         axes = (-towards, -right, -down, -about_towards, -about_right, -about_down)
-        return Controls(dict(zip(MOUSE_AXES, axes, strict=True)), self._buttons)
+        known = self._buttons is not None
+        return Controls(dict(zip(MOUSE_AXES, axes, strict=True)), self._buttons or frozenset(), complete=known)

@@ -78,14 +78,17 @@ class FakeSensor(Sensor):
 
 
 class FakeTeleop(Teleop):
-    """A device whose deadman, velocity and pressed buttons are attributes."""
+    """A device whose deadman (`pressed`), velocity and buttons are attributes. `activate` releases the deadman."""
 
     def __init__(self, ctx: Context) -> None:
         self._names = ctx.robot.joint_names
         self._open = False
         self._positions = np.zeros(len(self._names))
         self._last_ns = 0
-        self.deadman = False
+        self.pressed = False
+        self.silent = False
+        """Whether the deadman is not reported."""
+        self._let_go = False
         self.velocity = 0.0
         """Velocity of all joints [rad/s]."""
         self.events: tuple[OperatorEvent, ...] = ()
@@ -103,7 +106,11 @@ class FakeTeleop(Teleop):
     def activate(self, measured: JointReading) -> None:
         self._positions = measured.position.copy()
         self._last_ns = measured.stamp_ns
-        self.deadman = False
+        self.pressed = self._let_go = False
+
+    def press(self) -> None:
+        """Let go of the deadman and press it."""
+        self.pressed = self._let_go = True
 
     @override
     def read(self, measured: JointReading) -> TeleopCommand:
@@ -112,7 +119,15 @@ class FakeTeleop(Teleop):
         self._positions = self._positions + self.velocity * seconds(measured.stamp_ns - self._last_ns)
         self._last_ns = measured.stamp_ns
         events, self.events = self.events, ()
-        positions = dict(zip(self._names, self._positions.tolist(), strict=True)) if self.deadman else None
+        if self._let_go:
+            self.deadman.report(False, measured.stamp_ns)
+        self._let_go = False
+        if not self.silent:
+            self.deadman.report(self.pressed, measured.stamp_ns)
+        allowed = self.deadman.allows(measured.stamp_ns)
+        if not allowed:
+            self._positions = measured.position.copy()
+        positions = dict(zip(self._names, self._positions.tolist(), strict=True)) if allowed else None
         return TeleopCommand(positions, events=events)
 
 

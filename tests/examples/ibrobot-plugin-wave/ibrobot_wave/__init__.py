@@ -31,6 +31,8 @@ class WaveOptions:
 class Wave(Teleop):
     """What it does: a sine around the position at which it was activated."""
 
+    operated = False  # it moves by itself
+
     def __init__(self, options: WaveOptions, ctx: Context) -> None:
         self._options = options
         self._index = int(ctx.robot.indices([options.joint])[0])
