@@ -165,6 +165,7 @@ from ibrobot_core.messages import (
 )
 from ibrobot_core.robot import Description as Description, Joint as Joint, Robot as Robot, Vector as Vector
 from ibrobot_core.deadman import HOLD_S as HOLD_S, Deadman as Deadman
+from ibrobot_core.keys import HeldKeys as HeldKeys, KeyEvent as KeyEvent
 from ibrobot_core.clock import Clock as Clock, RealClock as RealClock, SteppedClock as SteppedClock
 from ibrobot_core.bus import Bus as Bus, Received as Received, Subscription as Subscription
 from ibrobot_core.services import (

@@ -72,14 +72,14 @@ class Deadman:
         """
         with self._lock:
             self._reported = True
+            if not pressed and self._pressed:
+                self._pressed, self._ended_ns = False, made_ns  # a release ends motion whenever it was made
             if made_ns < self._made_ns or made_ns <= self._since_ns:
                 return
             if self._pressed and made_ns - self._made_ns > self.silence_ns:
                 self._disarm(made_ns - 1)  # a press does not outlive a silence, even if nobody asked meanwhile
             self._made_ns = made_ns
             self._armed |= not pressed
-            if self._pressed and not pressed:
-                self._ended_ns = made_ns
             self._pressed = pressed and self._armed
 
     def allows(self, now_ns: int) -> bool:

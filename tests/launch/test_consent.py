@@ -66,7 +66,7 @@ def connect_the_device_again(run: Runtime, runs: Runs) -> None:
 
 def test_a_launch_moves_nothing(run: Runtime, runs: Runs) -> None:
     assert not moves(run)
-    runs.parts.MADE["lever"].pressed = True
+    runs.parts.MADE["lever"].press()
     assert moves(run)
 
 
@@ -76,13 +76,13 @@ def test_a_launch_moves_nothing(run: Runtime, runs: Runs) -> None:
     ids=lambda f: f.__name__,
 )
 def test_a_deadman_pressed_before_does_not_count_after(run: Runtime, runs: Runs, begin) -> None:
-    runs.parts.MADE["lever"].pressed = True
+    runs.parts.MADE["lever"].press()
     assert moves(run)
     begin(run, runs)
 
     moves(run, 15)  # a reset on the move brakes within the limits
     assert not moves(run)
-    runs.parts.MADE["lever"].pressed = True
+    runs.parts.MADE["lever"].press()
     assert moves(run)
 
 

@@ -85,7 +85,8 @@ def test_a_button_takes_the_robot_and_gives_it_back(begin) -> None:
     assert labels[:2] == ["policy", "handover"], "the command of the tick of the press is still the policy's"
     assert set(labels[1:]) == {"handover"}
     assert not episode.moves(), "nobody commands before the deadman is pressed"
-    episode.device.pressed, episode.device.velocity = True, 0.2
+    episode.device.press()
+    episode.device.velocity = 0.2
     assert episode.ticks(20)[-1] == "operator"
     assert episode.moves()
     episode.device.pressed = False
@@ -106,7 +107,7 @@ def test_the_operator_moves_the_robot_from_where_it_is(begin) -> None:
     episode.press()
     episode.ticks(40)
     held = episode.commands[-1]
-    episode.device.pressed = True
+    episode.device.press()
     episode.ticks(30)
     np.testing.assert_allclose(episode.commands[-1], held, atol=0.02)  # the device starts at the measured positions
     episode.check_steps()
@@ -131,7 +132,7 @@ def test_the_policys_plan_is_dropped_and_requested_again(begin) -> None:
 
 def test_the_deadman_takes_the_robot_if_chosen(begin) -> None:
     episode = begin("episodes={takeover: deadman}")
-    episode.device.pressed = True
+    episode.device.press()
     assert episode.ticks(30)[-1] == "operator"
     episode.device.pressed = False
     assert episode.ticks(40)[-1] == "policy"
@@ -178,7 +179,8 @@ def test_joints_without_a_device_hold(begin) -> None:
     episode = begin(intervene="{arm: lever}")
     episode.press()
     episode.ticks(40)
-    episode.device.pressed, episode.device.velocity = True, 0.2
+    episode.device.press()
+    episode.device.velocity = 0.2
     before = episode.commands[-1]
     episode.ticks(40)
     pan, grip = np.abs(episode.commands[-1] - before)
@@ -197,13 +199,13 @@ def test_a_device_with_motors_is_driven_to_the_robot_first(begin, monkeypatch: p
     monkeypatch.setattr(episode.device, "approach", approach)
     episode.press()
     episode.ticks(5)
-    episode.device.pressed = True
+    episode.device.press()
     episode.ticks(20)
     assert set(episode.ticks(10)) == {"handover"}
     episode.ticks(10)
     assert len(poses) == 25
     assert not episode.device.pressed, "it is activated once it has arrived"
-    episode.device.pressed = True
+    episode.device.press()
     assert episode.ticks(3)[-1] == "operator"
 
 
@@ -244,7 +246,7 @@ def test_panel_and_summary_say_who_commands(begin) -> None:
     assert episode.run.session.commander == "policy"
     episode.press()
     episode.ticks(30)
-    episode.device.pressed = True
+    episode.device.press()
     episode.ticks(50)
     assert episode.run.session.commander == "operator"
     episode.run.session.bus.call("/intervene", False)
@@ -262,7 +264,8 @@ def test_random_takeovers_stay_within_the_limits_and_are_labelled_as_they_happen
         assert labels[1:] == ["handover"] * (len(labels) - 1)
         episode.ticks(40)
         for _ in range(rng.randint(0, 3)):
-            episode.device.pressed, episode.device.velocity = True, rng.uniform(-1.5, 1.5)
+            episode.device.press()
+            episode.device.velocity = rng.uniform(-1.5, 1.5)
             labels = episode.ticks(rng.randint(2, 20))
             taken += 1
             assert labels[1:] == ["operator"] * (len(labels) - 1)
@@ -312,7 +315,7 @@ def test_only_corrections_are_recorded_with_the_time_around_them(
         episode.ticks(50)
         episode.press()
         episode.ticks(40)
-        episode.device.pressed = True
+        episode.device.press()
         episode.ticks(20)
         episode.press()
         episode.ticks(60)

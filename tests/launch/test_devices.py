@@ -50,9 +50,9 @@ def unplug(device: object, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_each_device_sees_and_moves_its_own_joints(run: Runtime, runs: Runs) -> None:
     left, right = runs.parts.MADE["left"], runs.parts.MADE["right"]
     assert way(run) == [False, False]
-    left.pressed = True
+    left.press()
     assert way(run) == [True, False]
-    right.pressed = True
+    right.press()
     assert way(run) == [True, True]
     left.pressed = False
     assert way(run) == [False, True]
@@ -68,7 +68,8 @@ def test_a_lost_device_stops_all_joints_until_a_reset_and_every_deadman(
     run: Runtime, runs: Runs, lost: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     left, right = runs.parts.MADE["left"], runs.parts.MADE["right"]
-    left.pressed = right.pressed = True
+    left.press()
+    right.press()
     assert way(run) == [True, True]
     with monkeypatch.context() as patched:
         unplug(runs.parts.MADE[lost], patched)
@@ -77,7 +78,8 @@ def test_a_lost_device_stops_all_joints_until_a_reset_and_every_deadman(
 
     run.reset()
     assert way(run) == [False, False], "the deadman of the other device counts as released, too"
-    left.pressed = right.pressed = True
+    left.press()
+    right.press()
     assert way(run) == [True, True]
 
 
@@ -91,7 +93,7 @@ def test_devices_lost_together_are_connected_again_together(
         run.step()
     assert run.session.faults == ("unplugged; unplugged",)
     run.reset()
-    runs.parts.MADE["right"].pressed = True
+    runs.parts.MADE["right"].press()
     assert way(run) == [False, True]
 
 
@@ -102,7 +104,7 @@ def test_a_device_cannot_move_joints_of_another(run: Runtime, runs: Runs, monkey
 
 
 def test_any_device_stops_the_robot(run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
-    runs.parts.MADE["left"].pressed = True
+    runs.parts.MADE["left"].press()
     assert way(run) == [True, False]
     with monkeypatch.context() as patched:
         patched.setattr(runs.parts.MADE["right"], "read", lambda measured: TeleopCommand(None, estop=True))

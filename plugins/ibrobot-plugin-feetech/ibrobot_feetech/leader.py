@@ -13,6 +13,7 @@ from ibrobot_core.api import (
     TICKS_PER_TURN,
     Context,
     HardwareError,
+    HeldKeys,
     JointReading,
     Teleop,
     TeleopCommand,
@@ -91,8 +92,7 @@ class LeaderTeleop(Teleop):
         self._following = False
         """Whether the approach is finished."""
         self._toggled = False
-        self._pressed_ns: int | None = None
-        self._held_until_ns = 0
+        self._held = HeldKeys(options.release)
         self._resting: NDArray[np.int32] | None = None
         """The leader's positions at the start of the mode [ticks]; None until they are read."""
         self._taken_up = False
@@ -160,21 +160,23 @@ class LeaderTeleop(Teleop):
                 self._let_go()
             except HardwareError as error:
                 self._ctx.log.error("%s: %s", self._ctx.name, error)
+        self._held.take(self._typed(), measured.stamp_ns)
+        self._held.forget()
         self._release()
-        self._typed()  # discard keys typed before the mode
 
     @override
     def read(self, measured: JointReading) -> TeleopCommand:
         if self._reader is None:
             raise TeleopError(f"{self._ctx.name}: the leader is not connected: call connect before read")
         now_ns = measured.stamp_ns
-        if self._options.estop_key in (typed := self._typed()):
-            self._release()
-            return TeleopCommand(None, estop=True)
-        self._handle_presses(typed.count(self._options.deadman_key), now_ns)
+        self._held.take(self._typed(), now_ns)
         self._receive(self._reader, now_ns)
-        if not self._engaged(now_ns):
+        # A press counts with the oldest of the servos' positions.
+        self.deadman.report(self._engaged(), int(self._ticks_ns.min()))
+        if not self.deadman.allows(now_ns):
             self._setpoint = None
+            if not self.deadman.armed:
+                self._release()
             return TeleopCommand(None)
         self._setpoint = self._next(measured)
         return TeleopCommand(dict(zip(self._joints, self._setpoint.tolist(), strict=True)))
@@ -197,12 +199,11 @@ class LeaderTeleop(Teleop):
         start = {
             "none": "move the leader arm to start",
             "toggle": f"press {key} to follow the leader arm",
-            "hold": f"hold {key} to follow the leader arm",
+            "hold": f"hold {key} to follow the leader arm{'' if self._held.exact else ' (known by its repeats)'}",
         }
         pause = {"none": "", "toggle": f": {key} pauses", "hold": f": release {key} to pause"}
         deadman = self._options.deadman
-        state = f"PAUSED: {start[deadman]}" if self._setpoint is None else f"following the leader arm{pause[deadman]}"
-        return f"{state}   {self._options.estop_key}  emergency stop"
+        return f"PAUSED: {start[deadman]}" if self._setpoint is None else f"following the leader arm{pause[deadman]}"
 
     def _check_names(self, option: str, names: Sequence[str], known: Sequence[str]) -> None:
         for name in names:
@@ -316,9 +317,8 @@ class LeaderTeleop(Teleop):
 
     def _release(self) -> None:
         """Return to the paused state, so that following begins with an approach."""
-        self._setpoint = self._pressed_ns = self._resting = None
+        self._setpoint = self._resting = None
         self._toggled = self._taken_up = False
-        self._held_until_ns = 0
 
     def _typed(self) -> list[str]:
         typed: list[str] = []
@@ -326,25 +326,16 @@ class LeaderTeleop(Teleop):
             typed.append(self._keys.get_nowait())
         return typed
 
-    def _handle_presses(self, presses: int, now_ns: int) -> None:
-        """Process presses of the deadman.
-
-        A terminal does not report the release of a key, but repeats a held one. So it counts as held while presses
-        follow one another quickly.
-        """
-        release_ns = ns(self._options.release)
-        for _ in range(presses):
-            self._toggled = not self._toggled
-            if self._pressed_ns is not None and now_ns - self._pressed_ns <= release_ns:
-                self._held_until_ns = now_ns + release_ns
-            self._pressed_ns = now_ns
-
-    def _engaged(self, now_ns: int) -> bool:
+    def _engaged(self) -> bool:
+        """Whether the deadman is pressed."""
+        key = self._options.deadman_key
         match self._options.deadman:
             case "toggle":
+                # Whatever comes while it follows pauses, so that a held key cannot start it again.
+                self._toggled = key not in self._held.touched if self._toggled else key in self._held.presses
                 return self._toggled
             case "hold":
-                return now_ns < self._held_until_ns
+                return self._held.held(key)
         return self._is_taken_up()
 
     def _is_taken_up(self) -> bool:

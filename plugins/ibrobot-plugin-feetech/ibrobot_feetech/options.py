@@ -121,14 +121,11 @@ class LeaderOptions:
         0.2, unit="s", gt=0, le=1, help="deadman hold: a key that is not repeated for this long counts as released"
     )
     deadman_key: str = option("space", help="key of the deadman; two leaders may have the same or different ones")
-    estop_key: str = option("esc", help="key of the emergency stop")
     lost_replies: int = option(3, unit="reads", ge=0, help="consecutive replies of a servo that may be missing")
 
     def __attrs_post_init__(self) -> None:
         if self.prefix and self.joints:
             raise ValueError("joints and prefix exclude each other; give one of them")
-        if self.deadman_key == self.estop_key:
-            raise ValueError(f"deadman_key and estop_key are both {self.estop_key!r}; give two different keys")
 
     def pairs(self, robot: Robot) -> Mapping[str, str]:
         """Joint of the leader -> joint of the robot."""
@@ -153,8 +150,7 @@ def check_follower(options: FollowerOptions, robot: Robot, joints: tuple[str, ..
 
 def leader_keys(options: LeaderOptions, robot: Robot) -> Mapping[str, str]:
     """The keys of the terminal that it reads."""
-    deadman = {} if options.deadman == "none" else {options.deadman_key: "deadman"}
-    return {**deadman, options.estop_key: "emergency stop"}
+    return {} if options.deadman == "none" else {options.deadman_key: "deadman"}
 
 
 def check_leader(options: LeaderOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:

@@ -27,6 +27,8 @@ from ibrobot_core.api import (
     TeleopCommand,
     TeleopError,
     Vector,
+    begin_operation,
+    operate,
 )
 
 from .conftest import JOINTS, OFFSETS, arm_calibration, prepare
@@ -64,11 +66,21 @@ class LeaderSuite(TeleopSuite):
     def leader(self, ctx: Context, deadman: str) -> Teleop:
         return LeaderTeleop(LeaderOptions(self.emulator.port, str(self.file), deadman=deadman), ctx)
 
+    way = 100
+
     @override
     def operate(self, teleop: Teleop) -> None:
+        self._turn(100)
+
+    @override
+    def hold(self, teleop: Teleop) -> None:
+        self.way = -self.way
+        self._turn(self.way)
+
+    def _turn(self, ticks: int) -> None:
         with self.emulator.lock:
             for servo in self.emulator.servos.values():
-                servo.turn(servo.encoder + 100)
+                servo.turn(servo.encoder + ticks)
 
 
 class TestWithoutADeadman(LeaderSuite):
@@ -87,7 +99,7 @@ class TestWithoutADeadman(LeaderSuite):
     def engage(self, teleop: Teleop) -> None:
         """Somebody takes the leader up."""
         still = np.zeros(6)
-        teleop.read(JointReading(self.clock.now_ns(), still, still, still))
+        operate(teleop, JointReading(self.clock.now_ns(), still, still, still))
         self.operate(teleop)
 
 
@@ -98,9 +110,18 @@ class TestToggle(LeaderSuite):
 
     @override
     def engage(self, teleop: Teleop) -> None:
-        self.typed.put("space")
+        for event in ("release:space", "space"):
+            self.typed.put(event)
 
     release = engage
+
+    @override
+    def rest(self, teleop: Teleop) -> None:
+        """It is paused."""
+
+    @override
+    def freeze(self, teleop: Teleop) -> None:
+        freeze(self.emulator)
 
 
 class TestHold(LeaderSuite):
@@ -110,17 +131,31 @@ class TestHold(LeaderSuite):
 
     @override
     def engage(self, teleop: Teleop) -> None:
-        self.typed.put("space")
-        self.typed.put("space")
+        for event in ("release:space", "space", "repeat:space"):
+            self.typed.put(event)
+
+    @override
+    def hold(self, teleop: Teleop) -> None:
+        super().hold(teleop)
+        self.typed.put("repeat:space")
 
     @override
     def release(self, teleop: Teleop) -> None:
-        self.clock.advance(300_000_000)
+        self.typed.put("release:space")
+
+    @override
+    def freeze(self, teleop: Teleop) -> None:
+        freeze(self.emulator)
 
     @override
     def context(self) -> Context:
         self.clock = SteppedClock(START_NS)
         return host_context(clock=self.clock, keys=lambda: self.typed)
+
+
+def freeze(emulator: Emulator) -> None:
+    """No servo answers any more."""
+    emulator.faults.silent.update(emulator.servos)
 
 
 class TeleopRig:
@@ -132,11 +167,22 @@ class TeleopRig:
         ctx = host_context("leader", clock=self.clock, keys=lambda: self.typed)
         self.leader = LeaderTeleop(LeaderOptions(str(link or emulator.port), str(file), **options), ctx)
         self.position: Vector = np.zeros(6)
+        self.waiting = ""
+        """A key that is typed when the leader is read next, but not while it is turned."""
+        self.follows = False
+        """Whether the robot follows the leader."""
+
+    def begin(self) -> None:
+        """Begin the mode, and see the deadman released; the terminal reports releases."""
+        begin_operation(self.leader, self.measured())
+        self.read("release:space", "release:l")
 
     def read(self, *keys: str) -> TeleopCommand:
-        for key in keys:
+        for key in (self.waiting, *keys) if self.waiting else keys:
             self.typed.put(key)
-        command = self.leader.read(self.measured())
+        self.waiting = ""
+        command = operate(self.leader, self.measured())
+        self.follows = command.positions is not None
         if command.positions is not None:
             for joint, position in command.positions.items():
                 self.position[JOINTS.index(joint)] = position
@@ -151,12 +197,20 @@ class TeleopRig:
             self.read()
         return self.position
 
-    def turn(self, joint: str, ticks: float, in_ns: int = 500_000_000) -> None:
-        """Move a joint of the leader to a reported position [ticks]."""
-        self.clock.advance(in_ns)
+    def turn(self, joint: str, ticks: float, in_ns: int = 500_000_000, *, read: bool = True) -> None:
+        """Move a joint of the leader to a reported position [ticks], after some time."""
         index = JOINTS.index(joint)
-        with self.emulator.lock:
-            self.emulator.servos[index + 1].turn(ticks + OFFSETS[index])
+        servo, goal = self.emulator.servos[index + 1], ticks + OFFSETS[index]
+        steps = in_ns // TICK_NS if read else 1
+        typed, self.waiting = self.waiting, ""
+        for step in range(steps):
+            with self.emulator.lock:
+                servo.turn(servo.encoder + (goal - servo.encoder) / (steps - step))
+            if read:
+                self.read()
+            else:
+                self.clock.advance(in_ns)
+        self.waiting = typed
 
     def register(self, name: str) -> list[int]:
         with self.emulator.lock:
@@ -168,9 +222,12 @@ def rig(emulator: Emulator, calibration_file: Path, request: pytest.FixtureReque
     given = getattr(request, "param", {})
     rig = TeleopRig(emulator, calibration_file, **given)
     rig.leader.connect()
-    rig.leader.activate(rig.measured())
+    if given.get("deadman") == "none":
+        begin_operation(rig.leader, rig.measured())
+    else:
+        rig.begin()
     if "deadman" not in given:
-        rig.typed.put("space")
+        rig.waiting = "space"
     yield rig
     rig.leader.disconnect()
 
@@ -209,7 +266,7 @@ class TestMapping:
     def test_the_deadman_may_have_another_key(self, rig: TeleopRig):
         rig.turn("shoulder_pan", 2048 + 0.5 * RADIAN)
         assert rig.read().positions is None, "space is another device's"
-        assert rig.leader.help() == "PAUSED: press l to follow the leader arm   esc  emergency stop"
+        assert rig.leader.help() == "PAUSED: press l to follow the leader arm"
         rig.read("l")
         assert rig.follow()[0] == pytest.approx(0.5, abs=1e-3)
 
@@ -250,13 +307,16 @@ class TestApproach:
         rig.read()
         assert rig.position[0] == pytest.approx(0.9, abs=1e-3), "it follows directly"
 
-    def test_after_a_host_that_stood_still_leaps_no_further_than_a_tenth_of_a_second(self, rig: TeleopRig):
+    def test_after_a_host_that_stood_still_it_waits_for_a_new_press(self, rig: TeleopRig):
         rig.turn("shoulder_pan", 2048 + 1.5 * RADIAN)
         rig.follow(3)
         before = rig.position[0]
         rig.clock.advance(5_000_000_000)
-        rig.read()
-        assert rig.position[0] - before == pytest.approx(0.1, abs=1e-3)
+        rig.follow(100)
+        assert rig.position[0] == before
+        rig.read("space")
+        rig.follow(100)
+        assert rig.position[0] > before + 0.5
 
 
 class TestTakeover:
@@ -278,7 +338,7 @@ class TestTakeover:
         way = self.approach(rig)
         assert np.abs(np.diff(way, axis=0)).max() < 1.5 * RADIAN * 0.01 * 2, "at ramp_velocity, 1 rad/s"
         assert rig.register("torque_enable") == [0] * 6
-        rig.leader.activate(rig.measured())
+        rig.begin()
         rig.typed.put("space")
         held = rig.position.copy()
         np.testing.assert_allclose(rig.follow(), held, atol=0.05)
@@ -292,7 +352,7 @@ class TestTakeover:
 
     def test_the_torque_is_off_if_the_takeover_is_broken_off(self, rig: TeleopRig):
         rig.position[0] = 1.0
-        for end in (lambda: rig.leader.activate(rig.measured()), rig.leader.disconnect):
+        for end in (lambda: begin_operation(rig.leader, rig.measured()), rig.leader.disconnect):
             assert not rig.leader.approach(rig.measured())
             assert rig.register("torque_enable") == [1] * 6
             end()
@@ -309,7 +369,7 @@ class TestDeadman:
     def test_without_a_word_in_the_yaml_it_waits_for_space(self, emulator: Emulator, calibration_file: Path):
         rig = TeleopRig(emulator, calibration_file)
         rig.leader.connect()
-        rig.leader.activate(rig.measured())
+        rig.begin()
         rig.turn("shoulder_pan", 2500)
         assert [rig.read().positions for _ in range(50)] == [None] * 50
         assert rig.leader.help().startswith("PAUSED: press space to follow")
@@ -319,19 +379,19 @@ class TestDeadman:
 
     @options(deadman="none")
     def test_none_follows_once_the_leader_is_taken_up(self, rig: TeleopRig):
-        rig.turn("shoulder_pan", 2500)  # while nobody read
+        rig.turn("shoulder_pan", 2500, read=False)
         assert [rig.read().positions for _ in range(50)] == [None] * 50
         assert rig.leader.help().startswith("PAUSED: move the leader arm")
         rig.turn("shoulder_pan", 2510)
         assert rig.read().positions is None, "it trembles"
         rig.turn("shoulder_pan", 2600)
         assert rig.follow()[0] == pytest.approx(552 / RADIAN, abs=1e-3)
-        rig.leader.activate(rig.measured())
+        begin_operation(rig.leader, rig.measured())
         assert rig.read().positions is None, "a reset waits again"
 
     @options(deadman="none")
     def test_a_lost_reply_at_the_start_causes_no_motion(self, rig: TeleopRig):
-        rig.turn("shoulder_pan", 2500)
+        rig.turn("shoulder_pan", 2500, read=False)
         rig.emulator.faults.silent.add(1)
         assert rig.read().positions is None
         rig.emulator.faults.silent.clear()
@@ -355,19 +415,37 @@ class TestDeadman:
     def test_held_follows_while_the_key_repeats_and_a_single_press_does_nothing(self, rig: TeleopRig):
         assert rig.read("space").positions is None
         assert [rig.read().positions for _ in range(50)] == [None] * 50
-        rig.read("space")
-        assert all(rig.read(*["space"] * (i % 3 == 0)).positions is not None for i in range(30))
-        paused = [rig.read().positions is None for _ in range(25)]
-        assert paused == sorted(paused)
-        assert paused[-1]
+        assert all(rig.read(*["repeat:space"] * (i % 3 == 0)).positions is not None for i in range(30))
+        assert "hold space to follow the leader arm" in rig.leader.help() or rig.follows
+        assert rig.read("release:space").positions is None
 
-    def test_the_emergency_stop_key(self, rig: TeleopRig):
-        assert rig.read("esc") == TeleopCommand(None, estop=True)
+    def test_a_held_key_without_reports_of_releases(self, emulator: Emulator, calibration_file: Path):
+        """It repeats after 0.4 s, every 30 ms: `toggle` starts once and pauses, `hold` follows while it repeats."""
+        follows = {}
+        for deadman in ("toggle", "hold"):
+            rig = TeleopRig(emulator, calibration_file, deadman=deadman)
+            rig.leader.connect()
+            begin_operation(rig.leader, rig.measured())
+            rig.read()
+            keys = [["space"] * (i == 0 or (i >= 40 and i % 3 == 1)) for i in range(200)]
+            follows[deadman] = [rig.read(*typed).positions is not None for typed in (*keys, *[[]] * 100)]
+            rig.leader.disconnect()
+        assert np.flatnonzero(follows["toggle"]).tolist() == list(range(15, 40))
+        assert np.flatnonzero(follows["hold"]).tolist() == list(range(40, 220))
+        assert "known by its repeats" in LeaderTeleop.help(rig.leader)
+
+    @options(deadman="toggle")
+    def test_key_repeats_are_no_presses(self, rig: TeleopRig):
+        rig.read("space")
+        assert all(rig.read(*["repeat:space"] * (i % 3 == 0)).positions is not None for i in range(200))
+        rig.read("release:space")
+        assert rig.follows
+        assert rig.read("space").positions is None
 
     @options(deadman="toggle")
     def test_what_was_typed_before_the_mode_began_does_not_count(self, rig: TeleopRig):
         rig.typed.put("space")
-        rig.leader.activate(rig.measured())
+        begin_operation(rig.leader, rig.measured())
         assert rig.read().positions is None
 
     def test_without_a_terminal_it_is_refused(self, emulator: Emulator, calibration_file: Path):
@@ -414,7 +492,7 @@ class TestBus:
     def test_a_position_that_no_hand_can_reach_is_not_followed(self, rig: TeleopRig):
         rig.turn("shoulder_pan", 3000)
         before = rig.follow().copy()
-        rig.turn("shoulder_pan", 100, in_ns=0)
+        rig.turn("shoulder_pan", 100, in_ns=0, read=False)
         rig.follow(3)
         np.testing.assert_array_equal(rig.position, before)
         with pytest.raises(TeleopError, match=r"servo 1 \(shoulder_pan\): position 100 right after 3000"):
@@ -426,6 +504,7 @@ class TestBus:
             prepare(emulator, arm_calibration())
             rig = TeleopRig(emulator, calibration_file, link)
             rig.leader.connect()
+            rig.begin()
             rig.read("space")
             emulator.unplug()
             with pytest.raises(TeleopError, match=r"leader: .*port: the port is"):
@@ -435,7 +514,7 @@ class TestBus:
                 rig.leader.connect()
             emulator.replug()
             rig.leader.connect()
-            rig.leader.activate(rig.measured())
+            rig.begin()
             assert rig.read().positions is None, "it waits to be started again"
             assert rig.read("space").positions is not None
             rig.leader.disconnect()
@@ -457,11 +536,11 @@ class TestOneOfTwo:
         leader = LeaderTeleop(LeaderOptions(emulator.port, str(calibration_file), prefix="right_", deadman="none"), ctx)
         leader.connect()
         still = JointReading(START_NS, np.zeros(6), np.zeros(6), np.zeros(6))
-        leader.activate(still)
-        leader.read(still)
+        begin_operation(leader, still)
+        operate(leader, attrs.evolve(still, stamp_ns=START_NS + 10_000_000))
         with emulator.lock:
             emulator.servos[1].turn(emulator.servos[1].encoder + 100)
-        positions = leader.read(attrs.evolve(still, stamp_ns=START_NS + 500_000_000)).positions
+        positions = operate(leader, attrs.evolve(still, stamp_ns=START_NS + 100_000_000)).positions
         leader.disconnect()
         assert positions == dict.fromkeys((f"right_{name}" for name in JOINTS), 0.0), "it begins where the robot is"
 
@@ -480,7 +559,6 @@ class TestOneOfTwo:
         ("given", "message"),
         [
             ({"prefix": "left_", "joints": {"gripper": "left_gripper"}}, "joints and prefix exclude each other"),
-            ({"deadman_key": "esc"}, "deadman_key and estop_key are both 'esc'; give two different keys"),
         ],
     )
     def test_options_that_exclude_each_other(self, given: dict[str, Any], message: str):

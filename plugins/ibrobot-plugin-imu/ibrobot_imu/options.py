@@ -63,7 +63,6 @@ class ImuOptions:
     release: float = option(
         0.2, unit="s", gt=0, le=1, help="deadman key: a key that is not repeated for this long counts as released"
     )
-    estop_key: str = option("esc", help="key of the emergency stop")
     timeout: float = option(
         0.1, unit="s", gt=0, le=1, help="time without a valid message after which the robot holds until the next press"
     )
@@ -75,8 +74,6 @@ class ImuOptions:
     def __attrs_post_init__(self) -> None:
         if not self.dead_zone < self.full_tilt:
             raise ValueError(f"dead_zone is {self.dead_zone:g}, must be below full_tilt, which is {self.full_tilt:g}")
-        if self.deadman_key == self.estop_key:
-            raise ValueError(f"deadman_key and estop_key are both {self.estop_key!r}; give two different keys")
         if not self.axes:
             raise ValueError("tool: every axis is none, so nothing could move; give at least one a tilt")
 
@@ -94,8 +91,7 @@ class ImuOptions:
 
 def imu_keys(options: ImuOptions, robot: Robot) -> Mapping[str, str]:
     """The keys of the terminal that it reads."""
-    deadman = {options.deadman_key: "deadman"} if options.deadman == "key" else {}
-    return {**deadman, options.estop_key: "emergency stop"}
+    return {options.deadman_key: "deadman"} if options.deadman == "key" else {}
 
 
 def check_imu(options: ImuOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:

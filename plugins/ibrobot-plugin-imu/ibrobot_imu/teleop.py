@@ -11,7 +11,7 @@ import serial
 from ibrobot_kinematics import JogArm, JogMotion, VelocityJog
 from ibrobot_kinematics.rotations import exp, log
 
-from ibrobot_core.api import Context, JointReading, Teleop, TeleopCommand, TeleopError, Vector, ns, seconds
+from ibrobot_core.api import Context, HeldKeys, JointReading, Teleop, TeleopCommand, TeleopError, Vector, ns, seconds
 from ibrobot_imu.messages import READERS, Angles
 from ibrobot_imu.options import TILTS, TOOL_AXES, ImuOptions
 
@@ -27,7 +27,7 @@ class ImuTeleop(Teleop):
     """Moves the tool at a velocity given by the tilt since the deadman was pressed. Time is that of the measurements.
 
     Each press makes the present orientation the zero, so that neither drift nor the mounting matters. Without valid
-    messages the robot holds, and the deadman must be pressed again.
+    messages the robot holds, and the deadman must be pressed again. Of a key, a press begins with its first repeat.
     """
 
     def __init__(self, options: ImuOptions, ctx: Context) -> None:
@@ -43,11 +43,8 @@ class ImuTeleop(Teleop):
         self._received_ns = 0
         """When it came [ns]."""
         self._warned = False
-        self._key_ns: int | None = None
-        """The last press of the key [ns]."""
-        self._held_until_ns = 0
-        self._was_held = True
-        """Whether the deadman was held at the last read; a press counts only after a release."""
+        self._held = HeldKeys(options.release)
+        self._key_deadman = options.deadman == "key"
         self._zero: Vector | None = None
         """The orientation at the press; None while released."""
         self._moved_ns: int | None = None
@@ -81,10 +78,9 @@ class ImuTeleop(Teleop):
 
     @override
     def activate(self, measured: JointReading) -> None:
-        self._typed()  # discard keys typed before the mode
-        self._zero = self._key_ns = self._moved_ns = None
-        self._held_until_ns = 0
-        self._was_held = self._options.deadman != "key"
+        self._held.take(self._typed(), measured.stamp_ns)
+        self._held.forget()
+        self._zero = self._moved_ns = None
         self._received_ns = measured.stamp_ns
         self._orientation = None
 
@@ -94,25 +90,24 @@ class ImuTeleop(Teleop):
         if port is None:
             raise TeleopError(f"{self._ctx.name}: the sensor is not connected: call connect before read")
         now_ns, options = measured.stamp_ns, self._options
-        typed = self._typed()
+        self._held.take(self._typed(), now_ns)
         try:
             self._receive(port, now_ns)
-            held = self._pressed(port) if options.deadman != "key" else self._key_held(typed, now_ns)
+            held = self._held.held(options.deadman_key) if self._key_deadman else self._pressed(port)
         except OSError as error:
             raise TeleopError(f"{self._ctx.name}: lost {options.port}: {error}") from None
-        before, self._was_held = self._was_held, held
         orientation = self._orientation
-        if options.estop_key in typed:
-            self._zero = None
-            return TeleopCommand(None, estop=True)
-        if not held or orientation is None or now_ns - self._received_ns > ns(options.timeout):
+        if now_ns - self._received_ns > ns(options.timeout):
+            self.deadman.disarm(now_ns)
+        elif orientation is not None:
+            # A line of the port says nothing without the messages that come by the same port.
+            self.deadman.report(held, self._received_ns)
+        if orientation is None or not self.deadman.allows(now_ns):
             self._zero = None
             return TeleopCommand(None)
-        if not before:
+        if self._zero is None:
             self._zero, self._moved_ns = orientation, None
             self._jog.restart(measured.position)
-        if self._zero is None:
-            return TeleopCommand(None)
         dt = min(seconds(now_ns - self._moved_ns), _LONGEST_STEP_S) if self._moved_ns is not None else 0.0
         self._moved_ns = now_ns
         setpoint = self._jog.move(measured.position, self._motion(self._zero.T @ orientation), dt)
@@ -128,10 +123,11 @@ class ImuTeleop(Teleop):
     @override
     def help(self) -> str:
         options = self._options
-        button = {"key": options.deadman_key, "cts": "the button at CTS", "dsr": "the button at DSR"}[options.deadman]
+        key = options.deadman_key + ("" if self._held.exact else " (known by its repeats)")
+        button = {"key": key, "cts": "the button at CTS", "dsr": "the button at DSR"}[options.deadman]
         state = "moves" if self._zero is not None else "no message yet" if self._orientation is None else "waits"
         moves = ", ".join(f"{tilt} {axis}" for axis, tilt in options.axes.items())
-        return f"{options.model} {state}: hold {button} and tilt ({moves})   {options.estop_key}  emergency stop"
+        return f"{options.model} {state}: hold {button} and tilt ({moves})"
 
     def _typed(self) -> list[str]:
         typed: list[str] = []
@@ -151,15 +147,6 @@ class ImuTeleop(Teleop):
             case "dsr":
                 return bool(port.dsr)
         return False
-
-    def _key_held(self, typed: list[str], now_ns: int) -> bool:
-        """Whether the key is held: a terminal reports no release, but repeats a held key."""
-        release_ns = ns(self._options.release)
-        for _ in range(typed.count(self._options.deadman_key)):
-            if self._key_ns is not None and now_ns - self._key_ns <= release_ns:
-                self._held_until_ns = now_ns + release_ns
-            self._key_ns = now_ns
-        return now_ns < self._held_until_ns
 
     def _receive(self, port: serial.Serial, now_ns: int) -> None:
         """Take the newest orientation, if one came.

@@ -44,8 +44,6 @@ CASES = {
         f"{AT}: dead_zone is 0.6, must be below full_tilt, which is 0.6"),
     "full tilt": ("bno08x}", "bno08x, full_tilt: 35}", f"{AT}.full_tilt: 35.0 is too large, must be at most 1.5 rad"),
     "deadman": ("bno08x}", "bno08x, deadman: none}", f"{AT}.deadman: 'none' is not one of: key, cts, dsr"),
-    "keys": ("bno08x}", "bno08x, deadman_key: esc}",
-        f"{AT}: deadman_key and estop_key are both 'esc'; give two different keys"),
     "release": ("bno08x}", "bno08x, release: 2}", f"{AT}.release: 2.0 is too large, must be at most 1 s"),
     "timeout": ("bno08x}", "bno08x, timeout: 0}", f"{AT}.timeout: 0.0 is too small, must be above 0 s"),
     "follow": ("bno08x}", "bno08x, follow: 0}", f"{AT}.follow: 0.0 is too small, must be above 0 rad"),

@@ -15,7 +15,18 @@ from ibrobot_imu.teleop import ImuTeleop
 from ibrobot_kinematics import robot_model
 from ibrobot_testing import TeleopSuite, host_context
 
-from ibrobot_core.api import Context, JointReading, Robot, Teleop, TeleopCommand, TeleopError, Vector, ns
+from ibrobot_core.api import (
+    Context,
+    JointReading,
+    Robot,
+    Teleop,
+    TeleopCommand,
+    TeleopError,
+    Vector,
+    begin_operation,
+    ns,
+    operate,
+)
 
 from .sensor import Sensor
 
@@ -39,7 +50,7 @@ class ImuSuite(TeleopSuite):
 
     @override
     def make(self, ctx: Context) -> Teleop:
-        return ImuTeleop(ImuOptions(self.sensor.port, self.model, timeout=1.0, release=1.0), ctx)
+        return ImuTeleop(ImuOptions(self.sensor.port, self.model, timeout=1.0), ctx)
 
     @override
     def poses(self, ctx: Context) -> list[Vector]:
@@ -48,17 +59,18 @@ class ImuSuite(TeleopSuite):
     @override
     def engage(self, teleop: Teleop) -> None:
         self.sensor.turn()
-        self.typed.put("space")
-        self.typed.put("space")
+        for event in ("release:space", "space", "repeat:space"):
+            self.typed.put(event)
 
     @override
     def operate(self, teleop: Teleop) -> None:
         self.sensor.turn(pitch=0.5)
+        self.typed.put("repeat:space")
 
     @override
     def release(self, teleop: Teleop) -> None:
-        """The last repeat of the key gets too old."""
-        self.ctx.clock.sleep_until(self.ctx.clock.now_ns() + ns(1.5))
+        self.sensor.turn()
+        self.typed.put("release:space")
 
 
 class TestBno08x(ImuSuite):
@@ -83,7 +95,7 @@ class Rig:
         ctx = host_context("imu", robot=robot, keys=lambda: self.typed)
         self.teleop = ImuTeleop(ImuOptions(sensor.port, model, **options), ctx)
         self.teleop.connect()
-        self.teleop.activate(self.measured())
+        begin_operation(self.teleop, self.measured())
 
     def measured(self) -> JointReading:
         return JointReading(ns(self.time_s), self.position.copy(), np.zeros(6), np.zeros(6))
@@ -91,12 +103,12 @@ class Rig:
     def tick(self, sent: bytes = b"") -> TeleopCommand:
         self.time_s += TICK_S
         if self.holds:
-            self.typed.put("space")
+            self.typed.put("repeat:space")
         if sent:
             self.sensor.send(sent)
         if self.tilt is not None:
             self.sensor.turn(**self.tilt)
-        command = self.teleop.read(self.measured())
+        command = operate(self.teleop, self.measured())
         if command.positions is not None:
             self.position = np.array([command.positions[name] for name in self.robot.joint_names])
         return command
@@ -110,9 +122,10 @@ class Rig:
 
     def press(self) -> None:
         """Hold the key at the present tilt."""
+        for event in ("release:space", "space"):
+            self.typed.put(event)
+        self.tick()
         self.holds = True
-        self.tick()
-        self.tick()
         assert self.tick().positions is not None
 
     def from_bent(self, **tilt: float) -> Vector:
@@ -192,6 +205,19 @@ def test_nothing_moves_without_the_key(rig: Rig):
     assert np.linalg.norm(rig.run(0.3, pitch=0.7)) == 0
 
 
+def test_without_reports_of_releases_a_key_is_held_while_it_repeats(rig: Rig):
+    """It repeats after 0.4 s, every 30 ms."""
+    rig.tilt = {}
+    moves = []
+    for i in range(200):
+        if i == 0 or (i >= 40 and i % 3 == 1):
+            rig.typed.put("space")
+        moves.append(rig.tick().positions is not None)
+    moves += [rig.tick().positions is not None for _ in range(50)]
+    assert np.flatnonzero(moves).tolist() == list(range(40, 220))
+    assert "space (known by its repeats)" in rig.teleop.help()
+
+
 def test_the_gripper_keeps_its_place(rig: Rig):
     rig.press()
     rig.run(0.5, pitch=0.7)
@@ -245,19 +271,10 @@ def test_an_unplugged_sensor_is_an_error_and_comes_back(start, monkeypatch: pyte
             rig.tick()
     rig.teleop.disconnect()
     rig.teleop.connect()
-    rig.teleop.activate(rig.measured())
+    begin_operation(rig.teleop, rig.measured())
     rig.let_go()
     rig.press()
     assert np.linalg.norm(rig.run(0.3, pitch=0.7)) > 0.01
-
-
-def test_the_stop_key_stops(rig: Rig):
-    rig.press()
-    rig.typed.put("esc")
-    command = rig.tick()
-    assert command.estop
-    assert command.positions is None
-    assert rig.tick().positions is None, "the key that is still held counts as released"
 
 
 class TestButton:
@@ -319,7 +336,7 @@ def test_a_port_that_is_not_there_is_named(robot: Robot):
 def test_help_says_what_to_hold_and_what_moves(start):
     rig = start()
     assert rig.teleop.help() == (
-        "bno08x no message yet: hold space and tilt (pitch x, -roll y, yaw z)   esc  emergency stop"
+        "bno08x no message yet: hold space (known by its repeats) and tilt (pitch x, -roll y, yaw z)"
     )
     rig.tick()
     assert rig.teleop.help().startswith("bno08x waits: hold space")

@@ -19,9 +19,7 @@ _CARTESIAN_KEYS = {"x": ("w", "s"), "y": ("a", "d"), "z": ("r", "f"), "pitch": (
 """Pitch is positive downwards, so the lower key is its plus."""
 CARTESIAN_AXES = tuple(_CARTESIAN_KEYS)
 _GRIPPER_KEYS = {"gripper_open": "o", "gripper_close": "c"}
-_COMMON_KEYS = {"faster": "+", "slower": "-", "estop": "space"}
-_WORDS = {"estop": "emergency stop"}
-"""Action -> what the keys of other devices call it."""
+_COMMON_KEYS = {"faster": "+", "slower": "-"}
 
 
 @attrs.frozen
@@ -125,7 +123,7 @@ def keys_of(options: KeyboardOptions, robot: Robot) -> Mapping[str, str]:
     except TeleopError:
         return {}
     actions = {**keymap.cartesian, **keymap.joints, **keymap.common}
-    return {key: _WORDS.get(action, action) for action, key in actions.items()}
+    return {key: action for action, key in actions.items()}
 
 
 def check_keys(options: KeyboardOptions, robot: Robot) -> Iterator[OptionFault]:

@@ -18,7 +18,11 @@ class KeyboardOptions:
     cartesian_speed: float = option(0.1, unit="m/s", gt=0, help="speed of the tool")
     gripper_speed: float = option(1.0, unit="rad/s", gt=0, help="speed of opening and closing")
     hold: float = option(
-        0.15, unit="s", gt=0, le=1, help="how long one key press moves; must exceed the terminal's auto-repeat interval"
+        0.15,
+        unit="s",
+        gt=0,
+        le=0.2,
+        help="how long one key press moves; must exceed the terminal's auto-repeat interval",
     )
     cartesian: bool = option(True, help="whether Cartesian jog is available; it needs robot.description.mjcf")
     gripper: str = option("gripper", help="joint group that the gripper keys move")

@@ -8,7 +8,18 @@ from typing import override
 import numpy as np
 from ibrobot_kinematics import JogArm
 
-from ibrobot_core.api import Context, JointReading, Teleop, TeleopCommand, TeleopError, Vector, ns, seconds
+from ibrobot_core.api import (
+    Context,
+    HeldKeys,
+    JointReading,
+    KeyEvent,
+    Teleop,
+    TeleopCommand,
+    TeleopError,
+    Vector,
+    ns,
+    seconds,
+)
 from ibrobot_keyboard.keymap import CARTESIAN_AXES, Mode, keymap_of
 from ibrobot_keyboard.options import KeyboardOptions
 
@@ -18,13 +29,15 @@ _SLOWEST, _FASTEST = 0.1, 4.0
 
 _GRIPPER, _HOME = "<gripper>", "<home>"
 """Axes in addition to the joints and those of the tool."""
+_SETTINGS = ("toggle", "faster", "slower")
 _MOTIONS = {"gripper_open": (_GRIPPER, 1), "gripper_close": (_GRIPPER, -1), "home": (_HOME, 1)}
 
 
 class KeyboardTeleop(Teleop):
-    """Moves while keys repeat, since a terminal reports presses and repeats but no releases.
+    """Moves while keys repeat, since most terminals report presses and repeats but no releases.
 
-    Each press moves for `hold` seconds from the tick that reads it. Time is that of the measurements.
+    Each press or repeat moves for `hold` seconds from the tick that counts it; see `HeldKeys`. Each key is a deadman.
+    Time is that of the measurements.
     """
 
     def __init__(self, options: KeyboardOptions, ctx: Context) -> None:
@@ -35,11 +48,12 @@ class KeyboardTeleop(Teleop):
         self._home = robot.pose("home") if "home" in robot.description.poses else None
         self._keymap = keymap_of(options, robot)
         self._keys: queue.SimpleQueue[str] | None = None
+        self._pressed = HeldKeys(options.hold)
         self._mode: Mode = "joints"
         self._speed = 1.0
         self._setpoint: Vector | None = None
         self._held: dict[str, tuple[int, int]] = {}
-        """Axis -> direction, and when its key counts as released [ns]."""
+        """Axis -> direction, and when its motion ends [ns]."""
         self._moved_ns: int | None = None
         """When the last motion was computed [ns]; None while at rest."""
 
@@ -60,8 +74,8 @@ class KeyboardTeleop(Teleop):
         self._held.clear()
         self._moved_ns = None
         self._arm.stop_tool()
-        while self._next_key() is not None:  # discards earlier keys
-            pass
+        self._pressed.take(self._typed(), measured.stamp_ns)
+        self._pressed.forget()
 
     @override
     def read(self, measured: JointReading) -> TeleopCommand:
@@ -72,14 +86,17 @@ class KeyboardTeleop(Teleop):
         if not self._moves():
             # The motion begins now, so after a pause of the host the robot does not jump.
             self._moved_ns = None
-        while (key := self._next_key()) is not None:
-            action = self._keymap.action(self._mode, key)
-            if action == "estop":
-                self._held.clear()
+        self._pressed.take(self._typed(), now_ns)
+        for event, key in self._pressed.events:
+            if (action := self._keymap.action(self._mode, key)) is not None:
+                self._take(event, action, now_ns)
+        if not self._held:
+            self.deadman.report(False, now_ns)
+        if not self.deadman.allows(now_ns):
+            self._held.clear()
+            if not self.deadman.armed:  # by a silence or a pause of the host
+                self._setpoint = None
                 self._arm.stop_tool()
-                return TeleopCommand(None, estop=True)
-            if action is not None:
-                self._press(action, now_ns)
         if not self._moves():
             return TeleopCommand(None)
         if self._setpoint is None:
@@ -97,29 +114,39 @@ class KeyboardTeleop(Teleop):
     def help(self) -> str:
         return self._keymap.help()
 
-    def _next_key(self) -> str | None:
-        if self._keys is None:
-            return None
-        try:
-            return self._keys.get_nowait()
-        except queue.Empty:
-            return None
+    def _typed(self) -> list[str]:
+        """The keys typed since the last call."""
+        typed: list[str] = []
+        while self._keys is not None and not self._keys.empty():
+            typed.append(self._keys.get_nowait())
+        return typed
 
-    def _press(self, action: str, now_ns: int) -> None:
+    def _take(self, event: KeyEvent, action: str, now_ns: int) -> None:
+        if action in _SETTINGS:
+            if event == "press":
+                self._set(action)
+            return
+        axis, direction = _MOTIONS.get(action) or (action[:-1], 1 if action[-1] == "+" else -1)
+        if event == "release":
+            self._held.pop(axis, None)
+            return
+        if event == "press" and not self._held:
+            self.deadman.report(False, now_ns)  # it was released before
+        self.deadman.report(True, now_ns)
+        if axis == _HOME:
+            self._held.clear()
+        self._held.pop(_HOME, None)
+        self._held[axis] = direction, now_ns + ns(self._options.hold)
+
+    def _set(self, action: str) -> None:
         if action == "toggle":
             self._mode = "cartesian" if self._mode == "joints" else "joints"
             self._held.clear()
             self._ctx.log.info("%s: jogs %s", self._ctx.name, "joints" if self._mode == "joints" else "the tool")
-        elif action in ("faster", "slower"):
-            factor = _SPEED_STEP if action == "faster" else 1 / _SPEED_STEP
-            self._speed = min(max(self._speed * factor, _SLOWEST), _FASTEST)
-            self._ctx.log.info("%s: speed %.0f %%", self._ctx.name, 100 * self._speed)
-        else:
-            axis, direction = _MOTIONS.get(action) or (action[:-1], 1 if action[-1] == "+" else -1)
-            if axis == _HOME:
-                self._held.clear()
-            self._held.pop(_HOME, None)
-            self._held[axis] = direction, now_ns + ns(self._options.hold)
+            return
+        factor = _SPEED_STEP if action == "faster" else 1 / _SPEED_STEP
+        self._speed = min(max(self._speed * factor, _SLOWEST), _FASTEST)
+        self._ctx.log.info("%s: speed %.0f %%", self._ctx.name, 100 * self._speed)
 
     def _move(self, before: Vector, dt: float) -> Vector:
         """The setpoint `dt` [s] after `before`, both [rad], shape (J,)."""

@@ -69,34 +69,46 @@ def test_the_toggle_key_changes_between_joints_and_tool(robot):
     typed: queue.SimpleQueue[str] = queue.SimpleQueue()
     teleop = KeyboardTeleop(KeyboardOptions(), host_context(robot=robot, keys=lambda: typed))
     teleop.connect()
+    typed.put("release:z")  # the terminal reports releases
     position = bent(robot)
 
     time_s = 0.0
 
+    rest = seen = position
+
     def hold(*keys: str) -> Vector:
-        """Press keys, and look 0.1 s later."""
-        nonlocal time_s
+        """Press keys, and look 0.1 s later; `rest` is where the arm stood before."""
+        nonlocal time_s, rest, seen
+        for time in np.arange(time_s, time_s + 1, DT):
+            command = teleop.read(JointReading(ns(time), position, position, position))
+            if command.positions is not None:
+                seen = np.array([command.positions[joint] for joint in robot.joint_names])
         time_s += 1
+        rest = seen
         for key in keys:
             typed.put(key)
         for time in np.arange(time_s, time_s + 0.105, DT):
             command = teleop.read(JointReading(ns(time), position, position, position))
+        time_s += 0.11
+        for key in keys:
+            typed.put(f"release:{key}")
         assert command.positions is not None
-        return np.array([command.positions[joint] for joint in robot.joint_names])
+        seen = np.array([command.positions[joint] for joint in robot.joint_names])
+        return seen
 
     joint = hold("w")
-    assert np.count_nonzero(joint - position) == 1
+    assert np.count_nonzero(joint - rest) == 1
     jogged_tool = hold("m", "w", "o")
-    way = tool(robot, jogged_tool)[0] - tool(robot, joint)[0]
+    way = tool(robot, jogged_tool)[0] - tool(robot, rest)[0]
     np.testing.assert_allclose(way, [0.008, 0, 0], atol=1.5e-3)  # it speeds up first
-    assert jogged_tool[-1] - joint[-1] == pytest.approx(0.1)
+    assert jogged_tool[-1] - rest[-1] == pytest.approx(0.1)
     rolled = hold("y")
-    (p0, r0), (p1, r1) = tool(robot, jogged_tool), tool(robot, rolled)
+    (p0, r0), (p1, r1) = tool(robot, rest), tool(robot, rolled)
     np.testing.assert_allclose(p1, p0, atol=2e-3)
     np.testing.assert_allclose(r1[:, 2], r0[:, 2], atol=2e-3)
     assert r0[:, 0] @ r1[:, 1] == pytest.approx(-np.sin(0.04), abs=0.01), "roll turns about the tool's own z axis"
     again = hold("m", "w")
-    assert np.count_nonzero(again - rolled) == 1
+    assert np.count_nonzero(again - rest) == 1
     assert "w/s x  a/d y  r/f z  g/t pitch  y/h roll" in teleop.help()
     teleop.disconnect()
 
@@ -106,10 +118,12 @@ def test_the_tool_speeds_up_and_slows_down_within_the_limits(robot):
     teleop = KeyboardTeleop(KeyboardOptions(cartesian_speed=0.3), host_context(robot=robot, keys=lambda: typed))
     teleop.connect()
     position, positions = bent(robot), []
-    typed.put("m")
+    for key in ("release:z", "m"):
+        typed.put(key)
     for tick in range(100):
         if tick in range(10, 30):
-            typed.put("s" if tick < 20 else "r")
+            key = "s" if tick < 20 else "r"
+            typed.put(key if tick in (10, 20) else f"repeat:{key}")
         reading = JointReading(ns(1 + tick * DT), position, position, position)
         command = teleop.read(reading)
         if command.positions is not None:

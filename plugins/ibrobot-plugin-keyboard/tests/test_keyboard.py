@@ -24,7 +24,9 @@ from ibrobot_core.api import (
     Teleop,
     TeleopCommand,
     TeleopError,
+    begin_operation,
     ns,
+    operate,
 )
 
 JOINTS = make_robot().joint_names
@@ -47,7 +49,8 @@ class TeleopRig:
         ctx = host_context("keyboard", robot=self.robot, keys=lambda: self.typed)
         self.teleop = KeyboardTeleop(self.options, ctx)
         self.teleop.connect()
-        self.teleop.activate(self.measured())
+        self.typed.put("release:z")  # the terminal reports releases
+        begin_operation(self.teleop, self.measured())
 
     def measured(self) -> JointReading:
         return JointReading(ns(self.time_s), self.position.copy(), np.zeros(6), np.zeros(6))
@@ -56,7 +59,7 @@ class TeleopRig:
         for key in keys:
             self.typed.put(key)
         self.time_s += seconds
-        command = self.teleop.read(self.measured())
+        command = operate(self.teleop, self.measured())
         if command.positions is not None:
             self.position = np.array([command.positions[joint] for joint in self.robot.joint_names])
         return command
@@ -64,7 +67,7 @@ class TeleopRig:
     def hold(self, key: str, seconds: float) -> None:
         """Keep a key down: it repeats every 30 ms."""
         for i in range(round(seconds / TICK_S) + 1):
-            self.tick(*([key] if i % 3 == 0 else []))
+            self.tick(*([key if i == 0 else f"repeat:{key}"] if i % 3 == 0 else []))
 
     def rest(self) -> None:
         """Let go of all keys until nothing moves."""
@@ -77,6 +80,8 @@ class TeleopRig:
 
 
 class TestKeyboard(TeleopSuite):
+    step_rad = 0.1  # motion goes on from the last setpoint
+
     @override
     def context(self) -> Context:
         self.typed: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -89,15 +94,16 @@ class TestKeyboard(TeleopSuite):
 
     @override
     def engage(self, teleop: Teleop) -> None:
-        self.typed.put("w")
+        for event in ("release:w", "w"):
+            self.typed.put(event)
 
     @override
     def operate(self, teleop: Teleop) -> None:
-        self.typed.put("w")
+        self.typed.put("repeat:w")
 
     @override
     def release(self, teleop: Teleop) -> None:
-        self.ctx.clock.sleep_until(self.ctx.clock.now_ns() + ns(KeyboardOptions().hold))
+        self.typed.put("release:w")
 
 
 PAIRS = [("w", "s"), ("e", "d"), ("r", "f"), ("t", "g"), ("y", "h")]
@@ -122,7 +128,7 @@ def test_a_tap_moves_for_the_hold_time_and_not_longer():
 def test_a_held_key_moves_without_a_break():
     rig = TeleopRig()
     for i in range(100):
-        assert rig.tick(*(["w"] if i % 9 == 0 else [])).positions is not None
+        assert rig.tick(*([f"{'repeat:' if i else ''}w"] if i % 9 == 0 else [])).positions is not None
 
 
 def test_without_keys_there_are_no_positions():
@@ -146,7 +152,7 @@ def test_activation_begins_where_the_robot_is_and_forgets_what_was_typed():
     rig.position = np.zeros(6)
     for key in ("w", "space"):
         rig.typed.put(key)
-    rig.teleop.activate(rig.measured())
+    begin_operation(rig.teleop, rig.measured())
     assert rig.tick() == TeleopCommand(None)
     assert rig.tick("e").positions == dict.fromkeys(JOINTS, 0.0)
 
@@ -223,18 +229,14 @@ def test_no_joint_goes_faster_than_its_own_limit():
 def test_a_host_that_stood_still_makes_no_leap():
     rig = TeleopRig()
     rig.tick("w")
-    rig.tick("w", seconds=5.0)
+    rig.tick(*["repeat:w"] * 60, seconds=5.0)
+    for _ in range(30):
+        rig.tick("repeat:w")
     assert rig.moved() == {}
-    rig.tick("w", seconds=0.14)
-    assert rig.moved() == pytest.approx({"shoulder_pan": 0.5 * 0.14})
-
-
-def test_the_emergency_key_asks_for_a_stop_once_and_ends_all_motion():
-    rig = TeleopRig()
+    rig.tick("release:w")
     rig.tick("w")
-    assert rig.tick("space", "e") == TeleopCommand(None, estop=True)
-    rig.teleop.activate(rig.measured())
-    assert rig.tick() == TeleopCommand(None)
+    rig.tick(seconds=0.1)
+    assert rig.moved() == pytest.approx({"shoulder_pan": 0.05})
 
 
 def test_keys_of_the_runtime_and_unknown_ones_do_nothing():
@@ -244,21 +246,20 @@ def test_keys_of_the_runtime_and_unknown_ones_do_nothing():
 
 
 def test_keys_can_be_given_other_actions():
-    keys = {"shoulder_pan+": "right", "shoulder_pan-": "left", "gripper_open": "w", "estop": "x"}
+    keys = {"shoulder_pan+": "right", "shoulder_pan-": "left", "gripper_open": "w"}
     rig = TeleopRig(options=KeyboardOptions(cartesian=False, keys=keys))
     rig.hold("left", 0.2)
     rig.hold("w", 0.2)
     # The hold time of the first key runs on for a while beside the second.
     assert set(rig.moved()) == {"shoulder_pan", "gripper"}
     assert rig.moved()["shoulder_pan"] < 0 < rig.moved()["gripper"]
-    assert rig.tick("x").estop
 
 
 WRONG_KEYS = {
     "unknown action": ({"shoulder_pam+": "1"}, "keys: no action 'shoulder_pam+', did you mean 'shoulder_pan+'?"),
     "nothing like it": (
         {"zzz": "1"},
-        "keys: no action 'zzz', the actions are: elbow_flex+, elbow_flex-, estop, faster",
+        "keys: no action 'zzz', the actions are: elbow_flex+, elbow_flex-, faster",
     ),
     "taken": ({"shoulder_pan+": "o"}, "keys: 'o' is assigned to both shoulder_pan+ and gripper_open"),
 }
@@ -282,12 +283,12 @@ def test_more_joints_than_keys_need_keys_of_their_own():
 def test_help_is_a_table_of_the_available_keys():
     assert TeleopRig().teleop.help().splitlines() == [
         "joints     w/s shoulder_pan  e/d shoulder_lift  r/f elbow_flex  t/g wrist_flex  y/h wrist_roll",
-        "always     o gripper_open  c gripper_close  0 home  + faster  - slower  space estop",
+        "always     o gripper_open  c gripper_close  0 home  + faster  - slower",
     ]
     bare = attrs.evolve(make_robot(), groups={}, description=Description())
     assert TeleopRig(robot=bare).teleop.help().splitlines() == [
         "joints     w/s shoulder_pan  e/d shoulder_lift  r/f elbow_flex  t/g wrist_flex  y/h wrist_roll  u/j gripper",
-        "always     + faster  - slower  space estop",
+        "always     + faster  - slower",
     ]
 
 
@@ -307,8 +308,8 @@ def test_typing_in_a_terminal_moves_a_joint():
             assert seen.get(timeout=60) == "w"
             # The reader feeds its subscribers one after another under one lock; subscribing again waits for that.
             keys.subscribe()
-            first, second = (
-                teleop.read(JointReading(ns(t), MIDDLE.copy(), np.zeros(6), np.zeros(6))) for t in (1.0, 1.1)
+            _, first, second = (
+                operate(teleop, JointReading(ns(t), MIDDLE.copy(), np.zeros(6), np.zeros(6))) for t in (1.0, 1.15, 1.2)
             )
     finally:
         os.close(person)
@@ -316,7 +317,54 @@ def test_typing_in_a_terminal_moves_a_joint():
     assert first.positions is not None
     assert second.positions is not None
     assert first.positions["shoulder_pan"] == 0.1
-    assert second.positions["shoulder_pan"] == pytest.approx(0.15)
+    assert second.positions["shoulder_pan"] == pytest.approx(0.125)
+
+
+def legacy_rig() -> TeleopRig:
+    """In a terminal that reports presses alone."""
+    rig = TeleopRig()
+    rig.teleop.disconnect()
+    rig.typed = queue.SimpleQueue()
+    rig.teleop = KeyboardTeleop(rig.options, host_context("keyboard", robot=rig.robot, keys=lambda: rig.typed))
+    rig.teleop.connect()
+    begin_operation(rig.teleop, rig.measured())
+    rig.tick()
+    return rig
+
+
+def press(rig: TeleopRig, ticks: range, key: str = "w") -> list[bool]:
+    """Whether the robot may move at each tick since the press of a key that repeats after 0.4 s, every 30 ms."""
+    return [rig.tick(*[key] * (tick == 0 or (tick >= 40 and tick % 3 == 1))).positions is not None for tick in ticks]
+
+
+def test_without_reports_of_releases_a_held_key_moves_and_its_release_ends_the_motion():
+    rig = legacy_rig()
+    moves = press(rig, range(100))
+    assert moves.index(True) == 15, "a press counts once it is clear that it is none of many repeats"
+    assert all(moves[45:])
+    after = [rig.tick().positions is not None for _ in range(30)]
+    assert sum(after) <= 16
+    assert press(rig, range(20))[-1], "the next press counts"
+
+
+@pytest.mark.parametrize("pressed_before", [5, 30, 60], ids=["just pressed", "before its first repeat", "repeating"])
+def test_a_key_held_over_an_activation_moves_nothing(pressed_before: int):
+    rig = legacy_rig()
+    press(rig, range(pressed_before))
+    begin_operation(rig.teleop, rig.measured())
+    assert not any(press(rig, range(pressed_before, 300)))
+    for _ in range(30):
+        rig.tick()
+    assert any(press(rig, range(20)))
+
+
+def test_a_terminal_that_stalls_sends_repeats_that_move_nothing():
+    rig = legacy_rig()
+    press(rig, range(100))
+    for _ in range(200):
+        rig.tick()
+    assert rig.tick(*["w"] * 66).positions is None
+    assert not any(press(rig, range(301, 500)))
 
 
 def test_the_hook_offers_the_keyboard():

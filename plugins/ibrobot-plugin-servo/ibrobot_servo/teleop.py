@@ -34,10 +34,17 @@ _STATUS_S = 0.1
 _FOLLOW_RAD = 0.1
 """An arm at rest that is further from its setpoint was moved otherwise, so it starts from its measured position."""
 _DIAGNOSTICS = "/diagnostics"
+_PAUSE_NS = ns(0.5)
+"""A stream of twists that was silent for so long counts as released [ns]."""
+_OFF_NS = ns(0.5)
+"""Largest difference between the time in a twist's header and ours [ns]."""
 
 
 class TwistTeleop(Teleop):
     """The newest twist moves the tool until its timeout; then it slows down to a stop, and the robot holds.
+
+    Twists other than zero count as a pressed deadman, a zero twist or a pause of 0.5 s as its release: a stream that
+    goes on over a reset, a mode switch or a gap moves nothing before.
 
     Time is that of the measurements; the age of a twist counts from its arrival.
     """
@@ -54,6 +61,8 @@ class TwistTeleop(Teleop):
         self._twists: Subscription | None = None
         self._serves = False
         """Whether it serves calls that send a twist."""
+        self._came_ns: int | None = None
+        """When the last twist was read [ns]."""
         self._fresh = True
         """Whether the next twist starts from the measured position."""
         self._published: tuple[ServoStatus, int] | None = None
@@ -84,7 +93,8 @@ class TwistTeleop(Teleop):
     def activate(self, measured: JointReading) -> None:
         if self._servo is not None and self._twists is not None:
             self._servo.reset(measured.position[self._indices])
-            self._twists.drain()  # discards earlier twists
+            if self._twists.drain():  # discards earlier twists
+                self._came_ns = measured.stamp_ns
         self._fresh = True
 
     @override
@@ -93,8 +103,12 @@ class TwistTeleop(Teleop):
         if servo is None or twists is None:
             raise TeleopError(f"{self._ctx.name}: twists are not connected: connect comes before read")
         here = measured.position[self._indices]
+        if self._came_ns is None or measured.stamp_ns - self._came_ns >= _PAUSE_NS:
+            self.deadman.report(False, measured.stamp_ns)
         for received in twists.drain():
             self._take(servo, received, measured.stamp_ns, here)
+        if not self.deadman.allows(measured.stamp_ns):
+            servo.halt()
         position = servo.step(measured.stamp_ns)
         moves = not servo.at_rest
         lead = self._ctx.robot.max_lead[self._indices]
@@ -129,7 +143,8 @@ class TwistTeleop(Teleop):
 
     def _take(self, servo: Servo, received: Received, now_ns: int, here: Vector) -> None:
         """Follow a twist, or refuse it."""
-        fault = self._fault(received.message, received.received_ns)
+        self._came_ns = now_ns
+        fault = self._fault(received.message, received.received_ns) or self._held(received.message, now_ns)
         if fault is None:
             assert isinstance(received.message, TwistStamped)
             if servo.at_rest and (self._fresh or np.abs(servo.position - here).max() > _FOLLOW_RAD):
@@ -143,6 +158,15 @@ class TwistTeleop(Teleop):
         if fault is not None:
             self._report(servo, fault, now_ns)
 
+    def _held(self, message: Message, now_ns: int) -> str | None:
+        """Report a twist to the deadman; returns the fault if it may not move the tool."""
+        assert isinstance(message, TwistStamped)
+        moves = _array(message.twist.linear).any() or _array(message.twist.angular).any()
+        self.deadman.report(bool(moves), now_ns)
+        if not moves or self.deadman.allows(now_ns):
+            return None
+        return "the stream went on over a reset, a mode switch or a gap: send a zero twist, or pause for 0.5 s"
+
     def _fault(self, message: Message, received_ns: int) -> str | None:
         if not isinstance(message, TwistStamped):
             return f"not a {TwistStamped.ros_type}"
@@ -151,6 +175,9 @@ class TwistTeleop(Teleop):
             return f"its frame is neither {frames[0]} nor {frames[1]}"
         if self._ctx.clock.now_ns() - received_ns > ns(self._options.timeout):
             return "read too late"
+        stamp_ns = message.header.stamp_ns
+        if stamp_ns and abs(stamp_ns - received_ns) > _OFF_NS:
+            return "the time in its header is more than 0.5 s off: set the clocks, or leave the time 0"
         return None
 
     def _report(self, servo: Servo, fault: str, now_ns: int) -> None:

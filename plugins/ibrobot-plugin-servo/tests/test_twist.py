@@ -34,7 +34,9 @@ from ibrobot_core.api import (
     TwistStamped,
     Vector,
     Vector3,
+    begin_operation,
     ns,
+    operate,
 )
 
 AXES = {"shoulder_pan": "0 0 1", "shoulder_lift": "0 1 0", "elbow_flex": "0 1 0", "wrist_flex": "0 1 0",
@@ -71,6 +73,9 @@ def twist(
 
 
 class TestTwist(TeleopSuite):
+    tolerance_rad = 2e-3  # the zero twist before is the first
+    step_rad = 0.1  # motion goes on from the last setpoint
+
     path: ClassVar[Path]
 
     @pytest.fixture(autouse=True)
@@ -97,7 +102,8 @@ class TestTwist(TeleopSuite):
 
     @override
     def release(self, teleop: Teleop) -> None:
-        self.ctx.clock.sleep_until(self.ctx.clock.now_ns() + ns(TwistOptions().timeout))
+        assert self.ctx.bus is not None
+        self.ctx.bus.publish(TOPIC, twist((0.0, 0.0, 0.0)))
 
 
 class Rig:
@@ -117,7 +123,7 @@ class Rig:
         self.follows = True
         self.teleop = TwistTeleop(options, self.ctx)
         self.teleop.connect()
-        self.teleop.activate(self.measured())
+        begin_operation(self.teleop, self.measured())
 
     def measured(self) -> JointReading:
         return JointReading(self.ctx.clock.now_ns(), self.position.copy(), np.zeros(6), np.zeros(6))
@@ -126,7 +132,7 @@ class Rig:
         self.ctx.clock.sleep_until(self.ctx.clock.now_ns() + ns(DT))
         for message in messages:
             self.bus.publish(topic, message)
-        positions = self.teleop.read(self.measured()).positions
+        positions = operate(self.teleop, self.measured()).positions
         self.commanded = positions is not None
         for name, position in (positions or {}).items():
             if self.follows:
@@ -163,7 +169,8 @@ def test_the_tool_follows_the_base_frame_and_its_own(model):
 def test_only_joints_that_move_the_tool_are_commanded(model):
     rig = Rig(model)
     rig.bus.publish(TOPIC, twist())
-    positions = rig.teleop.read(rig.measured()).positions
+    rig.ctx.clock.sleep_until(rig.ctx.clock.now_ns() + ns(DT))
+    positions = operate(rig.teleop, rig.measured()).positions
     assert positions is not None
     assert "gripper" not in positions
     assert len(positions) == 5
@@ -189,7 +196,7 @@ def test_a_joint_that_does_not_follow_makes_the_tool_wait(model):
     for _ in range(300):
         rig.bus.publish(TOPIC, twist((0.1, 0, 0)))
         rig.ctx.clock.sleep_until(rig.ctx.clock.now_ns() + ns(DT))
-        positions = rig.teleop.read(rig.measured()).positions or {}
+        positions = operate(rig.teleop, rig.measured()).positions or {}
         lead = [
             abs(at - BENT[rig.robot.joint_names.index(name)]) / rig.robot.max_lead[0] for name, at in positions.items()
         ]

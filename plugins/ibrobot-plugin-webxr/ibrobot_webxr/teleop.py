@@ -11,6 +11,7 @@ from ibrobot_kinematics.rotations import exp, log
 
 from ibrobot_core.api import (
     Context,
+    Deadman,
     JointReading,
     Robot,
     Teleop,
@@ -25,8 +26,6 @@ from ibrobot_webxr.options import HANDS, WebxrOptions
 from ibrobot_webxr.server import PageServer
 from ibrobot_webxr.shared import close_page, open_page
 
-_RESUME_S = 0.3
-"""A clutch still held after a loss shorter than this engages again by itself [s]."""
 _LONGEST_STEP_S = 0.1
 """Longest motion of the gripper in one command [s]: after a pause of the host it does not jump."""
 _LATE = 0.6
@@ -51,7 +50,7 @@ class WebxrTeleop(Teleop):
     """Moves the tool as the hand moves while the clutch is held, from where both are when it is pressed.
 
     When a hand is lost, or its poses come too late, the robot holds. The clutch must then be released and pressed
-    again, unless the loss was short.
+    again.
     """
 
     def __init__(self, options: WebxrOptions, ctx: Context) -> None:
@@ -103,7 +102,8 @@ class WebxrTeleop(Teleop):
         for hand, sample in self._inbox.drain():
             self._take(hand, sample, now_ns, here)
         engaged = self._engaged
-        if engaged is not None and (stop or not self._clutches[engaged].holds(now_ns) or not np.isfinite(here).all()):
+        held = {hand: clutch.holds(now_ns) for hand, clutch in self._clutches.items()}
+        if engaged is not None and (stop or not held[engaged] or not np.isfinite(here).all()):
             self._engaged = None
         if stop:
             self._clutches = {hand: _Clutch(self._options.timeout) for hand in self._hands}
@@ -142,7 +142,9 @@ class WebxrTeleop(Teleop):
     def _take(self, hand: str, sample: Sample, now_ns: int, here: Vector) -> None:
         """Follow a sample of a hand."""
         clutch = self._clutches[hand]
-        presses = clutch.take(sample, now_ns, engaged=hand == self._engaged)
+        presses = clutch.take(sample, now_ns)
+        if sample.pose is not None:
+            self.deadman.report(any(each.is_held for each in self._clutches.values()), sample.made_ns)
         if self._engaged == hand and (presses or not clutch.pressed):
             self._engaged = None
         if presses and self._engaged is None and np.isfinite(here).all():
@@ -174,57 +176,49 @@ class WebxrTeleop(Teleop):
 
 
 class _Clutch:
-    """The clutch of one hand: pressed after it was released.
+    """The clutch of one hand, as a deadman of its own.
 
     Attributes:
         sample: the newest usable sample.
-        pressed: whether it is held.
-        is_lost: whether the newest sample was not usable.
+        pressed: whether it is held, and moves the robot.
+        is_lost: whether the newest sample is too old.
     """
 
     def __init__(self, timeout_s: float) -> None:
         self._timeout_s = timeout_s
-        self._ready = False
-        """Whether it was released, so that a press counts."""
-        self._resumes = False
-        """Whether a hand that was lost moved the robot."""
+        self._deadman = Deadman()
         self.sample: Sample | None = None
         self.pressed = False
         self.is_lost = True
 
-    def take(self, sample: Sample, now_ns: int, *, engaged: bool) -> bool:
-        """Follow a sample; returns whether the clutch is pressed by it."""
+    def take(self, sample: Sample, now_ns: int) -> bool:
+        """Follow a sample; returns whether the clutch is pressed by it. A hand that is not tracked says nothing."""
         if sample.pose is None or sample.age_s(now_ns) > self._timeout_s:
-            self._lose(engaged)
             return False
-        before = self.sample
-        gap_s = 0.0 if before is None else (sample.made_ns - before.made_ns) * 1e-9
-        if engaged and gap_s > self._timeout_s:
-            self._lose(engaged)
-        self.sample, self.is_lost = sample, False
-        held = sample.pose.clutch
-        presses = held and (self._ready or (self._resumes and gap_s <= _RESUME_S))
-        self._ready = not held
-        self._resumes = False
-        self.pressed = held and (presses or engaged)
-        return presses
+        if self.sample is not None and (sample.made_ns - self.sample.made_ns) * 1e-9 > self._timeout_s:
+            self._deadman.disarm(sample.made_ns - 1)
+        self.sample = sample
+        before = self.pressed
+        self._deadman.report(sample.pose.clutch, sample.made_ns)
+        return self.holds(now_ns) and not before
 
     def holds(self, now_ns: int) -> bool:
         """Whether it is held, by a sample that is new enough."""
-        if self.sample is None or self.is_lost or self.sample.age_s(now_ns) > self._timeout_s:
-            self._lose(self.pressed)
+        self.is_lost = self.sample is None or self.sample.age_s(now_ns) > self._timeout_s
+        if self.is_lost:
+            self._deadman.disarm(now_ns)
+        self.pressed = self._deadman.allows(now_ns)
         return self.pressed
+
+    @property
+    def is_held(self) -> bool:
+        """Whether its newest sample has it pressed."""
+        return self.sample is not None and self.sample.pose is not None and self.sample.pose.clutch
 
     @property
     def is_stuck(self) -> bool:
         """Whether it is held without effect, until it is released."""
-        return self.sample is not None and self.sample.pose is not None and self.sample.pose.clutch and not self.pressed
-
-    def _lose(self, engaged: bool) -> None:
-        self._resumes |= engaged
-        self._ready = False
-        self.pressed = False
-        self.is_lost = True
+        return self.is_held and not self.pressed
 
 
 class _Tool:

@@ -66,6 +66,11 @@ class TeleopSuite(Suite[Teleop]):
         """
         self.operate(teleop)
 
+    def rest(self, teleop: Teleop) -> None:
+        """One period in which the deadman is released, and the device reports it; calls `release` by default."""
+        if self.has_deadman:
+            self.release(teleop)
+
     def freeze(self, teleop: Teleop) -> None:
         """The device goes silent, e.g. out of range, until the next `hold`, `release` or `engage`.
 
@@ -94,6 +99,11 @@ class TeleopSuite(Suite[Teleop]):
 
     def _begin(self, teleop: Teleop, ctx: Context, position: Vector) -> TeleopCommand:
         begin_operation(teleop, self._measure(ctx, position))
+        return self._press(teleop, ctx, position)
+
+    def _press(self, teleop: Teleop, ctx: Context, position: Vector) -> TeleopCommand:
+        self.rest(teleop)
+        operate(teleop, self._measure(ctx, position))
         self.engage(teleop)
         return operate(teleop, self._measure(ctx, position))
 
@@ -141,8 +151,7 @@ class TeleopSuite(Suite[Teleop]):
             pose = self.poses(ctx)[0]
             begin_operation(teleop, self._measure(ctx, pose))
             assert operate(teleop, self._measure(ctx, pose)).positions is None
-            self.engage(teleop)
-            assert operate(teleop, self._measure(ctx, pose)).positions is not None
+            assert self._press(teleop, ctx, pose).positions is not None
             self.release(teleop)
             commands = [operate(teleop, self._measure(ctx, pose)) for _ in range(2)]
             assert commands[-1].positions is None
@@ -158,8 +167,7 @@ class TeleopSuite(Suite[Teleop]):
                 for _ in range(100):
                     positions = operate(teleop, self._measure(ctx, pose)).positions
                     assert positions is None, "it commands positions before the operator has acted"
-                self.engage(teleop)
-                operate(teleop, self._measure(ctx, pose))
+                self._press(teleop, ctx, pose)
                 self.operate(teleop)
                 assert operate(teleop, self._measure(ctx, pose)).positions, "no positions once the operator acted"
 
@@ -178,10 +186,7 @@ class TeleopSuite(Suite[Teleop]):
             self.hold(teleop)
             positions = operate(teleop, self._measure(ctx, pose)).positions
             assert positions is None, "it moves again by the same press of the deadman"
-        self.release(teleop)
-        operate(teleop, self._measure(ctx, pose))
-        self.engage(teleop)
-        positions = operate(teleop, self._measure(ctx, pose)).positions
+        positions = self._press(teleop, ctx, pose).positions
         assert positions, "a new press moves nothing"
         for joint, position in positions.items():
             measured = pose[ctx.robot.joint_names.index(joint)]
@@ -252,11 +257,16 @@ class TeleopSuite(Suite[Teleop]):
         """`activate` and `read` do not change `measured`, and later changes of it do not affect the device."""
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
-            begin, now = self._measure(ctx, pose), self._measure(ctx, pose)
+            begin = self._measure(ctx, pose)
             begin_operation(teleop, begin)
             np.testing.assert_array_equal(begin.position, pose)
             begin.position[:] = 0.0
+            self.rest(teleop)
+            before = self._measure(ctx, pose)
+            operate(teleop, before)
+            before.position[:] = 0.0
             self.engage(teleop)
+            now = self._measure(ctx, pose)
             positions = operate(teleop, now).positions or {}
             np.testing.assert_array_equal(now.position, pose)
             for joint, position in positions.items():

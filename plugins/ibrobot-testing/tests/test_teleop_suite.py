@@ -47,18 +47,18 @@ class TestTeleop(TeleopSuite):
 
 
 class BeginsAtZero(FakeTeleop):
-    def activate(self, measured):
-        super().activate(measured)
+    def press(self):
+        super().press()
         self._positions = np.zeros_like(self._positions)
 
 
-class ActivatesOnce(FakeTeleop):
-    active = False
+class BeginsWhereItFirstBegan(FakeTeleop):
+    first = None
 
-    def activate(self, measured):
-        if not self.active:
-            super().activate(measured)
-        self.active = True
+    def press(self):
+        super().press()
+        self.first = self._positions if self.first is None else self.first
+        self._positions = self.first
 
 
 class UnknownJoint(FakeTeleop):
@@ -115,9 +115,11 @@ class MakesUpForMissedTicks(FakeTeleop):
 
 
 class KeepsTheMeasurement(FakeTeleop):
-    def activate(self, measured):
-        super().activate(measured)
-        self._positions = measured.position
+    def read(self, measured):
+        command = super().read(measured)
+        if command.positions is None:
+            self._positions = measured.position
+        return command
 
 
 class ChangesTheMeasurement(FakeTeleop):
@@ -155,7 +157,7 @@ class ReadsWhileDisconnected(FakeTeleop):
 
 WRONG = {
     BeginsAtZero: "begins_where_the_robot_is",
-    ActivatesOnce: "begins_where_the_robot_is",
+    BeginsWhereItFirstBegan: "begins_where_the_robot_is",
     UnknownJoint: "positions_are_of_known_joints",
     NotANumber: "positions_are_of_known_joints",
     NeverMoves: "operating_moves",

@@ -124,7 +124,7 @@ class FakeTeleop(Teleop):
         self._let_go = False
         if not self.silent:
             self.deadman.report(self.pressed, measured.stamp_ns)
-        allowed = self.deadman.allows(measured.stamp_ns)
+        allowed = self.deadman.allows(measured.stamp_ns) if self.operated else self.pressed
         if not allowed:
             self._positions = measured.position.copy()
         positions = dict(zip(self._names, self._positions.tolist(), strict=True)) if allowed else None
