@@ -98,9 +98,21 @@ def test_devices_lost_together_are_connected_again_together(
 
 
 def test_a_device_cannot_move_joints_of_another(run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runs.parts.MADE["left"], "read", lambda measured: TeleopCommand({"pan": 0.1, "grip": 0.9}))
+    left = runs.parts.MADE["left"]
+    left.operated = False
+    monkeypatch.setattr(left, "read", lambda measured: TeleopCommand({"pan": 0.1, "grip": 0.9}))
     assert way(run) == [False, False]
     assert run.session.faults == ("left: commands joints that are not its own: grip",)
+
+
+def test_a_device_that_reports_no_deadman_moves_nothing(
+    run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = runs.parts.MADE["left"]
+    monkeypatch.setattr(left, "read", lambda measured: TeleopCommand({"pan": 0.1}))
+    assert way(run) == [False, False]
+    (fault,) = run.session.faults
+    assert fault.startswith("FakeTeleop commands positions without a deadman: its read must call self.deadman.report")
 
 
 def test_any_device_stops_the_robot(run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:

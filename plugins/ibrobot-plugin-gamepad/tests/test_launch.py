@@ -201,8 +201,10 @@ def test_a_pad_and_the_keyboard_move_an_arm_each(bimanual: tuple[Run, queue.Simp
     assert (run.position - before)[5] > 0.2
 
     def jog(ticks: int, *reports: bytes) -> None:
+        for event in ("release:w", "w"):
+            typed.put(event)
         for _ in range(ticks):
-            typed.put("w")
+            typed.put("repeat:w")
             run.ticks(1, *reports)
 
     run.ticks(20, dualsense())

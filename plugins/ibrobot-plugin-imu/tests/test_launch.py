@@ -40,17 +40,22 @@ class Run:
     sensor: Sensor
     keys: list[queue.SimpleQueue[str]] = attrs.field(factory=list)
     runtime: Runtime = attrs.field(init=False)
+    down: set[str] = attrs.field(factory=set)
+    """The keys that are held."""
 
     def subscribe(self) -> queue.SimpleQueue[str]:
         self.keys.append(queue.SimpleQueue())
         return self.keys[-1]
 
     def ticks(self, count: int, *held: str, **tilt: float) -> None:
+        events = [f"release:{key}" for key in self.down - {*held}] + [key for key in held if key not in self.down]
+        self.down = {*held}
         for _ in range(count):
             self.sensor.turn(**tilt)
             for typed in self.keys:
-                for key in held:
-                    typed.put(key)
+                for event in events:
+                    typed.put(event)
+            events = [f"repeat:{key}" for key in held]
             assert not self.runtime.step()
 
     @property
@@ -116,7 +121,7 @@ def test_garbage_in_motion_holds(run: Run):
     for _ in range(60):
         run.sensor.send(rng.bytes(19))
         for typed in run.keys:
-            typed.put("z")
+            typed.put("repeat:z")
         run.runtime.step()
     held = run.position
     run.ticks(30, "z", yaw=-0.7)
