@@ -199,8 +199,9 @@ def test_a_simulated_recording_becomes_a_dataset_of_two_arms(tmp_path: Path):
     runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, keys=lambda: typed)))
     runtime.start()
     try:
-        for _ in range(40):
-            typed.put("w")
+        for i in range(40):
+            for key in ("release:w", "w") if i == 1 else ("repeat:w",) * (i > 1):
+                typed.put(key)
             runtime.step()
     finally:
         runtime.stop()

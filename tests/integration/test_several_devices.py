@@ -17,7 +17,7 @@ from ibrobot_core.plugins import installed_plugins
 
 pytestmark = pytest.mark.integration
 
-SPACE = "'space' is both emergency stop (keys) and deadman (it)"
+OPENS = "'o' is both gripper_open (keys) and deadman (it)"
 GROUPS = "control_modes.teleop.teleop={{arm: {}, gripper: {}}}"
 
 
@@ -63,13 +63,10 @@ def test_a_leader_moves_the_arm_and_a_gamepad_its_gripper(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("device", "keys", "twice"),
     [
-        ("so101_leader, port: /dev/a, calibration: none", "{}", SPACE),
-        ("imu, port: /dev/a, model: bno08x", "{}", SPACE),
-        (
-            "imu, port: /dev/a, model: bno08x, deadman_key: o",
-            "{estop: x}",
-            "'o' is both gripper_open (keys) and deadman (it)",
-        ),
+        ("so101_leader, port: /dev/a, calibration: none, deadman_key: o", "{}", OPENS),
+        ("imu, port: /dev/a, model: bno08x, deadman_key: o", "{}", OPENS),
+        ("imu, port: /dev/a, model: bno08x", "{gripper_open: space}", OPENS.replace("'o'", "'space'")),
+        ("imu, port: /dev/a, model: bno08x", "{}", ""),
         ("imu, port: /dev/a, model: bno08x, deadman: cts", "{}", ""),
         ("imu, port: /dev/a, model: bno08x, deadman_key: z", "{}", ""),
     ],

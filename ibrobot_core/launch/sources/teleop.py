@@ -29,7 +29,7 @@ class Braking:
         self._before: ControlState | None = None
 
     def add(self, positions: Mapping[str, float]) -> dict[str, float]:
-        """`positions` [rad] with those where joints stop that were commanded the last time."""
+        """`positions` [rad], and where the joints stop that were commanded only the last time [rad]."""
         before, state = self._before, self._session.state
         dropped = sorted(self._commanded - set(positions))
         self._commanded, self._before = frozenset(positions), state

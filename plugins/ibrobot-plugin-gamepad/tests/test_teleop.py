@@ -388,7 +388,7 @@ def test_a_silent_pad_that_sends_only_changes_ends_its_motion(hidapi: FakeHidapi
     assert "pad: it reports only changes, so a motion ends when it is silent" in caplog.text
 
 
-def test_whoever_trusts_the_link_of_a_pad_may_leave_a_stick_still(hidapi: FakeHidapi):
+def test_a_trusted_link_lets_a_stick_be_still(hidapi: FakeHidapi):
     rig = Rig(hidapi, attrs.evolve(JOINTS, trust_link=True), pad=Plugged(*XBOX))
     rig.tick(xbox(deadman=False))
     rig.tick(xbox(deadman=True, right=1))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, override
 
+import attrs
 import numpy as np
 import pytest
 from hypothesis import given
@@ -32,7 +33,14 @@ class TestConformance(TeleopSuite):
     @override
     def engage(self, teleop: Teleop) -> None:
         assert isinstance(teleop, WebTeleop)
-        teleop.take(press(teleop))
+        self.pressed = press(teleop)
+        teleop.take(self.pressed)
+
+    @override
+    def hold(self, teleop: Teleop) -> None:
+        assert isinstance(teleop, WebTeleop)
+        now = press(teleop, joints={"shoulder_pan": 1.0})
+        teleop.take(attrs.evolve(now, began_ns=self.pressed.began_ns))
 
     @override
     def operate(self, teleop: Teleop) -> None:
