@@ -6,6 +6,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
+from typing import ClassVar
 
 import attrs
 
@@ -86,6 +87,9 @@ class EpisodeAddress:
 
 class EpisodeReader(ABC):
     """Reads an episode, message by message, so that it need not fit into memory."""
+
+    sampled: ClassVar[bool] = False
+    """Whether its commands are samples of a motion, as rows of a dataset are; otherwise each holds until the next."""
 
     @abstractmethod
     def summary(self) -> EpisodeSummary:

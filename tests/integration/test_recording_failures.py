@@ -326,6 +326,24 @@ class TestOtherContract:
         assert "this episode: 20.0" in done.err
         assert "1 episode, " in done.out
 
+    @pytest.mark.parametrize("changed", ["robot", "calibration"])
+    def test_convert_leaves_out_another_robot(self, run: Run, tmp_path: Path, changed: str):
+        pan = {"id": 1, "drive_mode": 0, "homing_offset": 3, "range_min": 100, "range_max": 4000}
+        for number, offset in enumerate((3, 4), 1):
+            calibration = json.dumps({"arm": {"pan": {**pan, "homing_offset": offset}}})
+            mark = {"robot": f"arm{number}"} if changed == "robot" else {"calibration": calibration}
+            record(tmp_path / f"bags/episode_{number}", number, 0.5, "sort", **mark)
+        done = run("convert", tmp_path / "bags", "--out", tmp_path / "set", "--no-videos")
+        assert done.code == 1
+        assert "left out episode_2: its " in done.err
+        assert "--any-robot merges them all the same" in done.err
+        added = run("convert", tmp_path / "bags", "--out", tmp_path / "set", "--no-videos", "--append")
+        assert added.code == 1, "the dataset's robot counts"
+        assert (
+            run("convert", tmp_path / "bags", "--out", tmp_path / "set", "--no-videos", "--append", "--any-robot").code
+            == 0
+        )
+
     def test_verify_tells(self, run: Run, other: Path):
         done = run("episodes", "verify", other)
         assert done.code == 1
@@ -384,4 +402,4 @@ class TestMissingTopic:
         record(tmp_path / "unheard", 1, 0.5, contract=wanted, config=metadata["config"])
         done = run("replay", tmp_path / "unheard", "--sim", "--lockstep", "--headless")
         assert done.code == 2
-        assert "no message of /arm_position_controller/commands, so nothing to replay; available: /comm" in done.err
+        assert "/gripper_position_controller/commands, so nothing to replay; available: /commands, /joint" in done.err

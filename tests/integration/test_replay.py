@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 from collections.abc import Callable
 from contextlib import chdir
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import run_here
+from ibrobot_mcap.facts import set_custom
+from ibrobot_mcap.options import McapOptions
+from ibrobot_mcap.recorder import McapRecorder
+from ibrobot_testing.contexts import host_context
+
+from ibrobot_core.clock import SteppedClock
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
+from ibrobot_core.messages import Float64MultiArray
+from ibrobot_core.plugins import installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 
@@ -114,6 +126,38 @@ def test_other_joints_are_refused_also_by_force(replay: Command, picks: Path, tm
     assert "its actions differ, which --force-contract does not change" in done.stderr
     assert "clawed.yaml: topic: /arm_position_controller/commands" in done.stderr
     assert "elbow_flex, shoulder_lift, shoulder_pan" in done.stderr.replace("'", "")
+
+
+@pytest.mark.parametrize(("key", "value"), [("robot", "so102"), ("robot_type", "koch_follower")])
+def test_an_episode_of_another_robot_is_refused(replay: Command, picks: Path, tmp_path: Path, key: str, value: str):
+    shutil.copytree(picks / "episode_000001", tmp_path / "episode")
+    set_custom(tmp_path / "episode", {key: value})
+    known = {"robot": "so101", "robot_type": "so101_follower"}[key]
+    done = replay("episode", "so101_blind", "--sim", "--lockstep")
+    assert done.returncode == 2
+    assert (
+        f"its {key} is '{value}', that of this robot is '{known}'; --any-robot replays it all the same" in done.stderr
+    )
+    assert replay("episode", "so101_blind", "--sim", "--lockstep", "--any-robot").returncode == 0
+
+
+def test_a_command_far_outside_the_limits_is_refused(replay: Command, picks: Path, tmp_path: Path):
+    reader = installed_plugins().open_episode(picks / "episode_000001")
+    metadata = dict(reader.summary().metadata)
+    reader.close()
+    contract = Contract.from_canonical(json.loads(metadata["contract"]))
+    recorder = McapRecorder(McapOptions(), host_context(clock=SteppedClock(0)))
+    recorder.begin(EpisodeStart(tmp_path / "far", 0, contract.topics, metadata))
+    for at, pan in enumerate([0.0, 0.1, 957.0]):
+        for part in contract.action_parts:
+            values = np.zeros(len(part.joints))
+            values[0] = pan if "shoulder_pan" in part.joints else 0.0
+            recorder.write(part.topic, Float64MultiArray(values), at * 10_000_000)
+    recorder.end(EpisodeEnd(20_000_000, "success"))
+    recorder.close()
+    done = replay("far", "--sim", "--lockstep")
+    assert done.returncode == 2
+    assert "far: shoulder_pan is commanded to 957 rad 0.02 s after the first command, far outside its" in done.stderr
 
 
 def test_the_recorded_robot_is_taken_where_none_is_named(replay: Command, picks: Path):

@@ -40,7 +40,9 @@ _Progress = Callable[[int], AbstractContextManager[Any]]
 """Receives the number of episodes, and gives the function that shows the progress."""
 _MIB = 1 << 20
 _ONLY_TO_BAG = ("numbers",)
-_ONLY_TO_DATASET = ("append", "type_", "force_contract", "missing", "outcomes", "success", "jobs", "only", "context")
+_ONLY_TO_DATASET = (
+    "append", "type_", "force_contract", "any_robot", "missing", "outcomes", "success", "jobs", "only", "context",
+)  # fmt: skip
 _EVENT_S = 0.1
 _MUCH = 0.1
 """The report names episodes that lost a larger share of their ticks."""
@@ -73,6 +75,7 @@ def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--set", "sets", multiple=True, metavar="OPTION=VALUE", help="Any other option of the dataset writer.")
 @click.option("--config", metavar="CONFIG", help="Robot YAML, or a YAML with only a contract, for foreign bags.")
 @click.option("--force-contract", is_flag=True, help="Use --config's contract even if the recorded one differs.")
+@click.option("--any-robot", is_flag=True, help="Merge episodes even if robot, robot type or calibration differ.")
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of the dataset's joints; by default radians.")
 @click.option("--calibration", metavar="NAME", help="Calibration for --norm-mode, instead of the recorded one.")
 @click.option(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,6 +21,11 @@ from ibrobot_core.api import (
     Vector,
 )
 
+_DENSE = 1.5
+"""Longest median time between commands at the rate of control [periods]."""
+_ROUNDING = 1e-6
+"""Of a time in periods."""
+
 
 @attrs.frozen(eq=False)
 class Track:
@@ -37,11 +43,11 @@ class Track:
 
 @attrs.frozen(eq=False)
 class Playback:
-    """The motion of an episode; times count from its first command."""
+    """The motion of an episode; times count from its first command of any joint."""
 
     joints: tuple[str, ...]
     commands: Track
-    """Commanded positions."""
+    """Commanded positions at the ticks of control: the newest command by then."""
     states: Track | None
     """Measured positions; None if the episode has no joint states."""
     outcome: str
@@ -73,53 +79,82 @@ class Playback:
         }
 
 
-def read_playback(reader: EpisodeReader, contract: Contract) -> Playback:
+def read_playback(reader: EpisodeReader, contract: Contract, period_ns: int) -> Playback:
     """The motion of an episode.
+
+    Before its first command a joint has its recorded position or, if that is unknown, the position of the command: the
+    slow approach then leads there. After its last command it keeps that to the end.
 
     Args:
         reader: the episode.
-        contract: which topics carry the commands, and of which joints.
+        contract: which topics carry the commands, and of which joints. Joints of topics without commands are left out.
+        period_ns: period of the control loop that replays it [ns].
 
     Raises:
         ContractError: for a command with another length than in the contract.
-        RecorderError: when a topic has no commands, or the episode cannot be read.
+        RecorderError: when no topic has commands, or the episode cannot be read.
     """
     summary = reader.summary()
     present = {topic: each for topic, each in summary.topics.items() if each.count}
-    for part in contract.action_parts:
-        if part.topic not in present:
-            names = ", ".join(sorted(present)) or "none"
-            raise RecorderError(f"{summary.path}: no message of {part.topic}, so nothing to replay; available: {names}")
     if not contract.action_parts:
         raise RecorderError(f"{summary.path}: its contract has no action, so there is nothing to replay")
+    parts = [part for part in contract.action_parts if part.topic in present]
+    if not parts:
+        wanted = ", ".join(part.topic for part in contract.action_parts)
+        names = ", ".join(sorted(present)) or "none"
+        raise RecorderError(f"{summary.path}: no message of {wanted}, so nothing to replay; available: {names}")
+    joints = tuple(joint for part in parts for joint in part.joints)
     states = next((topic for topic, each in present.items() if each.type == JointState.ros_type), None)
+    found = _read(reader, {part.topic: len(part.joints) for part in parts}, states, joints)
+    first_ns = min(found[part.topic][0][0] for part in parts)
+    sent = [_track(found[part.topic], first_ns) for part in parts]
+    if not np.isfinite(np.concatenate([track.positions.ravel() for track in sent])).all():
+        raise RecorderError(f"{summary.path}: its commands are not all finite")
+    measured = _track(found[states], first_ns) if states in found else None
+    count = math.ceil(max(track.times[-1] for track in sent) * NS_PER_S / period_ns - _ROUNDING) + 1
+    held = np.concatenate([_at_ticks(track, count, period_ns, sampled=reader.sampled) for track in sent], axis=1)
+    if measured is not None:
+        held = np.where(np.isnan(held), measured.at(np.zeros(1)), held)
+    first = np.concatenate([track.positions[0] for track in sent])
+    held = np.where(np.isnan(held), first, held)
+    commands = Track(np.arange(count) * (period_ns / NS_PER_S), held)
+    return Playback(joints, commands, measured, summary.outcome, _seed(summary.metadata))
+
+
+def _read(
+    reader: EpisodeReader, sizes: Mapping[str, int], states: str | None, joints: tuple[str, ...]
+) -> dict[str, list[tuple[int, Vector]]]:
+    """Topic -> receipt [ns] and positions [rad] of its messages; `sizes` has those of the topics of commands."""
     found: dict[str, list[tuple[int, Vector]]] = {}
-    sizes = {part.topic: len(part.joints) for part in contract.action_parts}
     for item in reader.messages({*sizes, *([states] if states is not None else ())}):
         message: Any = item.message
         if isinstance(message, JointState):
-            values = _positions(message, contract.action_joints)
+            values = _positions(message, joints)
         elif isinstance(message, Float64MultiArray) and message.data.shape == (sizes[item.topic],):
             values = message.data
         else:
             raise ContractError(
-                f"{summary.path}: {item.topic} must be a {Float64MultiArray.ros_type} with {sizes[item.topic]} values, "
-                f"got {message!r:.200}"
+                f"{reader.summary().path}: {item.topic} must be a {Float64MultiArray.ros_type} with "
+                f"{sizes[item.topic]} values, got {message!r:.200}"
             )
         found.setdefault(item.topic, []).append((item.received_ns, values))
-    first_ns = max(found[topic][0][0] for topic in sizes)
-    tracks = [_track(found[topic], first_ns) for topic in sizes]
-    base = tracks[0].times[tracks[0].times >= 0]
-    if not base.size or not np.isfinite(np.concatenate([track.positions.ravel() for track in tracks])).all():
-        raise RecorderError(f"{summary.path}: its commands do not overlap in time, or are not all finite")
-    commands = Track(base - base[0], np.concatenate([track.at(base) for track in tracks], axis=1))
-    return Playback(
-        contract.action_joints,
-        commands,
-        _track(found[states], first_ns + round(base[0] * NS_PER_S)) if states in found else None,
-        summary.outcome,
-        _seed(summary.metadata),
-    )
+    return found
+
+
+def _at_ticks(track: Track, count: int, period_ns: int, *, sampled: bool) -> Vector:
+    """Commands at each of `count` ticks [rad], shape (count, J): the newest by then, NaN before the first.
+
+    Commands at the rate of control belong to the tick nearest to their receipt, which varies by less than a period.
+    Samples of a motion are interpolated.
+    """
+    ticks: NDArray[np.float64] = track.times * NS_PER_S / period_ns
+    every: NDArray[np.float64] = np.arange(count, dtype=np.float64)
+    if sampled:
+        return np.where((every < ticks[0] - _ROUNDING)[:, None], np.nan, track.at(every * (period_ns / NS_PER_S)))
+    if len(ticks) > 1 and np.median(np.diff(ticks)) <= _DENSE:
+        ticks = np.round(ticks)
+    newest = np.searchsorted(ticks - _ROUNDING, every, side="right") - 1
+    return np.where((newest < 0)[:, None], np.nan, track.positions[newest])
 
 
 def _positions(message: JointState, joints: tuple[str, ...]) -> Vector:

@@ -9,6 +9,7 @@ from typing import Any
 
 import attrs
 import click
+import numpy as np
 
 from ibrobot_core.api import (
     NORM_MODES,
@@ -17,6 +18,7 @@ from ibrobot_core.api import (
     EpisodeSummary,
     LaunchRequest,
     RecorderError,
+    Robot,
     RobotConfig,
     echo,
     find_config,
@@ -24,6 +26,7 @@ from ibrobot_core.api import (
     installed_plugins,
     load_calibration,
     load_config,
+    ns,
     run_options,
     run_overrides,
     run_robot,
@@ -31,9 +34,12 @@ from ibrobot_core.api import (
 )
 from ibrobot_data.episode import recorded_contract
 from ibrobot_data.given import metadata_from_config
-from ibrobot_data.playback import read_playback
+from ibrobot_data.playback import Playback, read_playback
 from ibrobot_data.replay_source import Replay, ReplaySource
+from ibrobot_data.same_robot import Identity
 
+_FAR = 0.5
+"""How far outside its limits a command may be, as a fraction of the joint's range; the safety layer clips it."""
 _MODE = "replay"
 """The name of the mode in which an episode is replayed."""
 
@@ -46,11 +52,12 @@ _MODE = "replay"
     help="Speed; 0.5 plays at half the recorded speed.",
 )  # fmt: skip
 @click.option("--force-contract", is_flag=True, help="Replay even if the observations of CONFIG differ.")
+@click.option("--any-robot", is_flag=True, help="Replay even if robot, robot type or calibration differ.")
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of joints in a dataset that does not state it.")
 @click.option("--calibration", metavar="NAME", help="Of such a dataset, if its unit needs one.")
 @run_options("overrides", "viewer", "headless", "dry_run", "as_json")
 def replay(
-    episode: Path, config: str | None, speed: float, force_contract: bool, norm_mode: str | None,
+    episode: Path, config: str | None, speed: float, force_contract: bool, any_robot: bool, norm_mode: str | None,
     calibration: str | None, **options: Any,
 ) -> None:  # fmt: skip
     """Play the commands of a recorded EPISODE, and compare the joints with the recorded ones.
@@ -71,7 +78,12 @@ def replay(
         robot = robot or _recorded(summary, changes, sim=sim)
         contract = Contract.from_config(robot)
         _check(contract, summary, str(robot.source), force=force_contract)
-        playback = read_playback(reader, contract)
+        if not any_robot:
+            _check_robot(robot, summary)
+        playback = read_playback(reader, contract, ns(1.0 / robot.control.rate_hz))
+        _check_limits(playback, robot.robot, episode)
+    if still := [joint for joint in contract.action_joints if joint not in playback.joints]:
+        echo(f"{episode}: has no commands of {', '.join(still)}: they hold", err=True)
     if not summary.finished:
         echo(f"{episode}: was never finished; {playback.duration:.2f} s of it could be read", err=True)
     run = Replay(str(episode), playback, speed)
@@ -85,6 +97,27 @@ def replay(
         dry_run=options["dry_run"],
         as_json=options["as_json"],
     )
+
+
+def _check_robot(robot: RobotConfig, summary: EpisodeSummary) -> None:
+    """Check that the robot is the recorded one, as far as the episode says."""
+    recorded = Identity.of_episode(summary.metadata)
+    if difference := Identity.of_robot(robot).difference(recorded, "this robot"):
+        raise RecorderError(f"{summary.path}: {difference}; --any-robot replays it all the same")
+
+
+def _check_limits(playback: Playback, robot: Robot, episode: Path) -> None:
+    """Check that no command is far outside the limits, as of a damaged file, another unit or another robot."""
+    columns = robot.indices(playback.joints)
+    lower, upper = robot.lower[columns], robot.upper[columns]
+    beyond = np.maximum(lower - playback.commands.positions, playback.commands.positions - upper)
+    far = np.argwhere(beyond > _FAR * (upper - lower))
+    for row, column in far[:1]:
+        raise RecorderError(
+            f"{episode}: {playback.joints[column]} is commanded to {playback.commands.positions[row, column]:.4g} rad "
+            f"{playback.commands.times[row]:.2f} s after the first command, far outside its limits "
+            f"{lower[column]:.4g} to {upper[column]:.4g} rad: it is damaged, or has another unit"
+        )
 
 
 def _without_sensors(robot: RobotConfig) -> RobotConfig:

@@ -49,6 +49,8 @@ class ConversionRequest:
     """Which rows to keep, by who commanded. Each stretch of them is an episode of the dataset."""
     context: float = option(2.0, ge=0)
     """Time to keep before and after each intervention, for `only: interventions` [s]."""
+    any_robot: bool = False
+    """Whether episodes of robots of other names, types or calibrations are merged."""
     append: bool = False
     """Whether to add to a dataset in `out`."""
     jobs: int = option(1, ge=1)

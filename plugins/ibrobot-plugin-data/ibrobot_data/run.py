@@ -49,6 +49,7 @@ from ibrobot_data.episode import (
 from ibrobot_data.identity import KnownEpisodes, identity
 from ibrobot_data.provenance import conversion, provenance
 from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
+from ibrobot_data.same_robot import Identity
 
 STAGING = ".staging"
 """Folder within the dataset for converted episodes until the merge."""
@@ -114,7 +115,7 @@ def convert(
             raise DatasetError(_THERE.format(request.out))
         reports = plan.run(watch)
         units = [unit for unit in plan.units() if not reports[unit.report.source].error]
-        reports |= _refuse_misfits(units, old)
+reports |= _refuse_misfits(request, units, old)
         units = [unit for unit in units if reports[unit.report.source].kept]
         if units and old is not None and not request.append:
             raise DatasetError(_THERE.format(request.out))
@@ -431,12 +432,15 @@ def _deferred_signals() -> Iterator[None]:
         signal.raise_signal(came[0])
 
 
-def _refuse_misfits(units: Sequence[Unit], old: DatasetSummary | None) -> dict[str, EpisodeReport]:
+def _refuse_misfits(
+    request: ConversionRequest, units: Sequence[Unit], old: DatasetSummary | None
+) -> dict[str, EpisodeReport]:
     """Reports of the units that do not fit the dataset, or the first unit if there is no dataset yet."""
     if not units:
         return {}
     fps, features, contract = units[0].fps, units[0].features, units[0].contract
     first = units[0].report.source
+    robot = Identity.of_dataset(old.metadata if old is not None else {}, units)
     if old is not None:
         fps, features, contract, first = old.fps, old.features, old.metadata["contract"], "the dataset"
     refused = {}
@@ -449,6 +453,10 @@ def _refuse_misfits(units: Sequence[Unit], old: DatasetSummary | None) -> dict[s
             keys = [key for key in {**features, **unit.features} if features.get(key) != unit.features.get(key)]
             each = ", ".join(f"{key} is {unit.features.get(key)}, not {features.get(key)}" for key in keys)
             wrong = f"its features differ from those of {first}: {each}"
+        elif not request.any_robot and (
+            difference := robot.difference(Identity.of_unit(unit.recorded, unit.robot_type, unit.calibration), first)
+        ):
+            wrong = f"{difference}; --any-robot merges them all the same"
         if wrong:
             refused[unit.report.source] = attrs.evolve(unit.report, error=wrong)
     return refused

@@ -97,6 +97,14 @@ def test_the_commands_are_those_of_the_episode_after_a_slow_way_to_the_first(rep
     assert len(commanded) - first <= 52, "it ends by itself"
 
 
+def test_steps_are_followed_at_every_tick(replay: Make):
+    ticks = np.arange(51)
+    pan = 0.003 * (ticks // 10)  # steps that the limits allow
+    grip = 0.003 * (ticks >= 35)
+    commanded = commands(replay(attrs.evolve(WAVE, commands=Track(TIMES, np.stack([pan, grip], axis=1)))))
+    np.testing.assert_allclose(commanded[-51:], np.stack([pan, grip], axis=1), atol=1e-9)
+
+
 @pytest.mark.parametrize("speed", [0.5, 2.0])
 def test_speed_scales_the_times(replay: Make, speed: float):
     commanded = commands(replay(speed=speed))

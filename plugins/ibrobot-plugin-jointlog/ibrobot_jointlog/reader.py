@@ -47,6 +47,8 @@ class JointLogReader(EpisodeReader):
         RecorderError: if the log is invalid, or lacks a joint of the contract's actions.
     """
 
+    sampled = True
+
     def __init__(self, address: EpisodeAddress) -> None:
         self._path = address.path
         self._file = self._path / LOG if self._path.is_dir() else self._path

@@ -42,6 +42,8 @@ class LeRobotReader(EpisodeReader):
         CalibrationError: if the unit of the joints needs a calibration that is missing.
     """
 
+    sampled = True
+
     def __init__(self, address: EpisodeAddress) -> None:
         root = address.path
         try:
