@@ -115,7 +115,7 @@ def convert(
             raise DatasetError(_THERE.format(request.out))
         reports = plan.run(watch)
         units = [unit for unit in plan.units() if not reports[unit.report.source].error]
-reports |= _refuse_misfits(request, units, old)
+        reports |= _refuse_misfits(request, units, old)
         units = [unit for unit in units if reports[unit.report.source].kept]
         if units and old is not None and not request.append:
             raise DatasetError(_THERE.format(request.out))
