@@ -153,12 +153,17 @@ class Worker(Component):
                     self.work(_POLL_S)
             finally:
                 self.teardown()
-        except Exception as error:  # noqa: BLE001 - reported to the run, which ends with it as the cause
+        except BaseException as error:  # noqa: BLE001 - reported to the run, which ends with it as the cause
             was_ready = self._ready.is_set()
-            self._failure = error
+            self._failure = as_failure(error)
             self._ready.set()
             if was_ready:
-                self._on_failure(self.name, error)
+                self._on_failure(self.name, self._failure)
+
+
+def as_failure(error: BaseException) -> Exception:
+    """The failure of a thread that `error` ended; `sys.exit` in a thread would otherwise end it in silence."""
+    return error if isinstance(error, Exception) else ComponentFailed(f"its thread was ended by {error!r}")
 
 
 def error_text(error: BaseException) -> str:

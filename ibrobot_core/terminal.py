@@ -10,7 +10,8 @@ import termios
 import threading
 import tty
 import weakref
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from ibrobot_core.errors import TeleopError
@@ -114,10 +115,16 @@ class KeyReader:
 
     Args:
         fd: the terminal; standard input by default.
+
+    Attributes:
+        beat: called by the thread that reads, at least 20 times per second.
+        gone: called by it when it ends because the terminal is gone.
     """
 
     def __init__(self, fd: int = 0) -> None:
         self._fd = fd
+        self.beat: Callable[[], None] = lambda: None
+        self.gone: Callable[[], None] = lambda: None
         self._lock = threading.Lock()
         self._subscribers: weakref.WeakSet[queue.SimpleQueue[str]] = weakref.WeakSet()
         self._thread: threading.Thread | None = None
@@ -149,10 +156,28 @@ class KeyReader:
             os.write(self._wake[1], b"x")
             thread.join()
         finally:
-            with suppress(termios.error):  # the terminal is gone
-                termios.tcsetattr(self._fd, termios.TCSAFLUSH, self._saved)
+            self._restore()
             for end in self._wake:
                 os.close(end)
+
+    @contextmanager
+    def suspended(self) -> Iterator[None]:
+        """Leave the terminal to other programs for a while, e.g. to the shell after Ctrl-Z."""
+        if self._thread is None:
+            yield
+            return
+        self._restore()
+        try:
+            yield
+        finally:
+            with suppress(termios.error):
+                tty.setcbreak(self._fd, termios.TCSANOW)
+
+    def _restore(self) -> None:
+        # At once: to wait until all output is written, as TCSAFLUSH does, takes forever on a terminal that is paused.
+        with suppress(termios.error):  # the terminal is gone
+            termios.tcsetattr(self._fd, termios.TCSANOW, self._saved)
+            termios.tcflush(self._fd, termios.TCIFLUSH)
 
     def subscribe(self) -> queue.SimpleQueue[str]:
         """A new queue of the keys typed from now on, filled while a reference to it exists."""
@@ -171,15 +196,17 @@ class KeyReader:
     def _read(self) -> None:
         typed = b""
         while True:
-            ready, _, _ = select.select([self._fd, self._wake[0]], [], [], _ESCAPE_S if typed else None)
+            self.beat()
+            ready, _, _ = select.select([self._fd, self._wake[0]], [], [], _ESCAPE_S)
             if self._wake[0] in ready:
                 return
             if ready:
                 try:
                     read = os.read(self._fd, 1024)
-                except OSError:  # the terminal is gone
-                    return
+                except OSError:
+                    read = b""
                 if not read:
+                    self.gone()
                     return
                 typed += read
             keys, typed = decode(typed, final=not ready)

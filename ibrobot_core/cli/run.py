@@ -11,16 +11,18 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext, suppress
 
 import attrs
 import click
 
+from ibrobot_core.aside import discard, output_aside
 from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.core import EMERGENCY_STOP
-from ibrobot_core.errors import IbrobotError
+from ibrobot_core.errors import IbrobotError, TeleopError
 from ibrobot_core.launch.models import check_models
+from ibrobot_core.launch.pulses import PULSE_S, Pulse
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.outside import LogFormatter, echo
@@ -34,6 +36,12 @@ _FAULTED = 1
 _INTERRUPTED_TWICE = 130
 _PANEL_HZ = 8
 _PLAIN_PERIOD_S = 2.0
+_READER_S = 1.0
+"""Time for which a run that a signal ended waits for a reader of its output that pauses [s]."""
+_KEYS_BLOCKED_S = 2.0
+_STOP_BLOCKED_S = 6.0
+"""Times without a sign of life of the threads that read and handle keys, after which the run ends [s]. The answer of
+control to the emergency stop may take 5 s."""
 
 
 def run_robot(
@@ -69,8 +77,11 @@ def run_robot(
             echo(json.dumps({**plan.facts(), "models": models}) if as_json else "\n".join([*plan.lines(), *models]))
             return
         hooks = make_hooks(runtime)
-        _stop_on_signals(runtime.session, keys)
+        signals = _Signals(runtime.session, keys)
+        stack.enter_context(output_aside(lambda: _READER_S if signals.came else None))
+        stack.enter_context(signals)
         if keys is not None:  # only now, since until here Ctrl-C ends the process without restoring the terminal
+            _watch_keys(runtime.session, keys)
             stack.enter_context(keys)
         try:
             status = _run(runtime, hooks, live=not headless, as_json=as_json)
@@ -105,48 +116,90 @@ def _run(runtime: Runtime, hooks: RunHooks, *, live: bool, as_json: bool) -> int
     return NOT_ALL_SUCCEEDED if outcome.successes < outcome.episodes or outcome.goals_failed else 0
 
 
-def _stop_on_signals(session: Session, keys: KeyReader | None) -> None:
-    """Stop the run at the first of the `end_signals`; a second SIGTERM brakes the robot on its way to a stop pose.
+def _watch_keys(session: Session, keys: KeyReader) -> None:
+    """Have the run end if the terminal's keys, the emergency stop among them, are read no more."""
+    pulse = Pulse("keys of the terminal", _KEYS_BLOCKED_S)
+    session.pulses.add(pulse)
+    keys.beat = pulse.beat
 
-    A second Ctrl-C ends the host, and control brakes the robot.
+    def gone() -> None:
+        session.pulses.discard(pulse)
+        session.fail(pulse.name, TeleopError("the terminal is gone: its keys stop the robot no more"))
+
+    keys.gone = gone
+
+
+class _Signals:
+    """Stops the run at the first of the `end_signals`; a second SIGTERM brakes the robot on its way to a stop pose.
+
+    A second Ctrl-C ends the host, and control brakes the robot. At Ctrl-Z, the robot holds before the host is suspended. A thread acts on the signals, since the main thread may be
+    blocked.
+
+    Attributes:
+        came: whether a signal ended the run.
     """
-    terminals = [fd for fd in (1, 2) if os.isatty(fd)]
 
-    def stop(number: int, frame: object) -> None:
+    def __init__(self, session: Session, keys: KeyReader | None) -> None:
+        self._session = session
+        self._keys = keys
+        self._terminals = [fd for fd in (1, 2) if os.isatty(fd)]
+        self.came = False
+
+    def __enter__(self) -> None:
+        suspend = [signal.SIGTSTP] if signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL else []
+        numbers = (*end_signals(), *suspend)
+        self._read, self._write = os.pipe()
+        os.set_blocking(self._write, False)
+        self._before = {number: signal.signal(number, lambda *_: None) for number in numbers}
+        self._wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+        self._thread = threading.Thread(target=self._act_on_all, name="signals", daemon=True)
+        self._thread.start()
+
+    def __exit__(self, *raised: object) -> None:
+        signal.set_wakeup_fd(self._wakeup)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        os.close(self._write)
+        self._thread.join()
+        os.close(self._read)
+
+    def _act_on_all(self) -> None:
+        while received := os.read(self._read, 64):
+            for number in received:
+                if number == signal.SIGTSTP:
+                    self._suspend()
+                elif number in self._before:
+                    self._stop(number)
+
+    def _stop(self, number: int) -> None:
+        session = self._session
         if session.finished.is_set() and number == signal.SIGINT:
-            if keys is not None:
-                keys.close()
+            if self._keys is not None:
+                self._keys.close()
             os._exit(_INTERRUPTED_TWICE)
         if number == signal.SIGHUP:  # the terminal may be closed; writing to it must not fail
-            _discard(terminals)
+            discard(self._terminals)
         if session.finished.is_set() and number == signal.SIGTERM:
-            threading.Thread(target=brake, name="signal", daemon=True).start()
+            threading.Thread(target=self._brake, name="signal", daemon=True).start()
             return
-        if session.request.lockstep:  # does not block: the run ends at a tick
-            finish()
-        else:  # see `on_signals`
-            threading.Thread(target=finish, name="signal", daemon=True).start()
-
-    def brake() -> None:
-        try:
-            session.emergency_stop()
-        except IbrobotError as error:
-            session.log.error("%s", error)
-
-    def finish() -> None:
-        session.log.info("stopping; Ctrl-C again stops at once")
+        self.came = True
         session.finish()
+        session.log.info("stopping; Ctrl-C again stops at once")
 
-    for each in end_signals():
-        signal.signal(each, stop)
+    def _brake(self) -> None:
+        try:
+            self._session.emergency_stop()
+        except IbrobotError as error:
+            self._session.log.error("%s", error)
 
-
-def _discard(descriptors: list[int]) -> None:
-    """Redirect these descriptors to the null device."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for descriptor in descriptors:
-        os.dup2(nowhere, descriptor)
-    os.close(nowhere)
+    def _suspend(self) -> None:
+        session = self._session
+        if session.has_control and not session.request.lockstep:
+            with suppress(IbrobotError):
+                session.control.call("fault", fault="the host was suspended by Ctrl-Z")
+            time.sleep(session.config.control.peer_timeout)  # until the robot has stopped
+        with self._keys.suspended() if self._keys is not None else nullcontext():
+            os.kill(os.getpid(), signal.SIGSTOP)
 
 
 class _Lines:
@@ -213,8 +266,14 @@ class _Panel:
 
     def _listen(self, keys: queue.SimpleQueue[str]) -> None:
         """Handle keys in a separate thread, so that the emergency stop does not wait, e.g. for a mode that loads."""
+        pulse = Pulse("emergency stop by Esc", _STOP_BLOCKED_S)
+        self._runtime.session.pulses.add(pulse)
         while True:
-            key = keys.get()
+            pulse.beat()
+            try:
+                key = keys.get(timeout=PULSE_S)
+            except queue.Empty:
+                continue
             if key == "esc":
                 self._try(self._runtime.session.emergency_stop)
             else:

@@ -326,6 +326,11 @@ class ControlClient(ControlHost):
             del self._replies[number]
             self._slow.discard(number)
 
+    def raise_fault(self, fault: str) -> None:
+        """Have control brake and hold because of a fault, without waiting for its answer."""
+        if self._child is not None:
+            self._child.channel.send({"do": "fault", "id": 0, "fault": fault})
+
     @override
     def arrive(self) -> None:
         while not self._arrived.wait(_GLANCE_S):
@@ -442,7 +447,7 @@ class ControlClient(ControlHost):
                     }
                 )  # fmt: skip
                 # Whatever it was doing, it does not go on with it unasked.
-                child.channel.send({"do": "fault", "id": 0, "fault": "the control process was silent"})
+                self.raise_fault("the control process was silent")
                 self._let_go(self._silence)
 
     def _describe_silence(self, pid: int, silent_s: float, *, stopped: bool) -> str:

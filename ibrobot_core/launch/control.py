@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping
 from typing import Any, override
 
@@ -14,9 +15,13 @@ from ibrobot_core.config.schema import ControlMode, RobotConfig
 from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
 from ibrobot_core.control.link import ControlState
 from ibrobot_core.descriptors import HardwareDescriptor
-from ibrobot_core.errors import HardwareError
+from ibrobot_core.errors import ComponentFailed, HardwareError
+from ibrobot_core.launch.pulses import PULSE_S
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import JOINT_STATES, Float64MultiArray, Header, JointState
+
+_PATIENCE_S = 1.0
+"""Time after the end of a run was asked for in which the main thread begins to stop it [s]."""
 
 
 class ControlComponent(Component):
@@ -32,6 +37,8 @@ class ControlComponent(Component):
         super().__init__(CONTROL, f"{parts} at {config.control.rate_hz:g} Hz, {where}", needs)
         self._session = session
         self._joints = config.robot.joint_names
+        self._checked_s = self._ending_s = 0.0
+        self._held = False
         self._actions = {name: tuple(_action_topics(config, mode)) for name, mode in config.control_modes.items()}
 
     @override
@@ -78,6 +85,8 @@ class ControlComponent(Component):
     def _publish(self, state: ControlState) -> None:
         session = self._session
         session.take_state(state)
+        if isinstance(session.control, ControlClient):
+            self._check_threads(session.control)
         bus = session.bus
         if not state.stale:  # what was not measured is missing, not repeated
             header = Header(state.stamp_ns)
@@ -89,6 +98,22 @@ class ControlComponent(Component):
         for topic, size in session.control.signals:
             bus.publish(topic, Float64MultiArray(state.signals[begin : begin + size].copy()))
             begin += size
+
+    def _check_threads(self, control: ControlClient) -> None:
+        """End the run if a thread that a STOP goes through hangs; have the robot hold if the main thread does not."""
+        session, now_s = self._session, time.monotonic()
+        if now_s - self._checked_s < PULSE_S:
+            return
+        passed_s, self._checked_s = now_s - self._checked_s, now_s
+        for late in [pulse for pulse in set(session.pulses) if pulse.is_late(passed_s)]:
+            session.fail(
+                late.name, ComponentFailed(f"does not react for {late.longest_s:g} s: STOP would be late there")
+            )
+        ending = session.finished.is_set() and not session.stopping.is_set()
+        self._ending_s = self._ending_s + min(passed_s, 2 * PULSE_S) if ending else 0.0
+        if self._ending_s > _PATIENCE_S and not self._held:
+            self._held = True
+            control.raise_fault("the run ends, but its main thread is busy")
 
     def _take(self, event: Mapping[str, Any]) -> None:
         session = self._session

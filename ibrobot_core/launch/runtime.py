@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import NoneType
@@ -10,7 +11,7 @@ from typing import Any
 import attrs
 
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.component import Component, Worker, error_line, error_text, exit_code
+from ibrobot_core.component import Component, Worker, as_failure, error_line, error_text, exit_code
 from ibrobot_core.config.missing import absent_models, unavailable_modes
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, NotSupported, PluginError
@@ -75,6 +76,7 @@ class Runtime:
         session.command_source = self.plan.mode.source
         self._started: list[Component] = []
         self._begun_ns = session.clock.now_ns()
+        self._restore_hook: Callable[[], None] = lambda: None
 
     def start(self, on_start: Callable[[str], None] = lambda name: None) -> None:
         """Start every component once the components it needs are ready.
@@ -89,6 +91,7 @@ class Runtime:
             IbrobotError: the cause, with the component's name.
         """
         session = self.session
+        self._watch_threads()
         if self.plan.without:
             session.log.warning("running without %s", self.plan.without)
         config = session.config
@@ -255,6 +258,7 @@ class Runtime:
         """
         session = self.session
         session.finish()
+        session.stopping.set()
         for service in (SET_MODE, RESET):
             session.bus.unserve(service)
         if (worker := self.plan.episodes_worker) in self._started:
@@ -273,6 +277,7 @@ class Runtime:
             if changing:
                 session.changing.release()
             session.bus.unserve(ESTOP)
+            self._restore_hook()
 
     def _halt(self) -> None:
         """Let control carry out the stop behaviour, while the components that can send an emergency stop still run."""
@@ -378,6 +383,21 @@ class Runtime:
         with _named(control):
             control.arrive()
         self._await_state()
+
+    def _watch_threads(self) -> None:
+        """Have the run end with any thread that dies of an exception: it may be one that a STOP goes through."""
+        before, hook = threading.excepthook, self._end_with
+
+        def restore() -> None:
+            if threading.excepthook == hook:  # the hook of a later run stays
+                threading.excepthook = before
+
+        threading.excepthook = hook
+        self._restore_hook = restore
+
+    def _end_with(self, dead: threading.ExceptHookArgs) -> None:
+        name = dead.thread.name if dead.thread is not None else "a thread"
+        self.session.fail(f"thread {name!r}", as_failure(dead.exc_value or dead.exc_type()))
 
     def _begin_mode(self) -> None:
         """Begin a mode without simulated episodes: one open-ended episode from the robot's present state."""

@@ -22,6 +22,7 @@ from ibrobot_core.errors import ComponentFailed, MissingDependency
 from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent, Teleop
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, by_cause
 from ibrobot_core.launch.episodes import Episodes
+from ibrobot_core.launch.pulses import Pulse
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
 
@@ -169,6 +170,9 @@ class Session:
         outcome: the outcome of the run so far.
         failure: the component that died and why; None without a failure.
         finished: set when the run should stop.
+        stopping: set once the main thread stops the components.
+        pulses: signs of life of the threads between a STOP and control. Add one, beat it at least every `PULSE_S`, and
+            remove it when the thread ends in an orderly way; a thread that stays silent for too long ends the run.
         operator_events: the operator's button presses on a teleoperation device, e.g. to begin and end episodes.
         log: the log of the run.
         command_source: the source that commands the active executors.
@@ -206,6 +210,8 @@ class Session:
         self.sensors: dict[str, SensorFigures] = {}
         self.failure: tuple[str, Exception] | None = None
         self.finished = threading.Event()
+        self.stopping = threading.Event()
+        self.pulses: set[Pulse] = set()
         self.operator_events: queue.SimpleQueue[OperatorEvent] = queue.SimpleQueue()
         self.log = logging.getLogger("ibrobot")
         self._faults: list[tuple[int, str]] = []

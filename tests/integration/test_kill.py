@@ -5,73 +5,23 @@ from __future__ import annotations
 import os
 import re
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import attrs
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from logged_run import PATIENCE_S, Run, errors_in, is_alive, logged_runs, wait_for
 
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site
 
 pytestmark = pytest.mark.integration
 
-PATIENCE_S = 60.0
 STOP_TICKS = 10
 """100 ms of the control loop. It brakes by ticks: those that a busy machine has it miss are none."""
-
-
-ROBOT = """
-robot:
-  name: mini
-  joints:
-    - {name: pan, lower: -3.0, upper: 3.0, max_velocity: 3.0, max_acceleration: 40.0}
-    - {name: lift, lower: -3.0, upper: 3.0, max_velocity: 3.0, max_acceleration: 40.0}
-  groups: {arm: [pan, lift]}
-  description:
-    poses: {rest: [-1.2, 1.2], far: [-2.7, 2.7]}
-hardware: {type: logged, log: commands.log}
-executors:
-  arm_position: {type: position, group: arm}
-models:
-  lost: {type: lost}
-control_modes:
-  teleop: {executors: [arm_position], teleop: swing}
-  policy: {executors: [arm_position], inference: {model: lost}}
-default_control_mode: teleop
-teleoperation:
-  swing: {type: swing}
-contract:
-  rate_hz: 30
-  observations:
-    - {key: observation.state, topic: /joint_states, select: [position.pan, position.lift]}
-  actions:
-    - {executor: arm_position, topic: /arm/commands}
-control: {rate_hz: 100, stop: hold}
-"""
 REST, FAR = np.array([-1.2, 1.2]), np.array([-2.7, 2.7])
-
-
-def wait_for(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE_S:.0f} s"
-        time.sleep(0.005)
-
-
-def is_alive(pid: int) -> bool:
-    """Whether a process runs; one that has ended and waits for its parent does not."""
-    try:
-        return pid > 0 and Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
 
 
 def memories(pids: list[int]) -> set[tuple[int, int]]:
@@ -87,90 +37,10 @@ def memories(pids: list[int]) -> set[tuple[int, int]]:
     return found
 
 
-@attrs.define
-class Run:
-    """A launched robot."""
-
-    folder: Path
-    host: subprocess.Popen[bytes]
-    control: int = 0
-    children: list[int] = attrs.field(factory=list)
-
-    @property
-    def log(self) -> list[list[str]]:
-        """The arm's setpoints so far: word, monotonic time [ns], positions [rad]; whole lines only."""
-        path = self.folder / "commands.log"
-        text = path.read_text() if path.exists() else ""
-        return [line.split() for line in text.rpartition("\n")[0].splitlines()]
-
-    def commands(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Times [ns], shape (N,), and positions [rad], shape (N, 2), of all commands."""
-        written = [line for line in self.log if line[0] == "write"]
-        return np.array([int(w[1]) for w in written]), np.array([[float(p) for p in w[2:]] for w in written])
-
-    def moves(self) -> NDArray[np.int64]:
-        """Times of the commands that moved the arm [ns], shape (M,)."""
-        times, positions = self.commands()
-        return times[1:][np.abs(np.diff(positions, axis=0)).max(axis=1) > 0]
-
-    def is_swinging(self) -> bool:
-        """Whether the arm's setpoints move fast now."""
-        _, positions = self.commands()
-        return len(positions) > 20 and bool(np.abs(np.diff(positions[-3:], axis=0)).min() > 0.02)
-
-    def find_control(self) -> None:
-        """Learn the process ids of the host's children."""
-        wait_for(lambda: len(self.log) > 10, "the arm has setpoints")
-        tasks = Path(f"/proc/{self.host.pid}/task")
-        self.children = [int(pid) for each in tasks.glob("*/children") for pid in each.read_text().split()]
-        (self.control,) = (
-            pid for pid in self.children if b"ibrobot_core.control.process" in Path(f"/proc/{pid}/cmdline").read_bytes()
-        )
-
-    def kill_host(self) -> tuple[int, int]:
-        """Kill the host; returns when it still lived and when it was dead [ns]."""
-        alive_ns = time.monotonic_ns()
-        self.host.kill()
-        self.host.wait(PATIENCE_S)
-        return alive_ns, time.monotonic_ns()
-
-    def end(self) -> tuple[int, str]:
-        """Wait for the host to exit; its status and standard error."""
-        status = self.host.wait(PATIENCE_S)
-        wait_for(lambda: not is_alive(self.control), "the control process exits")
-        return status, (self.folder / "errors.txt").read_text()
-
-
 @pytest.fixture
 def launch(site: Site, tmp_path: Path) -> Iterator[Callable[..., Run]]:
-    site.add("ibrobot-plugin-logged", "logged_parts.py")
-    (tmp_path / "mini.yaml").write_text(ROBOT)
-    runs: list[Run] = []
-
-    def start(*overrides: str, mode: str = "teleop", awaited: bool = True) -> Run:
-        command = [sys.executable, "-c", "from ibrobot_core.cli.main import main; main()", "launch", "mini.yaml"]
-        command += ["--headless", "--mode", mode, *(word for each in overrides for word in ("--set", each))]
-        # Files and no pipes: these stay open as long as any child lives.
-        with (tmp_path / "output.txt").open("w") as output, (tmp_path / "errors.txt").open("w") as errors:
-            host = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=output, stderr=errors)
-        run = Run(tmp_path, host)
-        runs.append(run)
-        if awaited:
-            wait_for(run.is_swinging, "the arm swings")
-            run.find_control()
-        return run
-
-    yield start
-    for run in runs:
-        for pid in (run.host.pid, *run.children):
-            with suppress(ProcessLookupError):
-                if is_alive(pid):
-                    os.kill(pid, signal.SIGKILL)
-        run.host.wait()
-
-
-def errors_in(error: str) -> list[str]:
-    return [line for line in error.splitlines() if line.startswith("error: ")]
+    with logged_runs(site, tmp_path) as start:
+        yield start
 
 
 class TestKilledHost:

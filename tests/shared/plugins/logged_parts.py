@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+import signal
+import sys
+import threading
 import time
 
 import attrs
@@ -20,6 +23,14 @@ from ibrobot_core.options import option
 core._POSE_TIMEOUT_S = host._STOP_TIMEOUT_S = 60.0
 
 
+def block_main(number, frame):
+    os.write(2, b"the main thread is blocked\n")
+    time.sleep(60)
+
+
+signal.signal(signal.SIGUSR1, block_main)
+
+
 class Arm(FakeRealHardware):
     """Logs every command with the time; `trouble` is a bug after a second."""
 
@@ -28,6 +39,12 @@ class Arm(FakeRealHardware):
         self._options = options
         self._log = os.open(options.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         self._reads = 0
+
+    def connect(self):
+        super().connect()
+        if self._options.fork and os.fork() == 0:
+            time.sleep(60)
+            os._exit(0)
 
     def read(self):
         self._reads += 1
@@ -51,6 +68,7 @@ class Arm(FakeRealHardware):
 class ArmOptions:
     log: str = option(help="file")
     trouble: bool = option(False, help="whether it has a bug")
+    fork: bool = option(False, help="whether a child outlives the control process")
 
 
 class Swing(FakeTeleop):
@@ -61,18 +79,44 @@ class Swing(FakeTeleop):
     def __init__(self, options, ctx):
         super().__init__(ctx)
         self._options = options
+        self._ctx = ctx
+        self._reads = 0
 
     def connect(self):
         super().connect()
         if self._options.fork and os.fork() == 0:
             time.sleep(60)
             os._exit(0)
+        if self._options.thread:
+            threading.Timer(3.0, self._die).start()
+            threading.enumerate()[-1].name = "swing helper"
+
+    def _die(self):
+        if self._options.thread == "exit":
+            sys.exit("a helper ended itself")
+        raise RuntimeError("a helper broke")
+
+    def _make_trouble(self):
+        match self._options.trouble:
+            case "block":
+                time.sleep(60)
+            case "exit":
+                sys.exit("a device ended it")
+            case "main":  # the main thread waits in a library, without the interpreter's lock
+                signal.pthread_kill(threading.main_thread().ident, signal.SIGUSR1)
+            case "link":
+                self._ctx.bus.publish = lambda *_: time.sleep(60)
 
     def activate(self, measured):
         super().activate(measured)
         self._start = (measured.stamp_ns, measured.position.copy())
 
     def read(self, measured):
+        self._reads += 1
+        if self._reads == 300 and self._options.trouble:
+            self._make_trouble()
+        if self._options.chatter:
+            self._ctx.log.warning("chatter " * 1000)
         begun_ns, middle = self._start
         swung = middle + 0.6 * math.sin(4.0 * (measured.stamp_ns - begun_ns) * 1e-9)
         return TeleopCommand(dict(zip(self._names, swung.tolist(), strict=True)))
@@ -81,6 +125,9 @@ class Swing(FakeTeleop):
 @attrs.frozen
 class SwingOptions:
     fork: bool = option(False, help="whether a child outlives the host")
+    thread: str = option("", help="how a thread of it dies: raise, exit")
+    trouble: str = option("", help="what happens after three seconds: block, exit, main, link")
+    chatter: bool = option(False, help="whether it logs much")
 
 
 class Camera(FakeSensor):
