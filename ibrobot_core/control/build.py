@@ -35,4 +35,4 @@ def build_core(config: RobotConfig, registry: Registry, clock: Clock, seed: int)
     else:
         problem = "neither hardware nor simulation is there: nothing to control"
         raise ConfigError([Problem(str(config.source), 0, "hardware", problem)])
-    return ControlCore(config, HardwareGroup(config.robot, hardware), executors, clock)
+    return ControlCore(config, HardwareGroup(config.robot, hardware, config.control.state_timeout), executors, clock)

@@ -12,7 +12,7 @@ from ibrobot_testing.contexts import make_robot
 from ibrobot_core.api import EpisodeSetup
 from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.errors import HardwareError, NotSupported
-from ibrobot_core.interfaces import Hardware, JointReading, Signal, nan_vector
+from ibrobot_core.interfaces import Hardware, JointReading, Signal, Torque, nan_vector
 from ibrobot_core.robot import Vector
 
 ROBOT = make_robot()
@@ -166,3 +166,77 @@ def test_only_a_simulation_is_set_up_again(two) -> None:
     with pytest.raises(NotSupported, match="only a simulation"):
         two[0].reset_episode(EpisodeSetup(1))
     assert two[0].success() is None
+
+
+class Relaxing(Part):
+    @override
+    def relax(self) -> Torque:
+        self._act()
+        return Torque.OFF
+
+
+class TestHanging:
+    """A part that does not return: its neighbours are read and written all the same."""
+
+    @pytest.fixture
+    def hung(self):
+        left, right = Relaxing(LEFT, 100), Relaxing(RIGHT, 90)
+        parts = HardwareGroup(ROBOT, {"left": left, "right": right}, timeout_s=0.05)
+        parts.write(np.arange(6.0))
+        right.gate.clear()
+        yield parts, left, right
+        right.gate.set()
+        parts.disconnect()
+
+    def test_a_write_that_hangs_is_named_and_the_others_are_written(self, hung):
+        parts, left, _ = hung
+        for _ in range(3):
+            with pytest.raises(HardwareError, match=r"^right: "):
+                parts.write(np.arange(6.0) + 1)
+
+        np.testing.assert_array_equal(left.written, left.order + 1)
+
+    def test_a_read_that_hangs_is_named(self, hung):
+        with pytest.raises(HardwareError, match=r"^right: hangs: it has not returned in time$"):
+            hung[0].read()
+        with pytest.raises(HardwareError, match=r"^right: still does not return from an earlier call$"):
+            hung[0].read()
+
+    def test_the_others_relax(self, hung):
+        with pytest.raises(HardwareError):
+            hung[0].read()
+        outcomes = hung[0].relax()
+
+        assert outcomes["left"] is Torque.OFF
+        assert "still does not return" in str(outcomes["right"])
+
+    def test_its_signals_are_missing_and_it_has_no_counters_or_conditions(self, hung):
+        parts, left, right = hung
+        with pytest.raises(HardwareError):
+            parts.read()
+        right.counters = right.health = lambda: pytest.fail("it would hang")
+
+        np.testing.assert_array_equal(parts.read_signals(), [*left.order[:2], np.nan, np.nan])
+        assert parts.counters() == {}
+        assert parts.health() == []
+
+    def test_once_it_returns_it_is_used_again(self, hung):
+        parts, _, right = hung
+        with pytest.raises(HardwareError):
+            parts.write(np.arange(6.0))
+        late = parts._threads["right"]._late
+        right.gate.set()
+        late.result(60.0)
+        parts.write(np.arange(6.0) + 2)
+
+        np.testing.assert_array_equal(right.written, right.order + 2)
+
+    def test_it_does_not_keep_the_others_from_being_released(self, hung, caplog):
+        parts, left, right = hung
+        left.connected = right.connected = True
+        with pytest.raises(HardwareError):
+            parts.read()
+        parts.disconnect()
+
+        assert (left.connected, right.connected) == (False, True)
+        assert "right hangs, and is not released" in caplog.text

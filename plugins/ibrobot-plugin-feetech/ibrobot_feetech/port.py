@@ -18,6 +18,9 @@ _GONE = (errno.EIO, errno.ENODEV, errno.ENXIO, errno.EBADF)
 _VMIN = 6
 """Index of the control characters among a terminal's attributes."""
 _NOTHING = bytes(4)
+_WRITE_S = 0.05
+"""Time beyond that on the wire after which a request that the port does not take fails [s]."""
+_BITS_PER_BYTE = 10
 _MOST_AWAITED = 255
 """Maximum number of bytes for which the kernel can delay waking a reader."""
 
@@ -39,6 +42,7 @@ class SerialPort:
         self._serial: serial.Serial | None = None
         self._fd = -1
         self._wake_at = 0
+        self._is_stuck = False
         self._waiting = bytearray(4)
 
     @property
@@ -70,6 +74,9 @@ class SerialPort:
         """Close the port. Safe to call twice."""
         port, self._serial, self._fd = self._serial, None, -1
         if port is not None:
+            if self._is_stuck:  # closing would wait until the unsent bytes are sent
+                with suppress(OSError, termios.error):
+                    termios.tcflush(port.fileno(), termios.TCOFLUSH)
             with suppress(OSError, termios.error):
                 port.close()
 
@@ -91,13 +98,10 @@ class SerialPort:
         """Send all of `request`.
 
         Raises:
-            PortError: if the port is gone or closed.
+            PortError: if the port is gone or closed, or does not take the request in time.
         """
         try:
-            sent = os.write(self._fd, request)
-            while sent < len(request):
-                select.select((), (self._fd,), ())
-                sent += os.write(self._fd, request[sent:])
+            self._write_rest(request, self._write_some(request))
         except OSError as error:
             raise self._gone(error) from None
 
@@ -126,7 +130,7 @@ class SerialPort:
         """Send `request` and return the bytes received when `size` have arrived or at the timeout; optimised for ticks.
 
         Raises:
-            PortError: if the port is gone or closed.
+            PortError: if the port is gone or closed, or does not take the request in time.
         """
         if size > _MOST_AWAITED:
             self.write(request)
@@ -134,8 +138,8 @@ class SerialPort:
         if size != self._wake_at:
             self._wake_when(size)
         try:
-            if os.write(self._fd, request) < len(request):
-                raise OSError(errno.EIO, "the port does not accept a request of a few bytes")
+            if (sent := self._write_some(request)) < len(request):
+                self._write_rest(request, sent)
             if self._poll.poll(timeout_ms):
                 if received := os.read(self._fd, size):
                     return received
@@ -143,6 +147,28 @@ class SerialPort:
             return self._pending()
         except OSError as error:
             raise self._gone(error) from None
+
+    def _write_some(self, request: bytes) -> int:
+        try:
+            sent = os.write(self._fd, request)
+        except BlockingIOError:
+            return 0
+        self._is_stuck &= sent < len(request)
+        return sent
+
+    def _write_rest(self, request: bytes, sent: int) -> None:
+        """Send `request` from byte `sent` on, before a deadline; discard all unsent bytes if it passes."""
+        patience_s = 0.0 if self._is_stuck else _WRITE_S + len(request) * _BITS_PER_BYTE / self.baud_rate
+        deadline = time.monotonic() + patience_s
+        while sent < len(request):
+            if not select.select((), (self._fd,), (), max(0.0, deadline - time.monotonic()))[1]:
+                self._is_stuck = True  # later requests do not wait for it again
+                # Commands that wait in the kernel would move the arm when the port goes on.
+                termios.tcflush(self._fd, termios.TCOFLUSH)
+                raise PortError(
+                    Place(self.path), f"the port takes no bytes: a request was not sent within {_WRITE_S:g} s"
+                )
+            sent += self._write_some(request[sent:])
 
     def discard(self) -> int:
         """Discard received bytes; returns their number.
