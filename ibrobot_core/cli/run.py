@@ -132,8 +132,8 @@ def _watch_keys(session: Session, keys: KeyReader) -> None:
 class _Signals:
     """Stops the run at the first of the `end_signals`; a second SIGTERM brakes the robot on its way to a stop pose.
 
-    A second Ctrl-C ends the host, and control brakes the robot. At Ctrl-Z, the robot holds before the host is suspended. A thread acts on the signals, since the main thread may be
-    blocked.
+    A second Ctrl-C ends the host, and control brakes the robot. At Ctrl-Z, the robot holds before the host is
+    suspended. A thread acts on the signals, since the main thread may be blocked.
 
     Attributes:
         came: whether a signal ended the run.
