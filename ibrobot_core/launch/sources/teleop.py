@@ -44,6 +44,7 @@ class Braking:
         stop = np.clip(stop, np.minimum(robot.lower[columns], command), np.maximum(robot.upper[columns], command))
         return {**positions, **dict(zip(dropped, stop.tolist(), strict=True))}
 
+
 _BLOCKED_S = 6.0
 """Time without a reading of the devices after which the run ends [s]; the answer of control may take 5 s."""
 
