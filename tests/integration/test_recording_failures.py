@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -145,16 +146,26 @@ def silent(bags: Path) -> Path:
 
 
 class TestFullDisk:
-    def test_record_ends_the_recording_and_the_robot_goes_on(self, run: Run, mounted: Callable[[str], Path]):
-        disk = mounted("size=500k")
-        done = record_picks(run, disk, episodes=3)
+    def test_record_ends_with_the_recording(self, run: Run, mounted: Callable[[str], Path]):
+        """Nobody is there to make room, so no further episode is run and lost."""
+        disk = mounted("size=1000k")
+        done = record_picks(run, disk, episodes=20)
         assert done.code == 1
         assert done.out.splitlines()[-1].startswith("faults     recording ended: ")
         assert f"cannot be written: {FULL}; it stays unfinished, with what was written before" in done.err
-        assert "episodes   3, of which 3 succeeded" in done.out, "the robot went on"
-        whole = [count for finished, count in states(disk / "picks") if finished]
-        assert f"recorded   {len(whole)} of 3 episodes" in done.out
-        assert not all(finished for finished, _ in states(disk / "picks"))
+        assert "; the run ends" in done.err
+        found = states(disk / "picks")
+        assert 1 <= len(found) < 20
+        assert [finished for finished, _ in found] == [True] * (len(found) - 1) + [False]
+
+    def test_a_run_that_only_happens_to_record_goes_on(self, run: Run, mounted: Callable[[str], Path]):
+        disk = mounted("size=300k")
+        recording = f"recording={{type: mcap, root: {disk}, dataset: picks, min_free: 0}}"
+        arguments = ("launch", "so101_blind", "--sim", "--lockstep", "--headless", "--episodes", 2, "--set", recording)
+        done = run(*arguments)
+        assert done.code == 1
+        assert "the robot goes on" in done.err
+        assert "episodes   2, of which 2 succeeded" in done.out
 
     def test_record_refuses_to_begin_where_there_is_too_little_room(self, run: Run, mounted: Callable[[str], Path]):
         disk = mounted("size=2m")
@@ -186,6 +197,26 @@ class TestFullDisk:
         again = run("convert", disk / "set:0", "--out", disk / "other")
         assert again.code == 1
 
+    def test_convert_stops_at_the_first_and_goes_on_where_there_is_room(
+        self, run: Run, tmp_path: Path, mounted: Callable[[str], Path]
+    ):
+        disk = mounted("size=500k")
+        for number in range(1, 5):
+            record(tmp_path / f"bags/episode_{number}", number, 0.3 if number == 1 else 1.2, "sort")
+        arguments = ("convert", tmp_path / "bags", "--out", disk / "set", "--no-videos", "--jobs", 1)
+        done = run(*arguments)
+        assert (done.code, done.out) == (1, "")
+        assert done.err.count(FULL) == 1, "not once for each episode"
+        assert "stopped at episode_" in done.err
+        kept = [int(text) for text in re.findall(r"(\d) of 4 episodes are converted and kept in", done.err)]
+        assert kept[0] >= 1
+        assert f"{disk}/set/.staging: make room, and run the same command again" in done.err
+        assert list((disk / "set").rglob("*.making")) == []
+        subprocess.run(["mount", "-o", "remount,size=40m", str(disk)], check=True)
+        done = run(*arguments)
+        assert done.code == 0, done.err
+        assert f"4 episodes, 113 frames, {kept[0]} of them by an earlier run" in done.out
+
     def test_convert_with_a_bounded_file_size(self, run: Run, bags: Path, tmp_path: Path):
         done = run("convert", bags, "--out", tmp_path / "set", "--no-videos", "--jobs", 1, largest=10_000)
         assert done.code == 1
@@ -196,8 +227,9 @@ class TestFullDisk:
         disk = mounted("size=400k")
         done = run("convert", dataset, "--to", "bag", "--out", disk / "back", "--set", "min_free=0")
         assert done.code == 1
-        assert f"left out set:0: {disk}/back" in done.err
-        assert FULL in done.err
+        assert f"stopped at set:0: {disk}/back" in done.err
+        assert f"0 of 2 episodes are converted and kept in {disk}/back: make room, and run the same command" in done.err
+        assert done.err.count(FULL) == 1
         assert list(disk.rglob("*.mcap")) == []
         done = run("convert", dataset, "--to", "bag", "--out", disk / "back")
         assert "MiB left, recording needs 512 MiB (min_free)" in done.err

@@ -10,6 +10,7 @@ import shutil
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from errno import EDQUOT, ENOSPC
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from ibrobot_core.api import (
     ContractError,
     DatasetError,
     DatasetWriter,
+    DiskFull,
     EpisodeAddress,
     EpisodeReader,
     EpisodeSummary,
@@ -77,6 +79,11 @@ class Job:
     episode: Path
     source: str
     unit: Path
+
+    @property
+    def making(self) -> Path:
+        """The unit while it is incomplete."""
+        return self.unit.with_name(f"{self.unit.name}.making")
 
 
 @attrs.frozen
@@ -151,8 +158,11 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
     Args:
         job: the episode and its unit.
         progress: called with the number of frames done since the last call.
+
+    Raises:
+        DiskFull: if the disk of the unit is full.
     """
-    making = job.unit.with_name(f"{job.unit.name}.making")
+    making = job.making
     shutil.rmtree(making, ignore_errors=True)
     report = EpisodeReport(job.source)
     with ExitStack() as stack:
@@ -178,6 +188,7 @@ def _convert(
         making.rename(job.unit)
     except (IbrobotError, OSError) as error:
         shutil.rmtree(making, ignore_errors=True)
+        stop_if_full(error, job.source)
         return attrs.evolve(report, error=str(error))
     except Exception as error:  # noqa: BLE001 - a fault in a plugin must not cost the other episodes
         shutil.rmtree(making, ignore_errors=True)
@@ -187,6 +198,19 @@ def _convert(
 
 _NOTHING = {"interventions": "no operator commands in it", "policy": "no policy commands in it"}
 """Rows to keep -> why an episode without any is passed over."""
+
+
+def stop_if_full(error: BaseException, source: str) -> None:
+    """Raise an error that ends the whole conversion if a full disk caused `error`, as it would fail the others too.
+
+    Raises:
+        DiskFull: then.
+    """
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, DiskFull) or (isinstance(cause, OSError) and cause.errno in (ENOSPC, EDQUOT)):
+            raise DiskFull(f"{source}: {error}") from error
+        cause = cause.__cause__ or cause.__context__
 
 
 def unexpected(error: Exception) -> str:

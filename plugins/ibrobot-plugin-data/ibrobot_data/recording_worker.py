@@ -54,7 +54,8 @@ class RecordingWorker(SessionWorker):
     """Writes the bus's messages to a recorder during an episode; its `service` begins and ends the run's episodes.
 
     If the recorder fails, e.g. on a full disk, the recording of the episode ends with a fault. The robot continues, and
-    the next episode is recorded again.
+    the next episode is recorded again. A run of `ibrobot record` whose mode begins the episodes ends instead: nobody is
+    there to make room.
     """
 
     def __init__(self, session: Session, config: RecordingConfig) -> None:
@@ -280,8 +281,11 @@ class RecordingWorker(SessionWorker):
         self.failure = error
         fault = f"recording ended: {error_line(error)}"
         session.add_fault(fault)
-        session.log.error("%s; the robot goes on", fault)
+        ends = session.request.by_operator and session.simulates_episodes
+        session.log.error("%s; %s", fault, "the run ends" if ends else "the robot goes on")
         session.emit("ibrobot_fault_raised", fault=fault)
+        if ends:
+            session.finish()
 
     def _report_absent(self) -> None:
         """Report once, after the first episode, the listed topics without messages: they may be misspelt."""

@@ -27,6 +27,7 @@ from ibrobot_core.api import (
     Contract,
     DatasetError,
     DatasetSummary,
+    DiskFull,
     EpisodeAddress,
     IbrobotError,
     Ownership,
@@ -102,6 +103,7 @@ def convert(
     Raises:
         DatasetError: when `out` has a dataset and `append` is false, when these episodes do not fit the dataset, or
             when it cannot be written.
+        DiskFull: when the disk fills up; what is converted is kept.
         PluginError: when the dataset writer is not installed.
     """
     begin = time.monotonic()
@@ -314,8 +316,17 @@ class _Plan:
                 shutil.rmtree(job.unit, ignore_errors=True)
                 todo.append(job)
         total = sum(self._expected[job.source] for job in todo)
-        for report in _run_in_processes(todo, self._request.jobs, lambda done, report: watch(done, total, report)):
-            self._reports[report.source] = report
+        try:
+            for report in _run_in_processes(todo, self._request.jobs, lambda done, report: watch(done, total, report)):
+                self._reports[report.source] = report
+        except DiskFull as error:
+            for job in todo:
+                shutil.rmtree(job.making, ignore_errors=True)
+            kept = len(self.units())
+            raise DiskFull(
+                f"stopped at {error}; {kept} of {len(self._jobs)} episodes are converted and kept in "
+                f"{self._request.out / STAGING}: make room, and run the same command again"
+            ) from None
 
 
 def _identity(episode: Path) -> str:
@@ -381,7 +392,7 @@ def _run_in_processes(
             "a converting process was killed, e.g. because memory ran out; finished episodes are kept: "
             "run the same command again, with fewer --jobs if needed"
         ) from None
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, DiskFull):
         _end_pool(pool)
         raise
     finally:

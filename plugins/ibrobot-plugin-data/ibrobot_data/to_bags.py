@@ -18,6 +18,7 @@ from ibrobot_core.api import (
     Context,
     Contract,
     ContractError,
+    DiskFull,
     EpisodeEnd,
     EpisodeReader,
     EpisodeStart,
@@ -30,6 +31,7 @@ from ibrobot_core.api import (
     SteppedClock,
     installed_plugins,
 )
+from ibrobot_data.episode import stop_if_full
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_start import episode_folder
 from ibrobot_data.request import EpisodeReport, Report
@@ -95,7 +97,13 @@ def _convert_all(request: BagRequest, watch: Watch) -> list[EpisodeReport]:
         def progress(frames: int, before: int = done) -> None:
             watch(before + frames, before + frames, None)
 
-        report = job.run(progress)
+        try:
+            report = job.run(progress)
+        except DiskFull as error:
+            raise DiskFull(
+                f"stopped at {error}; {len([each for each in reports if not each.error])} of {len(request.numbers)} "
+                f"episodes are converted and kept in {request.out}: make room, and run the same command again"
+            ) from None
         done += report.frames
         watch(done, done, report)
         reports.append(report)
@@ -126,6 +134,7 @@ class _Job:
                     return attrs.evolve(report, passed_over=self._known(summary, reader.digest()))
                 frames = self._write(reader, summary, self._check(summary), prompt, progress)
         except (IbrobotError, OSError) as error:
+            stop_if_full(error, report.source)
             return attrs.evolve(report, error=str(error))
         finally:
             if reader is not None:
