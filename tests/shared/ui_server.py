@@ -11,6 +11,7 @@ from typing import Any
 import aiohttp
 from aiohttp import web
 from ibrobot_web.server.guard import Guard
+from ibrobot_web.server.listening import runner_of
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
@@ -24,9 +25,11 @@ class UiServer:
 
     Args:
         folders: the opened folders.
+        port: the port; 0 for any free one.
     """
 
-    def __init__(self, folders: Sequence[Path]) -> None:
+    def __init__(self, folders: Sequence[Path], port: int = 0) -> None:
+        self.port = port
         self.guard = Guard(("127.0.0.1",), secure=False)
         opened = Folders(folders)
         options = ("--web", "--set", "viewer.port=0", "--set", "viewer.browser=false")
@@ -36,10 +39,10 @@ class UiServer:
         self._base = ""
 
     async def __aenter__(self) -> UiServer:
-        self._runner = web.AppRunner(make_app(self.guard, self.ui), shutdown_timeout=0.1)
+        self._runner = runner_of(make_app(self.guard, self.ui), 0.1)
         await self._runner.setup()
-        await web.TCPSite(self._runner, "127.0.0.1", 0).start()
-        port = self._runner.addresses[0][1]
+        await web.TCPSite(self._runner, "127.0.0.1", self.port, reuse_address=True).start()
+        self.port = port = self._runner.addresses[0][1]
         self.guard.listen_on(port)
         self._base = f"http://127.0.0.1:{port}"
         self.client = self.browser()

@@ -16,6 +16,7 @@ from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import Drive
 from ibrobot_web.server.guard import Guard
+from ibrobot_web.server.listening import runner_of
 
 Reply = Callable[[Mapping[str, Any]], None]
 
@@ -46,7 +47,7 @@ class Server:
         async def scene() -> bytes:
             return b"{}"
 
-        self._runner = web.AppRunner(make_app(self.guard, self.broadcast, self.drive, scene), shutdown_timeout=0.1)
+        self._runner = runner_of(make_app(self.guard, self.broadcast, self.drive, scene), 0.1)
         await self._runner.setup()
         site = web.TCPSite(self._runner, "127.0.0.1", 0)
         await site.start()

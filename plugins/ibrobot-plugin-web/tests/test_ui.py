@@ -55,8 +55,8 @@ def test_nothing_is_served_without_a_session_and_watching_changes_nothing(tmp_pa
         (b"[]", "must be a JSON object"),
         (b"{", "must be JSON"),
         (b"[" * 100_000, "must be JSON"),
-        (b"{}", "no job None"),
-        (b'{"number": "1"}', "no job 1"),
+        (b"{}", "number: required key is missing"),
+        (b'{"number": "1"}', "number: expected a whole number"),
     ],
     ids=lambda value: str(value)[:12],
 )

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import json
+import logging
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
 import aiohttp
+import attrs
 import pytest
 from ibrobot_web.ui.server import LARGEST_REQUEST, VIEWS, routes_of
 from ui_server import UiServer, run_ui
@@ -31,6 +34,8 @@ WRONG: tuple[Any, ...] = (
     {"path": "a\0b", "paths": ["a\0b"], "out": "a\0b", "dataset": "\0", "robot": "\0", "checkpoint": "\0"},
     {"path": "a" * 100_000, "paths": ["a" * 100_000], "out": "b" * 5000, "dataset": "c" * 5000},
 )
+ENDED_S = 8.0
+"""The time in which requests that are sent by half are ended by far, here after 0.2 s."""
 OUTSIDE = ("..", "../x", "/etc/passwd", "/", "a/../../b", "//etc")
 
 
@@ -39,6 +44,12 @@ def routes(views: Any = VIEWS) -> Iterator[tuple[str, str]]:
         for route in routes_of(view):
             method, path = route.split()
             yield method, f"/api/{view}{path}"
+
+
+def keys_of(method: str, path: str) -> set[str]:
+    """The keys of a request."""
+    _, _, view, name = path.split("/")
+    return {field.name for field in attrs.fields(routes_of(view)[f"{method} /{name}"].request)}
 
 
 async def status(browser: aiohttp.ClientSession, method: str, path: str, **more: Any) -> int:
@@ -66,6 +77,47 @@ def test_strangers_watchers_and_other_sites_reach_no_request(tmp_path: Path) -> 
         assert server.ui.jobs.all() == []
 
     run_ui([tmp_path], test)
+
+
+def test_unknown_keys_are_refused_before_anything_runs(tmp_path: Path) -> None:
+    async def test(server: UiServer) -> None:
+        for method, path in routes():
+            sent = {"params": {"--help": "1"}} if method == "GET" else {"json": {"--help": 1}}
+            async with server.client.request(method, path, **sent) as answer:
+                assert (answer.status, "--help: unknown key" in (await answer.json())["error"]) == (400, True), path
+        assert server.ui.jobs.all() == []
+
+    run_ui([tmp_path], test)
+
+
+def test_requests_that_are_sent_by_half_are_ended_and_what_is_no_http_says_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("ibrobot_web.server.listening.REQUEST_S", 0.2)
+    monkeypatch.setattr("ibrobot_web.ui.server.REQUEST_S", 0.2)
+    garbage = (
+        b"", b"GET / HTTP/1.1\r\nHost: x\r\n", b"G", b"\x16\x03\x01\x00\xa5", b"GET / HTTP/9.9\r\n\r\n",
+        b"GET / HTTP/1.1\r\nContent-Length: x\r\n\r\n", b"POST / HTTP/1.1\r\nTransfer-Encoding: y\r\n\r\n",
+        b"\x00" * 100, b"GET /" + b"a" * 20_000 + b" HTTP/1.1\r\n\r\n",
+    )  # fmt: skip
+
+    async def test(server: UiServer) -> None:
+        async def send(data: bytes) -> None:
+            reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+            writer.write(data)
+            with contextlib.suppress(ConnectionError):
+                await asyncio.wait_for(reader.read(), ENDED_S)
+            writer.close()
+
+        await asyncio.gather(*(send(data) for data in garbage * 5))
+        cookies = server.client.cookie_jar.filter_cookies(server.client._base_url)  # type: ignore[arg-type]
+        cookie = "; ".join(f"{each.key}={each.value}" for each in cookies.values())
+        head = f"POST /api/jobs/cancel HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nCookie: {cookie}\r\n"
+        await send(f"{head}Content-Type: application/json\r\nContent-Length: 20\r\n\r\n{{".encode())
+        await server.get("session")
+
+    run_ui([tmp_path], test)
+    assert [record for record in caplog.records if record.exc_info or record.levelno >= logging.WARNING] == []
 
 
 def test_large_and_malformed_bodies_are_refused(tmp_path: Path) -> None:
@@ -127,18 +179,16 @@ def test_no_request_reaches_files_outside_the_opened_folders(tmp_path: Path, out
     folder.mkdir()
 
     async def test(server: UiServer) -> None:
-        facts = dict.fromkeys(("path", "out", "dataset", "robot", "checkpoint", "target"), outside)
+        facts: dict[str, Any] = dict.fromkeys(("path", "out", "dataset", "robot", "checkpoint", "target"), outside)
+        more = {"paths": [outside], "begin_s": 0, "end_s": 1, "id": "x", "outcome": "success", "digest": "x"}
+        facts |= {**more, "steps": 1, "batch_size": 1, "topic": "/t", "at_s": 0}
         for method, path in routes(FILES):
             if path.endswith("/list"):
                 continue
-            if method == "GET":
-                query = {**facts, "topic": "/t", "at_s": "0"}
-                async with server.client.get(path, params=query) as answer:
-                    text = json.dumps(await answer.json())
-            else:
-                more = {"paths": [outside], "begin_s": 0, "end_s": 1, "id": "x", "outcome": "success", "digest": "x"}
-                async with server.client.post(path, json={**facts, **more, "steps": 1, "batch_size": 1}) as answer:
-                    text = json.dumps(await answer.json())
+            known = {name: value for name, value in facts.items() if name in keys_of(method, path)}
+            sent = {"params": known} if method == "GET" else {"json": known}
+            async with server.client.request(method, path, **sent) as answer:
+                text = json.dumps(await answer.json())
             assert "outside the opened folders" in text or "a plugin that is not installed" in text, (path, text)
         assert server.ui.jobs.all() == []
 

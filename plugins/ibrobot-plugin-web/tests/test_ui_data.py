@@ -14,6 +14,7 @@ from ibrobot_web.ui import convert, training
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
+from ibrobot_web.ui.server import routes_of
 from ui_server import UiServer, run_ui
 
 from ibrobot_core.api import IbrobotError, find_config, installed_plugins
@@ -32,6 +33,12 @@ def ui(tmp_path: Path) -> Ui:
     (folder / "training/checkpoints/000010/pretrained_model").mkdir(parents=True)
     (folder / "training/checkpoints/000010/pretrained_model/config.json").write_text("{}")
     return Ui(Folders([folder]), Jobs(folder))
+
+
+def ask(ui: Ui, view: str, route: str, facts: Any = None) -> Any:
+    """The answer of a view to plain facts."""
+    found = routes_of(view)[route]
+    return found.answer(ui, found.read(facts or {}))
 
 
 @pytest.mark.parametrize("name", ["so101", "so101_blind", "so101_pick_cube", "bi_so101"])
@@ -78,27 +85,29 @@ def test_what_cannot_be_edited_is_said(text: str, model: str, error: str) -> Non
 
 
 def test_a_shipped_robot_is_copied_and_an_own_one_is_changed(ui: Ui) -> None:
-    checkpoint = training.listing(ui, {})["checkpoints"][0]["path"]
+    checkpoint = ask(ui, "training", "GET /list")["checkpoints"][0]["path"]
     assert checkpoint == "training/checkpoints/000010/pretrained_model"
     asked = {"robot": "so101_blind", "checkpoint": checkpoint}
     shipped = CONFIG.read_bytes()
-    seen = training.preview(ui, asked)
+    seen = ask(ui, "training", "GET /preview", asked)
     assert (seen["target"], seen["new"]) == ("so101_blind_trained.yaml", True)
     assert seen["problems"] == [] or ("hardware", "mujoco") not in installed_plugins().entries
     assert sum(line.startswith("+") for line in seen["diff"]) == 3, "a model, a mode, and the diff's head"
     assert not list(ui.folders.first.glob("*.yaml")), "looking changes nothing"
-    done = training.apply(ui, {**asked, "digest": seen["digest"]})
+    done = ask(ui, "training", "POST /apply", {**asked, "digest": seen["digest"]})
     assert CONFIG.read_bytes() == shipped
     own = {"robot": done["robot"], "checkpoint": checkpoint}
-    again = training.preview(ui, own)
+    again = ask(ui, "training", "GET /preview", own)
     assert (again["target"], again["new"], again["diff"]) == ("so101_blind_trained.yaml", False, [])
     with pytest.raises(IbrobotError, match="exists already"):
-        training.apply(ui, {**asked, "digest": seen["digest"]})
+        ask(ui, "training", "POST /apply", {**asked, "digest": seen["digest"]})
     (ui.folders.first / "wrong.yaml").write_text(shipped.decode().replace("upper:", "uper:", 1))
-    assert any("uper" in problem for problem in training.preview(ui, {**own, "robot": "wrong.yaml"})["problems"])
+    assert any(
+        "uper" in problem for problem in ask(ui, "training", "GET /preview", {**own, "robot": "wrong.yaml"})["problems"]
+    )
     (ui.folders.first / done["robot"]).write_text(shipped.decode() + "# mine\n")
     with pytest.raises(IbrobotError, match="has changed since"):
-        training.apply(ui, {**own, "digest": again["digest"]})
+        ask(ui, "training", "POST /apply", {**own, "digest": again["digest"]})
 
 
 def test_nothing_outside_the_opened_folders_is_read_or_written(ui: Ui, tmp_path: Path) -> None:
@@ -111,16 +120,17 @@ def test_nothing_outside_the_opened_folders_is_read_or_written(ui: Ui, tmp_path:
         {"robot": "so101_blind", "checkpoint": inside, "target": "/etc/x.yaml"},
     ):
         with pytest.raises(IbrobotError, match="outside the opened folders"):
-            training.preview(ui, facts)
+            ask(ui, "training", "GET /preview", facts)
         with pytest.raises(IbrobotError, match="outside the opened folders"):
-            training.apply(ui, {**facts, "digest": "x"})
+            ask(ui, "training", "POST /apply", {**facts, "digest": "x"})
     train = {"dataset": "a", "out": "b", "steps": 1, "batch_size": 1}
     for wrong, error in (
         ({"dataset": "/etc"}, "outside"), ({"out": ".."}, "outside"), ({"policy": "--x=1"}, "must be names"),
-        ({"device": "cpu --x"}, "must be names"), ({"steps": 0}, "steps must be"), ({"steps": "x"}, "steps must be"),
+        ({"device": "cpu --x"}, "must be names"), ({"steps": 0}, "steps: 0 is too small"),
+        ({"steps": "x"}, "steps: expected a whole number"), ({"gpu": 1}, "gpu: unknown key"),
     ):  # fmt: skip
         with pytest.raises(IbrobotError, match=error):
-            training.start(ui, {**train, **wrong})
+            ask(ui, "training", "POST /start", {**train, **wrong})
     assert ui.jobs.all() == []
 
 
@@ -128,11 +138,12 @@ def test_nothing_outside_the_opened_folders_is_read_or_written(ui: Ui, tmp_path:
 def test_conversions_are_confined_and_their_options_checked(ui: Ui) -> None:
     for wrong, error in (
         ({"paths": ["/etc"]}, "outside"), ({"out": "../x"}, "outside"), ({"out": "."}, "choose a new folder"),
-        ({"only": "x"}, "only must be one of all"), ({"missing": "--help"}, "missing must be one of"),
-        ({"append": "yes"}, "append must be true or false"), ({"out": 3}, "out must be a text"),
+        ({"only": "x"}, "only: 'x' is not one of"), ({"missing": "--help"}, "missing: '--help' is not one of"),
+        ({"append": "yes"}, "append: expected true or false"), ({"out": 3}, "out: expected text"),
+        ({"paths": []}, "paths: choose at least one"), ({"paths": None}, "paths: expected a list"),
     ):  # fmt: skip
         with pytest.raises(IbrobotError, match=error):
-            convert.start(ui, {"paths": ["."], "out": "new", **wrong})
+            ask(ui, "convert", "POST /start", {"paths": ["."], "out": "new", **wrong})
     assert ui.jobs.all() == []
 
 

@@ -77,7 +77,7 @@ def test_a_run_that_fails_shows_its_error(folder: Path) -> None:
         assert (job["number"], job["kind"], job["exit_code"]) == (number, "run", 2)
         assert "--mode=web --web" in job["command"]
         assert any("wrong.yaml:5: robot.joints.pan.uper: unknown key" in line for line in lines)
-        with pytest.raises(RuntimeError, match="sim must be true or false"):
+        with pytest.raises(RuntimeError, match="sim: expected true or false"):
             await server.post("robots/launch", robot="so101", sim="yes")
 
     run_ui([folder], test)
@@ -129,7 +129,7 @@ def test_the_progress_of_a_session_is_read_from_its_status_lines(folder: Path) -
 
     async def test(server: UiServer) -> None:
         for wrong in (0, 1.5, "x", None):
-            with pytest.raises(RuntimeError, match="episodes must be a whole number from 1"):
+            with pytest.raises(RuntimeError, match="episodes: "):
                 await server.post("record/start", robot="so101", sim=True, episodes=wrong)
         asked = {"robot": "arms/pan.yaml", "sim": False, "mode": "nope", "episodes": 3, "prompt": "--pick"}
         await server.post("record/start", **asked, dataset="a b")
@@ -151,3 +151,18 @@ def test_the_progress_of_a_session_is_read_from_its_status_lines(folder: Path) -
         "progress": 0.5,
         "text": "2 of 4 episodes saved",
     }
+
+
+def test_links_out_of_the_folder_are_not_followed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    outside = tmp_path_factory.mktemp("outside")
+    (outside / "secret.yaml").write_text(ROBOT.replace("A pan axis", "The password is swordfish"))
+    (folder / "linked.yaml").symlink_to(outside / "secret.yaml")
+    (folder / "arms" / "arm.yaml").symlink_to(folder / "arms" / "pan.yaml")
+
+    async def test(server: UiServer) -> None:
+        listed = await server.get("robots/list")
+        assert "swordfish" not in json.dumps(listed)
+        mine = {each["robot"] for each in listed if each["source"] == "folder"}
+        assert mine == {"wrong.yaml", "arms/pan.yaml", "arms/arm.yaml"}, "a link within the folder is no way out of it"
+
+    run_ui([folder], test)

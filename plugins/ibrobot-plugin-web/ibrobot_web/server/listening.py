@@ -2,12 +2,34 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import ssl
 from collections.abc import Sequence
 
+from aiohttp import web
+
 from ibrobot_core.api import IbrobotError
 from ibrobot_web.options import is_loopback
+
+REQUEST_S = 5.0
+"""Time in which a client must send a request [s]."""
+_LINGER_S = 1.0
+"""Time for which the rest of a request is still read after its answer [s]."""
+
+
+def runner_of(app: web.Application, close_s: float) -> web.AppRunner:
+    """What runs an application; at its end, requests are given `close_s` [s].
+
+    It closes connections on which no request arrives within `REQUEST_S`. Clients that send what is no HTTP are no news:
+    the server's own messages stay out of the log.
+    """
+    quiet = logging.getLogger("ibrobot.web.http")
+    quiet.setLevel(logging.CRITICAL)
+    return web.AppRunner(
+        app, access_log=None, logger=quiet, keepalive_timeout=REQUEST_S, lingering_time=_LINGER_S,
+        shutdown_timeout=close_s,
+    )  # fmt: skip
 
 
 def tls_of(prefix: str, certificate: str | None, key: str | None) -> ssl.SSLContext | None:

@@ -33,7 +33,7 @@ from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import Answer, Drive
 from ibrobot_web.server.guard import Guard
-from ibrobot_web.server.listening import host_names, listen, tls_of
+from ibrobot_web.server.listening import host_names, listen, runner_of, tls_of
 
 _STREAM_BYTES = 4 << 20
 """Frames that wait to be broadcast [bytes]."""
@@ -94,8 +94,9 @@ class RunLink:
                     payload = await as_jpeg(payload)
                 self.broadcast.publish(channel, payload)
         except asyncio.IncompleteReadError:
-            self.ended.set()
+            return
         finally:
+            self.ended.set()
             writer.close()
 
     def _execute(self, sent: Sent[RunCommand], answer: Answer) -> None:
@@ -137,9 +138,7 @@ async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any
     listening = listen("viewer: ", order["address"], order["port"], "--set viewer.port=0")
     port = listening.getsockname()[1]
     guard.listen_on(port)
-    runner = web.AppRunner(
-        make_app(guard, link.broadcast, link.drive, link.scene), access_log=None, shutdown_timeout=_CLOSE_S
-    )
+    runner = runner_of(make_app(guard, link.broadcast, link.drive, link.scene), _CLOSE_S)
     await runner.setup()
     try:
         site = web.SockSite(runner, listening, ssl_context=tls)
@@ -153,9 +152,10 @@ async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any
         channel.send(links)
         await link.ended.wait()
         loop.remove_reader(channel.fileno())
-        for task in (relaying, living, scene):
+        tasks = (relaying, living, scene)
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(relaying, living, scene, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
     finally:
         await runner.cleanup()
 

@@ -10,7 +10,7 @@ class Ui extends EventTarget {
     super();
     this.jobs = new Map(); // number -> {number, kind, title, state, facts, lines, …}
     this.session = { role: "watch", folders: [], views: [] };
-    this.connected = false;
+    this.connected = null; // false once a connection was lost
   }
 
   get drives() { return this.session.role === "drive"; }
@@ -55,8 +55,14 @@ class Ui extends EventTarget {
 
   follow() {
     const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/jobs`);
-    socket.onopen = () => { this.connected = true; this.jobs.clear(); showConnection(); };
-    socket.onclose = () => { this.connected = false; showConnection(); setTimeout(() => this.follow(), 1000); };
+    socket.onopen = () => {
+      const again = this.connected === false;
+      this.connected = true;
+      this.jobs.clear();
+      showConnection();
+      if (again) shown?.show?.(true, address()[1]); // what was shown may have changed
+    };
+    socket.onclose = () => { this.lose(); setTimeout(() => this.follow(), 1000); };
     socket.onmessage = ({ data }) => {
       const { job, lines } = JSON.parse(data);
       const known = this.jobs.get(job.number);
@@ -68,6 +74,14 @@ class Ui extends EventTarget {
     };
   }
 }
+
+// What the page shows is old from now on, and is hidden; a server that was started again has another address.
+Ui.prototype.lose = async function lose() {
+  this.connected = false;
+  showConnection();
+  const known = await fetch("/api/session").then(({ status }) => status !== 401, () => true);
+  if (!known) showConnection("this page belongs to a server that has ended: open the address that the new one shows");
+};
 
 async function ask(address, options) {
   let response;
@@ -122,9 +136,10 @@ async function showView() {
   shown?.show?.(true, rest);
 }
 
-function showConnection() {
-  say($("connection"), ui.connected ? "" : "not connected: is ibrobot ui running?");
+function showConnection(why = "not connected: is ibrobot ui running?") {
+  say($("connection"), ui.connected ? "" : why);
   $("connection").classList.toggle("bad", !ui.connected);
+  $("main").hidden = ui.connected === false;
 }
 
 function showRunning() {

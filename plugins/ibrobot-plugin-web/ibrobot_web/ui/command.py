@@ -18,7 +18,7 @@ from ibrobot_core.api import LogFormatter, echo, end_signals
 from ibrobot_web.desktop import has_desktop
 from ibrobot_web.options import WebOptions
 from ibrobot_web.server.guard import Guard
-from ibrobot_web.server.listening import host_names, listen, tls_of
+from ibrobot_web.server.listening import host_names, listen, runner_of, tls_of
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
@@ -80,7 +80,7 @@ async def _serve(options: WebOptions, context: Ui, *, browser: bool) -> None:
     listening = listen("", options.host, options.port, "--port 0")
     port = listening.getsockname()[1]
     guard.listen_on(port)
-    runner = web.AppRunner(make_app(guard, context), access_log=None, shutdown_timeout=_CLOSE_S)
+    runner = runner_of(make_app(guard, context), _CLOSE_S)
     await runner.setup()
     try:
         await web.SockSite(runner, listening, ssl_context=tls).start()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import attrs
 
-from ibrobot_core.api import IbrobotError
+from ibrobot_core.api import RequestError, RequestLimits, Service, option
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
 
@@ -40,47 +41,73 @@ class Blob:
     content_type: str
 
 
-Handler = Callable[[Ui, Mapping[str, Any]], Any]
-"""Answers a request. It gets the query of a GET, whose values are texts, or the JSON object of a POST, and returns what
-JSON can express, or a `Blob`. It runs in a thread, may block, and raises IbrobotError for what the page is to show."""
+_LIMITS = RequestLimits(values=10_000, text=4_500, depth=3)
+_WHOLE = re.compile(r"-?\d{1,18}")
 
 
-def text(facts: Mapping[str, Any], name: str, default: str | None = None) -> str:
-    """A text of a request.
+@attrs.frozen(eq=False)
+class Route[Q]:
+    """How a view answers a request.
 
-    Raises:
-        IbrobotError: if it is missing and has no default, or is of another type.
+    The request, the query of a GET or the JSON object of a POST, is checked against its class before anything runs.
     """
-    value = facts.get(name, default)
-    if not isinstance(value, str):
-        raise IbrobotError(f"{name} must be a text" if name in facts else f"{name} is missing")
-    return value
 
+    answer: Callable[[Ui, Q], Any]
+    """Returns what JSON can express, or a `Blob`. It runs in a thread, may block, and raises IbrobotError for what the
+    page is to show."""
+    request: type[Q]
+    """Class of the request, with its fields as `option`."""
 
-def integer(facts: Mapping[str, Any], name: str, *, default: int | None = None, least: int = 0) -> int:
-    """A whole number of a request, as JSON or as the text of a query.
+    def read_query(self, query: Mapping[str, str]) -> Q:
+        """The request in a query, whose values are texts.
 
-    Raises:
-        IbrobotError: if it is missing and has no default, is of another type, or too small.
-    """
-    value = facts.get(name, default)
-    if isinstance(value, str):
+        Raises:
+            RequestError: if it does not fit.
+        """
+        attrs.resolve_types(self.request)  # type: ignore[type-var]
+        kinds = {field.name: field.type for field in attrs.fields(self.request)}  # type: ignore[arg-type]
+        return self.read({name: _typed(text, kinds.get(name)) for name, text in query.items()})
+
+    def read(self, facts: Any) -> Q:
+        """The request in a JSON object.
+
+        Raises:
+            RequestError: if it does not fit.
+        """
         try:
-            value = int(value)
+            return Service("", self.request, object, limits=_LIMITS).read(facts)
+        except RequestError as error:
+            raise RequestError(str(error).removeprefix(": ")) from None
+
+
+def _typed(text: str, kind: Any) -> Any:
+    """A text of a query as the type of its field; the text itself if it is not one."""
+    if kind is bool:
+        return {"true": True, "false": False}.get(text, text)
+    if kind is int and _WHOLE.fullmatch(text):
+        return int(text)
+    if kind is float:
+        try:
+            return float(text)
         except ValueError:
-            value = None
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise IbrobotError(f"{name} must be a whole number from {least}; it is {facts.get(name)!r}")
-    return value
+            return text
+    return text
 
 
-def flag(facts: Mapping[str, Any], name: str) -> bool:
-    """A switch of a request; off if it is missing.
+@attrs.frozen
+class NamesPath:
+    """A request about a file or folder."""
 
-    Raises:
-        IbrobotError: if it is of another type.
-    """
-    value = facts.get(name, False)
-    if not isinstance(value, bool):
-        raise IbrobotError(f"{name} must be true or false")
-    return value
+    path: str = option(help="in an opened folder")
+
+
+def _some(instance: object, attribute: object, paths: tuple[str, ...]) -> None:
+    if not paths:
+        raise ValueError("choose at least one")
+
+
+@attrs.frozen
+class NamesPaths:
+    """A request about files or folders."""
+
+    paths: tuple[str, ...] = option(validator=_some, help="in opened folders")

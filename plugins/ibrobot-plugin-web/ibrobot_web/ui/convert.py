@@ -6,20 +6,29 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from ibrobot_core.api import NORM_MODES, IbrobotError, installed_plugins
-from ibrobot_web.ui.context import Handler, Ui, flag, text
+import attrs
+
+from ibrobot_core.api import NORM_MODES, IbrobotError, NoRequest, installed_plugins, option
+from ibrobot_web.ui.context import NamesPaths, Route, Ui
 from ibrobot_web.ui.job_runner import Reader
 from ibrobot_web.ui.recordings import find_recordings, paths_of
 
-_CHOICES = {
-    "only": ("all", "interventions", "policy"),
-    "missing": ("skip", "hold", "refuse"),
-    "norm_mode": NORM_MODES,
-    "outcome": ("", "success", "failure", "unknown"),
-}
+
+@attrs.frozen(kw_only=True)
+class Conversion(NamesPaths):
+    """What to convert. An empty text leaves a choice to the command."""
+
+    out: str = option(help="folder of the dataset")
+    only: str = option("", choices=("", "all", "interventions", "policy"), help="frames to keep")
+    missing: str = option("", choices=("", "skip", "hold", "refuse"), help="what to do about missing samples")
+    norm_mode: str = option("", choices=("", *NORM_MODES), help="units of joints")
+    outcome: str = option("", choices=("", "success", "failure", "unknown"), help="episodes to keep")
+    prompt: str = option("", help="task of all episodes")
+    append: bool = option(False, help="whether to add to a dataset")
+    success: bool = option(False, help="whether to write a feature that tells success")
 
 
-def listing(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+def listing(ui: Ui, request: NoRequest) -> dict[str, Any]:
     """Folders with episodes, and how many each has; and the datasets to which episodes can be added."""
     found = find_recordings(ui.folders.paths)
     counts: dict[str, int] = {}
@@ -32,28 +41,21 @@ def listing(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
+def start(ui: Ui, request: Conversion) -> dict[str, int]:
     """Begin a conversion."""
     if "convert" not in installed_plugins().commands:
         raise IbrobotError("converting needs a plugin that is not installed: pip install ibrobot-plugin-data")
-    paths = paths_of(ui, facts)
-    out = ui.folders.find(text(facts, "out"))
+    paths = paths_of(ui, request.paths)
+    out = ui.folders.find(request.out)
     if out in ui.folders.paths:
         raise IbrobotError(f"{out}: is an opened folder; choose a new folder in it, e.g. datasets/pick_cube")
-    if (out / "meta" / "info.json").is_file() and not flag(facts, "append"):
+    if (out / "meta" / "info.json").is_file() and not request.append:
         raise IbrobotError(f"{ui.folders.name(out)}: has a dataset already; choose “Add to it”, or another folder")
     arguments = ["convert", "--events", f"--out={out}"]
-    for name, choices in _CHOICES.items():
-        chosen = text(facts, name, "")
-        if chosen and chosen not in choices:
-            raise IbrobotError(f"{name} must be one of {', '.join(each for each in choices if each)}, got {chosen!r}")
-        if chosen:
-            arguments.append(f"--{name.replace('_', '-')}={chosen}")
-    if prompt := text(facts, "prompt", ""):
-        arguments.append(f"--prompt={prompt}")
-    for name in ("append", "success"):
-        if flag(facts, name):
-            arguments.append(f"--{name}")
+    for name, value in attrs.asdict(request).items():
+        if name not in ("paths", "out") and value:
+            option_name = f"--{name.replace('_', '-')}"
+            arguments.append(option_name if value is True else f"{option_name}={value}")
     known = {"out": ui.folders.name(out), "problems": [], "progress": 0.0}
     job = ui.jobs.start(
         "convert", f"Convert into {ui.folders.name(out)}", [*arguments, *paths], facts=known, read=event_reader()
@@ -112,4 +114,4 @@ def told(report: Mapping[str, Any]) -> str:
     return f"{episodes}, {report['frames']} frames{others}; the dataset has {size:.1f} MB"
 
 
-ROUTES: dict[str, Handler] = {"GET /list": listing, "POST /start": start}
+ROUTES: dict[str, Route[Any]] = {"GET /list": Route(listing, NoRequest), "POST /start": Route(start, Conversion)}

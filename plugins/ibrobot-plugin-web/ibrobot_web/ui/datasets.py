@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from typing import Any
 
-from ibrobot_core.api import IbrobotError, installed_plugins
+from ibrobot_core.api import IbrobotError, NoRequest, installed_plugins
 from ibrobot_web.ui import episodes
-from ibrobot_web.ui.context import Handler, Ui, text
+from ibrobot_web.ui.context import NamesPath, Route, Ui
 from ibrobot_web.ui.recordings import find_recordings, run_command
 
 
-def listing(ui: Ui, facts: Mapping[str, Any]) -> list[str]:
+def listing(ui: Ui, request: NoRequest) -> list[str]:
     """The datasets in the opened folders."""
     return [ui.folders.name(path) for path in find_recordings(ui.folders.paths).datasets]
 
 
-def info(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+def info(ui: Ui, request: NamesPath) -> dict[str, Any]:
     """What a dataset contains."""
     if "datasets" not in installed_plugins().commands:
         raise IbrobotError("datasets need a plugin that is not installed: pip install ibrobot-plugin-lerobot")
-    path = ui.folders.find(text(facts, "path"))
+    path = ui.folders.find(request.path)
     found: dict[str, Any] = json.loads(run_command(ui, "datasets", "info", "--json", str(path)))
     return {**found, "path": ui.folders.name(path)}
 
 
-ROUTES: dict[str, Handler] = {
-    "GET /list": listing, "GET /info": info, "GET /open": episodes.facts_of, "GET /series": episodes.series,
-    "GET /picture": episodes.picture, "GET /scene": episodes.scene, "GET /objects": episodes.objects,
-}  # fmt: skip
+ROUTES: dict[str, Route[Any]] = {
+    "GET /list": Route(listing, NoRequest),
+    "GET /info": Route(info, NamesPath),
+    **{f"GET /{name}": episodes.ROUTES[f"GET /{name}"] for name in ("open", "series", "picture", "scene", "objects")},
+}

@@ -9,8 +9,17 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import Child, ComponentFailed, GuideDescriptor, IbrobotError, Question, installed_plugins
-from ibrobot_web.ui.context import Blob, Handler, Ui, integer, text
+from ibrobot_core.api import (
+    Child,
+    ComponentFailed,
+    GuideDescriptor,
+    IbrobotError,
+    NoRequest,
+    Question,
+    installed_plugins,
+    option,
+)
+from ibrobot_web.ui.context import Blob, Route, Ui
 
 _MODULE = "ibrobot_web.ui.guide_process"
 _POLL_S = 0.1
@@ -155,7 +164,45 @@ def devices_of(ui: Ui) -> Devices:
     return devices
 
 
-def listing(ui: Ui, facts: Mapping[str, Any]) -> list[dict[str, Any]]:
+@attrs.frozen
+class StartGuide:
+    """Which guide to start."""
+
+    name: str = option(help="its name")
+    answers: Mapping[str, str | bool] = option(factory=dict, help="question -> answer")
+
+
+@attrs.frozen
+class AskState:
+    """A request for what a guide shows."""
+
+    after: int = option(0, ge=0, help="number of items that the page has")
+
+
+@attrs.frozen
+class NamesPicture:
+    """A request for a picture of a guide."""
+
+    picture: int = option(ge=0, help="its number")
+    n: int = option(0, help="number of the guide, so that browsers keep no picture of another one")
+
+
+@attrs.frozen
+class NamesGuide:
+    """A request about a guide that runs."""
+
+    number: int = option(ge=0, help="its number")
+
+
+@attrs.frozen
+class GiveAnswer(NamesGuide):
+    """An answer to what a guide asks."""
+
+    ask: int = option(ge=0, help="number of the question")
+    ok: bool = option(True, help="yes or no; true for what is done")
+
+
+def listing(ui: Ui, request: NoRequest) -> list[dict[str, Any]]:
     """The guides of all plugins, with their questions."""
     return [
         {
@@ -168,16 +215,13 @@ def listing(ui: Ui, facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
+def start(ui: Ui, request: StartGuide) -> dict[str, int]:
     """Start a guide."""
-    name = text(facts, "name")
-    guide = next((each for each in installed_plugins().guides if each.name == name), None)
+    guide = next((each for each in installed_plugins().guides if each.name == request.name), None)
     if guide is None:
-        raise IbrobotError(f"no guide {name!r}")
-    given = facts.get("answers", {})
-    if not isinstance(given, dict):
-        raise IbrobotError("answers must be an object")
-    return {"number": devices_of(ui).start(guide, {each.name: _answer(each, given) for each in guide.questions()})}
+        raise IbrobotError(f"no guide {request.name!r}")
+    answers = {each.name: _answer(each, request.answers) for each in guide.questions()}
+    return {"number": devices_of(ui).start(guide, answers)}
 
 
 def _answer(question: Question, given: Mapping[str, Any]) -> str | bool:
@@ -192,22 +236,22 @@ def _answer(question: Question, given: Mapping[str, Any]) -> str | bool:
     return value
 
 
-def state(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+def state(ui: Ui, request: AskState) -> dict[str, Any]:
     """What the guide shows, from item number `after` on, and what it asks."""
-    devices, after = devices_of(ui), integer(facts, "after", default=0)
+    devices = devices_of(ui)
     with devices.lock:
         work = devices.work
         if work is None:
             return {"number": 0, "state": "none", "items": [], "ask": None}
         return {
             "number": work.number, "name": work.name, "title": work.title, "state": work.state, "error": work.error,
-            "items": work.items[after:], "ask": work.ask,
+            "items": work.items[request.after :], "ask": work.ask,
         }  # fmt: skip
 
 
-def picture(ui: Ui, facts: Mapping[str, Any]) -> Blob:
+def picture(ui: Ui, request: NamesPicture) -> Blob:
     """A picture that the guide has shown."""
-    devices, index = devices_of(ui), integer(facts, "picture")
+    devices, index = devices_of(ui), request.picture
     with devices.lock:
         if devices.work is None or index >= len(devices.work.pictures):
             raise IbrobotError("no such picture")
@@ -215,20 +259,18 @@ def picture(ui: Ui, facts: Mapping[str, Any]) -> Blob:
     return Blob(content, "image/png" if content.startswith(b"\x89PNG") else "image/jpeg")
 
 
-def answer(ui: Ui, facts: Mapping[str, Any]) -> None:
+def answer(ui: Ui, request: GiveAnswer) -> None:
     """Answer what the guide asks."""
-    ok = facts.get("ok", True)
-    if not isinstance(ok, bool):
-        raise IbrobotError("ok must be true or false")
-    devices_of(ui).answer(integer(facts, "number"), integer(facts, "ask"), ok)
+    devices_of(ui).answer(request.number, request.ask, request.ok)
 
 
-def cancel(ui: Ui, facts: Mapping[str, Any]) -> None:
+def cancel(ui: Ui, request: NamesGuide) -> None:
     """End the guide."""
-    devices_of(ui).cancel(integer(facts, "number"))
+    devices_of(ui).cancel(request.number)
 
 
-ROUTES: dict[str, Handler] = {
-    "GET /list": listing, "GET /state": state, "GET /picture": picture,
-    "POST /start": start, "POST /answer": answer, "POST /cancel": cancel,
+ROUTES: dict[str, Route[Any]] = {
+    "GET /list": Route(listing, NoRequest), "GET /state": Route(state, AskState),
+    "GET /picture": Route(picture, NamesPicture), "POST /start": Route(start, StartGuide),
+    "POST /answer": Route(answer, GiveAnswer), "POST /cancel": Route(cancel, NamesGuide),
 }  # fmt: skip

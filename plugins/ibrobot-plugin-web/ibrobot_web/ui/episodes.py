@@ -3,16 +3,55 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from ibrobot_core.api import IbrobotError
-from ibrobot_web.ui.context import Blob, Handler, Ui, text
+import attrs
+
+from ibrobot_core.api import IbrobotError, NoRequest, option
+from ibrobot_web.ui.context import Blob, NamesPath, NamesPaths, Route, Ui
 from ibrobot_web.ui.recordings import episodes_of, find_recordings, paths_of, playback, run_command
 
+_LONGEST_S = 1e6
 
-def listing(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+
+@attrs.frozen
+class NamesTopic(NamesPath):
+    """A request about a topic of an episode."""
+
+    topic: str = option(help="its name")
+
+
+@attrs.frozen
+class NamesPicture(NamesTopic):
+    """A request for a picture."""
+
+    at_s: float = option(unit="s", ge=0, le=_LONGEST_S, help="time since the episode's begin")
+
+
+@attrs.frozen
+class Mark(NamesPaths):
+    """How episodes went."""
+
+    outcome: Literal["success", "failure", "unknown"] = option(help="of all of them")
+
+
+@attrs.frozen
+class Trim(NamesPath):
+    """The part of an episode to keep."""
+
+    begin_s: float = option(unit="s", ge=0, le=_LONGEST_S, help="its begin, since the episode's")
+    end_s: float = option(unit="s", ge=0, le=_LONGEST_S, help="its end, since the episode's begin")
+
+
+@attrs.frozen
+class Restore(NamesPath):
+    """What to put back."""
+
+    id: str = option(help="as the trash lists it")
+
+
+def listing(ui: Ui, request: NoRequest) -> dict[str, Any]:
     """All episodes in the opened folders."""
     found = find_recordings(ui.folders.paths)
     rows = [episodes_of(ui).row(ui, path) for path in found.episodes]
@@ -20,37 +59,37 @@ def listing(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
     return {"episodes": rows, "complete": found.complete, "trashes": trashes}
 
 
-def trash(ui: Ui, facts: Mapping[str, Any]) -> list[dict[str, Any]]:
+def trash(ui: Ui, request: NamesPath) -> list[dict[str, Any]]:
     """What can be undone in a folder, newest first."""
-    folder = ui.folders.find(text(facts, "path"))
+    folder = ui.folders.find(request.path)
     rows = json.loads(run_command(ui, "episodes", "trash", str(folder), "--json"))
     return [
         {**row, "path": ui.folders.name(Path(row["path"])), "folder": ui.folders.name(folder)} for row in rows[::-1]
     ]
 
 
-def facts_of(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+def facts_of(ui: Ui, request: NamesPath) -> dict[str, Any]:
     """What an episode contains, and the robot's motion."""
-    return playback(ui, facts).facts()
+    return playback(ui, request.path).facts()
 
 
-def series(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+def series(ui: Ui, request: NamesTopic) -> dict[str, Any]:
     """The numbers of a topic over time."""
-    return playback(ui, facts).series(text(facts, "topic"))
+    return playback(ui, request.path).series(request.topic)
 
 
-def picture(ui: Ui, facts: Mapping[str, Any]) -> Blob:
+def picture(ui: Ui, request: NamesPicture) -> Blob:
     """A camera's picture at a time; empty if there is none."""
-    found = playback(ui, facts).picture(text(facts, "topic"), _seconds(facts, "at_s"))
+    found = playback(ui, request.path).picture(request.topic, request.at_s)
     return Blob(found.content, found.content_type) if found is not None else Blob(b"", "image/jpeg")
 
 
-def scene(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+def scene(ui: Ui, request: NamesPath) -> dict[str, Any]:
     """The robot's shapes."""
     from ibrobot_web.scene import make_scene
 
     try:
-        description = playback(ui, facts).description(ui.folders.find)
+        description = playback(ui, request.path).description(ui.folders.find)
     except IbrobotError as error:
         return {"bodies": [], "meshes": [], "tip": None, "problem": str(error)}
     key = json.dumps(description, sort_keys=True)
@@ -61,62 +100,55 @@ def scene(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def objects(ui: Ui, facts: Mapping[str, Any]) -> list[dict[str, Any]]:
+def objects(ui: Ui, request: NamesPath) -> list[dict[str, Any]]:
     """The objects of a simulated scene, and where they were."""
-    return playback(ui, facts).objects(ui.folders.find)
+    return playback(ui, request.path).objects(ui.folders.find)
 
 
-def mark(ui: Ui, facts: Mapping[str, Any]) -> str:
+def mark(ui: Ui, request: Mark) -> str:
     """Judge episodes."""
-    return run_command(ui, "episodes", "mark", *paths_of(ui, facts), text(facts, "outcome"))
+    return run_command(ui, "episodes", "mark", *paths_of(ui, request.paths), request.outcome)
 
 
-def trim(ui: Ui, facts: Mapping[str, Any]) -> str:
+def trim(ui: Ui, request: Trim) -> str:
     """Replace an episode by a part of it."""
-    path = ui.folders.find(text(facts, "path"))
-    begin_s, end_s = _seconds(facts, "begin_s"), _seconds(facts, "end_s")
+    path = ui.folders.find(request.path)
+    begin_s, end_s = request.begin_s, request.end_s
     episodes_of(ui).forget()
     return run_command(ui, "episodes", "trim", str(path), "--in-place", f"--from={begin_s}", f"--to={end_s}")
 
 
-def delete(ui: Ui, facts: Mapping[str, Any]) -> str:
+def delete(ui: Ui, request: NamesPaths) -> str:
     """Move episodes to the trash."""
-    paths = paths_of(ui, facts)
+    paths = paths_of(ui, request.paths)
     episodes_of(ui).forget()
     return run_command(ui, "episodes", "delete", "--to-trash", *paths)
 
 
-def restore(ui: Ui, facts: Mapping[str, Any]) -> str:
+def restore(ui: Ui, request: Restore) -> str:
     """Put an original back."""
-    folder = ui.folders.find(text(facts, "path"))
+    folder = ui.folders.find(request.path)
     episodes_of(ui).forget()
-    return run_command(ui, "episodes", "trash", str(folder), f"--restore={text(facts, 'id')}")
+    return run_command(ui, "episodes", "trash", str(folder), f"--restore={request.id}")
 
 
-def empty(ui: Ui, facts: Mapping[str, Any]) -> str:
+def empty(ui: Ui, request: NamesPath) -> str:
     """Delete what is in a trash for good."""
-    return run_command(ui, "episodes", "trash", str(ui.folders.find(text(facts, "path"))), "--empty", "--yes")
+    return run_command(ui, "episodes", "trash", str(ui.folders.find(request.path)), "--empty", "--yes")
 
 
-def repair(ui: Ui, facts: Mapping[str, Any]) -> str:
+def repair(ui: Ui, request: NamesPath) -> str:
     """Repair an unfinished episode."""
-    path = ui.folders.find(text(facts, "path"))
+    path = ui.folders.find(request.path)
     episodes_of(ui).forget()
     return run_command(ui, "episodes", "repair", str(path))
 
 
-def _seconds(facts: Mapping[str, Any], name: str) -> float:
-    try:
-        value = float(facts[name])
-    except (KeyError, TypeError, ValueError):
-        raise IbrobotError(f"{name} must be a number of seconds") from None
-    if not 0 <= value < 1e6:
-        raise IbrobotError(f"{name} must be from 0 s to 1,000,000 s, got {value:g}")
-    return value
-
-
-ROUTES: dict[str, Handler] = {
-    "GET /list": listing, "GET /trash": trash, "GET /open": facts_of, "GET /series": series, "GET /picture": picture,
-    "GET /scene": scene, "GET /objects": objects, "POST /mark": mark, "POST /trim": trim, "POST /delete": delete,
-    "POST /restore": restore, "POST /empty": empty, "POST /repair": repair,
+ROUTES: dict[str, Route[Any]] = {
+    "GET /list": Route(listing, NoRequest), "GET /trash": Route(trash, NamesPath),
+    "GET /open": Route(facts_of, NamesPath), "GET /series": Route(series, NamesTopic),
+    "GET /picture": Route(picture, NamesPicture), "GET /scene": Route(scene, NamesPath),
+    "GET /objects": Route(objects, NamesPath), "POST /mark": Route(mark, Mark), "POST /trim": Route(trim, Trim),
+    "POST /delete": Route(delete, NamesPaths), "POST /restore": Route(restore, Restore),
+    "POST /empty": Route(empty, NamesPath), "POST /repair": Route(repair, NamesPath),
 }  # fmt: skip

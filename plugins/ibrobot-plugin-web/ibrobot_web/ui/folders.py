@@ -42,6 +42,10 @@ class Folders:
             raise IbrobotError(f"{text} is outside the opened folders ({opened}); open its folder: ibrobot ui FOLDER")
         return path
 
+    def has(self, path: Path) -> bool:
+        """Whether a path is a file of the opened folders, and no link out of them."""
+        return path.is_file() and any(path.resolve().is_relative_to(folder) for folder in self.paths)
+
     def name(self, path: Path) -> str:
         """A path as the page shows it, and as `find` reads it: relative to the first folder, or absolute."""
         return str(path.relative_to(self.first)) if path.is_relative_to(self.first) else str(path)

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
-from ibrobot_web.ui.context import Handler, Ui
+import attrs
+
+from ibrobot_core.api import option
+from ibrobot_web.ui.context import Route, Ui
 
 
-def cancel(ui: Ui, facts: Mapping[str, Any]) -> None:
+@attrs.frozen
+class NamesJob:
+    """A request about a job."""
+
+    number: int = option(ge=1, help="its number")
+
+
+def cancel(ui: Ui, request: NamesJob) -> None:
     """End a job as Ctrl-C does; the second time at once."""
-    ui.jobs.cancel(facts.get("number"))
+    ui.jobs.cancel(request.number)
 
 
-ROUTES: dict[str, Handler] = {"POST /cancel": cancel}
+ROUTES: dict[str, Route[Any]] = {"POST /cancel": Route(cancel, NamesJob)}

@@ -8,9 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.api import IbrobotError, installed_plugins
-from ibrobot_web.ui.context import Handler, Ui, integer, text
-from ibrobot_web.ui.robots import RUN_DONE, read_address, run_arguments
+import attrs
+
+from ibrobot_core.api import IbrobotError, installed_plugins, option
+from ibrobot_web.ui.context import Route, Ui
+from ibrobot_web.ui.robots import RUN_DONE, Launch, read_address, run_arguments
 
 _DATASET = re.compile(r"\w[\w .-]*(?:/\w[\w .-]*)*")
 _LONGEST_PROMPT = 500
@@ -20,9 +22,27 @@ _SUMMARY = re.compile(r"recorded +(?P<saved>\d+) of (?P<count>\d+) episodes? int
 """The line of its summary."""
 
 
-def place(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+@attrs.frozen
+class NamesDataset:
+    """A request about a dataset of episodes."""
+
+    dataset: str = option("default", help="its name")
+    root: str = option("episodes", help="folder of all datasets")
+
+
+@attrs.frozen(kw_only=True)
+class RecordSession(Launch):
+    """What to record."""
+
+    episodes: int = option(ge=1, le=100_000, help="number of episodes")
+    prompt: str = option("", help="the task")
+    dataset: str = option("default", help="name of the dataset")
+    root: str = option("episodes", help="folder of all datasets")
+
+
+def place(ui: Ui, request: NamesDataset) -> dict[str, Any]:
     """Where episodes go, how many the dataset has, how large they are, and the disk's free space."""
-    folder = _folder(ui, facts)
+    folder = _folder(ui, request.root, request.dataset)
     episodes = [path for path in (folder / "episodes").glob("episode_*") if path.is_dir()]
     sizes = [sum(each.stat().st_size for each in path.rglob("*") if each.is_file()) for path in episodes]
     existing = folder
@@ -36,17 +56,17 @@ def place(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
+def start(ui: Ui, request: RecordSession) -> dict[str, int]:
     """Begin a session: `ibrobot record`, which ends by itself after the last episode."""
     if "record" not in installed_plugins().commands:
         raise IbrobotError("recording needs a plugin that is not installed: pip install ibrobot-plugin-data")
-    prompt, count = text(facts, "prompt", ""), integer(facts, "episodes", least=1)
+    prompt, count = request.prompt, request.episodes
     if len(prompt) > _LONGEST_PROMPT:
         raise IbrobotError(f"the task has {len(prompt)} characters; at most {_LONGEST_PROMPT} are possible")
-    folder = _folder(ui, facts)
-    root = ui.folders.find(text(facts, "root", "episodes"))
+    folder = _folder(ui, request.root, request.dataset)
+    root = ui.folders.find(request.root)
     arguments = [
-        "record", *run_arguments(ui, facts), f"--root={root}", f"--dataset={folder.relative_to(root)}",
+        "record", *run_arguments(ui, request), f"--root={root}", f"--dataset={folder.relative_to(root)}",
         f"--prompt={prompt}", f"--episodes={count}",
     ]  # fmt: skip
     known = {"dataset": ui.folders.name(folder), "saved": 0, "episodes": count, "progress": 0.0}
@@ -56,12 +76,12 @@ def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
     return {"number": job.number}
 
 
-def _folder(ui: Ui, facts: Mapping[str, Any]) -> Path:
+def _folder(ui: Ui, root: str, dataset: str) -> Path:
     """The dataset's folder."""
-    dataset = text(facts, "dataset", "default").strip()
+    dataset = dataset.strip()
     if _DATASET.fullmatch(dataset) is None:
         raise IbrobotError(f"dataset {dataset!r}: use letters, digits, spaces, dots, - and _, e.g. pick_cube")
-    return ui.folders.find(str(Path(text(facts, "root", "episodes")) / dataset))
+    return ui.folders.find(str(Path(root) / dataset))
 
 
 def read_status(line: str) -> Mapping[str, Any] | None:
@@ -79,4 +99,4 @@ def read_status(line: str) -> Mapping[str, Any] | None:
     return read_address(line)
 
 
-ROUTES: dict[str, Handler] = {"GET /place": place, "POST /start": start}
+ROUTES: dict[str, Route[Any]] = {"GET /place": Route(place, NamesDataset), "POST /start": Route(start, RecordSession)}

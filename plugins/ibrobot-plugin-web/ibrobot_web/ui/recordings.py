@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import attrs
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, installed_plugins
 from ibrobot_web.playback import Playback, problems_of
-from ibrobot_web.ui.context import Ui, text
+from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.job_runner import IBROBOT
 
 _DEPTH = 6
@@ -126,24 +126,21 @@ def episodes_of(ui: Ui) -> Episodes:
     return found
 
 
-def playback(ui: Ui, facts: Mapping[str, Any]) -> Playback:
+def playback(ui: Ui, path: str) -> Playback:
     """The episode that a request names, or `DATASET:N`.
 
     Raises:
         IbrobotError: if it is outside the opened folders, or cannot be read.
     """
-    return episodes_of(ui).opened(ui.folders.find(text(facts, "path")))
+    return episodes_of(ui).opened(ui.folders.find(path))
 
 
-def paths_of(ui: Ui, facts: Mapping[str, Any]) -> list[str]:
+def paths_of(ui: Ui, given: Sequence[str]) -> list[str]:
     """The paths that a request names, confined to the opened folders.
 
     Raises:
-        IbrobotError: if there is none, one is outside, or one does not exist.
+        IbrobotError: if one is outside, or does not exist.
     """
-    given = facts.get("paths")
-    if not isinstance(given, list) or not given or not all(isinstance(each, str) for each in given):
-        raise IbrobotError("paths must be a list of paths")
     paths = [ui.folders.find(each) for each in given]
     for path in paths:
         if not path.exists():

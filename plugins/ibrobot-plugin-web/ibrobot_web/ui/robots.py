@@ -8,19 +8,23 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import attrs
+
 from ibrobot_core.api import (
     ConfigError,
     IbrobotError,
+    NoRequest,
     RobotConfig,
     absent_sensors,
     describe_absent,
     find_config,
     installed_plugins,
     load_config,
+    option,
     shipped_configs,
     unavailable_modes,
 )
-from ibrobot_web.ui.context import Handler, Ui, flag, text
+from ibrobot_web.ui.context import Route, Ui
 
 _ROBOT = re.compile(r"^robot:", re.MULTILINE)
 _SUMMARY = re.compile(r"\A(?:#[^\n]*\n)+")
@@ -37,7 +41,22 @@ RUN_DONE = (0, 3)
 _checking = threading.Lock()
 
 
-def listing(ui: Ui, facts: Mapping[str, Any]) -> list[dict[str, str]]:
+@attrs.frozen
+class NamesRobot:
+    """A request about a robot."""
+
+    robot: str = option(help="name of a shipped robot, or path of its YAML")
+    sim: bool = option(False, help="whether in simulation")
+
+
+@attrs.frozen
+class Launch(NamesRobot):
+    """What to launch."""
+
+    mode: str = option("", help="control mode; empty: the robot's default")
+
+
+def listing(ui: Ui, request: NoRequest) -> list[dict[str, str]]:
     """The robots to choose from: `robot`, its summary, and where it is from."""
     found = []
     plugins = {config.name: config.summary for config in installed_plugins().configs}
@@ -59,7 +78,7 @@ def _yamls(ui: Ui) -> Iterator[Path]:
             folders[:] = sorted(kept) if depth < _DEPTH else []
             for name in sorted(names):
                 path = parent / name
-                if path.suffix in (".yaml", ".yml") and path.is_file() and _ROBOT.search(_head(path)):
+                if path.suffix in (".yaml", ".yml") and ui.folders.has(path) and _ROBOT.search(_head(path)):
                     yield path
                     seen += 1
                     if seen == _MOST:
@@ -81,9 +100,9 @@ def _summary(content: str) -> str:
     return re.split(r"(?<=[.:]) ", words, maxsplit=1)[0].rstrip(".:")
 
 
-def check(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+def check(ui: Ui, request: NamesRobot) -> dict[str, Any]:
     """What `ibrobot config check` reports about a robot, and its modes and devices."""
-    robot, simulated = robot_of(ui, facts), facts.get("sim") == "true"
+    robot, simulated = robot_of(ui, request.robot), request.sim
     registry = installed_plugins()
     with _checking:
         try:
@@ -152,37 +171,35 @@ def _mode_for_page(config: RobotConfig) -> str:
     return own[0] if own else config.default_control_mode
 
 
-def launch(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
+def launch(ui: Ui, request: Launch) -> dict[str, int]:
     """Launch a robot with its page."""
-    robot = robot_of(ui, facts)
-    arguments = ["launch", *run_arguments(ui, facts)]
-    job = ui.jobs.start("run", _title(robot, facts), arguments, read=read_address, done_codes=RUN_DONE)
+    robot = robot_of(ui, request.robot)
+    arguments = ["launch", *run_arguments(ui, request)]
+    job = ui.jobs.start("run", _title(robot, simulated=request.sim), arguments, read=read_address, done_codes=RUN_DONE)
     return {"number": job.number}
 
 
-def robot_of(ui: Ui, facts: Mapping[str, Any]) -> str:
-    """The robot of a request: the name of a shipped one, or the path of a file in an opened folder.
+def robot_of(ui: Ui, name: str) -> str:
+    """The robot that a request names: the name of a shipped one, or the path of a file in an opened folder.
 
     Raises:
         IbrobotError: if it is outside the opened folders.
     """
-    name = text(facts, "robot")
     return name if name in shipped_configs(installed_plugins()) else str(ui.folders.find(name))
 
 
-def run_arguments(ui: Ui, facts: Mapping[str, Any]) -> list[str]:
+def run_arguments(ui: Ui, request: Launch) -> list[str]:
     """The arguments of a run: robot, body, mode and page."""
-    mode = text(facts, "mode", "")
     return [
-        robot_of(ui, facts),
-        *(["--sim"] if flag(facts, "sim") else []),
-        *([f"--mode={mode}"] if mode else []),
+        robot_of(ui, request.robot),
+        *(["--sim"] if request.sim else []),
+        *([f"--mode={request.mode}"] if request.mode else []),
         *ui.run_options,
     ]
 
 
-def _title(robot: str, facts: Mapping[str, Any]) -> str:
-    return f"{Path(robot).stem} in simulation" if flag(facts, "sim") else Path(robot).stem
+def _title(robot: str, *, simulated: bool) -> str:
+    return f"{Path(robot).stem} in simulation" if simulated else Path(robot).stem
 
 
 def read_address(line: str) -> Mapping[str, Any] | None:
@@ -191,4 +208,8 @@ def read_address(line: str) -> Mapping[str, Any] | None:
     return found.groupdict() if found is not None else None
 
 
-ROUTES: dict[str, Handler] = {"GET /list": listing, "GET /check": check, "POST /launch": launch}
+ROUTES: dict[str, Route[Any]] = {
+    "GET /list": Route(listing, NoRequest),
+    "GET /check": Route(check, NamesRobot),
+    "POST /launch": Route(launch, Launch),
+}

@@ -17,7 +17,8 @@ from aiohttp import WSMsgType, web
 from ibrobot_core.api import ConfigError, IbrobotError, error_text
 from ibrobot_web.server.app import STATIC, Files
 from ibrobot_web.server.guard import Guard
-from ibrobot_web.ui.context import Blob, Handler, Ui
+from ibrobot_web.server.listening import REQUEST_S
+from ibrobot_web.ui.context import Blob, Route, Ui
 
 VIEWS = {
     "robots": "Robots",
@@ -72,27 +73,27 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
     app.router.add_get("/api/jobs", follow)
     app.router.add_get("/static/{path:.*}", files.serve)
     for name in VIEWS:
-        for route, handler in routes_of(name).items():
+        for route, answered in routes_of(name).items():
             method, path = route.split()
-            app.router.add_route(method, f"/api/{name}{path}", functools.partial(_answer, handler, guard))
+            app.router.add_route(method, f"/api/{name}{path}", functools.partial(_answer, answered, guard))
     return app
 
 
-def routes_of(view: str) -> dict[str, Handler]:
-    """The requests of a view, e.g. `GET /list`, and what answers each."""
-    routes: dict[str, Handler] = import_module(f"ibrobot_web.ui.{view}").ROUTES
+def routes_of(view: str) -> dict[str, Route[Any]]:
+    """The requests of a view, e.g. `GET /list`, and how each is answered."""
+    routes: dict[str, Route[Any]] = import_module(f"ibrobot_web.ui.{view}").ROUTES
     return routes
 
 
-async def _answer(handler: Handler, guard: Guard, request: web.Request) -> web.StreamResponse:
+async def _answer(route: Route[Any], guard: Guard, request: web.Request) -> web.StreamResponse:
     """Answer a view's request, in a thread. Sessions for watching may only GET, which changes nothing."""
     if request.method == "GET":
-        facts: Mapping[str, Any] = dict(request.query)
+        facts = route.read_query(request.query)
     else:
         if guard.session(request).role != "drive":
             raise IbrobotError("this link is for watching only")
-        facts = await _body(request)
-    answer = await asyncio.to_thread(handler, request.app[_UI], facts)
+        facts = route.read(await _body(request))
+    answer = await asyncio.to_thread(route.answer, request.app[_UI], facts)
     if isinstance(answer, Blob):
         return web.Response(body=answer.content, content_type=answer.content_type)
     return web.json_response(answer, dumps=_dumps)
@@ -102,7 +103,10 @@ async def _body(request: web.Request) -> Mapping[str, Any]:
     if request.content_type != "application/json":
         raise IbrobotError("a request must be JSON")
     try:
-        body = json.loads(await request.read())
+        async with asyncio.timeout(REQUEST_S):
+            body = json.loads(await request.read())
+    except TimeoutError:
+        raise web.HTTPRequestTimeout from None
     except (ValueError, RecursionError):
         raise IbrobotError("a request must be JSON") from None
     if not isinstance(body, dict):

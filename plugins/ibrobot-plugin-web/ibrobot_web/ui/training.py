@@ -10,9 +10,20 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.api import ConfigError, IbrobotError, find_config, from_document, installed_plugins, parse_yaml
+import attrs
+
+from ibrobot_core.api import (
+    ConfigError,
+    IbrobotError,
+    NoRequest,
+    find_config,
+    from_document,
+    installed_plugins,
+    option,
+    parse_yaml,
+)
 from ibrobot_web.model_edit import ModelEdit, with_model
-from ibrobot_web.ui.context import Handler, Ui, integer, text
+from ibrobot_web.ui.context import Route, Ui
 from ibrobot_web.ui.convert import parse_event
 from ibrobot_web.ui.job_runner import Reader
 from ibrobot_web.ui.recordings import find_recordings
@@ -28,7 +39,37 @@ _WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _DEVICE = re.compile(r"[a-z]+(:\d+)?")
 
 
-def listing(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+@attrs.frozen
+class Training:
+    """What to train."""
+
+    dataset: str = option(help="dataset to train on")
+    out: str = option(help="folder of the checkpoints")
+    steps: int = option(ge=1, le=100_000_000, help="number of steps")
+    batch_size: int = option(ge=1, le=1_000_000, help="frames of a step")
+    policy: str = option("small_act", help="type of the policy")
+    device: str = option("auto", help="where it is trained, e.g. cuda:0")
+
+
+@attrs.frozen
+class Change:
+    """A change of a robot YAML for a trained policy."""
+
+    robot: str = option(help="name of a shipped robot, or path of its YAML")
+    checkpoint: str = option(help="folder of the trained policy")
+    target: str = option("", help="file to write; empty: the robot's own, or a new one")
+    model: str = option("", help="name of the model in the YAML")
+    mode: str = option("", help="name of the mode that runs it")
+
+
+@attrs.frozen(kw_only=True)
+class AgreedChange(Change):
+    """A change that was shown."""
+
+    digest: str = option(help="of the file for which it was shown")
+
+
+def listing(ui: Ui, request: NoRequest) -> dict[str, Any]:
     """Datasets to train on, trained policies, and what is missing for training."""
     registry = installed_plugins()
     missing = "" if "train" in registry.commands else "pip install ibrobot-plugin-lerobot"
@@ -58,13 +99,13 @@ def _row(ui: Ui, path: Path) -> dict[str, Any]:
     return {"path": ui.folders.name(path), "changed_s": (path / "config.json").stat().st_mtime}
 
 
-def start(ui: Ui, facts: Mapping[str, Any]) -> dict[str, int]:
+def start(ui: Ui, request: Training) -> dict[str, int]:
     """Begin a training."""
-    dataset, out = ui.folders.find(text(facts, "dataset")), ui.folders.find(text(facts, "out"))
-    policy, device = text(facts, "policy", "small_act"), text(facts, "device", "auto")
+    dataset, out = ui.folders.find(request.dataset), ui.folders.find(request.out)
+    policy, device = request.policy, request.device
     if _WORD.fullmatch(policy) is None or _DEVICE.fullmatch(device) is None:
         raise IbrobotError(f"policy {policy!r} and device {device!r} must be names, e.g. act and cuda:0")
-    steps, batch_size = integer(facts, "steps", least=1), integer(facts, "batch_size", least=1)
+    steps, batch_size = request.steps, request.batch_size
     arguments = [
         "train", "--events", f"--out={out}", f"--policy={policy}", f"--device={device}", f"--steps={steps}",
         f"--batch-size={batch_size}", str(dataset),
@@ -114,9 +155,9 @@ def _left(reports: Sequence[tuple[int, float]], steps: int) -> str:
     return f"about {left_s / 60:.0f} min" if left_s >= 60 else "less than a minute"
 
 
-def preview(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
+def preview(ui: Ui, request: Change) -> dict[str, Any]:
     """The change of a robot YAML for a trained policy, as a diff, and where it would be written."""
-    source, target, edit = _edited(ui, facts)
+    source, target, edit = _edited(ui, request)
     old = source.read_text(encoding="utf-8")
     names = (ui.folders.name(source) if target == source else source.name, ui.folders.name(target))
     diff = difflib.unified_diff(old.splitlines(), edit.text.splitlines(), *names, lineterm="", n=2)
@@ -126,10 +167,10 @@ def preview(ui: Ui, facts: Mapping[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def apply(ui: Ui, facts: Mapping[str, Any]) -> dict[str, str]:
+def apply(ui: Ui, request: AgreedChange) -> dict[str, str]:
     """Write the change that was shown."""
-    source, target, edit = _edited(ui, facts)
-    if _digest(source.read_text(encoding="utf-8")) != text(facts, "digest"):
+    source, target, edit = _edited(ui, request)
+    if _digest(source.read_text(encoding="utf-8")) != request.digest:
         raise IbrobotError(f"{source.name} has changed since; look at the change again")
     if target != source and target.exists():
         raise IbrobotError(f"{ui.folders.name(target)} exists already; choose it as the robot, or another name")
@@ -142,20 +183,20 @@ def apply(ui: Ui, facts: Mapping[str, Any]) -> dict[str, str]:
     return {"robot": ui.folders.name(target), "mode": edit.mode}
 
 
-def _edited(ui: Ui, facts: Mapping[str, Any]) -> tuple[Path, Path, ModelEdit]:
+def _edited(ui: Ui, request: Change) -> tuple[Path, Path, ModelEdit]:
     """The robot's file, the file to write, and its new text. Files outside the opened folders are copied into them."""
-    source = Path(find_config(robot_of(ui, facts), installed_plugins())).resolve()
-    checkpoint = ui.folders.find(text(facts, "checkpoint"))
+    source = Path(find_config(robot_of(ui, request.robot), installed_plugins())).resolve()
+    checkpoint = ui.folders.find(request.checkpoint)
     if not (checkpoint / "config.json").is_file():
         raise IbrobotError(f"{ui.folders.name(checkpoint)}: is not a trained policy: it has no config.json")
     inside = any(source.is_relative_to(folder) for folder in ui.folders.paths)
     target = source if inside else ui.folders.first / f"{source.stem}_trained.yaml"
-    given = text(facts, "target", "")
+    given = request.target
     if given and not inside:
         target = ui.folders.find(given)
     if target.suffix not in (".yaml", ".yml"):
         raise IbrobotError(f"{ui.folders.name(target)}: a robot's file must end with .yaml")
-    model, mode = text(facts, "model", ""), text(facts, "mode", "")
+    model, mode = request.model, request.mode
     return source, target, with_model(source.read_text(encoding="utf-8"), str(checkpoint), model=model, mode=mode)
 
 
@@ -177,9 +218,9 @@ def _problems(content: str, target: Path) -> list[str]:
     return [f"{each.path}: {each.message}" for each in found]
 
 
-ROUTES: dict[str, Handler] = {
-    "GET /list": listing,
-    "POST /start": start,
-    "GET /preview": preview,
-    "POST /apply": apply,
+ROUTES: dict[str, Route[Any]] = {
+    "GET /list": Route(listing, NoRequest),
+    "POST /start": Route(start, Training),
+    "GET /preview": Route(preview, Change),
+    "POST /apply": Route(apply, AgreedChange),
 }
