@@ -52,8 +52,8 @@ class Log:
     def read(cls, path: Path) -> Log:
         text = path.read_text()
         header, *rows = csv.reader(text.splitlines())
-        assert tuple(header) == ("time_s", *JOINTS)
-        numbers = np.array(rows, dtype=float)
+        assert tuple(header) == ("time_s", *JOINTS, "crc32")
+        numbers = np.array([row[:-1] for row in rows], dtype=float)
         return cls(numbers[:, 0], numbers[:, 1:], text)
 
     def joint(self, name: str) -> np.ndarray:

@@ -1,10 +1,14 @@
-"""Joint logs on disk: a CSV with the header `time_s,JOINT,…` and a row of positions [rad] for each time."""
+"""Joint logs on disk: a CSV with the header `time_s,JOINT,…` and a row of positions [rad] for each time.
+
+Recorded logs have a last column `crc32`: the checksum of all lines up to this one, without this column in the rows.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from zlib import crc32
 
 import attrs
 import numpy as np
@@ -12,7 +16,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import RecorderError
 
-TIME = "time_s"
+TIME, SUM = "time_s", "crc32"
 
 
 @attrs.frozen(eq=False)
@@ -26,16 +30,25 @@ class JointLog:
     """[rad], shape (N, J)."""
 
 
-def header(joints: Sequence[str]) -> str:
-    """The first line of a log."""
-    return ",".join((TIME, *joints)) + "\n"
+def header(joints: Sequence[str]) -> tuple[str, int]:
+    """The first line of a log, and its checksum."""
+    line = ",".join((TIME, *joints, SUM))
+    return f"{line}\n", crc32(line.encode())
 
 
-def row(time_ns: int, positions: Iterable[float]) -> str:
-    """A line of a log, from which the same floats and the exact time in nanoseconds can be read."""
+def row(time_ns: int, positions: Iterable[float], checksum: int) -> tuple[str, int]:
+    """A line of a log, from which the same floats and the exact time in nanoseconds can be read, and its checksum.
+
+    Args:
+        time_ns: the time [ns].
+        positions: [rad].
+        checksum: of the line before.
+    """
     sign, time_ns = ("-", -time_ns) if time_ns < 0 else ("", time_ns)
     time = f"{sign}{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000:09d}"
-    return ",".join((time, *(repr(float(p)) for p in positions))) + "\n"
+    line = ",".join((time, *(repr(float(p)) for p in positions)))
+    checksum = crc32(line.encode(), checksum)
+    return f"{line},{checksum:08x}\n", checksum
 
 
 def read_log(path: Path) -> JointLog:
@@ -46,10 +59,14 @@ def read_log(path: Path) -> JointLog:
     """
     try:
         # Accept the byte order mark that spreadsheets write.
-        first, *rows = path.read_text(encoding="utf-8-sig").removesuffix("\n").split("\n")
+        *lines, rest = path.read_text(encoding="utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise RecorderError(f"{path}: cannot be read: {error}") from None
-    names = [name.strip() for name in first.split(",")]
+    if rest:
+        raise RecorderError(f"{path}:{len(lines) + 1}: the line does not end, so the log was cut off within it")
+    first, *rows = lines or [""]
+    rows = _checked(path, first, rows)
+    names = [name.strip() for name in first.removesuffix(f",{SUM}").split(",")]
     _check_header(path, names)
     times: list[float] = []
     samples: list[list[float]] = []
@@ -63,6 +80,23 @@ def read_log(path: Path) -> JointLog:
     if not times:
         raise RecorderError(f"{path}:1: has no row after the header")
     return JointLog(tuple(names[1:]), np.array(times), np.array(samples))
+
+
+def _checked(path: Path, first: str, rows: Sequence[str]) -> list[str]:
+    """The rows without their checksums, which a log that was written by hand does not have."""
+    if not first.endswith(f",{SUM}"):
+        return list(rows)
+    checksum, checked = crc32(first.encode()), []
+    for number, line in enumerate(rows, start=2):
+        content, _, stated = line.rpartition(",")
+        checksum = crc32(content.encode(), checksum)
+        if stated != f"{checksum:08x}":
+            raise RecorderError(
+                f"{path}:{number}: the line or one before it was changed: {SUM} is {stated!r}, must be "
+                f"{checksum:08x}; after a change on purpose, remove the column {SUM}"
+            )
+        checked.append(content)
+    return checked
 
 
 def _check_header(path: Path, names: Sequence[str]) -> None:

@@ -54,6 +54,9 @@ class JointLogReader(EpisodeReader):
         self._file = self._path / LOG if self._path.is_dir() else self._path
         self._facts = _facts(self._path / METADATA) if self._path.is_dir() else {}
         self._log = read_log(self._file)
+        stated, count = self._facts.get("samples"), len(self._log.times)
+        if stated is not None and self._facts.get("outcome") != "unfinished" and stated != count:
+            raise RecorderError(f"{self._file}: has {count} samples, {METADATA} says {stated}: lines are missing")
         contract = address.given.get("contract")
         parts = Contract.from_canonical(json.loads(contract)).action_parts if contract is not None else ()
         for part in parts:

@@ -26,6 +26,10 @@ class _Episode:
 
     start: EpisodeStart
     descriptor: int
+    checksum: int = 0
+    """Of the last row."""
+    written_checksum: int = 0
+    """Of the last row on the disk."""
     size: int = 0
     rows: list[str] = attrs.field(factory=list)
     oldest_ns: int = 0
@@ -34,7 +38,7 @@ class _Episode:
     repeated: int = 0
 
     def flush(self) -> None:
-        block = "".join(self.rows).encode()
+        block, count = "".join(self.rows).encode(), len(self.rows)
         self.rows.clear()
         try:
             written = os.write(self.descriptor, block)
@@ -42,8 +46,10 @@ class _Episode:
                 raise OSError(f"only {written} of {len(block)} bytes were written")
         except OSError as error:
             os.ftruncate(self.descriptor, self.size)
+            self.samples, self.checksum = self.samples - count, self.written_checksum  # these rows are lost
             raise RecorderError(f"{self.start.directory / 'joints.csv'}: {error}") from error
         self.size += len(block)
+        self.written_checksum = self.checksum
 
 
 class JointLogRecorder(Recorder):
@@ -66,7 +72,8 @@ class JointLogRecorder(Recorder):
         except OSError as error:
             raise RecorderError(f"cannot record into {episode.directory}: {error}") from error
         try:
-            opened.rows.append(header(self._joints))
+            line, opened.checksum = header(self._joints)
+            opened.rows.append(line)
             opened.flush()
             self._write_metadata(opened, {"outcome": "unfinished"})
         except RecorderError:
@@ -86,10 +93,11 @@ class JointLogRecorder(Recorder):
             # After a lost reply, the last reading is published again with its old stamp; skip it.
             episode.repeated += 1
             return
-        line = row(stamp_ns - episode.start.stamp_ns, self._positions(message))
+        line, checksum = row(stamp_ns - episode.start.stamp_ns, self._positions(message), episode.checksum)
         if not episode.rows:
             episode.oldest_ns = stamp_ns
         episode.rows.append(line)
+        episode.checksum = checksum
         episode.newest_ns = stamp_ns
         episode.samples += 1
         if stamp_ns - episode.oldest_ns >= FLUSH_NS:

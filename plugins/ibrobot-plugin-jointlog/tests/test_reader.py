@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from ibrobot_jointlog import ibrobot_readers
-from ibrobot_jointlog.log import header, row
+from ibrobot_jointlog.log import header, read_log, row
 from ibrobot_testing import make_robot
 
 from ibrobot_core.api import (
@@ -29,7 +31,11 @@ WAVE = np.array([[0.1 * i, -0.2 * i, 0.3, 0.0, 0.01 * i, 0.5] for i in range(5)]
 
 def write_log(path: Path, joints: tuple[str, ...] = JOINTS) -> Path:
     columns = [JOINTS.index(joint) for joint in joints]
-    path.write_text(header(joints) + "".join(row(ns(2.0 + 0.1 * i), p[columns]) for i, p in enumerate(WAVE)))
+    text, checksum = header(joints)
+    for i, positions in enumerate(WAVE):
+        line, checksum = row(ns(2.0 + 0.1 * i), positions[columns], checksum)
+        text += line
+    path.write_text(text)
     return path
 
 
@@ -74,6 +80,37 @@ def test_joint_of_the_contract_that_the_log_lacks_is_named(tmp_path: Path):
         read(path, contract(JOINTS))
 
 
+@given(at=st.integers(0, 10_000), bit=st.integers(0, 7))
+def test_no_flipped_bit_goes_unnoticed(tmp_path_factory: pytest.TempPathFactory, at: int, bit: int):
+    path = write_log(tmp_path_factory.mktemp("log") / "wave.csv")
+    whole = bytearray(path.read_bytes())
+    whole[at % len(whole)] ^= 1 << bit
+    path.write_bytes(whole)
+    with pytest.raises(RecorderError):
+        read_log(path)
+
+
+@given(size=st.integers(0, 10_000))
+def test_a_log_that_was_cut_is_refused_or_has_whole_lines(tmp_path_factory: pytest.TempPathFactory, size: int):
+    path = write_log(tmp_path_factory.mktemp("log") / "wave.csv")
+    whole = path.read_bytes()
+    part = whole[: size % len(whole)]
+    path.write_bytes(part)
+    if part.endswith(b"\n") and part.count(b"\n") > 1:
+        np.testing.assert_array_equal(read_log(path).positions, WAVE[: part.count(b"\n") - 1])
+    else:
+        with pytest.raises(RecorderError):
+            read_log(path)
+
+
+def test_a_lost_line_is_found(tmp_path: Path):
+    path = write_log(tmp_path / "wave.csv")
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:2] + lines[3:]))
+    with pytest.raises(RecorderError, match=r"wave\.csv:3: the line or one before it was changed: crc32 is"):
+        read_log(path)
+
+
 def test_other_files_are_no_joint_logs(tmp_path: Path):
     (descriptor,) = ibrobot_readers()
     (tmp_path / "table.csv").write_text("a,b\n1,2\n")
@@ -83,7 +120,7 @@ def test_other_files_are_no_joint_logs(tmp_path: Path):
 
 
 NUMBERS = ",0,0,0,0,0,0\n"
-HEADER = header(JOINTS)
+HEADER = f"time_s,{','.join(JOINTS)}\n"
 BAD = {
     "no joint": ("time_s,\n", "1: the header begins with 'time_s', must be time_s,JOINT,…"),
     "joint twice": (HEADER.replace("elbow_flex", "gripper"), "1: joint 'gripper' has 2 columns, must have one"),
@@ -94,6 +131,10 @@ BAD = {
     "not finite": (HEADER + "0" + NUMBERS + "1,0,0,0,0,nan,0\n", "3: wrist_roll is nan, must be finite"),
     "time not finite": (HEADER + "inf" + NUMBERS, "2: time_s is inf, must be finite"),
     "time stands": (HEADER + "1" + NUMBERS + "1" + NUMBERS, "3: time_s is 1.0, must be greater than 1.0"),
+    "no end": (
+        HEADER + "0" + NUMBERS + "1,0,0,0,0,0,-0.",
+        "3: the line does not end, so the log was cut off within it",
+    ),
     "time runs back": (HEADER + "2" + NUMBERS + "1" + NUMBERS, "3: time_s is 1.0, must be greater than 2.0"),
 }
 

@@ -197,3 +197,14 @@ def test_an_episode_without_joint_states_is_refused(recorder, tmp_path):
 def test_the_hook_offers_the_recorder():
     (descriptor,) = ibrobot_recorders()
     assert isinstance(descriptor.make(descriptor.options(), host_context()), JointLogRecorder)
+
+
+def test_an_episode_whose_log_lacks_its_last_lines_is_refused(recorder, episode):
+    recorder.begin(episode)
+    for i in range(3):
+        recorder.write("/joint_states", state(START_NS + i, [0.0] * 6), START_NS)
+    path = recorder.end(EpisodeEnd(START_NS + 3, "success"))
+    log = path / "joints.csv"
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:-1]))
+    with pytest.raises(RecorderError, match=r"joints\.csv: has 2 samples, metadata\.json says 3: lines are missing"):
+        JointLogReader(EpisodeAddress(path))
