@@ -15,18 +15,15 @@ from ibrobot_core.api import RecorderError, echo, wrong_input
 @wrong_input()
 def mark(episodes: tuple[Path, ...], outcome: str) -> None:
     """Set the OUTCOME of EPISODES, e.g. after a repair. The episode records that its outcome was set by hand."""
+    from ibrobot_mcap.commands.found import opened
     from ibrobot_mcap.facts import set_custom
     from ibrobot_mcap.metadata import MARKED, OUTCOME
     from ibrobot_mcap.owning import owning
-    from ibrobot_mcap.reader import Rosbag2Reader
 
     for episode in episodes:
         with owning(episode, "is being marked"):
-            reader = Rosbag2Reader(episode)
-            try:
+            with opened(episode) as reader:
                 whole = episode.is_dir() and reader.finished and not reader.short()
-            finally:
-                reader.close()
             if not whole:
                 raise RecorderError(f"{episode}: is unfinished, or lacks messages; run `ibrobot episodes repair` first")
             set_custom(episode, {OUTCOME: outcome, MARKED: "true"})
