@@ -221,7 +221,7 @@ class Started:
 
 
 def aside(act: Callable[..., Any], *arguments: Any) -> Any:
-    """The result of a function in a forked process: pyarrow starts threads, which a process that forks must not have."""
+    """The result of a function in a forked process, since pyarrow starts threads, and this process forks."""
     read, write_ = os.pipe()
     child = os.fork()
     if child == 0:
@@ -336,7 +336,7 @@ def trial(
             here("episodes", "repair", place / "pick")
         if names[0] in ("convert", "append", "merge"):  # the others are done or not
             ended.append(Started(names[0], place, 0.0).end())
-            if ended[-1].code and not (ended[-1].code == 1 and "left out" in ended[-1].said):
+            if "already has a dataset" in ended[-1].said:
                 return ended, [f"{names[0]}: does not go on: {ended[-1].said[-300:]}"]
     return ended, aside(all_faults, place, ended)
 
