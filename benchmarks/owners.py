@@ -18,7 +18,6 @@ import io
 import itertools
 import json
 import os
-import pickle
 import random
 import re
 import shutil
@@ -106,7 +105,7 @@ def write(folder: Path, count: int, number: int, pause_s: float = 0.0) -> None:
 def record(place: Path) -> None:
     taken = take_next_folder(SimpleNamespace(folder=place / "pick"))  # type: ignore[arg-type]
     with taken:
-        write(taken.path, RECORDED, random.getrandbits(60), 0.004)
+        write(taken.path, RECORDED, random.getrandbits(60), 0.016)
 
 
 def merge(place: Path) -> None:
@@ -225,14 +224,14 @@ def aside(act: Callable[..., Any], *arguments: Any) -> Any:
     read, write_ = os.pipe()
     child = os.fork()
     if child == 0:
-        with open(write_, "wb") as stream:
-            pickle.dump(act(*arguments), stream)
+        with open(write_, "w") as stream:
+            json.dump(act(*arguments), stream)
         os._exit(0)
     os.close(write_)
-    with open(read, "rb") as stream:
-        content = stream.read()
+    with open(read) as stream:
+        result = json.load(stream)
     assert os.waitpid(child, 0)[1] == 0
-    return pickle.loads(content)  # noqa: S301 - of this process
+    return result
 
 
 def all_faults(place: Path, ended: list[Ended]) -> list[str]:
@@ -277,10 +276,10 @@ def faults(place: Path, ended: list[Ended]) -> Iterator[str]:
             # What a refused conversion has converted stays for the next one.
             if left and not (left == [".staging"] and any(each.code for each in ended)):
                 yield f"{name}: {left} is left"
-    there = lengths(place / "set")
-    if "merge" in kept and len(there) < 2:
+    episodes = len(lengths(place / "set"))
+    if "merge" in kept and episodes < 2:
         yield "the merged part is not there"
-    if {"append", "merge"} <= kept and len(there) < 3 and any("1 episode" in each.said for each in ended):
+    if {"append", "merge"} <= kept and episodes < 3 and any("1 episode" in each.said for each in ended):
         yield "of what was appended and merged, one is missing"
     for each in ended:
         yield from refusal_faults(each)

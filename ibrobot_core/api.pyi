@@ -92,7 +92,9 @@ from ibrobot_core.interfaces import (
     Transport as Transport,
     Viewer as Viewer,
     begin_operation as begin_operation,
+    find_episode as find_episode,
     nan_vector as nan_vector,
+    short_name as short_name,
     operate as operate,
     trajectory_goal as trajectory_goal,
 )
@@ -203,7 +205,11 @@ from ibrobot_core.launch.runtime import (
 from ibrobot_core.cli.run import run_robot as run_robot
 from ibrobot_core.launch.absence import absent_sensors as absent_sensors, describe_absent as describe_absent
 from ibrobot_core.launch.models import check_models as check_models
-from ibrobot_core.cli.options import run_options as run_options, run_overrides as run_overrides
+from ibrobot_core.cli.options import (
+    EpisodePath as EpisodePath,
+    run_options as run_options,
+    run_overrides as run_overrides,
+)
 from ibrobot_core.run_hooks import RUN_KEYS as RUN_KEYS, RunHooks as RunHooks
 from ibrobot_core.launch.transport import TransportLink as TransportLink
 from ibrobot_core.units import (

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, override
 
 import click
 from click import argument, option
 
 from ibrobot_core.descriptors import ViewerDescriptor
+from ibrobot_core.interfaces.reader import find_episode
 from ibrobot_core.plugins import installed_plugins
 
 
@@ -35,6 +38,17 @@ class _ViewerOption(click.Option):
     def get_help_record(self, ctx: click.Context) -> tuple[str, str]:
         flags = ", ".join(f"{flag} ({type_})" for type_, flag in _viewer_flags().items())
         return "--viewer TYPE", f"{self.help} Short: {flags}." if flags else str(self.help)
+
+
+class EpisodePath(click.Path):
+    """A recorded episode or a folder of them: a path, or a short name such as `pick:1`; see `find_episode`."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    @override
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        return find_episode(Path(os.fsdecode(super().convert(value, param, ctx))))
 
 
 _OPTIONS: dict[str, Callable[..., Any]] = {

@@ -32,7 +32,15 @@ from ibrobot_core.interfaces.planner import (
     PositionGoal,
 )
 from ibrobot_core.interfaces.policy import Frame, PictureCodec, Policy, PolicySpec, Tensors
-from ibrobot_core.interfaces.reader import EpisodeAddress, EpisodeReader, EpisodeSummary, Recorded, TopicSummary
+from ibrobot_core.interfaces.reader import (
+    EpisodeAddress,
+    EpisodeReader,
+    EpisodeSummary,
+    Recorded,
+    TopicSummary,
+    find_episode,
+    short_name,
+)
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.interfaces.sensor import Sensor
 from ibrobot_core.interfaces.teleop import OperatorEvent, Teleop, TeleopCommand, begin_operation, operate

@@ -59,6 +59,38 @@ class EpisodeSummary:
     """The outcome stated by the recorder."""
 
 
+_NUMBERED = re.compile(r"(.+):(\d+)")
+_ROOT = Path("episodes")
+"""Folder of datasets whose episodes need no path."""
+
+
+def find_episode(path: Path) -> Path:
+    """The folder of a recorded episode that a short name means; any other path as it is.
+
+    `ROOT/pick:1` is `ROOT/pick/episodes/episode_000001`, and `pick:1` alone also that below `episodes`.
+    """
+    named = _NUMBERED.fullmatch(path.name)
+    if named is None or path.exists():
+        return path
+    dataset = path.with_name(named[1])
+    if path == Path(path.name) and not dataset.exists():
+        dataset = _ROOT / dataset
+    folder = dataset / "episodes" / f"episode_{int(named[2]):06d}"
+    return folder if folder.exists() else path
+
+
+def short_name(episode: Path) -> str:
+    """The shortest name of an episode that every command takes: `find_episode` gives its path."""
+    numbered = re.fullmatch(r"episode_(\d{6,})", episode.name)
+    if numbered is not None and episode.parent.name == "episodes":
+        dataset = episode.parents[1]
+        for name in (dataset.name, str(dataset)):
+            short = f"{name}:{int(numbered[1])}"
+            if find_episode(Path(short)) == episode:
+                return short
+    return str(episode)
+
+
 @attrs.frozen
 class EpisodeAddress:
     """The address of an episode."""
@@ -72,14 +104,15 @@ class EpisodeAddress:
 
     @classmethod
     def of(cls, path: Path, given: Mapping[str, str] | None = None) -> EpisodeAddress:
-        """Parse the path of an episode, or `DATASET:N`.
+        """Parse the path of an episode, its short name, or `DATASET:N`.
 
         Raises:
             RecorderError: if it does not exist.
         """
-        named = re.fullmatch(r"(.+):(\d+)", path.name)
+        path = find_episode(path)
         if path.exists():
             return cls(path, None, given or {})
+        named = _NUMBERED.fullmatch(path.name)
         if named is None or not (dataset := path.with_name(named[1])).exists():
             raise RecorderError(f"{path}: there is no such episode")
         return cls(dataset, int(named[2]), given or {})

@@ -378,3 +378,15 @@ def test_by_default_all_cores_convert(bags: Path, tmp_path: Path, monkeypatch: p
     assert convert(bags, "--out", tmp_path / "default").returncode == 0
     assert convert(bags, "--out", tmp_path / "given", "--jobs", "2").returncode == 0
     assert jobs == [3, 2]
+
+
+def test_episodes_and_datasets_have_short_names(bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "episodes").mkdir()
+    bags.rename(tmp_path / "episodes/pick")
+    monkeypatch.chdir(tmp_path)
+    assert report("pick:2", "--out", "set")["reports"][0]["source"] == "pick/episode_000002"
+    assert "episodes/pick/episodes/episode_000002: " in run_here("replay", "pick:2", "--sim", "--dry-run").stderr
+    assert "pick:3: there is no such episode" in run_here("replay", "pick:3", "--sim", "--dry-run").stderr
+    (tmp_path / "set").rename("pick")  # a dataset of that name here: its episode 2, from 0
+    assert "has no episode 2; available: 0 to 0" in convert("pick:2", "--out", "again").stderr
+    assert report("pick:0", "episodes/pick:2", "--out", "again")["episodes"] == 2

@@ -23,6 +23,7 @@ from ibrobot_core.api import (
     Contract,
     DatasetDescriptor,
     DatasetError,
+    EpisodePath,
     Flag,
     echo,
     installed_plugins,
@@ -65,7 +66,7 @@ def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @click.command()
-@click.argument("episodes", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("episodes", nargs=-1, required=True, type=EpisodePath())
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The dataset: a new folder.")
 @click.option("--to", type=click.Choice(("dataset", "bag")), default="dataset", show_default=True, help="What to make.")
 @click.option("--episodes", "numbers", metavar="N,N-M", help="With --to bag: only these episodes, counted from 0.")

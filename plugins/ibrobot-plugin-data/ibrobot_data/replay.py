@@ -15,6 +15,7 @@ from ibrobot_core.api import (
     NORM_MODES,
     Contract,
     ContractError,
+    EpisodePath,
     EpisodeSummary,
     LaunchRequest,
     RecorderError,
@@ -45,7 +46,7 @@ _MODE = "replay"
 
 
 @click.command()
-@click.argument("episode", type=click.Path(path_type=Path))
+@click.argument("episode", type=EpisodePath())
 @run_options("config", "sim", "lockstep")
 @click.option(
     "--speed", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, metavar="X",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -69,12 +70,39 @@ def test_list_tells_every_episode_of_a_folder_of_datasets(tmp_path):
     made(tmp_path, 1, prompt="pick the cube")
     unfinish(made(tmp_path, 2), cut=400)
     output = run("list", tmp_path)
-    assert "pick/episode_000001" in output
+    assert f" {tmp_path / 'pick'}:1 " in output
     assert "unfinished" in output
     rows = json.loads(run("list", tmp_path / "pick", "--json"))
     assert [row["finished"] for row in rows] == [True, False]
     assert rows[0]["messages"] == 100
     assert rows[0]["prompt"] == "pick the cube"
+
+
+def test_every_command_takes_the_names_that_list_prints(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = made(tmp_path / "episodes", 12)
+    (path.parent / "episode_000012_restored").mkdir()
+    shutil.copytree(path, path.parent / "episode_000012_restored", dirs_exist_ok=True)
+    for folder in ("episodes", "episodes/pick", "episodes/pick/episodes"):
+        assert [line.split()[0] for line in run("list", folder).splitlines()[1:]] == [
+            "pick:12",
+            "episodes/pick/episodes/episode_000012_restored",
+        ]
+    assert run("list", tmp_path / "episodes").splitlines()[1].split()[0] == f"{tmp_path}/episodes/pick:12"
+    for name in ("pick:12", "episodes/pick:12", f"{tmp_path}/episodes/pick:12"):
+        for command in (
+            ("list", name), ("info", name), ("verify", name), ("repair", name), ("mark", name, "success"),
+            ("export", name, JOINTS, "-o", "joints.csv"), ("trim", name, "--to", "0.5", "-o", "part"),
+            ("trim", name, "--in-place", "--to", "0.9"), ("delete", name, "--yes"),
+        ):  # fmt: skip
+            assert "no such" not in run(*command)
+        assert not path.exists()
+        (tmp_path / "joints.csv").unlink()
+        shutil.rmtree(tmp_path / "part")
+        run("trash", "episodes/pick", "--empty", "--yes")
+        made(tmp_path / "episodes", 12)
+    with pytest.raises(RecorderError, match="pick:13: there is no such episode"):
+        run("info", "pick:13")
 
 
 def test_names_are_whole_where_the_output_goes_to_a_file_or_a_program(tmp_path):
@@ -94,7 +122,7 @@ def test_one_that_cannot_be_read_does_not_hide_the_others(tmp_path):
     (bad / "metadata.yaml").write_text("][")
     result = CliRunner().invoke(episodes, ["list", str(tmp_path)])
     assert result.exit_code == 1
-    assert "pick/episode_000001" in result.output
+    assert f"{tmp_path / 'pick'}:1 " in result.output
     assert "unreadable" in result.output
 
 

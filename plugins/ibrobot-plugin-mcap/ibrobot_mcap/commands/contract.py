@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import RecorderError, echo, wrong_input
+from ibrobot_core.api import EpisodePath, RecorderError, echo, wrong_input
 
 
 @click.group()
@@ -15,7 +15,7 @@ def contract() -> None:
 
 
 @contract.command()
-@click.argument("bag", type=click.Path(path_type=Path))
+@click.argument("bag", type=EpisodePath())
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="The new file; by default, print the contract.")
 @wrong_input()
 def init(bag: Path, output: Path | None) -> None:

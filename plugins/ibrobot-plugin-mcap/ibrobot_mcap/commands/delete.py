@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import Declined, RecorderError, echo, wrong_input
+from ibrobot_core.api import Declined, EpisodePath, RecorderError, echo, wrong_input
 
 
 @click.command()
-@click.argument("episodes", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.argument("episodes", type=EpisodePath(), nargs=-1, required=True)
 @click.option("--yes", is_flag=True, help="Do not ask.")
 @click.option("--to-trash", is_flag=True, help="Move them to .trash beside them, without asking.")
 @wrong_input()

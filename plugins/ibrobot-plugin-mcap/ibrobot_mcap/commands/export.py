@@ -12,14 +12,14 @@ import attrs
 import click
 import numpy as np
 
-from ibrobot_core.api import Image, Message, RecorderError, echo, wrong_input
+from ibrobot_core.api import EpisodePath, Image, Message, RecorderError, echo, wrong_input
 
 _TO_RGB = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, 3), "bgra8": (2, 1, 0, 3)}
 """Encoding -> its channels in PNG order."""
 
 
 @click.command()
-@click.argument("episode", type=click.Path(path_type=Path))
+@click.argument("episode", type=EpisodePath())
 @click.argument("topic")
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), required=True, help="A .csv file, or a folder for images."

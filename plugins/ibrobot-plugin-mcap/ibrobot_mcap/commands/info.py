@@ -10,14 +10,14 @@ import attrs
 import click
 from rich.table import Table
 
-from ibrobot_core.api import Screen, echo, wrong_input
+from ibrobot_core.api import EpisodePath, Screen, echo, wrong_input
 
 _LONG = 200
 """For longer metadata, only the length is printed [characters]."""
 
 
 @click.command()
-@click.argument("episode", type=click.Path(path_type=Path))
+@click.argument("episode", type=EpisodePath())
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, with all metadata.")
 @wrong_input()
 def info(episode: Path, as_json: bool) -> None:

@@ -9,20 +9,21 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from ibrobot_core.api import RecorderError, Screen, echo, styled, wrong_input
+from ibrobot_core.api import EpisodePath, RecorderError, Screen, echo, short_name, styled, wrong_input
 
 _WIDE = 100
 """Width of a terminal with enough room for prompts and years [columns]."""
 
 
 @click.command("list")
-@click.argument("path", type=click.Path(path_type=Path), default=Path("episodes"))
+@click.argument("path", type=EpisodePath(), default=Path("episodes"))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @wrong_input()
 def list_episodes(path: Path, as_json: bool) -> None:
     """List the episodes in PATH.
 
-    PATH is a folder of datasets (by default `episodes`), a dataset, or an episode.
+    PATH is a folder of datasets (by default `episodes`), a dataset, or an episode. All commands take the names that it
+    prints, e.g. pick:1.
     """
     from ibrobot_mcap.commands.found import (
         date_of,
@@ -72,7 +73,7 @@ def list_episodes(path: Path, as_json: bool) -> None:
             table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "prompt")
         for row in rows:
             table.add_row(
-                _shown(Path(str(row["path"])), path),
+                short_name(Path(str(row["path"]))),
                 str(row["date"])[0 if wide else 5 :],
                 f"{row['duration_s']:.1f}",
                 str(row["messages"]),
@@ -86,11 +87,3 @@ def list_episodes(path: Path, as_json: bool) -> None:
         echo(f"unreadable: {problem}", err=True)
     if problems:
         raise SystemExit(1)
-
-
-def _shown(episode: Path, folder: Path) -> str:
-    """An episode's path within the listed folder, without the parts common to all episodes."""
-    if episode == folder:
-        return episode.name
-    parts = [part for part in episode.relative_to(folder).parts if part != "episodes"]
-    return "/".join(parts)

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import RecorderError, echo, wrong_input
+from ibrobot_core.api import EpisodePath, RecorderError, echo, wrong_input
 
 
 @click.command()
-@click.argument("episodes", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("episodes", nargs=-1, required=True, type=EpisodePath())
 @click.argument("outcome", type=click.Choice(("success", "failure", "unknown")))
 @wrong_input()
 def mark(episodes: tuple[Path, ...], outcome: str) -> None:

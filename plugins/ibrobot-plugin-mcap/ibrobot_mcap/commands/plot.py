@@ -10,13 +10,23 @@ from typing import Any
 import click
 import numpy as np
 
-from ibrobot_core.api import NS_PER_S, Contract, Float64MultiArray, Image, JointState, RecorderError, echo, wrong_input
+from ibrobot_core.api import (
+    NS_PER_S,
+    Contract,
+    EpisodePath,
+    Float64MultiArray,
+    Image,
+    JointState,
+    RecorderError,
+    echo,
+    wrong_input,
+)
 
 _THUMBNAILS = 8
 
 
 @click.command()
-@click.argument("episode", type=click.Path(path_type=Path))
+@click.argument("episode", type=EpisodePath())
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="A .png file; by default NAME.png.")
 @wrong_input()
 def plot(episode: Path, output: Path | None) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import EpisodeSummary, InUse, RecorderError, echo, wrong_input
+from ibrobot_core.api import EpisodePath, EpisodeSummary, InUse, RecorderError, echo, wrong_input
 
 
 @click.command()
-@click.argument("path", type=click.Path(path_type=Path))
+@click.argument("path", type=EpisodePath())
 @wrong_input()
 def repair(path: Path) -> None:
     """Repair unfinished or incomplete episodes in PATH.

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import Declined, RecorderError, echo, wrong_input
+from ibrobot_core.api import Declined, EpisodePath, RecorderError, echo, wrong_input
 
 
 @click.command("trash")
-@click.argument("path", type=click.Path(path_type=Path), default=Path("episodes"))
+@click.argument("path", type=EpisodePath(), default=Path("episodes"))
 @click.option("--restore", metavar="ID", help="Put this one back, as it was.")
 @click.option("--empty", is_flag=True, help="Delete all of them for good, after asking.")
 @click.option("--yes", is_flag=True, help="Do not ask.")

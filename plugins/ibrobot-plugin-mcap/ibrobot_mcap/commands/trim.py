@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import echo, wrong_input
+from ibrobot_core.api import EpisodePath, echo, wrong_input
 
 
 @click.command()
-@click.argument("episode", type=click.Path(path_type=Path))
+@click.argument("episode", type=EpisodePath())
 @click.option("--from", "begin_s", type=click.FloatRange(min=0), default=0.0, show_default=True, help="Start [s].")
 @click.option("--to", "end_s", type=click.FloatRange(min=0), help="End [s]; by default the end of the episode.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="The new episode.")

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import echo, wrong_input
+from ibrobot_core.api import EpisodePath, echo, wrong_input
 
 
 @click.command()
-@click.argument("path", type=click.Path(path_type=Path))
+@click.argument("path", type=EpisodePath())
 @click.option("--gap", type=click.FloatRange(min=1), default=5.0, show_default=True, help="Longest pause, in periods.")
 @wrong_input()
 def verify(path: Path, gap: float) -> None:
