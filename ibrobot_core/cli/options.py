@@ -11,7 +11,6 @@ import click
 from click import argument, option
 
 from ibrobot_core.descriptors import ViewerDescriptor
-from ibrobot_core.interfaces.reader import find_episode
 from ibrobot_core.plugins import installed_plugins
 
 
@@ -48,6 +47,8 @@ class EpisodePath(click.Path):
 
     @override
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        from ibrobot_core.interfaces.reader import find_episode
+
         return find_episode(Path(os.fsdecode(super().convert(value, param, ctx))))
 
 
