@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from typing import Any, override
 
 from rich.console import Console
@@ -19,6 +21,11 @@ class Screen(Console):
     @override
     def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(printable(text), **{**options, "markup": False, "emoji": False})
+
+    @override
+    def on_broken_pipe(self) -> None:
+        # Rich would exit without a word.
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
 
 
 def styled(value: object, style: str = "", **options: Any) -> Text:

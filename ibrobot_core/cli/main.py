@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
+import re
 import sys
+from difflib import get_close_matches
 from importlib import import_module
 from typing import override
 
@@ -18,6 +21,9 @@ from ibrobot_core.outside import echo
 
 _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
 """Exit codes of errors without their own; docs/reference/exit-codes.md lists all."""
+
+_OUTPUT_REFUSED = (errno.ENOSPC, errno.EPIPE, errno.EIO)
+"""Errors of a full device, a reader that is gone, and a terminal that is gone."""
 
 COMMANDS = {
     "launch": ("ibrobot_core.cli.launch:launch", "Run a robot, real or simulated."),
@@ -55,6 +61,13 @@ class LazyGroup(click.Group):
         return command
 
     @override
+    def invoke(self, ctx: click.Context) -> object:
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError as error:  # click would exit without a word
+            raise IbrobotError(f"standard output: {error.strerror}") from error
+
+    @override
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         from ibrobot_core.plugins import installed_plugins
 
@@ -76,16 +89,55 @@ def cli(debug: bool) -> None:
 
 def main() -> None:
     """Run the command line. Every error is one line and sets the exit code; see docs/reference/exit-codes.md."""
+    _replace_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # an ASCII terminal shows \u2026 instead of raising an error
             stream.reconfigure(errors="backslashreplace")
     try:
-        sys.exit(cli(prog_name="ibrobot", standalone_mode=False))
+        try:
+            code = cli(prog_name="ibrobot", standalone_mode=False)
+        finally:
+            sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the end of the process: nothing else can tell it
         lines, code = _error_lines(error)
         for line in lines:
             echo(f"error: {line}", err=True)
-        sys.exit(code)
+    sys.exit(code)
+
+
+def _replace_closed_streams() -> None:
+    """Open the null device in place of standard streams that the caller has closed."""
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        if getattr(sys, name) is None:
+            descriptor = os.open(os.devnull, os.O_RDWR)
+            if descriptor != number:
+                os.dup2(descriptor, number)
+                os.close(descriptor)
+            setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
+
+
+def _has_working_folder() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def _discard_output() -> None:
+    """Let the interpreter end without another attempt to write what standard output did not take."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
+
+
+def _suggestion(message: str, ctx: click.Context | None) -> str:
+    """The command that a mistyped one resembles."""
+    mistyped = re.fullmatch(r"No such command '(.*)'", message)
+    if mistyped is None or ctx is None or not isinstance(ctx.command, click.Group):
+        return ""
+    close = get_close_matches(mistyped[1], ctx.command.list_commands(ctx), 1)
+    return f", did you mean {close[0]!r}?" if close else ""
 
 
 def _error_lines(error: BaseException) -> tuple[list[str], int]:
@@ -96,9 +148,22 @@ def _error_lines(error: BaseException) -> tuple[list[str], int]:
         return ["stopped"], _INTERRUPTED
     if isinstance(error, click.UsageError):
         hint = f"; see {error.ctx.command_path} --help" if error.ctx is not None else ""
-        return [error.format_message().replace("\n", " ").removesuffix(".") + hint], _WRONG
+        message = error.format_message().replace("\n", " ").removesuffix(".")
+        return [f"{message}{_suggestion(message, error.ctx)}{hint}"], _WRONG
     if isinstance(error, click.ClickException):
         return error.format_message().splitlines(), _WRONG if isinstance(error, click.FileError) else error.exit_code
-    if isinstance(error, OSError) and error.strerror and str(error.filename) in sys.argv:
-        return [f"{error.filename}: {error.strerror}"], _WRONG
+    if isinstance(error, OSError) and (found := _system_error(error)) is not None:
+        return found
     return [describe_bug(error)], _FAILED
+
+
+def _system_error(error: OSError) -> tuple[list[str], int] | None:
+    """The message and exit code of an error of the caller's files, output or folder; None for any other."""
+    if error.strerror and str(error.filename) in sys.argv:
+        return [f"{error.filename}: {error.strerror}"], _WRONG
+    if error.filename is None and error.errno in _OUTPUT_REFUSED:
+        _discard_output()
+        return [f"standard output: {error.strerror}"], _FAILED
+    if isinstance(error, FileNotFoundError) and not _has_working_folder():
+        return ["the working folder no longer exists: change to another one"], _WRONG
+    return None

@@ -113,4 +113,9 @@ def run_overrides(options: Mapping[str, Any]) -> tuple[str, ...]:
     if viewer and options["headless"]:
         flag = _viewer_flags().get(viewer, "--viewer")
         raise click.UsageError(f"{flag} and --headless exclude each other")
-    return (*([f"viewer.type={viewer}"] if viewer else []), *options["overrides"])
+    if not viewer:
+        return tuple(options["overrides"])
+    from ibrobot_core.config.overrides import Override
+
+    typed = _viewer_flags().get(viewer, f"--viewer {viewer}")
+    return (Override.of(typed, f"viewer.type={viewer}"), *options["overrides"])

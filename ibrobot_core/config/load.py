@@ -131,7 +131,10 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
     entered = simulated or sections.plain.get("default_control_mode")
     Checks(document, sections, communicates).run()
     check_names(document, sections)
-    unavailable = split(document, sections.plain, sections.missing, entered, everything=communicates)
+    simulable = ("hardware", str(document.get("simulation", "type"))) in registry.entries
+    unavailable = split(
+        document, sections.plain, sections.missing, entered, everything=communicates, simulable=simulable
+    )
     contract_checks = ContractChecks(document, sections)
     contract = contract_checks.run()
     document.raise_problems()

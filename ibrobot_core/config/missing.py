@@ -28,8 +28,9 @@ class Missing:
 
 
 def split(
-    document: Document, plain: Mapping[str, Any], missing: Sequence[Missing], entered: str | None, *, everything: bool
-) -> Mapping[str, str]:
+    document: Document, plain: Mapping[str, Any], missing: Sequence[Missing], entered: str | None, *,
+    everything: bool, simulable: bool,
+) -> Mapping[str, str]:  # fmt: skip
     """Add the missing plugins of the entered mode as one problem of the document.
 
     Args:
@@ -38,6 +39,7 @@ def split(
         missing: all missing components.
         entered: the first mode of the run.
         everything: whether all components are needed.
+        simulable: whether `--sim` would run the robot with the installed plugins.
 
     Returns:
         For the other modes, mode -> why it is unavailable.
@@ -52,7 +54,9 @@ def split(
     now = acting | (observed if "recording" in document.root else set()) | used.get(entered or "", set())
     needed = [each for each in missing if everything or each.key in now or not _may_wait(document, each.key)]
     if needed:
-        document.add(needed[0].place, describe(each.error for each in needed))
+        hardware = simulable and any(each.key[0] == "hardware" for each in needed)
+        instead = "; or run it in simulation: --sim" if hardware else ""
+        document.add(needed[0].place, describe(each.error for each in needed) + instead)
     lacking = {name: [each.error for each in missing if each.key in keys] for name, keys in used.items()}
     return {name: describe(errors) for name, errors in lacking.items() if errors and name != entered}
 

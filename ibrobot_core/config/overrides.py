@@ -13,10 +13,23 @@ from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.options import did_you_mean
 
 
+class Override(str):
+    """An override `path.to.key=value` for which the user typed something else, e.g. `--viewer web`."""
+
+    typed: str
+
+    @classmethod
+    def of(cls, typed: str, text: str) -> Override:
+        """The override `text` for what the user typed."""
+        made = cls(text)
+        made.typed = typed
+        return made
+
+
 def apply_overrides(document: Document, overrides: Sequence[str], flag: str = "--set") -> None:
     """Apply `overrides` to `document` in order; their faults are added to it, as faults of the option `flag`."""
     for rank, text in enumerate(overrides, start=1):
-        place = Place(rank, 0, 0, f"{flag} {text}")
+        place = Place(rank, 0, 0, text.typed if isinstance(text, Override) else f"{flag} {text}")
         path, equals, value_text = text.partition("=")
         if not equals or not path or not all(path.split(".")):
             message = "expected PATH=VALUE, e.g. control.rate_hz=50"

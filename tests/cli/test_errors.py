@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from ibrobot_testing import ibrobot_command
 
 from ibrobot_core.bugs import DEBUG
 
@@ -36,6 +38,7 @@ def bugs(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (("config", "check", "a", "b"), 2, "Got unexpected extra argument (b); see ibrobot config check --help"),
         (("odd", "read"), 2, "Missing argument 'FILE'; see ibrobot odd read --help"),
         (("odd", "xyzzy"), 2, "No such command 'xyzzy'; see ibrobot odd --help"),
+        (("confg",), 2, "No such command 'confg', did you mean 'config'?; see ibrobot --help"),
         (("odd", "read", "no.txt"), 2, "no.txt: No such file or directory"),
         (
             ("odd", "take", "no.txt"),
@@ -115,3 +118,45 @@ def test_no_command_needs_more_than_ascii(
         getattr(sys, name).close()
     assert "UnicodeEncodeError" not in (tmp_path / "stderr").read_text()
     assert (tmp_path / "stdout").read_text() + (tmp_path / "stderr").read_text()
+
+
+def piped(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[str]:
+    """Run the command line as a process, with given standard streams."""
+    command = (*ibrobot_command(), *arguments)
+    return subprocess.run(command, text=True, check=False, timeout=60, **streams)
+
+
+def test_full_output_is_an_error_of_one_line() -> None:
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        ran = piped("plugins", stdout=full, stderr=subprocess.PIPE)
+    assert (ran.returncode, ran.stderr) == (1, "error: standard output: No space left on device\n")
+
+
+def test_reader_that_left_is_an_error_of_one_line() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w", encoding="utf-8") as output:
+        ran = piped("plugins", stdout=output, stderr=subprocess.PIPE)
+    assert (ran.returncode, ran.stderr) == (1, "error: standard output: Broken pipe\n")
+
+
+@pytest.mark.parametrize("closed", [0, 1, 2])
+def test_closed_standard_streams_are_no_bug(closed: int) -> None:
+    command = f"{shlex.join(ibrobot_command())} plugins {closed}>&-"
+    ran = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False, timeout=60)
+    assert (ran.returncode, ran.stderr) == (0, "")
+
+
+def test_deleted_working_folder_is_no_bug(tmp_path: Path) -> None:
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    command = f"rmdir {folder} && exec {shlex.join(ibrobot_command())} config check robot.yaml --set recording.root=x"
+    ran = subprocess.run(["sh", "-c", command], cwd=folder, capture_output=True, text=True, check=False, timeout=60)
+    assert ran.returncode == 2
+    assert "bug" not in ran.stderr
+
+
+def test_viewer_is_named_as_it_was_typed(ibrobot: Ibrobot, robot: Path) -> None:
+    ran = ibrobot("launch", "mini.yaml", "--viewer", "foo", "--dry-run")
+    assert ran.code == 2
+    assert ran.err.startswith("error: --viewer foo: viewer.type: ")

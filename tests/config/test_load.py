@@ -284,3 +284,17 @@ def test_mode_with_a_planner_is_unavailable_without_the_source_of_goals(
 def test_executor_of_the_contract_must_be_installed(faults_of_edit: Faults, mode: str) -> None:
     message = faults_of_edit("arm_position: {type: position", "arm_position: {type: trajectory", mode=mode)
     assert message == f"robot.yaml:18: executors.arm_position.type: {NOT_INSTALLED}"
+
+
+@pytest.mark.parametrize(("simulation", "hint"), [("world", "; or run it in simulation: --sim"), ("mujoco", "")])
+def test_hardware_that_is_not_installed_mentions_an_installed_simulation(
+    faults_of_edit: Faults, simulation: str, hint: str
+) -> None:
+    message = faults_of_edit(
+        "hardware: {type: bus, port: /dev/null}\nsimulation: {type: world}",
+        f"hardware: {{type: feetech_so101}}\nsimulation: {{type: {simulation}}}",
+    )
+    assert message == (
+        "robot.yaml:12: hardware.type: hardware type 'feetech_so101' needs a plugin that is not installed: "
+        f"pip install ibrobot-plugin-feetech{hint}"
+    )

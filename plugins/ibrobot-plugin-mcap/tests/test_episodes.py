@@ -368,6 +368,9 @@ def test_delete_asks_and_takes_nothing_but_episodes(tmp_path):
     path = made(tmp_path)
     CliRunner().invoke(episodes, ["delete", str(path)], input="n\n")
     assert path.is_dir()
+    unanswered = CliRunner().invoke(episodes, ["delete", str(path)])
+    assert (unanswered.exit_code, path.is_dir()) == (2, True)
+    assert "Standard input has no answer: run it in a terminal, or give --yes" in unanswered.output
     with pytest.raises(RecorderError, match="is not an episode; nothing was deleted"):
         run("delete", "--yes", path, tmp_path)
     assert path.is_dir()

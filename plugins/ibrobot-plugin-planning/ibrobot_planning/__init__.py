@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from ibrobot_core.api import (
     Command,
     ExecutorDescriptor,
-    ModelError,
     NoOptions,
     OptionFault,
     PlannerDescriptor,
@@ -16,7 +15,6 @@ from ibrobot_core.api import (
     SourceDescriptor,
     did_you_mean,
     hookimpl,
-    read_mjcf,
 )
 from ibrobot_planning.engines import find_engines
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
@@ -135,6 +133,8 @@ def _tasks(options: NoOptions, session: Session) -> Component:
 
 def _unknown_names(options: WorldOptions, robot: Robot) -> Iterable[OptionFault]:
     """Faults of names that are neither a link of the robot's model nor an object."""
+    from ibrobot_core.api import ModelError, read_mjcf
+
     mjcf = robot.description.mjcf
     if mjcf is None:
         return

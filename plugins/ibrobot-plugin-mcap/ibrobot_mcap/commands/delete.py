@@ -20,6 +20,7 @@ def delete(episodes: tuple[Path, ...], yes: bool, to_trash: bool) -> None:
     After --to-trash, `ibrobot episodes trash --restore` brings them back.
     """
     from ibrobot_mcap import trash
+    from ibrobot_mcap.commands.ask import agree
     from ibrobot_mcap.commands.found import size_of, told_size
     from ibrobot_mcap.reader import is_rosbag2
 
@@ -32,7 +33,7 @@ def delete(episodes: tuple[Path, ...], yes: bool, to_trash: bool) -> None:
             echo(f"to undo: ibrobot episodes trash {episode.parent} --restore {trashed.id}", err=True)
             echo(f"{episode}: moved to {trash.TRASH}")
             continue
-        if not (yes or click.confirm(f"delete {episode} ({told_size(size_of(episode))})?")):
+        if not (yes or agree(f"delete {episode} ({told_size(size_of(episode))})?")):
             raise Declined
         trash.delete(episode)
         echo(f"{episode}: deleted")

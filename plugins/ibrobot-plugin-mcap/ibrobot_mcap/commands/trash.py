@@ -25,6 +25,7 @@ def trash_command(path: Path, restore: str | None, empty: bool, yes: bool, as_js
     PATH is a folder of datasets (by default `episodes`), a dataset, or the folder of its episodes.
     """
     from ibrobot_mcap import trash
+    from ibrobot_mcap.commands.ask import agree
     from ibrobot_mcap.commands.found import size_of, told_size
 
     if restore is not None and empty:
@@ -41,7 +42,7 @@ def trash_command(path: Path, restore: str | None, empty: bool, yes: bool, as_js
         return
     sizes = [size_of(each.kept) for each in found]
     if empty:
-        if found and not (yes or click.confirm(f"delete {len(found)} ({told_size(sum(sizes))}) for good?")):
+        if found and not (yes or agree(f"delete {len(found)} ({told_size(sum(sizes))}) for good?")):
             raise Declined
         echo(f"{path}: deleted {len(trash.empty(path))} for good")
     elif as_json:
