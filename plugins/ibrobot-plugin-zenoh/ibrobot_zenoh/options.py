@@ -6,11 +6,14 @@ import ipaddress
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.api import MESSAGE_TYPES, OptionFault, Robot, did_you_mean, documented, option
+from ibrobot_core.api import OptionFault, did_you_mean, documented, option
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
 
 MIB = 1024 * 1024
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
@@ -92,6 +95,8 @@ def _check_topics(instance: Any, attribute: attrs.Attribute[Any], value: tuple[s
 def _check_subscribed(
     instance: Any, attribute: attrs.Attribute[Any], value: tuple[str, ...] | Mapping[str, str]
 ) -> None:
+    from ibrobot_core.api import MESSAGE_TYPES
+
     _check_topics(instance, attribute, tuple(value))
     for topic, type_name in value.items() if isinstance(value, Mapping) else ():
         if type_name not in MESSAGE_TYPES:
