@@ -289,7 +289,7 @@ class _Panel:
         if key == "f10":
             self._try(lambda: self._runtime.reset(stops))
         elif (mode := self._runtime.session.mode_keys.get(key.upper())) is not None:
-            self._try(lambda: self._runtime.switch_mode(mode))
+            self._try(lambda: self._runtime.switch_mode(mode, stops))
 
     def _try(self, act: Callable[[], object]) -> None:
         try:

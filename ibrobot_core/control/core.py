@@ -630,9 +630,9 @@ class ControlCore:
             self._begin_again(self._first_reading())
         return {"cleared": cleared}
 
-    def _refuse_after(self, stops: int) -> None:
+    def _refuse_after(self, stops: int, what: str = "reset") -> None:
         if self.stops > stops:
-            raise HardwareError("reset: refused, an emergency stop came after it was requested")
+            raise HardwareError(f"{what}: refused, an emergency stop came after it was requested")
 
     def _begin_again(self, measured: JointReading) -> None:
         """Enter the mode at `measured`, without faults.
@@ -648,7 +648,9 @@ class ControlCore:
         self.fault = self._unwell = ""
         self._enter()
 
-    def _goal(self, executor: str, goal_id: str, goal: Mapping[str, Any]) -> None:
+    def _goal(self, executor: str, goal_id: str, goal: Mapping[str, Any], stops: int | None = None) -> None:
+        """Pass a goal to an executor; `stops` as for a reset: a goal requested before an emergency stop is refused."""
+        self._refuse_after(self.stops if stops is None else stops, f"goal {goal_id}")
         self._executors.set_goal(executor, goal_id, goal, self._at_tick)
         self._commanded_ns = self._clock.now_ns()
 

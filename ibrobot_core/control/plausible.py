@@ -15,7 +15,7 @@ class Plausibility:
     """Detects readings to which no joint can have moved, e.g. after damage to a reply that its checksum missed.
 
     Within a control period a joint moves at most at `KNOCKED` or at twice its `max_velocity`, whichever is more; in the
-    time for which it was not measured, it moves at most at its `max_velocity`.
+    time for which it was not measured, a period at least, it moves at most at its `max_velocity`.
 
     Args:
         robot: the joints.
@@ -26,6 +26,7 @@ class Plausibility:
         self._names = robot.joint_names
         self._velocity = robot.max_velocity
         self._knock: Vector = np.maximum(KNOCKED, 2 * self._velocity) * seconds(period_ns)
+        self._usual: Vector = self._knock + self._velocity * seconds(period_ns)
 
     def jump(self, before: Vector, now: Vector, since_ns: int) -> str:
         """What is implausible about positions `now` after `before` [rad], shape (J,); empty if nothing is.
@@ -36,6 +37,8 @@ class Plausibility:
             since_ns: time since `before` was measured [ns].
         """
         away = np.abs(now - before)
+        if not (away > self._usual).any():
+            return ""
         beyond = away > self._knock + self._velocity * seconds(since_ns)
         if not beyond.any():
             return ""

@@ -30,6 +30,7 @@ class SetMode:
     """A request to `/set_mode`."""
 
     mode: str = option(help="a control mode of the robot YAML")
+    stops: int | None = option(None, ge=0, help="number of emergency stops that the sender knew of; none: all so far")
 
 
 @documented
@@ -117,7 +118,7 @@ class Runtime:
             if ended and isinstance(error, ComponentFailed):
                 return
             raise
-        session.bus.serve(SET_MODE, lambda request: self.switch_mode(request.mode))
+        session.bus.serve(SET_MODE, lambda request: self.switch_mode(request.mode, request.stops))
         session.bus.serve(RESET, lambda request: self.reset(request.stops))
 
     def wait(self, timeout_s: float) -> bool:
@@ -141,11 +142,15 @@ class Runtime:
                 session.fail(component.name, error)
         return self.wait(0.0)
 
-    def switch_mode(self, name: str) -> None:
+    def switch_mode(self, name: str, stops: int | None = None) -> None:
         """Enter another mode: start its components, then change the owner of the joints within one tick.
 
         For the present mode, continue it if a reset made the robot hold; otherwise do nothing. A request waits for a
         mode switch or reset under way.
+
+        Args:
+            name: the mode.
+            stops: as for `reset`.
 
         Raises:
             IbrobotError: if there is no such mode, its components do not start, or the robot is stopped, now or
@@ -158,7 +163,7 @@ class Runtime:
             raise PluginError(f"mode {name} is unavailable: {reason}")
         if session.faults:
             raise HardwareError(f"mode {name}: refused before a reset: {session.faults[-1]}")
-        with self._changing(f"mode {name}", session.stops):
+        with self._changing(f"mode {name}", session.stops if stops is None else stops):
             if name != session.mode:
                 self._enter(name)
             elif session.held:

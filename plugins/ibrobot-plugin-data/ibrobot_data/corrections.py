@@ -137,6 +137,8 @@ class Corrections(SourceWorker):
         with self.lock:
             if not self.active:
                 raise NotSupported(f"mode {self.mode.name} does not run: nobody can take the robot from its policy")
+            if self.session.faults:
+                raise NotSupported(f"nobody takes the robot before a reset: {self.session.faults[-1]}")
             self._change(not self._taken if take is None else take)
             return self._commander
 
@@ -195,7 +197,9 @@ class Corrections(SourceWorker):
                 presses += 1
             else:
                 session.pass_on(event)
-        if presses % 2:
+        if session.faults:
+            pass  # a handover that began now would be one after the reset
+        elif presses % 2:
             self._change(not self._taken)
         elif self._options.takeover == "deadman" and bool(command.positions) != self._engaged:
             self._change(bool(command.positions), engaged=True)

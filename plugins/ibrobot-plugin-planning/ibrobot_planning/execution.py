@@ -80,24 +80,27 @@ class Execution:
         self._ahead: dict[str, _Next] = {}
         """Goals that wait until the executor's braking motion permits them."""
         self._number = 0
+        self._stops = 0
+        """Number of emergency stops when the present move was requested."""
 
     @property
     def under_way(self) -> bool:
         """Whether an executor has not ended yet."""
         return bool(self._tracks or self._ahead)
 
-    def begin(self, number: int, goals: Mapping[str, ExecutorGoal]) -> None:
+    def begin(self, number: int, goals: Mapping[str, ExecutorGoal], stops: int) -> None:
         """Send goals to executors at rest.
 
         Args:
             number: of the move.
             goals: executor -> its goal.
+            stops: number of emergency stops when it was requested; control refuses it after a newer one.
 
         Raises:
             HardwareError: if an executor refuses its goal; the others are cancelled.
         """
         with self._lock:
-            self._tracks, self._ahead, self._number = {}, {}, number
+            self._tracks, self._ahead, self._number, self._stops = {}, {}, number, stops
             try:
                 for name, goal in goals.items():
                     self._send(name, f"{number}:{name}", goal)
@@ -121,11 +124,12 @@ class Execution:
                     return
                 self._tracks[name] = _Track(goal_id, None)
 
-    def brake(self, number: int) -> Vector | None:
+    def brake(self, number: int, stops: int) -> Vector | None:
         """Let trajectories go on for a moment, and then brake along their path, until `follow` adds the next motion.
 
         Args:
             number: of the next move.
+            stops: as for `begin`.
 
         Returns:
             Where the robot comes to rest [rad], shape (J,); None if a running goal cannot be continued like that.
@@ -143,7 +147,7 @@ class Execution:
             except HardwareError as error:
                 self._session.log.warning("the arm stops before its next motion: braking was refused: %s", error)
                 return None
-            self._number = number
+            self._number, self._stops = number, stops
             return rest
 
     def follow(self, goals: Mapping[str, ExecutorGoal]) -> None:
@@ -219,7 +223,7 @@ class Execution:
         message: dict[str, Any] = {"position": goal} if isinstance(goal, float) else trajectory_goal(goal)
         if takes_over is not None:
             message["takes_over"] = takes_over
-        self._session.control.call("goal", executor=name, goal_id=goal_id, goal=message)
+        self._session.control.call("goal", executor=name, goal_id=goal_id, goal=message, stops=self._stops)
         self._tracks[name] = _Track(goal_id, None if isinstance(goal, float) else goal)
 
     def _begin(self, name: str, following: _Next) -> bool:

@@ -232,7 +232,6 @@ class PlannerSource(SourceWorker):
                 self._watch()
             if self._move is not None:
                 self._go_on(self._move)
-            self._drop_stopped()
             if self._move is None and self._queue and self._at_rest():
                 self._begin(self._queue.popleft())
             if self._move is not None and self.session.clock.now_ns() - self._status_ns >= _STATUS_NS:
@@ -358,16 +357,9 @@ class PlannerSource(SourceWorker):
             old.dropped = why
             self._execution.stop(old.number)
 
-    def _drop_stopped(self) -> None:
-        """Fail the goals that were requested before an emergency stop."""
-        stopped = [move for move in self._queue if move.stops < self.session.stops]
-        for move in stopped:
-            self._queue.remove(move)
-            self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, "an emergency stop came after it")
-
     def _hand_over(self, old: _Move, new: _Move) -> bool:
         """Plan to the next goal while the robot moves; return False if it must stop first."""
-        rest = self._execution.brake(new.number)
+        rest = self._execution.brake(new.number, new.stops)
         if rest is None:
             return False
         self._queue.remove(new)
@@ -436,7 +428,7 @@ class PlannerSource(SourceWorker):
             goals, move.planned = self._plans.plan(move.target, self._execution.commanded())
             with self._choosing:
                 self._move = move
-            self._execution.begin(move.number, goals)
+            self._execution.begin(move.number, goals, move.stops)
         except PlanningError as error:
             self._finish(move, "PLANNING_FAILED", error.code, str(error))
         except HardwareError as error:
