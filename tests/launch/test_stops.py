@@ -48,7 +48,8 @@ def teleop(runs: Runs) -> Runtime:
     """A robot that its operator moves."""
     runtime = runs.start("control_modes.teleop.teleop=lever", mode="teleop")
     lever = runs.parts.MADE["lever"]
-    lever.velocity, lever.deadman = 0.5, True
+    lever.velocity = 0.5
+    lever.press()
     steps(runtime)
     return runtime
 
@@ -359,12 +360,16 @@ def assert_braked(commands: list[Any]) -> None:
 class Typed(queue.SimpleQueue[str]):
     """Keys; after `end`, the thread that waits for them ends."""
 
-    taken = 0
-    """Number of keys that were handled: it asks for the next one."""
+    handled = 0
+    """Number of keys that were handled: the thread has asked for the next one."""
+    _given = False
 
-    def get(self, *arguments: Any) -> str:
-        self.taken += 1
-        if (key := super().get(*arguments)) == "end":
+    def get(self, block: bool = True, timeout: float | None = None) -> str:
+        self.handled += self._given
+        self._given = False
+        key = super().get(block, timeout)
+        self._given = True
+        if key == "end":
             raise SystemExit
         return key
 
@@ -378,8 +383,6 @@ class Keys:
         self.panel._runtime, self.panel._hooks, self.panel._pressed = run, RunHooks(), queue.SimpleQueue()
         self.thread = threading.Thread(target=self._listen)
         self.thread.start()
-        while not self.typed.taken:
-            time.sleep(0.001)
 
     def _listen(self) -> None:
         with suppress(SystemExit):
@@ -391,11 +394,11 @@ class Keys:
 
     def press(self, *keys: str) -> None:
         """Press keys, and wait until they were received."""
-        wanted = self.typed.taken + len(keys)
+        wanted = self.typed.handled + len(keys)
         for key in keys:
             self.typed.put(key)
         deadline_s = time.monotonic() + PATIENCE_S
-        while self.typed.taken < wanted:
+        while self.typed.handled < wanted:
             assert time.monotonic() < deadline_s
             time.sleep(0.001)
 
