@@ -314,6 +314,8 @@ def _print_summary(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
     echo(f"{summary['robot']}: {summary['mode']} for {summary['duration_s']:.1f} s")
     if summary["episodes"]:
         echo(f"episodes   {summary['episodes']}, of which {summary['successes']} succeeded")
+    if summary["disturbed"]:
+        echo(f"disturbed  {summary['disturbed']} episodes, by a fault or an emergency stop")
     if summary["lockstep"]:
         echo(f"loop       {loop['ticks']} ticks in lockstep")
     elif loop["ticks"]:

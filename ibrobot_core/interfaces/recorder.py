@@ -37,6 +37,8 @@ class EpisodeEnd:
     """`success`, `failure`, `discarded` or `unknown`."""
     dropped: Mapping[str, int] = attrs.field(factory=dict)
     """Messages lost before they reached the recorder, per topic."""
+    faults: tuple[str, ...] = ()
+    """The faults and emergency stops during the episode."""
 
 
 class Recorder(ABC):

@@ -20,6 +20,7 @@ class Episodes:
         """Prompt of the next episode."""
         self.begun_ns = 0
         """Start of the present episode [ns]."""
+        self._faults_before = 0
 
     def begin(self) -> None:
         """Begin the next episode."""
@@ -27,7 +28,17 @@ class Episodes:
         self.number += 1
         self.running = True
         self.begun_ns = session.clock.now_ns()
+        self._faults_before = len(session.outcome.faults)
         session.emit("ibrobot_episode_started", episode=self.number, mode=session.mode)
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """The faults and emergency stops since the present or last episode began."""
+        return tuple(self._session.outcome.faults[self._faults_before :])
+
+    def judged(self, outcome: str) -> str:
+        """The outcome of the present episode, of which `outcome` is said: one with a fault or stop is no success."""
+        return "failure" if outcome == "success" and self.faults else outcome
 
     def end(self, outcome: str) -> None:
         """End the present episode, if any, with outcome `success`, `failure`, `discarded` or `unknown`."""
@@ -35,6 +46,10 @@ class Episodes:
             return
         session = self._session
         self.running = False
+        outcome = self.judged(outcome)
+        if self.faults and outcome != "discarded":
+            session.outcome.disturbed += 1
+            session.log.warning("episode %d is disturbed by: %s", self.number, "; ".join(self.faults))
         if outcome == "discarded":
             session.log.info("episode %d: discarded", self.number)
         elif outcome != "unknown":

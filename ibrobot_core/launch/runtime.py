@@ -319,6 +319,7 @@ class Runtime:
             "duration_s": round((session.clock.now_ns() - self._begun_ns) * 1e-9, 3),
             "episodes": outcome.episodes,
             "successes": outcome.successes,
+            "disturbed": outcome.disturbed,
             "goals_failed": outcome.goals_failed,
             "faults": outcome.faults,
             "holding": outcome.holding,

@@ -62,6 +62,8 @@ class Outcome:
 
     episodes: int = 0
     successes: int = 0
+    disturbed: int = 0
+    """Number of episodes during which a fault or an emergency stop occurred."""
     faults: list[str] = attrs.field(factory=list)
     goals_failed: int = 0
     holding: list[str] = attrs.field(factory=list)
@@ -215,6 +217,8 @@ class Session:
         self.operator_events: queue.SimpleQueue[OperatorEvent] = queue.SimpleQueue()
         self.log = logging.getLogger("ibrobot")
         self._faults: list[tuple[int, str]] = []
+        self._stopped_by = -1, ""
+        """Generation and text of control's last fault."""
         self._control: ControlHost | None = None
         self._commanding = threading.Lock()
         self._new_state = threading.Condition()
@@ -364,9 +368,17 @@ class Session:
         return f"{f'press {keys[0]}' if keys else 'call /set_mode'} to go on with {self.mode}"
 
     def add_fault(self, fault: str, generation: int | None = None) -> None:
-        """Add a fault raised in `generation`; None stands for the present one."""
+        """Add a fault that control raised in `generation`; None stands for one that does not stop the robot."""
         self.outcome.faults.append(fault)
         self._faults.append((self.generation if generation is None else generation, fault))
+        if generation is not None:
+            self._stopped_by = generation, fault
+
+    @property
+    def stopped_by(self) -> str:
+        """The last fault or emergency stop for which control holds the robot until a reset; empty if it does not."""
+        generation, fault = self._stopped_by
+        return fault if generation >= self.generation else ""
 
     @property
     def failure_text(self) -> str:

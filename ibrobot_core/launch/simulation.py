@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import override
 
+from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.launch.session import Session, SessionWorker
 from ibrobot_core.units import NS_PER_S, ns
 
@@ -18,6 +19,8 @@ class SimulatedEpisodes(SessionWorker):
         self._wanted = wanted
         self._longest_ns = ns(session.config.contract.max_duration_s)
         self._begun_ns: int | None = None
+        self._stopped = 0
+        """Number of episodes that an emergency stop ended; others take their places."""
 
     @override
     def work(self, timeout_s: float) -> None:
@@ -36,6 +39,9 @@ class SimulatedEpisodes(SessionWorker):
         if self._begun_ns is None:
             if not (session.held or (state is not None and state.estop)):
                 self._begin_episode()
+        elif faults := session.episodes.faults:
+            self._stopped += EMERGENCY_STOP in faults
+            self._end_episode("failure")
         elif state is not None and state.generation == session.generation and state.success:
             self._end_episode("success")
         elif (age_ns := session.clock.now_ns() - self._begun_ns) > self._longest_ns:
@@ -56,5 +62,5 @@ class SimulatedEpisodes(SessionWorker):
         session.end_source()
         self._begun_ns = None
         session.episodes.end(outcome)
-        if self._wanted is not None and session.episodes.number >= self._wanted:
+        if self._wanted is not None and session.episodes.number - self._stopped >= self._wanted:
             session.finish()

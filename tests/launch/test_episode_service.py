@@ -14,6 +14,7 @@ from ibrobot_data.episode_service import DISCARD, START, STATUS, STOP, EpisodeSe
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import DiskFull, IbrobotError, InUse, NotSupported, RecorderError, RequestError
+from ibrobot_core.launch.runtime import ESTOP, RESET
 from ibrobot_core.ownership import Ownership
 
 if TYPE_CHECKING:
@@ -53,6 +54,20 @@ def test_a_root_that_cannot_be_written_is_found_before_anything_starts(runs: Run
     (runs.folder / "file").write_text("")
     with pytest.raises(RecorderError, match=r"recording.root: .* cannot be written: .*; choose another root"):
         runs.make(RECORDING, f"recording.root={root}", mode="teleop", by_operator=True)
+
+
+def test_no_episode_begins_before_an_emergency_stop_is_reset(run: Runtime, runs: Runs):
+    bus = run.session.bus
+    bus.call(ESTOP, None)
+    ticks(run, 3)
+    with pytest.raises(RecorderError, match=r"^not recording: emergency stop; reset it first$"):
+        bus.call(START, "pick the cube")
+    ticks(run, 50)
+    bus.call(RESET, None)
+    ticks(run, 3)
+    bus.call(START, "pick the cube")
+    assert bus.call(STATUS, None)["recording"]
+    run.stop()
 
 
 def test_services_begin_end_and_discard_episodes(run: Runtime, runs: Runs):

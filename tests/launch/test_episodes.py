@@ -78,7 +78,35 @@ def test_the_next_episode_waits_for_the_reset_of_an_emergency_stop(runs: Runs):
     assert len(runs.parts.EVENTS) == 3, "nor does the reset alone begin it"
     runtime.switch_mode("policy")
     finish(runtime)
-    assert runtime.summary()["successes"] == 1
+    summary = runtime.summary()
+    # The episode that was stopped is none of the two.
+    assert (summary["episodes"], summary["successes"], summary["disturbed"]) == (3, 2, 1)
+
+
+def test_an_emergency_stop_ends_an_episode_at_once_as_a_failure(runs: Runs):
+    runtime = runs.start(RECORDING, episodes=2)
+    seconds(runtime, 0.2)
+    runtime.session.bus.call(ESTOP, None)
+    seconds(runtime, 0.1)
+    assert ("ended", 1, "failure") in runs.parts.EVENTS
+    runtime.stop()
+    metadata = json.loads((runs.folder / "kept/picks/episodes/episode_000001/metadata.json").read_text())
+    assert (metadata["outcome"], metadata["faults"]) == ("failure", ["emergency stop"])
+
+
+def test_a_success_after_a_fault_is_a_failure(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    runtime.session.control.call("fault", fault="the gripper is stuck")
+    seconds(runtime, 0.1)
+    runtime.session.bus.call(RESET, None)
+    runtime.session.episodes.end("success")
+    assert runs.parts.EVENTS[-1] == ("ended", 1, "failure")
+    summary = runtime.summary()
+    assert (summary["episodes"], summary["successes"], summary["disturbed"]) == (1, 0, 1)
+    runtime.session.episodes.begin()
+    runtime.session.episodes.end("success")
+    assert runs.parts.EVENTS[-1] == ("ended", 2, "success"), "a fault counts for its own episode"
+    runtime.stop()
 
 
 def test_a_mode_without_simulated_episodes_is_one_that_ends_with_the_run(runs: Runs):

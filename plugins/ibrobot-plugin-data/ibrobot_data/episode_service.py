@@ -105,7 +105,7 @@ class EpisodeService(Episodes):
     @override
     def end(self, outcome: str) -> None:
         if self.running:
-            self._recording.end(outcome)
+            self._recording.end(self.judged(outcome), self.faults)
         super().end(outcome)
 
     @property
@@ -134,8 +134,8 @@ class EpisodeService(Episodes):
             prompt: description of the task; None repeats the last prompt.
 
         Raises:
-            RecorderError: if an episode is being recorded, topics of the contract are silent (names them), or no file
-                can hold the prompt.
+            RecorderError: if an episode is being recorded, a fault or emergency stop is not reset, topics of the
+                contract are silent (names them), or no file can hold the prompt.
             DiskFull: if the disk has no room for an episode of `contract.max_duration_s` at present rates.
             NotSupported: if the mode begins episodes itself.
         """
@@ -143,6 +143,8 @@ class EpisodeService(Episodes):
             self._check_by_operator()
             if self.running:
                 raise RecorderError("an episode is being recorded; end it first")
+            if fault := self._session.stopped_by:
+                raise RecorderError(f"not recording: {fault}; reset it first")
             if silent := self._recording.silent():
                 topics = ", ".join(
                     f"{topic} ({'nothing yet' if age is None else f'nothing for {age:.1f} s'})"

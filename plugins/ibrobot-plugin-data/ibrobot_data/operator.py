@@ -85,13 +85,20 @@ class Operator(RunHooks):
                 self._refuse(f"recording ended: {service.failure}")
                 if self._auto:  # no operator can correct it
                     self._run.finish()
+            elif self._auto and service.faults:
+                self._end(lambda: service.stop("failure"))
             elif service.elapsed_s() >= self._longest_s:
                 self._run.log.info("the episode is %g s long (contract.max_duration_s): ended", self._longest_s)
                 self._end(lambda: service.stop("unknown"))
-        elif self._count is not None and service.saved >= self._count:
+        elif self._count is not None and service.saved - self._spoilt >= self._count:
             self._run.finish()
         elif self._auto and self._clock_s() >= self._not_before_s:
             self._begin(self._prompt)
+
+    @property
+    def _spoilt(self) -> int:
+        """Number of automatic episodes with a fault or emergency stop; others take their places."""
+        return self._run.outcome.disturbed if self._auto else 0
 
     @override
     def key(self, key: str) -> bool:

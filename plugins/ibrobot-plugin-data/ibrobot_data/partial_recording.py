@@ -63,8 +63,8 @@ class PartialRecording(RecordingWorker):
         self._later(partial(self._begin_run_episode, number, prompt))
 
     @override
-    def end(self, outcome: str) -> None:
-        self._later(partial(self._end_run_episode, outcome))
+    def end(self, outcome: str, faults: tuple[str, ...] = ()) -> None:
+        self._later(partial(self._end_run_episode, outcome, faults))
 
     @override
     def work(self, timeout_s: float) -> None:
@@ -104,10 +104,10 @@ class PartialRecording(RecordingWorker):
         self._present = number, prompt
         self._recent.clear()
 
-    def _end_run_episode(self, outcome: str) -> None:
+    def _end_run_episode(self, outcome: str, faults: tuple[str, ...]) -> None:
         self._present = None
         if self._open:
-            self._end_part(self.session.bus.snapshot_ns(), outcome)
+            self._end_part(self.session.bus.snapshot_ns(), outcome, faults)
 
     def _begin_part(self, now_ns: int) -> None:
         assert self._present is not None
@@ -125,10 +125,10 @@ class PartialRecording(RecordingWorker):
         for item in recent:
             super()._write(item, item.received_ns)
 
-    def _end_part(self, now_ns: int, outcome: str) -> None:
+    def _end_part(self, now_ns: int, outcome: str, faults: tuple[str, ...] = ()) -> None:
         with self._pending_lock:
             self._provisional += outcome != "discarded"
-        self._end_episode(EpisodeEnd(now_ns, outcome), outcome != "discarded")
+        self._end_episode(EpisodeEnd(now_ns, outcome, faults=faults), outcome != "discarded")
 
     def _presses(self) -> int:
         """How often the key or the service was used since the last call."""

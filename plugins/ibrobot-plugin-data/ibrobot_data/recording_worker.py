@@ -140,12 +140,12 @@ class RecordingWorker(SessionWorker):
         with self._pending_lock:
             self._pending.append((self.session.bus.snapshot_ns(), act))
 
-    def end(self, outcome: str) -> None:
-        """End the episode; messages up to now belong to it."""
+    def end(self, outcome: str, faults: tuple[str, ...] = ()) -> None:
+        """End the episode, during which `faults` occurred; messages up to now belong to it."""
         with self._pending_lock:
             provisional = outcome != "discarded" and self.failure is None
             self._provisional += provisional
-            end = EpisodeEnd(self.session.bus.snapshot_ns(), outcome)
+            end = EpisodeEnd(self.session.bus.snapshot_ns(), outcome, faults=faults)
             self._pending.append((end.stamp_ns, partial(self._end_episode, end, provisional)))
 
     @property

@@ -205,6 +205,19 @@ def test_unattended_episodes_pause_and_end_with_the_count(record: Record):
     assert run.ended == [(1, "unknown"), (2, "unknown")]
 
 
+def test_an_unattended_episode_with_an_emergency_stop_is_replaced(record: Record):
+    run = record(auto=True, count=1, prompt="pick")
+    run.step(10)
+    run.runtime.session.emergency_stop()
+    run.step(100)
+    assert run.ended == [(1, "failure")], "it ends at once, and none begins before the reset"
+    run.runtime.reset()
+    run.step(200)
+    assert run.finished
+    assert run.ended == [(1, "failure"), (2, "unknown")]
+    assert run.runtime.summary()["disturbed"] == 1
+
+
 def test_why_it_does_not_begin_is_shown(record: Record):
     run = record("idle", auto=True, prompt="")
     run.step(3)

@@ -117,6 +117,7 @@ class JointLogRecorder(Recorder):
             shutil.rmtree(directory)
             return None
         closing = {"outcome": episode.outcome, "end_stamp_ns": episode.stamp_ns, "dropped": dict(episode.dropped)}
+        closing |= {"faults": list(episode.faults)} if episode.faults else {}
         self._write_metadata(ended, closing)
         return directory
 

@@ -85,7 +85,7 @@ class McapRecorder(Recorder):
         for topic, type_ in start.topics.items():
             if topic not in self._topics:
                 storage.announce(self._topic(topic, type_))
-        storage.finish(episode.outcome, dropped)
+        storage.finish(episode.outcome, dropped, episode.faults)
         if failure is not None:
             self._ctx.log.warning("%s ends early: %s", start.directory, failure)
         return start.directory

@@ -6,13 +6,13 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
 from ibrobot_core.api import NS_PER_S, EpisodeStart, RecorderError, ns
 from ibrobot_mcap.bagfile import BagFile, Item
-from ibrobot_mcap.metadata import DROPPED, OUTCOME, Counted, Topic, information, write_metadata
+from ibrobot_mcap.metadata import DROPPED, FAULTS, OUTCOME, Counted, Topic, information, write_metadata
 from ibrobot_mcap.options import MIB, McapOptions
 
 _LOOK_SIZE = 16 * MIB
@@ -114,7 +114,7 @@ class Storage:
         except OSError as error:
             self._fail(error)
 
-    def finish(self, outcome: str, dropped: Mapping[str, int]) -> None:
+    def finish(self, outcome: str, dropped: Mapping[str, int], faults: Sequence[str] = ()) -> None:
         """Finish the episode: write the files' indices, then `metadata.yaml`, which marks it as complete.
 
         Raises:
@@ -126,6 +126,7 @@ class Storage:
             raise self._broken
         lost = json.dumps(dict(sorted(dropped.items())))
         custom = {**self._episode.metadata, OUTCOME: outcome, DROPPED: lost}
+        custom |= {FAULTS: json.dumps(list(faults))} if faults else {}
         try:
             self._check_place()
             self._close_file(custom)

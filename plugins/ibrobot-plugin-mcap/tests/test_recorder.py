@@ -22,7 +22,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import ConnectionExtRosbag2
 
-from ibrobot_core.api import NS_PER_S, Image, JointState, RecorderError, String
+from ibrobot_core.api import NS_PER_S, EpisodeEnd, Image, JointState, RecorderError, String
 
 from .conftest import CAMERA, JOINTS, Bench, joints, picture, read, stamp, summary
 
@@ -83,6 +83,14 @@ def test_the_file_is_what_ros_tools_expect(bench):
     assert topic["topic_metadata"]["type_description_hash"] == type_hash(JointState.ros_type)
     assert topic["topic_metadata"]["offered_qos_profiles"][0]["durability"] == "volatile"
     assert facts["custom_data"] == {"prompt": "pick", "outcome": "success", "dropped": "{}"}
+
+
+def test_faults_during_an_episode_are_in_its_metadata(bench):
+    made = bench()
+    made.begin()
+    path = made.recorder.end(EpisodeEnd(stamp(3), "failure", faults=("emergency stop", "servo 3 is hot")))
+    facts = yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert facts["custom_data"]["faults"] == '["emergency stop", "servo 3 is hot"]'
 
 
 def test_a_topic_that_stays_silent_is_listed(bench):

@@ -59,6 +59,7 @@ class FakeRecorder(Recorder):
             shutil.rmtree(start.directory)
             return None
         metadata = {**start.metadata, "outcome": episode.outcome, "dropped": dict(episode.dropped)}
+        metadata |= {"faults": list(episode.faults)} if episode.faults else {}
         (start.directory / "metadata.json").write_text(json.dumps(metadata))
         return start.directory
 
