@@ -211,6 +211,8 @@ class Tool:
             taken = self._at(position, axis, start, tolerance, goal.orientation_tolerance or 0.01)
         else:
             taken = self._posed(position, self.model.forward(start).rotation, start, tolerance)
+            if not taken:
+                raise _unreachable(f"{self.model.tip} cannot keep its orientation at {_text(position)}")
         return [self._compared(each.joints, position, rotation) for each in taken]
 
     def _in_plane(self, position: Vector, axis: Vector) -> Vector:

@@ -58,7 +58,7 @@ MOVE_ACTION = Service(
 """Named like MoveIt's action, and so is the next one."""
 EXECUTE = Service(
     "/execute_trajectory", Execute, int, "Follow a trajectory that begins where the robot is; answers with its number.",
-    limits=RequestLimits(values=100_000),
+    limits=RequestLimits(values=60_000),
 )  # fmt: skip
 MOVE_TO_POSE = Service(
     "/moveit_gateway/move_to_pose", MoveToPose, MoveResult,

@@ -242,7 +242,7 @@ class WorldKeeper(Component):
 
     def _attach(self, world: World, it: Attached) -> World:
         hand = self._hand() if it.link is None else ()
-        link = it.link or hand[0]
+        link = hand[0] if it.link is None else it.link
         placed = np.linalg.inv(self._link(link)) @ matrix(world.named(it.name).pose)
         return world.attach(it.name, link, pose(placed), frozenset((*hand, *it.may_touch)))
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Results
-from ibrobot_planning.planning_services import CARTESIAN, COMPUTE_FK, PLAN
+from ibrobot_planning.planning_services import CARTESIAN, COMPUTE_FK, COMPUTE_IK, PLAN
 from ibrobot_planning.requests import GoTo, Numbered
 from ibrobot_planning.source import (
     CANCEL,
@@ -455,3 +455,12 @@ def test_long_lists_are_refused(run):
     ):
         with pytest.raises(RequestError, match=told):
             bus.call(service, request)
+
+
+@pytest.mark.parametrize("policy", ["refuse", "nearest", "keep_axis", "arm_plane", "current", "free"])
+@pytest.mark.parametrize("xyz", [(0.0, 0.0, 0.0), (0.0, 0.0, 1e-9), (0.0, 0.0, 0.9), (1e-12, 0.0, -0.1)])
+def test_poses_on_the_axis_of_the_base_are_planned_or_refused(run, policy: str, xyz: tuple[float, float, float]):
+    bus = run().session.bus
+    goal = {"xyz": list(xyz), "quaternion": [0, 0, 0, 1], "beyond_reach": policy}
+    for answer in (bus.call(PLAN, {"goals": [goal]}), bus.call(COMPUTE_IK, {"goal": goal})):
+        assert "Error" not in answer.message

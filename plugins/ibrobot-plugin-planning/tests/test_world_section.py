@@ -252,6 +252,7 @@ IMPOSSIBLE = (
     (ADD, "{name: cup}", RequestError, "expected a mapping with name, object, replace, got '{name: cup}'"),
     (REMOVE, "cup", PlanningError, "no object 'cup'; the objects are: table, can"),
     (ATTACH, {"name": "can", "link": "foot"}, PlanningError, "no link 'foot'; the links are: world, base"),
+    (ATTACH, {"name": "can", "link": ""}, PlanningError, "no link ''"),
     (DETACH, {"name": "can"}, PlanningError, "object 'can' is not attached"),
     (CLEARANCE, {"positions": {"pam": 1.0}}, PlanningError, "no joint 'pam', did you mean 'pan'"),
     (CLEARANCE, {"positions": [1.0]}, RequestError, "positions: expected a mapping, got a list"),

@@ -32,7 +32,7 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
     yield TransportDescriptor(
         type="zenoh", options=ZenohOptions, make=_zenoh, default=True, listen=server_options, components=_components,
         used=lambda options: options.share != Share(), check_options=check_files,
-        publishes=lambda options: [(("share", "subscribe", i), it) for i, it in enumerate(options.share.subscribe)],
+        publishes=lambda options: [(("share", "subscribe"), each) for each in options.share.subscribe],
         summary="between machines, including ROS 2 nodes with rmw_zenoh",
     )  # fmt: skip
 

@@ -1,0 +1,230 @@
+"""Generated requests to every service of a simulated SO-101 in motion, over Zenoh, from several clients at once.
+
+    python benchmarks/service_requests.py [--requests 5000] [--clients 2] [--seed 0]
+
+Meanwhile one more client keeps the arm moving, and stops and resets it. It fails if the run ends, if an answer shows
+the environment or an error of Python, or if a refused request takes more than a second or 200 MB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import queue
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import ibrobot_data.corrections
+import ibrobot_data.episode_service
+import ibrobot_data.partial_recording
+import ibrobot_planning.clouds
+import ibrobot_planning.planning_services
+import ibrobot_planning.source
+import ibrobot_planning.tasks.runner
+import ibrobot_planning.world
+import ibrobot_planning.world_keeper
+import ibrobot_web.teleop
+from ibrobot_planning.client import Node
+from ibrobot_servo.teleop import twist_service
+
+import ibrobot_core.launch.runtime
+import ibrobot_core.launch.sources.policy
+from ibrobot_core.api import IbrobotError, Service
+
+ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT / "tests" / "shared"))
+from plain_requests import SECRET, Requests  # noqa: E402
+
+VALUE = "hunter2-0451"
+SHOWN = re.compile(
+    rf"{VALUE}|Traceback|the service failed|\b[A-Z]\w*(Error|Exception): |a bug|/root/|{os.environ['HOME']}/"
+)
+"""What no answer may show."""
+WAITS = ("/moveit_gateway/move_to_pose", "/moveit_gateway/move_to_configuration")
+"""They answer when the motion has ended."""
+MIB = 1 << 20
+
+
+def declared() -> dict[str, Service[Any, Any]]:
+    """The services of core and the plugins."""
+    modules = [
+        ibrobot_core.launch.runtime, ibrobot_core.launch.sources.policy, ibrobot_data.corrections,
+        ibrobot_data.episode_service, ibrobot_data.partial_recording, ibrobot_planning.clouds,
+        ibrobot_planning.planning_services, ibrobot_planning.source, ibrobot_planning.tasks.runner,
+        ibrobot_planning.world, ibrobot_planning.world_keeper, ibrobot_web.teleop,
+    ]  # fmt: skip
+    found = [value for module in modules for value in vars(module).values() if isinstance(value, Service)]
+    return {each.name: each for each in (*found, twist_service("/servo_node/delta_twist_cmds"))}
+
+
+def resident(pid: int) -> int:
+    """Memory of a process [bytes]."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+    return int(re.search(r"VmRSS:\s+(\d+)", status)[1]) * 1024  # type: ignore[index]
+
+
+def await_port(port: int, run: subprocess.Popen[bytes]) -> None:
+    """Wait until a run listens."""
+    while run.poll() is None:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
+            return
+        time.sleep(0.1)
+
+
+class Findings:
+    """What the clients saw. Thread-safe by the interpreter's lock."""
+
+    def __init__(self) -> None:
+        self.outcomes = Counter[str]()
+        self.slowest: dict[str, tuple[float, str]] = {}
+        self.refused: tuple[float, str] = (0.0, "")
+        self.wrong: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def add(self, service: str, took_s: float, answer: str, *, accepted: bool, request: str) -> None:
+        """Note an answer."""
+        self.outcomes["accepted" if accepted else "refused"] += 1
+        self.slowest[service] = max(self.slowest.get(service, (0.0, "")), (took_s, request[:200]))
+        if not accepted and service not in WAITS:
+            self.refused = max(self.refused, (took_s, f"{service} {request[:300]} -> {answer[:200]}"))
+        if shown := SHOWN.search(answer):
+            self.wrong.put(f"{service} {request[:300]} -> {answer[:500]} shows {shown[0]!r}")
+
+
+def ask(node: Node, service: str, request: Any, findings: Findings) -> None:
+    """Call a service, and note the answer."""
+    begun, accepted = time.monotonic(), True
+    try:
+        answer = json.dumps(node.call(service, request))
+    except IbrobotError as error:
+        answer, accepted = str(error), False
+    findings.add(service, time.monotonic() - begun, answer, accepted=accepted, request=repr(request))
+
+
+def client(address: str, number: int, count: int, seed: int, findings: Findings) -> None:
+    """Ask `count` generated requests."""
+    requests, known = Requests(seed), declared()
+    with Node(f"client{number}", f"connect=[{address}]") as node:
+        names = sorted(set(node.call("/rosapi/services")) | set(known))
+        for i in range(count):
+            name = names[(i * 7 + number) % len(names)] if i < len(names) else requests._random.choice(names)
+            if name in known:
+                ask(node, name, requests.request(known[name]), findings)
+
+
+def mover(address: str, ended: threading.Event, moved: list[int]) -> None:
+    """Keep the arm moving, in spite of the others."""
+    with Node("mover", f"connect=[{address}]") as node:
+        for i in range(1_000_000):
+            if ended.is_set():
+                return
+            for service, request in (
+                ("/reset", None),
+                ("/set_mode", "moveit_planning"),
+                ("/planning/go_to", ("home", "shoulder_pan=0.6", "shoulder_pan=-0.6")[i % 3]),
+            ):
+                try:
+                    node.call(service, request)
+                    moved[0] += service == "/planning/go_to"
+                except IbrobotError:
+                    pass
+            ended.wait(1.0)
+
+
+def main() -> int:
+    """Run it."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--requests", type=int, default=5000)
+    parser.add_argument("--clients", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--port", type=int, default=17447)
+    options = parser.parse_args()
+    address = f"tcp/127.0.0.1:{options.port}"
+    transport = (
+        f"transport={{type: zenoh, mode: router, listen: [{address}], share: {{services: [{', '.join(declared())}]}}}}"
+    )
+    findings, ended, moved = Findings(), threading.Event(), [0]
+    with tempfile.TemporaryDirectory() as folder:
+        log, result = Path(folder) / "log", Path(folder) / "result"
+        command = [
+            str(Path(sys.executable).with_name("ibrobot")), "launch",
+            str(ROOT / "configs" / "so101_blind.yaml"), "--sim",
+            "--mode", "moveit_planning", "--json", "--set", transport, "--set", "world={scene: true}",
+        ]  # fmt: skip
+        with log.open("w") as told, result.open("w") as summary:
+            run = subprocess.Popen(
+                command,
+                env=os.environ | {SECRET: VALUE},
+                stderr=told,
+                stdout=summary,
+                stdin=subprocess.DEVNULL,
+                cwd=folder,
+            )
+        try:
+            threads = [threading.Thread(target=mover, args=(address, ended, moved), daemon=True)]
+            threads += [
+                threading.Thread(
+                    target=client,
+                    args=(address, i, options.requests // options.clients, options.seed + i, findings),
+                    daemon=True,
+                )
+                for i in range(options.clients)
+            ]
+            await_port(options.port, run)
+            threads[0].start()
+            while moved[0] < 3 and run.poll() is None:  # so that all libraries are loaded
+                time.sleep(0.1)
+            before = resident(run.pid)
+            for thread in threads[1:]:
+                thread.start()
+            most = now = before
+            while any(thread.is_alive() for thread in threads[1:]) and run.poll() is None:
+                with suppress(OSError, TypeError):  # it may end at any time
+                    now = resident(run.pid)
+                most = max(most, now)
+                time.sleep(0.02)
+            alive = run.poll() is None
+        finally:
+            ended.set()
+            if run.poll() is None:
+                run.send_signal(signal.SIGINT)
+            run.wait(30)
+        text = log.read_text(encoding="utf-8")
+        counts = json.loads(result.read_text(encoding="utf-8") or "{}")
+    return report(findings, counts, text, moved[0], most - before, alive=alive)
+
+
+def report(findings: Findings, summary: dict[str, Any], log: str, moved: int, grown: int, *, alive: bool) -> int:
+    """Print what was found; 1 if something is wrong."""
+    print(f"{dict(findings.outcomes)}, {moved} motions of the mover, run alive: {alive}")
+    print(
+        f"memory grew by at most {grown / MIB:.0f} MiB; "
+        f"slowest refusal {findings.refused[0]:.2f} s: {findings.refused[1]}"
+    )
+    for service, (took, request) in sorted(findings.slowest.items(), key=lambda item: -item[1][0])[:8]:
+        print(f"  {took:6.2f} s {service} {request[:100]}")
+    print(f"faults {summary.get('faults')}, counters {summary.get('counters')}")
+    wrong = [findings.wrong.get() for _ in range(findings.wrong.qsize())]
+    lines = log.splitlines()
+    wrong += [line for line in lines if VALUE in line]
+    wrong += [line for i, each in enumerate(lines) if "Traceback" in each for line in lines[i : i + 40]]
+    wrong += [] if alive else ["the run ended:", *log.splitlines()[-20:]]
+    wrong += [f"a refusal took {findings.refused[0]:.2f} s"] if findings.refused[0] > 1.0 else []
+    wrong += [f"memory grew by {grown / MIB:.0f} MiB"] if grown > 200 * MIB else []
+    for line in wrong[:120]:
+        print("WRONG", line)
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
