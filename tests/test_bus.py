@@ -161,7 +161,7 @@ def test_what_was_received_by_the_snapshot_is_in_the_queues() -> None:
         assert bisect_right(stamps, now_ns) <= queued
 
 
-def test_a_topic_has_the_stated_type_whatever_came_first(bus: Bus) -> None:
+def test_a_topic_has_the_stated_type_after_a_wrong_first_message(bus: Bus) -> None:
     bus.publish("/a", String("first"), latched=True)
     subscription = bus.subscribe("/a", 10, Int32)
 

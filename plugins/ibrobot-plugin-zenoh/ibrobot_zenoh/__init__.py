@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import Command, DecoderDescriptor, PanelDescriptor, TransportDescriptor, hookimpl
@@ -32,9 +32,16 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
     yield TransportDescriptor(
         type="zenoh", options=ZenohOptions, make=_zenoh, default=True, listen=server_options, components=_components,
         used=lambda options: options.share != Share(), check_options=check_files,
-        publishes=lambda options: [(("share", "subscribe"), each) for each in options.share.subscribe],
+        publishes=_subscribed,
         summary="between machines, including ROS 2 nodes with rmw_zenoh",
     )  # fmt: skip
+
+
+def _subscribed(options: ZenohOptions) -> list[tuple[tuple[str | int, ...], str]]:
+    """The topics of other machines, each with its place in the options."""
+    topics = options.share.subscribe
+    keys: Iterable[str | int] = topics if isinstance(topics, Mapping) else range(len(topics))
+    return [(("share", "subscribe", key), topic) for key, topic in zip(keys, topics, strict=True)]
 
 
 def _peers(session: Session) -> list[tuple[str, ...]]:
