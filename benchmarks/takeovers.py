@@ -205,10 +205,11 @@ class WithKeys(Person):
         self.queues.append(queue.SimpleQueue())
         return self.queues[-1]
 
-    def type(self, key: str) -> None:
-        """Type a key."""
+    def type(self, *keys: str) -> None:
+        """Type keys, in a terminal that reports releases."""
         for each in self.queues:
-            each.put(key)
+            for key in keys:
+                each.put(key)
 
     @override
     def toggle(self) -> None:
@@ -218,23 +219,28 @@ class WithKeys(Person):
     @override
     def engage(self) -> None:
         self._key = "w"
-        self.type(self._key)
+        self.type("release:w", "w")
 
     @override
     def release(self) -> None:
+        self.type(f"release:{self._key}")
         self._key = ""
 
     @override
     def tick(self, rng: random.Random) -> None:
         if self._key:
             if rng.random() < 0.05:
-                self._key = rng.choice(_KEYS)
-            self.type(self._key)
+                self._change(rng.choice(_KEYS))
+            self.type(f"repeat:{self._key}")
+
+    def _change(self, key: str) -> None:
+        self.type(key)
+        self._key = key
 
     @override
     def turn_back(self, joint: int, ahead: bool) -> None:
         if self._key:
-            self._key = _KEYS[2 * joint + ahead]
+            self._change(_KEYS[2 * joint + ahead])
 
 
 class WithLeader(WithKeys):
@@ -258,7 +264,7 @@ class WithLeader(WithKeys):
     @override
     def engage(self) -> None:
         self._key = "-"
-        self.type("space")
+        self.type("release:space", "space")
 
     @override
     def release(self) -> None:
@@ -304,12 +310,12 @@ class WithSensor(WithKeys):
     @override
     def engage(self) -> None:
         self._key = "space"
-        self.type("space")
+        self.type("release:space", "space")
 
     @override
     def tick(self, rng: random.Random) -> None:
         if self._key:
-            self.type(self._key)
+            self.type(f"repeat:{self._key}")
             if rng.random() < 0.05:
                 self._tilt = {"pitch": rng.uniform(-0.6, 0.6), "yaw": rng.uniform(-0.6, 0.6)}
         self._sensor.turn(**self._tilt)

@@ -95,6 +95,7 @@ class KeyboardTeleop(Teleop):
         if not self.deadman.allows(now_ns):
             self._held.clear()
             if not self.deadman.armed:  # by a silence or a pause of the host
+                self._pressed.forget()
                 self._setpoint = None
                 self._arm.stop_tool()
         if not self._moves():

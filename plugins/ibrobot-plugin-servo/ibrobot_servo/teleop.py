@@ -36,6 +36,8 @@ _FOLLOW_RAD = 0.1
 _DIAGNOSTICS = "/diagnostics"
 _PAUSE_NS = ns(0.5)
 """A stream of twists that was silent for so long counts as released [ns]."""
+_SOON_NS = ns(0.25)
+"""Time after the beginning of the mode in which a stream shows that it goes on [ns]."""
 _OFF_NS = ns(0.5)
 """Largest difference between the time in a twist's header and ours [ns]."""
 
@@ -61,7 +63,7 @@ class TwistTeleop(Teleop):
         self._twists: Subscription | None = None
         self._serves = False
         """Whether it serves calls that send a twist."""
-        self._came_ns: int | None = None
+        self._quiet_since_ns = 0
         """When the last twist was read [ns]."""
         self._fresh = True
         """Whether the next twist starts from the measured position."""
@@ -93,8 +95,9 @@ class TwistTeleop(Teleop):
     def activate(self, measured: JointReading) -> None:
         if self._servo is not None and self._twists is not None:
             self._servo.reset(measured.position[self._indices])
-            if self._twists.drain():  # discards earlier twists
-                self._came_ns = measured.stamp_ns
+            came = bool(self._twists.drain())  # discards earlier twists
+            # While the device was closed, a stream may have gone on: then the next twist comes soon.
+            self._quiet_since_ns = measured.stamp_ns - (0 if came else _PAUSE_NS - _SOON_NS)
         self._fresh = True
 
     @override
@@ -103,7 +106,7 @@ class TwistTeleop(Teleop):
         if servo is None or twists is None:
             raise TeleopError(f"{self._ctx.name}: twists are not connected: connect comes before read")
         here = measured.position[self._indices]
-        if self._came_ns is None or measured.stamp_ns - self._came_ns >= _PAUSE_NS:
+        if measured.stamp_ns - self._quiet_since_ns >= _PAUSE_NS:
             self.deadman.report(False, measured.stamp_ns)
         for received in twists.drain():
             self._take(servo, received, measured.stamp_ns, here)
@@ -143,7 +146,7 @@ class TwistTeleop(Teleop):
 
     def _take(self, servo: Servo, received: Received, now_ns: int, here: Vector) -> None:
         """Follow a twist, or refuse it."""
-        self._came_ns = now_ns
+        self._quiet_since_ns = now_ns
         fault = self._fault(received.message, received.received_ns) or self._held(received.message, now_ns)
         if fault is None:
             assert isinstance(received.message, TwistStamped)

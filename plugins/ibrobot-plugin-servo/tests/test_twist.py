@@ -124,6 +124,10 @@ class Rig:
         self.teleop = TwistTeleop(options, self.ctx)
         self.teleop.connect()
         begin_operation(self.teleop, self.measured())
+        for _ in range(30):  # no stream goes on
+            self.tick()
+        self.positions.clear()
+        self.status.drain()
 
     def measured(self) -> JointReading:
         return JointReading(self.ctx.clock.now_ns(), self.position.copy(), np.zeros(6), np.zeros(6))

@@ -102,8 +102,9 @@ class TeleopSuite(Suite[Teleop]):
         return self._press(teleop, ctx, position)
 
     def _press(self, teleop: Teleop, ctx: Context, position: Vector) -> TeleopCommand:
-        self.rest(teleop)
-        operate(teleop, self._measure(ctx, position))
+        if self.has_operator:
+            self.rest(teleop)
+            operate(teleop, self._measure(ctx, position))
         self.engage(teleop)
         return operate(teleop, self._measure(ctx, position))
 
@@ -262,9 +263,10 @@ class TeleopSuite(Suite[Teleop]):
             np.testing.assert_array_equal(begin.position, pose)
             begin.position[:] = 0.0
             self.rest(teleop)
-            before = self._measure(ctx, pose)
-            operate(teleop, before)
-            before.position[:] = 0.0
+            if self.has_operator:
+                before = self._measure(ctx, pose)
+                operate(teleop, before)
+                before.position[:] = 0.0
             self.engage(teleop)
             now = self._measure(ctx, pose)
             positions = operate(teleop, now).positions or {}
