@@ -3,8 +3,8 @@
     python benchmarks/deadman_table.py [--device NAME ...] [--event NAME ...]
 
 Each cell is a run of the simulated arm in lockstep, with the device emulated at its reports: HID reports, replies of
-servos, a serial port, keys of a terminal, poses of a headset, twists. A person presses the deadman and moves the arm; the event
-happens, and the person keeps the deadman pressed for 3 s. A cell shows the time from the last report that counts until
+servos, a serial port, keys of a terminal, poses of a headset, twists. A person presses the deadman and moves the arm;
+the event happens, and the person keeps the deadman pressed for 3 s. A cell shows the time from the last report that counts until
 the command rests [ms], and how far the command moved afterwards [mrad]. At the end a new press must move the arm. Exits
 with 1 if a motion lasts longer than 0.3 s, or the arm moves again without a new press.
 """
@@ -359,7 +359,7 @@ class Headset(Person):
         if abs(self._at + self._way) > 0.1:
             self._way = -self._way
         self._at += self._way
-        pose = HandPose((0.0, 0.0, 0.0, 1.0), (0.0, 1.0, self._at), clutch)
+        pose = HandPose((0.0, 0.0, 0.0, 1.0), (0.0, 1.0 + self._at, 0.0), clutch)
         self._exchange.put(Hands(self._sent, 0.01 * self._sent, 0.0, {"right": pose}), 0.0)
 
     @override
@@ -599,6 +599,7 @@ def _measure(person: Person, event: str) -> Cell:
         trial.ticks(80, person.rest)
         assert trial.moves(), "the device does not move the arm"
         begun = len(trial.commands)
+        assert np.ptp(trial.commands[-20:], axis=0).max() > 0.01, "the arm does not move when the event happens"
         EVENTS[event](trial)
         steps = np.abs(np.diff(trial.commands[begun - 1 :], axis=0)).max(axis=1)
         period_s = 1.0 / config.control.rate_hz
