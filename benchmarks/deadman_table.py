@@ -4,7 +4,7 @@
 
 Each cell is a run of the simulated arm in lockstep, with the device emulated at its reports: HID reports, replies of
 servos, a serial port, keys of a terminal, poses of a headset, twists. A person presses the deadman and moves the arm;
-the event happens, and the person keeps the deadman pressed for 3 s. A cell shows the time from the last report that counts until
+the event happens, and the person keeps the deadman pressed for 3 s. A cell shows the time from the last report until
 the command rests [ms], and how far the command moved afterwards [mrad]. At the end a new press must move the arm. Exits
 with 1 if a motion lasts longer than 0.3 s, or the arm moves again without a new press.
 """

@@ -202,6 +202,33 @@ class _Signals:
             os.kill(os.getpid(), signal.SIGSTOP)
 
 
+def _listen(session: Session, take: Callable[[tuple[str, int]], None]) -> None:
+    """Stop the robot at Esc, in every mode and view; `take` gets other keys with the number of emergency stops.
+
+    A thread does it, so that the emergency stop does not wait, e.g. for a mode that loads.
+    """
+    if session.request.keys is None:
+        return
+    keys = session.request.keys()
+    pulse = Pulse("emergency stop by Esc", _STOP_BLOCKED_S)
+    session.pulses.add(pulse)
+
+    def work() -> None:
+        while True:
+            pulse.beat()
+            with suppress(queue.Empty):
+                key = keys.get(timeout=PULSE_S)
+                if key != "esc":
+                    take((key, session.stops))
+                    continue
+                try:
+                    session.emergency_stop()
+                except IbrobotError as error:
+                    session.log.error("%s", error)
+
+    threading.Thread(target=work, name="runtime keys", daemon=True).start()
+
+
 class _Lines:
     """Plain status lines, for output without a terminal."""
 
@@ -214,6 +241,7 @@ class _Lines:
         handler = logging.StreamHandler(sys.stderr)
         handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
         _log_to(handler)
+        _listen(runtime.session, lambda pressed: None)
 
     def starting(self, component: str) -> None:
         """Print nothing for components that start."""
@@ -244,9 +272,7 @@ class _Panel:
         self._next_s = 0.0
         self._pressed: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
         """Keys, each with the number of emergency stops when it was pressed."""
-        keys = runtime.session.request.keys
-        if keys is not None:
-            threading.Thread(target=self._listen, args=(keys(),), name="runtime keys", daemon=True).start()
+        _listen(runtime.session, self._pressed.put)
 
     def starting(self, component: str) -> None:
         """Show the component that starts."""
@@ -263,21 +289,6 @@ class _Panel:
         help_text = "\n".join(text for text in (session.command_source.help(), self._hooks.help()) if text)
         self._rates.sample(session)
         self._display.update(panel(session, self._log, self._rates, help_text, self._hooks.rows()), refresh=True)
-
-    def _listen(self, keys: queue.SimpleQueue[str]) -> None:
-        """Handle keys in a separate thread, so that the emergency stop does not wait, e.g. for a mode that loads."""
-        pulse = Pulse("emergency stop by Esc", _STOP_BLOCKED_S)
-        self._runtime.session.pulses.add(pulse)
-        while True:
-            pulse.beat()
-            try:
-                key = keys.get(timeout=PULSE_S)
-            except queue.Empty:
-                continue
-            if key == "esc":
-                self._try(self._runtime.session.emergency_stop)
-            else:
-                self._pressed.put((key, self._runtime.session.stops))
 
     def _handle_key(self, key: str, stops: int) -> None:
         session = self._runtime.session
