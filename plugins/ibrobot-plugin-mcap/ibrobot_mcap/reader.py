@@ -53,6 +53,8 @@ class Rosbag2Reader(EpisodeReader):
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        if not path.exists():
+            raise RecorderError(f"{path}: there is no such episode")
         facts = read_facts(path / METADATA) if path.is_dir() else None
         self._finished = facts is not None or not path.is_dir()
         self._closing = ExitStack()

@@ -117,7 +117,7 @@ def trim(episode: Path, begin_s: float, end_s: float | None) -> tuple[Rewritten,
         RecorderError: if the part is not within the episode, or cannot be written; the episode is then unchanged.
     """
     with owning(episode, "is being trimmed"):
-        if not episode.is_dir():
+        if episode.is_file():
             raise RecorderError(f"{episode}: must be the episode's folder, not a file of it")
         return _trim(episode, begin_s, end_s)
 

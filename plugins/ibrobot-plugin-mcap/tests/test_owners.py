@@ -83,6 +83,22 @@ def test_of_two_restores_at_once_the_second_finds_nothing_to_restore(episode):
     assert len(read(episode)) == 100
 
 
+def test_an_episode_that_was_deleted_meanwhile_is_not_there(episode, monkeypatch):
+    real = Ownership.__init__
+
+    def late(self, path, *arguments, **more):
+        """Another command deletes the episode between the look at it and the lock."""
+        real(self, path, *arguments, **more)
+        shutil.rmtree(path, ignore_errors=True)
+
+    shutil.copytree(episode, kept := episode.with_name("kept"))
+    monkeypatch.setattr(Ownership, "__init__", late)
+    for command in (("mark", episode, "failure"), ("trim", episode, "--in-place"), ("trim", episode, "-o", "part")):
+        with pytest.raises(RecorderError, match="episode_000001: there is no such episode"):
+            run(*command)
+        shutil.copytree(kept, episode)
+
+
 @pytest.mark.parametrize("threaded", [False, True])
 def test_a_recording_whose_folder_was_replaced_is_no_success(tmp_path, bench, threaded):
     made = bench(threaded=threaded)
