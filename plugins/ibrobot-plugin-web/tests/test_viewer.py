@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 import socket
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Mapping
@@ -18,7 +21,7 @@ from ibrobot_web import ibrobot_viewers
 from ibrobot_web.options import WebOptions
 from ibrobot_web.viewer import WebViewer
 
-from ibrobot_core.api import Context, ControlState, Header, IbrobotError, JointState, Message, Viewer
+from ibrobot_core.api import ComponentFailed, Context, ControlState, Header, IbrobotError, JointState, Message, Viewer
 
 OPTIONS = WebOptions(port=0, browser=False, rate_hz=60)
 
@@ -118,3 +121,48 @@ def test_options_that_would_open_the_robot_to_the_network_are_refused(options: d
 def test_the_page_needs_a_run() -> None:
     with pytest.raises(IbrobotError, match="viewer type web shows a run"):
         WebViewer(OPTIONS, host_context("viewer")).open()
+
+
+def updated_until_it_fails(viewer: WebViewer) -> str:
+    """Update a viewer until it ends the run; return why."""
+    deadline_s = time.monotonic() + 60
+    while time.monotonic() < deadline_s:
+        try:
+            viewer.update()
+        except ComponentFailed as failed:
+            return str(failed)
+        time.sleep(0.01)
+    raise AssertionError("the run goes on")
+
+
+def test_a_server_that_is_stopped_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    viewer = WebViewer(OPTIONS, make_context())
+    viewer.open()
+    assert viewer._child is not None
+    pid = viewer._child.pid
+    try:
+        monkeypatch.setattr("ibrobot_web.viewer._SILENT_S", 0.7)
+        os.kill(pid, signal.SIGSTOP)
+        assert "silent for 0.7 s: its STOP would not be heard" in updated_until_it_fails(viewer)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+        viewer.close()
+
+
+def test_messages_that_the_server_cannot_have_sent_are_dropped_and_a_bug_behind_stop_ends_the_run(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    viewer = WebViewer(OPTIONS, make_context())
+    viewer.open()
+    try:
+        child: Any = viewer._child
+        arrived = [{"event": "pages"}, {"do": "estop"}, {"stop": "1"}, {"command": "operate", "facts": {}}]
+        monkeypatch.setattr(child, "receive", lambda: [arrived.pop()] if arrived else [{"alive": True}])
+        deadline_s = time.monotonic() + 60
+        while arrived and time.monotonic() < deadline_s:
+            assert viewer.update()
+        assert sum("which was dropped" in message for message in caplog.messages) >= 3
+        monkeypatch.setattr(child, "receive", lambda: 1 / 0)
+        assert "the page can no longer stop the robot" in updated_until_it_fails(viewer)
+    finally:
+        viewer.close()
