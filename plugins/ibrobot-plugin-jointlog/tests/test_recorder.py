@@ -38,6 +38,8 @@ TOPICS = {"/joint_states": JointState.ros_type}
 class TestJointLogRecorder(RecorderSuite):
     """A joint log keeps header stamps and positions, so these are all that the suite's messages have."""
 
+    joint_states_only = True
+
     @override
     def make(self, ctx: Context) -> JointLogRecorder:
         return JointLogRecorder(ctx)
@@ -57,6 +59,10 @@ class TestJointLogRecorder(RecorderSuite):
         stamps = [start_ns + ns(t) for t in log.times.tolist()]
         messages = [JointState(Header(s), JOINTS, p) for s, p in zip(stamps, log.positions, strict=True)]
         return {"/joint_states": list(zip(stamps, messages, strict=True))}
+
+    @override
+    def read_dropped(self, path: Path) -> Mapping[str, int]:
+        return json.loads((path / "metadata.json").read_text())["dropped"]
 
     @override
     def read_metadata(self, path: Path) -> Mapping[str, str]:

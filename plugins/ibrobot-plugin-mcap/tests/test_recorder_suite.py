@@ -37,6 +37,13 @@ class McapSuite(RecorderSuite):
             reader.close()
         return {**summary.metadata, "outcome": summary.outcome}
 
+    def read_dropped(self, path):
+        reader = Rosbag2Reader(path)
+        try:
+            return {topic: each.dropped for topic, each in reader.summary().topics.items()}
+        finally:
+            reader.close()
+
 
 class TestInLockstep(McapSuite):
     pass

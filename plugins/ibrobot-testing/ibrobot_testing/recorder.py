@@ -17,8 +17,10 @@ from ibrobot_core.api import (
     Context,
     EpisodeEnd,
     EpisodeStart,
+    Float64MultiArray,
     Header,
     JointState,
+    Joy,
     Message,
     Recorder,
     RecorderError,
@@ -31,12 +33,14 @@ Record = tuple[int, Message]
 
 
 class RecorderSuite(Suite[Recorder]):
-    """Checks of every `Recorder`. The subclass defines `read_back` and `read_metadata`."""
+    """Checks of every `Recorder`. The subclass defines `read_back`, `read_metadata` and `read_dropped`."""
 
     topic: ClassVar[str] = "/joint_states"
     """A topic of JointState that the recorder stores."""
     max_loss_s: ClassVar[float] = 1.0
     """Maximum loss after a crash [s]."""
+    joint_states_only: ClassVar[bool] = False
+    """Whether the recorder is made for joint states alone; messages of other types are then not expected back."""
 
     def read_back(self, path: Path) -> Mapping[str, Sequence[Record]]:
         """Topic -> records, in the order written; `path` may also be a copy of an unfinished episode."""
@@ -45,6 +49,10 @@ class RecorderSuite(Suite[Recorder]):
     def read_metadata(self, path: Path) -> Mapping[str, str]:
         """The stored `EpisodeStart.metadata`, and `outcome`."""
         raise NotImplementedError(f"{type(self).__name__} must define read_metadata(self, path)")
+
+    def read_dropped(self, path: Path) -> Mapping[str, int]:
+        """The stored `EpisodeEnd.dropped`, topic -> messages."""
+        raise NotImplementedError(f"{type(self).__name__} must define read_dropped(self, path)")
 
     def records(self, ctx: Context, count: int = 50) -> list[Record]:
         """JointStates at 10 Hz with awkward numbers, as received a millisecond after their stamps."""
@@ -95,6 +103,78 @@ class RecorderSuite(Suite[Recorder]):
             metadata = self.read_metadata(path)
             assert metadata["prompt"] == "pick: the “cube”,\n'now'"
             assert metadata["outcome"] == "failure"
+
+    def test_loses_nothing_of_a_long_episode(self, tmp_path: Path) -> None:
+        """All of several thousand messages are reproduced."""
+        with self.recording(tmp_path / "episode") as (recorder, ctx):
+            records = self.records(ctx, 2500)
+            self._write(recorder, records)
+            path = recorder.end(self._end(ctx, "success"))
+            assert path is not None
+            assert [received_ns for received_ns, _ in self.read_back(path)[self.topic]] == [r[0] for r in records]
+
+    def test_records_other_types(self, tmp_path: Path) -> None:
+        """Text and arrays on topics that were announced are reproduced."""
+        self._needs_other_types()
+        ctx = self.context()
+        others = _others(ctx)
+        topics = {topic: message.ros_type for topic, message in others.items()}
+        start = attrs.evolve(self._start(ctx, tmp_path / "episode"), topics={self.topic: JointState.ros_type, **topics})
+        assert self._recorded(ctx, start, others) == {topic: [(ctx.clock.now_ns(), m)] for topic, m in others.items()}
+
+    def test_records_any_topic_if_asked(self, tmp_path: Path) -> None:
+        """With `any_topic`, messages of topics that appear later are reproduced."""
+        self._needs_other_types()
+        ctx = self.context()
+        others = _others(ctx)
+        start = attrs.evolve(self._start(ctx, tmp_path / "episode"), any_topic=True)
+        assert self._recorded(ctx, start, others) == {topic: [(ctx.clock.now_ns(), m)] for topic, m in others.items()}
+
+    def _needs_other_types(self) -> None:
+        if self.joint_states_only:
+            pytest.skip("records joint states only")
+
+    def _recorded(self, ctx: Context, start: EpisodeStart, messages: Mapping[str, Message]) -> dict[str, list[Record]]:
+        """What an episode with a message on each topic gives back."""
+        recorder = self.make(ctx)
+        try:
+            recorder.begin(start)
+            for topic, message in messages.items():
+                recorder.write(topic, message, ctx.clock.now_ns())
+            path = recorder.end(self._end(ctx, "success"))
+            assert path is not None
+            return {topic: list(kept) for topic, kept in self.read_back(path).items() if kept}
+        finally:
+            recorder.close()
+
+    def test_keeps_what_was_lost_before(self, tmp_path: Path) -> None:
+        """The recording contains the counts of messages that did not reach the recorder."""
+        with self.recording(tmp_path / "episode") as (recorder, ctx):
+            self._write(recorder, self.records(ctx))
+            path = recorder.end(attrs.evolve(self._end(ctx, "success"), dropped={self.topic: 3}))
+            assert path is not None
+            assert {topic: count for topic, count in self.read_dropped(path).items() if count} == {self.topic: 3}
+
+    def test_metadata_survives_a_crash(self, tmp_path: Path) -> None:
+        """The initial metadata can be read from an episode that has not ended."""
+        with self.recording(tmp_path / "episode") as (recorder, ctx):
+            self._write(recorder, self.records(ctx))
+            shutil.copytree(tmp_path / "episode", tmp_path / "crashed")
+            assert self.read_metadata(tmp_path / "crashed")["prompt"] == "pick: the “cube”,\n'now'"
+
+    def test_sizes_are_estimated(self, tmp_path: Path) -> None:
+        """`size_of` works for every type, before and within an episode, and grows with the message."""
+        ctx = self.context()
+        recorder = self.make(ctx)
+        messages = [self.records(ctx, 1)[0][1], *_others(ctx).values()]
+        try:
+            assert all(recorder.size_of(message) > 0 for message in messages)
+            recorder.begin(self._start(ctx, tmp_path / "episode"))
+            assert all(recorder.size_of(message) > 0 for message in messages)
+            small, large = (recorder.size_of(Float64MultiArray(np.ones(size))) for size in (10, 10_000))
+            assert large > 100 * small
+        finally:
+            recorder.close()
 
     def test_never_writes_over_anything(self, tmp_path: Path) -> None:
         """An existing directory is refused and not changed."""
@@ -189,3 +269,12 @@ class RecorderSuite(Suite[Recorder]):
             path = recorder.end(self._end(ctx, "success"))
             assert path is not None
             assert list(self.read_back(path)[self.topic]) == [(received_ns, copy)]
+
+
+def _others(ctx: Context) -> dict[str, Message]:
+    """Topic -> a message that is no joint state."""
+    return {
+        "/note": String("the “cube”\n"),
+        "/commands": Float64MultiArray(np.array([0.1, -2.5e300, 0.0])),
+        "/joy": Joy(Header(ctx.clock.now_ns(), "pad"), np.array([0.5], np.float32), np.array([1, 0], np.int32)),
+    }

@@ -11,7 +11,7 @@ import pytest
 from ibrobot_testing import RecorderSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeRecorder
 
-from ibrobot_core.api import Header, JointState
+from ibrobot_core.api import MESSAGE_TYPES, Header, JointState
 
 
 class TestRecorder(RecorderSuite):
@@ -24,14 +24,25 @@ class TestRecorder(RecorderSuite):
         kept: dict[str, list[Any]] = {}
         for text in (path / "records.jsonl").read_text().splitlines():
             line = json.loads(text)
-            arrays = (np.array(line[name]) for name in ("position", "velocity", "effort"))
-            message = JointState(Header(line["stamp_ns"]), tuple(line["name"]), *arrays)
+            message = message_of(line["type"], line["message"])
             kept.setdefault(line["topic"], []).append((line["received_ns"], message))
         return kept
 
     @override
     def read_metadata(self, path):
         return json.loads((path / "metadata.json").read_text())
+
+    @override
+    def read_dropped(self, path):
+        return self.read_metadata(path)["dropped"]
+
+
+def message_of(type_: str, fields: dict[str, Any]) -> Any:
+    """The message of these plain values."""
+    made = {name: Header(**value) if name == "header" else value for name, value in fields.items()}
+    return MESSAGE_TYPES[type_](
+        **{name: tuple(v) if name == "name" else v for name, v in made.items() if name != "layout"}
+    )
 
 
 class RoundsNumbers(FakeRecorder):
@@ -131,7 +142,61 @@ class LoneWriteAtTheEnd(WritesAtTheEnd):
     """As `WritesAtTheEnd`, under the other check that it fails."""
 
 
+class LosesEveryThousandth(FakeRecorder):
+    count = 0
+
+    def write(self, topic, message, received_ns):
+        self.count += 1
+        if self.count % 1000:
+            super().write(topic, message, received_ns)
+
+
+class JointStatesOnly(FakeRecorder):
+    def write(self, topic, message, received_ns):
+        if isinstance(message, JointState) or self._open().any_topic:
+            super().write(topic, message, received_ns)
+
+
+class IgnoresAnyTopic(FakeRecorder):
+    def begin(self, episode):
+        super().begin(attrs.evolve(episode, any_topic=False))
+
+
+class LosesDropped(FakeRecorder):
+    def end(self, episode):
+        return super().end(attrs.evolve(episode, dropped={}))
+
+
+class SizeOfNothing(FakeRecorder):
+    def size_of(self, message):
+        return 0
+
+
+class SizeRaises(FakeRecorder):
+    def size_of(self, message):
+        return super().size_of(message) if isinstance(message, JointState) else len(message.name)
+
+
+class SizeOfAll(FakeRecorder):
+    def size_of(self, message):
+        return 1000
+
+
+class MetadataAtTheEnd(FakeRecorder):
+    def _write_metadata(self, closing):
+        if closing["outcome"] != "unfinished":
+            super()._write_metadata(closing)
+
+
 WRONG = {
+    LosesEveryThousandth: "loses_nothing_of_a_long_episode",
+    JointStatesOnly: "records_other_types",
+    IgnoresAnyTopic: "records_any_topic_if_asked",
+    LosesDropped: "keeps_what_was_lost_before",
+    SizeOfNothing: "sizes_are_estimated",
+    SizeRaises: "sizes_are_estimated",
+    SizeOfAll: "sizes_are_estimated",
+    MetadataAtTheEnd: "metadata_survives_a_crash",
     RoundsNumbers: "gives_back_what_was_written",
     SkipsTheFirst: "gives_back_what_was_written",
     StampsOnWriting: "gives_back_what_was_written",
@@ -148,6 +213,12 @@ WRONG = {
 }
 
 
+ALONE = {
+    LosesEveryThousandth, JointStatesOnly, IgnoresAnyTopic, LosesDropped, SizeOfNothing, SizeRaises, SizeOfAll,
+    MetadataAtTheEnd,
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(("wrong", "caught_by"), WRONG.items(), ids=lambda v: getattr(v, "__name__", v))
 def test_catches(wrong, caught_by, tmp_path):
     class Suite(TestRecorder):
@@ -155,7 +226,10 @@ def test_catches(wrong, caught_by, tmp_path):
         def make(self, ctx):
             return wrong(ctx)
 
-    assert caught_by in failed_checks(Suite, tmp_path)
+    failed = failed_checks(Suite, tmp_path)
+    assert caught_by in failed
+    if wrong in ALONE:
+        assert set(failed) == {caught_by}, "no other check catches it"
 
 
 def test_every_check_catches_something():

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, override
 
+import attrs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +19,6 @@ from ibrobot_core.api import (
     EpisodeEnd,
     EpisodeStart,
     Feature,
-    JointState,
     Message,
     Recorder,
     RecorderError,
@@ -26,7 +26,7 @@ from ibrobot_core.api import (
 
 
 class FakeRecorder(Recorder):
-    """Writes JointStates to `records.jsonl`, one flushed line each; metadata to `metadata.json`."""
+    """Writes messages to `records.jsonl`, one flushed line each, as plain values; metadata to `metadata.json`."""
 
     def __init__(self, ctx: Context) -> None:
         self._episode: EpisodeStart | None = None
@@ -40,27 +40,27 @@ class FakeRecorder(Recorder):
         episode.directory.mkdir()
         self._file = (episode.directory / "records.jsonl").open("w")
         self._episode = episode
+        self._write_metadata({"outcome": "unfinished"})
 
     @override
     def write(self, topic: str, message: Message, received_ns: int) -> None:
-        if topic not in self._open().topics or not isinstance(message, JointState):
+        if topic not in self._open().topics and not self._open().any_topic:
             return
-        arrays = {name: getattr(message, name).tolist() for name in ("position", "velocity", "effort")}
-        line = {"topic": topic, "received_ns": received_ns, "stamp_ns": message.header.stamp_ns, "name": message.name}
-        self._file.write(json.dumps(line | arrays) + "\n")
+        line = {"topic": topic, "received_ns": received_ns, "type": message.ros_type, "message": _plain(message)}
+        self._file.write(json.dumps(line) + "\n")
         self._file.flush()
 
     @override
     def end(self, episode: EpisodeEnd) -> Path | None:
         start = self._open()
         self._file.close()
+        if episode.outcome != "discarded":
+            faults = {"faults": list(episode.faults)} if episode.faults else {}
+            self._write_metadata({"outcome": episode.outcome, "dropped": dict(episode.dropped), **faults})
         self._episode = None
         if episode.outcome == "discarded":
             shutil.rmtree(start.directory)
             return None
-        metadata = {**start.metadata, "outcome": episode.outcome, "dropped": dict(episode.dropped)}
-        metadata |= {"faults": list(episode.faults)} if episode.faults else {}
-        (start.directory / "metadata.json").write_text(json.dumps(metadata))
         return start.directory
 
     @override
@@ -72,6 +72,19 @@ class FakeRecorder(Recorder):
         if self._episode is None:
             raise RecorderError("no episode has begun")
         return self._episode
+
+    def _write_metadata(self, closing: Mapping[str, Any]) -> None:
+        start = self._open()
+        (start.directory / "metadata.json").write_text(json.dumps({**start.metadata, **closing}))
+
+
+def _plain(value: Any) -> Any:
+    """A message, or a value in one, as JSON values."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if attrs.has(type(value)):
+        return {field.name: _plain(getattr(value, field.name)) for field in attrs.fields(type(value))}
+    return value
 
 
 class FakeDataset(DatasetWriter):
