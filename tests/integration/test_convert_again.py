@@ -96,7 +96,7 @@ def test_killed_at_any_point_of_its_end_the_same_command_goes_on(
         shutil.copytree(tmp_path / "before", whole)
     assert convert(*command, "--out", whole).returncode == 1
     last, points = 0, set()
-    for back in (None, 0, 1, 2, 3, 5, 8, 13, 21):
+    for back in (None, 0, 1, 3, 8, 21):
         shutil.rmtree(out, ignore_errors=True)
         if append:
             shutil.copytree(tmp_path / "before", out)
@@ -111,7 +111,7 @@ def test_killed_at_any_point_of_its_end_the_same_command_goes_on(
         assert again.returncode == 1, again.stderr
         assert "already has a dataset" not in again.stderr, f"{back} changes before its end"
         assert digest(out) == digest(whole), f"{back} changes before its end"
-    assert len(points) == 8
+    assert len(points) == 5
 
 
 def test_a_killed_conversion_of_what_all_can_be_converted_ends_well(bags: Path, tmp_path: Path) -> None:
