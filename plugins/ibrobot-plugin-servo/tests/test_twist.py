@@ -193,6 +193,27 @@ def test_without_twists_the_arm_stops_within_its_accelerations_and_is_let_go(mod
     assert not velocities[-1].any()
 
 
+@pytest.mark.parametrize("off_s", [-3600.0, -0.6, 0.6, 3600.0])
+def test_a_twist_whose_time_is_off_moves_nothing(model, off_s: float):
+    rig = Rig(model)
+    for _ in range(20):
+        stamped = attrs.evolve(twist(), header=Header(rig.ctx.clock.now_ns() + ns(off_s), ""))
+        np.testing.assert_array_equal(rig.tick(stamped), BENT)
+    assert any("more than 0.5 s off" in reason for reason in rig.counts())
+    assert rig.follow(attrs.evolve(twist(), header=Header(rig.ctx.clock.now_ns(), "")), 0.3).any()
+
+
+def test_a_stream_that_goes_on_over_a_reset_moves_nothing_before_a_zero_twist_or_a_pause(model):
+    for release in ([twist((0.0, 0.0, 0.0))], [None] * 51):
+        rig = Rig(model)
+        assert rig.follow(twist(), 0.3).any()
+        begin_operation(rig.teleop, rig.measured())
+        assert not rig.follow(twist(), 2.0).any()
+        for message in release:
+            rig.tick(*[message] * (message is not None))
+        assert rig.follow(twist(), 0.3).any()
+
+
 def test_a_joint_that_does_not_follow_makes_the_tool_wait(model):
     rig = Rig(model)
     rig.follows = False
