@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
@@ -88,6 +89,19 @@ class SensorSuite(Suite[Sensor]):
                 if silent == 3:
                     return
             pytest.fail("messages come though the device captures nothing")
+
+    def test_reading_ends_with_its_time_out(self) -> None:
+        """`read` of a device that captures nothing returns after its time-out, at the latest after `timeout_s`."""
+        with self.opened() as (sensor, ctx):
+            self._next(sensor, ctx)
+            self.silence(sensor)
+            with ThreadPoolExecutor(1) as pool:
+                for _ in range(5):  # earlier messages may still arrive
+                    reading = pool.submit(sensor.read, 0.01)
+                    done, _ = wait([reading], self.timeout_s / 10)
+                    if not done:
+                        sensor.close()  # ends the call, if anything does
+                    assert done, f"read(0.01) still waits after {self.timeout_s / 10:g} s"
 
     def test_messages_stay_as_they_were(self) -> None:
         """A message does not change when the next one is read."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import override
 
 import attrs
@@ -14,6 +15,8 @@ from ibrobot_core.api import CameraInfo, CompressedImage, Header, SensorError
 
 
 class TestSensor(SensorSuite):
+    timeout_s = 5.0
+
     @override
     def make(self, ctx):
         return FakeSensor(ctx)
@@ -45,6 +48,16 @@ class RepeatsTheLastImage(FakeSensor):
     def read(self, timeout_s):
         self._last_ns = -1
         return super().read(timeout_s)
+
+
+class IgnoresItsTimeOut(FakeSensor):
+    """Waits longer than it was told to."""
+
+    def read(self, timeout_s):
+        image = super().read(timeout_s)
+        if image is None:
+            time.sleep(1.0)
+        return image
 
 
 class ReusesItsBuffer(FakeSensor):
@@ -106,6 +119,7 @@ WRONG = {
     StampsStandStill: "stamps_strictly_increase",
     StampsAhead: "stamps_strictly_increase",
     RepeatsTheLastImage: "silence_gives_none",
+    IgnoresItsTimeOut: "reading_ends_with_its_time_out",
     ReusesItsBuffer: "messages_stay_as_they_were",
     ShortRows: "images_are_whole",
     CutsItsJpegs: "images_are_whole",
