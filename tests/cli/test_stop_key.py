@@ -24,6 +24,7 @@ class Typed(queue.SimpleQueue[str]):
         return key
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize("view", ["_Lines", "_Panel"])
 def test_esc_stops_in_every_view(view: str, monkeypatch: pytest.MonkeyPatch) -> None:
     typed, stopped = Typed(), threading.Event()
@@ -36,3 +37,6 @@ def test_esc_stops_in_every_view(view: str, monkeypatch: pytest.MonkeyPatch) -> 
         for key in ("w", "space", "esc", "end"):
             typed.put(key)
         assert stopped.wait(60)
+    for thread in threading.enumerate():
+        if thread.name == "runtime keys":
+            thread.join(60)
