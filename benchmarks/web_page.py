@@ -136,7 +136,7 @@ async def kills(count: int) -> bool:
                 async with client(address) as operator:
                     await operator.call("operate", take_over=True)
                     speed = -0.6 if watcher.states[-1]["position"][0] > 0 else 0.6
-                    await operator.jog(0.5, number + 1, joints={"shoulder_pan": speed, "wrist_roll": speed})
+                    await operator.jog(0.5, joints={"shoulder_pan": speed, "wrist_roll": speed})
                     if how == "closed":
                         await operator.drive.close()
                     elif how == "killed":

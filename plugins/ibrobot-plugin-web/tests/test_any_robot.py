@@ -34,7 +34,7 @@ def test_the_page_shows_and_drives_it(tmp_path: Path) -> None:
             (crate,) = page.status["objects"]
             assert (crate["name"], crate["size"], crate["pos"]) == ("crate", [0.05] * 3, [0.4, 0.2, 0.05])
             before = page.states[-1]["position"]
-            await page.jog(1.0, 1, joints={"turn": 0.5, "finger": 1.0})
+            await page.jog(1.0, joints={"turn": 0.5, "finger": 1.0})
             after = page.states[-1]["position"]
             assert after[0] > before[0] + 0.1
             assert after[-1] > before[-1] + 0.01, "the joint that slides"

@@ -53,8 +53,8 @@ class Rig:
 
     def __init__(self, services: Mapping[str, Callable[[Any], Any]]) -> None:
         self.session: Session = make_session()
-        self.control: Any = Control()
-        self.session.control = self.control
+        found: Any = Control()
+        self.session.control = self.control = found
         for name, handler in services.items():
             self.session.bus.unserve(name)
             self.session.bus.serve(stand_in(name), handler)

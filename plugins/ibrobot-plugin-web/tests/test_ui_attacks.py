@@ -82,7 +82,7 @@ def test_strangers_watchers_and_other_sites_reach_no_request(tmp_path: Path) -> 
 def test_unknown_keys_are_refused_before_anything_runs(tmp_path: Path) -> None:
     async def test(server: UiServer) -> None:
         for method, path in routes():
-            sent = {"params": {"--help": "1"}} if method == "GET" else {"json": {"--help": 1}}
+            sent: dict[str, Any] = {"params": {"--help": "1"}} if method == "GET" else {"json": {"--help": 1}}
             async with server.client.request(method, path, **sent) as answer:
                 assert (answer.status, "--help: unknown key" in (await answer.json())["error"]) == (400, True), path
         assert server.ui.jobs.all() == []
@@ -186,7 +186,7 @@ def test_no_request_reaches_files_outside_the_opened_folders(tmp_path: Path, out
             if path.endswith("/list"):
                 continue
             known = {name: value for name, value in facts.items() if name in keys_of(method, path)}
-            sent = {"params": known} if method == "GET" else {"json": known}
+            sent: dict[str, Any] = {"params": known} if method == "GET" else {"json": known}
             async with server.client.request(method, path, **sent) as answer:
                 text = json.dumps(await answer.json())
             assert "outside the opened folders" in text or "a plugin that is not installed" in text, (path, text)

@@ -153,6 +153,7 @@ def test_what_is_outside_or_malformed_is_refused(episode: Path, tmp_path: Path) 
 
     async def test(server: UiServer) -> None:
         for path in (str(episode), f"../{episode.relative_to(tmp_path)}", "link/episode_000001", "..", "/etc", "a\0b"):
+            facts: dict[str, Any]
             topic = {"topic": TOP}
             for name, more in {
                 "open": {},
@@ -167,7 +168,6 @@ def test_what_is_outside_or_malformed_is_refused(episode: Path, tmp_path: Path) 
                     continue
                 with pytest.raises(RuntimeError, match=r"outside the opened folders|control character"):
                     await answer
-            facts: dict[str, Any]
             for name, facts in {
                 "trim": {"begin_s": 0, "end_s": 1},
                 "repair": {},
