@@ -132,7 +132,7 @@ async def kills(count: int) -> bool:
     with page_run(*SO101) as address:
         async with client(address) as watcher:
             await watcher.until(lambda: "jog" in watcher.status.get("services", ()))
-            for number, how in zip(range(count), itertools.cycle(held)):
+            for how in itertools.islice(itertools.cycle(held), count):
                 async with client(address) as operator:
                     await operator.call("operate", take_over=True)
                     speed = -0.6 if watcher.states[-1]["position"][0] > 0 else 0.6
