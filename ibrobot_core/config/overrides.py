@@ -14,7 +14,7 @@ from ibrobot_core.options import did_you_mean
 
 
 class Override(str):
-    """An override `path.to.key=value` for which the user typed something else, e.g. `--viewer web`."""
+    """An override `path.to.key=value` for which the user typed something else, e.g. a flag of a viewer."""
 
     typed: str
 

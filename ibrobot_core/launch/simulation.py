@@ -39,8 +39,8 @@ class SimulatedEpisodes(SessionWorker):
         if self._begun_ns is None:
             if not (session.held or (state is not None and state.estop)):
                 self._begin_episode()
-        elif faults := session.episodes.faults:
-            self._stopped += EMERGENCY_STOP in faults
+        elif EMERGENCY_STOP in session.episodes.faults:
+            self._stopped += 1
             self._end_episode("failure")
         elif state is not None and state.generation == session.generation and state.success:
             self._end_episode("success")

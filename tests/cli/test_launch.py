@@ -89,7 +89,7 @@ def test_the_summary_in_words(launch: Callable[..., Ran]):
     assert ran.out.splitlines() == [
         "mini: policy for 1.1 s",
         "episodes   2, of which 2 succeeded",
-        "loop       55 ticks in lockstep",
+        "loop       56 ticks in lockstep",
         "faults     none",
     ]
 

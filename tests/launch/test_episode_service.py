@@ -13,7 +13,7 @@ from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_service import DISCARD, START, STATUS, STOP, EpisodeService
 
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import DiskFull, IbrobotError, InUse, NotSupported, RecorderError, RequestError
+from ibrobot_core.errors import ConfigError, DiskFull, IbrobotError, InUse, NotSupported, RecorderError, RequestError
 from ibrobot_core.launch.runtime import ESTOP, RESET
 from ibrobot_core.ownership import Ownership
 
@@ -49,10 +49,16 @@ def test_a_list_of_topics_must_have_the_contracts(runs: Runs):
     runs.make(RECORDING, "recording.topics=[/joint_states]", mode="teleop")  # a log; the run does not wait for it
 
 
-@pytest.mark.parametrize("root", ["/proc/none", "file/below"])
-def test_a_root_that_cannot_be_written_is_found_before_anything_starts(runs: Runs, root: str):
+@pytest.mark.parametrize(
+    ("root", "message"),
+    [
+        ("/proc/none", r"recording.root: .* cannot be written: .*; choose another root"),
+        ("file/below", r"recording.root: .*/file is a file, not a folder"),
+    ],
+)
+def test_a_root_that_cannot_be_written_is_found_before_anything_starts(runs: Runs, root: str, message: str):
     (runs.folder / "file").write_text("")
-    with pytest.raises(RecorderError, match=r"recording.root: .* cannot be written: .*; choose another root"):
+    with pytest.raises((RecorderError, ConfigError), match=message):
         runs.make(RECORDING, f"recording.root={root}", mode="teleop", by_operator=True)
 
 
