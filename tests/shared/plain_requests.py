@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 from collections.abc import Sequence
 from typing import Any, get_args
@@ -27,6 +28,8 @@ TEXTS = (
     "table", "gripper", "shoulder_pan", "base",
 )  # fmt: skip
 NAMES = ("shoulder_pan", "elbow_flex", "gripper", "pan", "cube", "x", "", "a" * 1001, "\x00")
+_MOST_CHARACTERS = 1_500_000
+"""More takes the client longer to encode than the robot to refuse."""
 LENGTHS = (0, 1, 2, 3, 3, 3, 4, 6, 21, 101, 2001, 30_000)
 
 
@@ -87,11 +90,9 @@ class Requests:
         if fixed and self._random.random() < 0.9:
             return [self._of(kind, depth - 1) for kind in kinds]
         length = self._length()
-        before = self._left
         one = [self._of(kinds[0], depth - 1) for _ in range(min(length, 3))]
-        size = max((before - self._left) // 3, 1)
-        self._left -= size * length
-        return (one * length)[: max(min(length, 40_000 // size), 1)] if length else []
+        most = _MOST_CHARACTERS * len(one) // max(len(json.dumps(one)), 1)
+        return (one * length)[: max(min(length, most), len(one))]
 
     def _length(self) -> int:
         """Number of items; the whole request must stay within what a network carries quickly."""
