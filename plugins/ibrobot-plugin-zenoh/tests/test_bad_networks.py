@@ -187,7 +187,7 @@ def test_urgent_requests_wait_for_no_others(monkeypatch: pytest.MonkeyPatch):
     def answer(payload: Payload, _: object) -> bytes:
         if payload != b"stop":
             busy.release()
-            release.wait(WAIT_S)
+            release.wait()
         return b"done"
 
     server.serve_with_urgent("services", answer, lambda payload: payload == b"stop")
@@ -205,9 +205,11 @@ def test_urgent_requests_wait_for_no_others(monkeypatch: pytest.MonkeyPatch):
         thread.start()
     for _ in range(2):
         assert busy.acquire(timeout=WAIT_S)
-    for _ in range(20):
-        assert robot.request("services", b"stop", WAIT_S) == b"done"
-    release.set()
+    try:
+        for _ in range(20):
+            assert robot.request("services", b"stop", WAIT_S) == b"done"
+    finally:
+        release.set()
     told = [outcomes.get(timeout=WAIT_S) for _ in asking]
     assert any("overloaded" in each for each in told), "the flood was one"
     for thread in asking:
