@@ -275,7 +275,7 @@ class TestProcess:
         assert host.call("estop")["stops"] == 1
         resetting.join()
 
-        assert answers.get() == "reset: refused, an emergency stop came after it was requested"
+        assert answers.get(timeout=PATIENCE_S) == "reset: refused, an emergency stop came after it was requested"
         assert reports.state(lambda state: state.stops == 1).estop
         assert host.stops == 1
 
