@@ -5,14 +5,13 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.cli.run import _Panel
+from ibrobot_core.cli.run import _listen, _Panel
 from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, TeleopError, TransportError
 from ibrobot_core.launch.runtime import ESTOP, RESET, SET_MODE, Runtime
 from ibrobot_core.run_hooks import RunHooks
@@ -381,16 +380,15 @@ class Keys:
         self.typed = Typed()
         self.panel = _Panel.__new__(_Panel)
         self.panel._runtime, self.panel._hooks, self.panel._pressed = run, RunHooks(), queue.SimpleQueue()
-        self.thread = threading.Thread(target=self._listen)
-        self.thread.start()
-
-    def _listen(self) -> None:
-        with suppress(SystemExit):
-            self.panel._listen(self.typed)
+        run.session.request = attrs.evolve(run.session.request, keys=lambda: self.typed)
+        before = set(threading.enumerate())
+        _listen(run.session, self.panel._pressed.put)
+        self.threads = set(threading.enumerate()) - before
 
     def close(self) -> None:
         self.typed.put("end")
-        self.thread.join(PATIENCE_S)
+        for thread in self.threads:
+            thread.join(PATIENCE_S)
 
     def press(self, *keys: str) -> None:
         """Press keys, and wait until they were received."""
