@@ -18,6 +18,7 @@ import attrs
 from ibrobot_core.api import (
     Channel,
     ComponentFailed,
+    Failure,
     Policy,
     build_policy,
     error_text,
@@ -95,7 +96,7 @@ def main(parent: int, request: int, answer: int) -> int:
         frames = [memoryview(mmap.mmap(descriptor, WIRE_LIMITS.size)) for descriptor in (request, answer)]
         ModelLoop(policy, channel, frames[0], frames[1]).run()
     except Exception as error:  # noqa: BLE001 - the host reports it
-        channel.send({"event": "failed", "error": error_text(error)})
+        channel.report(Failure(error_text(error)))
         return 1
     finally:
         if policy is not None:

@@ -219,7 +219,7 @@ def test_messages_from_text():
     ):
         with pytest.raises(ConfigError, match=message):
             message_from("std_msgs/msg/Bool", text)
-    with pytest.raises(ConfigError, match="could not convert"):
+    with pytest.raises(ConfigError, match="expected a number, got 'a'"):
         message_from("std_msgs/msg/Float64MultiArray", "data: [a]")
 
 
