@@ -22,6 +22,7 @@ from ibrobot_core.control.health import Health
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.control.plausible import Plausibility
 from ibrobot_core.control.safety import SafetyLayer
+from ibrobot_core.control.timing import Pace
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
 from ibrobot_core.interfaces import EpisodeSetup, Executor, JointReading, Signal, Torque
 from ibrobot_core.robot import Vector
@@ -103,6 +104,7 @@ class ControlCore:
         # A value is too low if the process is interrupted between its two clocks, never too high.
         self._asleep_ns = max(clock.asleep_ns() for _ in range(3))
         self._health = Health(config.control.load_shedding, self._log)
+        self._pace = Pace(self.period_ns)
         self._shedding = self._has_shed = False
         self._commanded_ns: int | None = None
         """Time of the last plan or goal of this generation [ns]; None before the first."""
@@ -196,7 +198,10 @@ class ControlCore:
         """
         self._due_ns = self._clock.now_ns() if due_ns is None else due_ns
         self._check_suspend()
+        begun_ns = self._clock.now_ns()
         self._read()
+        if slow := self._pace.tick(periods, self._clock.now_ns() - begun_ns):
+            self._log.warning("%s", slow)
         signals = self._read_signals()
         success = self._hardware.success()
         self._check_following()
@@ -269,7 +274,7 @@ class ControlCore:
             "joints": dict(self._safety.interventions),
             "executors": self._executors.counters(),
             "hardware": self._hardware.counters(),
-            "loop": dict(self._counts),
+            "loop": {**self._counts, "slow_seconds": self._pace.slow_seconds},
             "conditions": [attrs.asdict(each) for each in self._health.conditions],
         }
 

@@ -6,8 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from ibrobot_core.units import NS_PER_S
+
 REPORT_TICKS = 20
 """Ticks between two reports of timing and counters to the host."""
+_LEAST_SHARE = 0.9
+"""Share of the rate below which a loop is slow."""
 _BINS = 20_001
 """Resolution of lateness in microseconds; more than 20 ms counts as 20 ms."""
 
@@ -44,3 +48,45 @@ class Punctuality:
             "lateness_p99_us": p99,
             "missed": self._missed,
         }
+
+
+class Pace:
+    """Notices, second by second, that a loop keeps missing ticks.
+
+    Args:
+        period_ns: control period [ns].
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._ticks = self._periods = self._reading_ns = 0
+        self._slow = False
+        self.slow_seconds = 0
+        """Seconds in which the loop ran slower than `_LEAST_SHARE` of its rate."""
+
+    def tick(self, periods: int, reading_ns: int) -> str:
+        """Count a tick.
+
+        Args:
+            periods: periods since the last tick.
+            reading_ns: how long the hardware was read [ns].
+
+        Returns:
+            A warning when slowness begins; empty otherwise.
+        """
+        self._ticks += 1
+        self._periods += periods
+        self._reading_ns += reading_ns
+        if self._periods * self._period_ns < NS_PER_S:
+            return ""
+        share, reading_s = self._ticks / self._periods, self._reading_ns / self._ticks / NS_PER_S
+        self._ticks = self._periods = self._reading_ns = 0
+        before, self._slow = self._slow, share < _LEAST_SHARE
+        self.slow_seconds += self._slow
+        if before or not self._slow:
+            return ""
+        asked_hz = NS_PER_S / self._period_ns
+        return (
+            f"the control loop runs at {share * asked_hz:.0f} Hz instead of {asked_hz:.0f} Hz: reading the joints takes"
+            f" {reading_s * 1e3:.1f} ms of {self._period_ns / 1e6:.1f} ms"
+        )
