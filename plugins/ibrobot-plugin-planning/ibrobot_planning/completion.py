@@ -1,6 +1,6 @@
 """Trajectories in full: from where the robot stands, with velocities and accelerations, and within the limits.
 
-Whoever made a trajectory, executors follow its points by quintics of positions, velocities and accelerations. What the
+Executors follow the points of every trajectory by quintics of positions, velocities and accelerations. What the
 points leave out is computed here, so that the motion that is checked is the motion that the robot makes:
 
 - Positions alone: the cubic spline with continuous accelerations, at rest at both ends.

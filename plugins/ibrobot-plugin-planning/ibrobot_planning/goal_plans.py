@@ -176,7 +176,7 @@ class GoalPlans:
         return goals, planned
 
     def _checked(self, trajectory: JointTrajectory, start: Vector, others: Mapping[str, float]) -> JointTrajectory:
-        """A trajectory in full, within the limits and free in the present world, whoever made it.
+        """A trajectory in full, within the limits and free in the present world.
 
         Raises:
             PlanningError: if it is not.

@@ -1,4 +1,4 @@
-"""Targets beyond reach, by whatever factor: the ordinary refusal, whoever asks."""
+"""Targets beyond reach, by whatever factor: the ordinary refusal, for every caller."""
 
 from __future__ import annotations
 

@@ -130,7 +130,7 @@ WAYS = [through_service, through_target, through_client]
 
 
 @pytest.mark.parametrize("through", WAYS)
-def test_jump_is_refused_whoever_asks(run, through: Callable[[Runtime, JointTrajectory], MoveResult]):
+def test_jump_is_refused_for_every_caller(run, through: Callable[[Runtime, JointTrajectory], MoveResult]):
     runtime = at_up(run)
     before = command(runtime)
     result = through(runtime, trajectory((0, [0.0] * 5), (0.01, [1.5, 0, 0, 0, 0])))
@@ -140,7 +140,7 @@ def test_jump_is_refused_whoever_asks(run, through: Callable[[Runtime, JointTraj
 
 
 @pytest.mark.parametrize("through", WAYS)
-def test_wall_is_seen_whoever_asks(run, through: Callable[[Runtime, JointTrajectory], MoveResult]):
+def test_wall_is_seen_for_every_caller(run, through: Callable[[Runtime, JointTrajectory], MoveResult]):
     runtime = at_left(run)
     result = through(runtime, trajectory((0, LEFT), (4, RIGHT)))
     assert (result.success, result.code) == (False, PlanCode.INVALID_MOTION_PLAN)

@@ -392,7 +392,7 @@ def test_goal_that_waits_when_its_mode_ends_is_dropped(run):
     assert runtime.session.bus.call(RESULT, Numbered(number)).outcome == "CANCELLED"
 
 
-def test_old_result_is_told_from_a_goal_that_there_was_not(run):
+def test_old_result_differs_from_a_missing_goal(run):
     runtime = run(mode="joint")
     first = runtime.session.bus.call(GO_TO, "up")
     for _ in range(Results.KEPT):
