@@ -134,6 +134,7 @@ def _tasks(options: NoOptions, session: Session) -> Component:
 def _unknown_names(options: WorldOptions, robot: Robot) -> Iterable[OptionFault]:
     """Faults of names that are neither a link of the robot's model nor an object."""
     from ibrobot_core.api import ModelError, read_mjcf
+    from ibrobot_planning.world import FLOOR
 
     mjcf = robot.description.mjcf
     if mjcf is None:
@@ -144,7 +145,7 @@ def _unknown_names(options: WorldOptions, robot: Robot) -> Iterable[OptionFault]
         return  # core reports it
     prefixes = tuple(robot.description.arms) or ("",)
     links = [prefix + name for prefix in prefixes for name in ("world", *model.links, *model.frames)]
-    known = [*links, *options.objects, *options.clouds]
+    known = [*links, *options.objects, *options.clouds, FLOOR]
     for name, thing in options.objects.items():
         if name in links:
             yield OptionFault(("objects", name), f"a link of {mjcf.name} has this name already")
@@ -153,7 +154,7 @@ def _unknown_names(options: WorldOptions, robot: Robot) -> Iterable[OptionFault]
                 ("objects", name, "link"), f"unknown link {thing.link!r}{did_you_mean(thing.link, links, 'known')}"
             )
         for i, other in enumerate(thing.may_touch):
-            if other not in known:
+            if other not in known and not options.scene:  # objects of the scene are checked at the start
                 message = f"unknown link or object {other!r}{did_you_mean(other, known, 'known')}"
                 yield OptionFault(("objects", name, "may_touch", i), message)
 
