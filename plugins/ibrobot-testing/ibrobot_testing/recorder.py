@@ -272,7 +272,7 @@ class RecorderSuite(Suite[Recorder]):
 
 
 def _others(ctx: Context) -> dict[str, Message]:
-    """Topic -> a message that is no joint state."""
+    """Topic -> a message that is not a joint state."""
     return {
         "/note": String("the “cube”\n"),
         "/commands": Float64MultiArray(np.array([0.1, -2.5e300, 0.0])),
