@@ -142,7 +142,7 @@ class DualSense(_Hid):
 
     device = "{type: gamepad, via: hid, cartesian: false}"
     ids = (0x054C, 0x0CE6)
-    absent = ("key repeat", "network cut")
+    absent: tuple[str, ...] = ("key repeat", "network cut")
 
     @override
     def reports(self, held: bool) -> tuple[bytes, ...]:
@@ -154,7 +154,7 @@ class Xbox(_Hid):
 
     device = "{type: gamepad, via: hid, cartesian: false}"
     ids = (0x045E, 0x0B13)
-    absent = ("key repeat", "network cut")
+    absent: tuple[str, ...] = ("key repeat", "network cut")
 
     @override
     def reports(self, held: bool) -> tuple[bytes, ...]:
@@ -170,7 +170,7 @@ class SpaceMouse(_Hid):
     ids = (0x256F, 0xC635)
     usage = 0x08
     presses = 2
-    absent = ("key repeat", "network cut")
+    absent: tuple[str, ...] = ("key repeat", "network cut")
 
     def __init__(self) -> None:
         super().__init__()
@@ -193,7 +193,7 @@ class Keyboard(Person):
 
     device = "{type: keyboard, cartesian: false}"
     key = "w"
-    absent = ("key repeat",)
+    absent: tuple[str, ...] = ("key repeat",)
 
     def __init__(self) -> None:
         super().__init__()
@@ -233,7 +233,7 @@ class _Leader(Keyboard):
 
     key = "space"
     faults = True
-    absent = ("network cut",)
+    absent: tuple[str, ...] = ("network cut",)
     deadman = ""
 
     def __init__(self, folder: Path) -> None:
@@ -295,7 +295,7 @@ class LeaderHold(_Leader):
     """`deadman: hold`."""
 
     deadman = "hold"
-    absent = ("key repeat", "network cut")
+    absent: tuple[str, ...] = ("key repeat", "network cut")
 
 
 class LeaderToggle(_Leader):
@@ -317,7 +317,7 @@ class Imu(Keyboard):
 
     key = "space"
     faults = True
-    absent = ("unplug", "replug", "key repeat", "network cut")
+    absent: tuple[str, ...] = ("unplug", "replug", "key repeat", "network cut")
 
     def __init__(self) -> None:
         super().__init__()
@@ -343,7 +343,7 @@ class Headset(Person):
     """A controller of a headset, whose poses arrive at the page's server."""
 
     device = "{type: webxr, port: 0}"
-    absent = ("key repeat",)
+    absent: tuple[str, ...] = ("key repeat",)
 
     def __init__(self) -> None:
         super().__init__()
@@ -383,7 +383,7 @@ class Twists(Person):
     """A program that sends twists with the time in their headers."""
 
     device = "{type: twist}"
-    absent = ("key repeat", "unplug", "replug", "thaw")
+    absent: tuple[str, ...] = ("key repeat", "unplug", "replug", "thaw")
     """A pause of 0.5 s counts as the release: whoever sends again after a gap asks for motion anew."""
 
     @override

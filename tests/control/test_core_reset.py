@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -236,7 +238,7 @@ def into(make_rig, phase: Phase):
     return rig
 
 
-COMMANDS = {
+COMMANDS: dict[str, dict[str, Any]] = {
     "switch_mode": {"mode": "plan"},
     "goal": {"executor": "arm_trajectory", "goal_id": "1", "goal": {}},
     "reset": {},

@@ -399,6 +399,7 @@ class TestProcess:
             host.call("estop")
 
     def test_without_the_hosts_signs_of_life_it_holds(self, make, reports, monkeypatch):
+        beats: Any
         monkeypatch.setattr("ibrobot_core.control.link.SharedMemory.beat", lambda memory: next(beats, None))
         host = make()
         beats = beats_of(host)

@@ -363,7 +363,7 @@ class TestOtherContract:
         pan = {"id": 1, "drive_mode": 0, "homing_offset": 3, "range_min": 100, "range_max": 4000}
         for number, offset in enumerate((3, 4), 1):
             calibration = json.dumps({"arm": {"pan": {**pan, "homing_offset": offset}}})
-            mark = {"robot": f"arm{number}"} if changed == "robot" else {"calibration": calibration}
+            mark: dict[str, Any] = {"robot": f"arm{number}"} if changed == "robot" else {"calibration": calibration}
             record(tmp_path / f"bags/episode_{number}", number, 0.5, "sort", **mark)
         done = run("convert", tmp_path / "bags", "--out", tmp_path / "set", "--no-videos")
         assert done.code == 1

@@ -158,7 +158,10 @@ def test_the_next_command_is_missing_where_it_comes_late(span: tuple[float, floa
     """With `align: next`, commands do not count for ticks long before them, and none follows an early end."""
     record(tmp_path / "bag", 5, LONG_S, gap={COMMANDS: span})
     (action,) = CONTRACT.action_parts
-    parts = {"observation_parts": BENCH.observation_parts[:1], "action_parts": (attrs.evolve(action, align="next"),)}
+    parts: dict[str, Any] = {
+        "observation_parts": BENCH.observation_parts[:1],
+        "action_parts": (attrs.evolve(action, align="next"),),
+    }
     contract = attrs.evolve(CONTRACT, **parts)
     read = samples(tmp_path / "bag")
     begin_ns = min(each.received_ns for of_topic in read.values() for each in of_topic)

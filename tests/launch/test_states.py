@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import attrs
 import numpy as np
@@ -45,7 +45,8 @@ def test_a_state_that_was_not_read_is_no_message(runs: Runs, mute) -> None:
     assert len(commands.drain()) == 21, "what the robot is told is published all the same"
     mute(False)
     run.step()
-    stamps = [item.message.header.stamp_ns for item in states.drain()]
+    messages: list[Any] = [item.message for item in states.drain()]
+    stamps = [message.header.stamp_ns for message in messages]
     assert stamps == [run.session.clock.now_ns()]
 
 
@@ -60,10 +61,11 @@ def test_a_frame_lacks_a_state_older_than_the_contract_allows(runs: Runs, mute) 
         mute(True)
         for _ in range(10):
             run.step()
-        before = run.session.acting.dispatch.requests
+        acting: Any = run.session.acting
+        before = acting.dispatch.requests
         for _ in range(60):
             run.step()
-        assert (run.session.acting.dispatch.requests > before) is asks
+        assert (acting.dispatch.requests > before) is asks
         mute(False)
         run.stop()
 
@@ -77,6 +79,7 @@ def test_a_device_can_stop_a_robot_whose_joints_do_not_answer(runs: Runs, mute) 
     runs.parts.Stick.read = lambda stick, measured: TeleopCommand(None, estop=True)
     run.step()
     run.step()
+    assert run.session.state is not None
     assert run.session.state.estop
 
 
@@ -100,6 +103,7 @@ def test_watching_gives_the_newest_state_once(runs: Runs) -> None:
 
 def test_a_new_state_wakes_who_waits(runs: Runs) -> None:
     session = runs.make(mode="idle").session
+    got: list[Any]
     watch, got = session.watch_states(), []
     waiting = threading.Thread(target=lambda: got.append(watch.get(30.0)))
     waiting.start()
@@ -119,7 +123,9 @@ def test_each_state_says_who_commanded_however_late_the_operator_is(runs: Runs) 
     labels = run.session.bus.subscribe("/commander", 1000)
     commands = run.session.bus.subscribe("/arm/commands", 1000)
     labels.drain()  # the latched one
+    control: Any = run.session.control
     for _ in range(30):
-        run.session.control.step()  # control alone
+        control.step()  # control alone
     assert len(commands.drain()) == 30
-    assert [item.message.data for item in labels.drain()] == ["policy"] * 30
+    said: list[Any] = [item.message for item in labels.drain()]
+    assert [message.data for message in said] == ["policy"] * 30

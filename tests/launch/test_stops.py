@@ -87,13 +87,14 @@ class TestReset:
         steps(teleop)
         assert teleop.session.faults == ("mode teleop does not start over: the lever is gone",)
         teleop.reset()
-        assert teleop.session.faults == ()
+        assert not teleop.session.faults
 
     def test_that_control_refuses_does_not_end_a_mode_that_moves(self, teleop: Runtime, monkeypatch):
         monkeypatch.setattr(teleop.session, "command", lambda do, **_: (_ for _ in ()).throw(HardwareError("not now")))
         with pytest.raises(HardwareError, match="not now"):
             teleop.reset()
-        assert teleop.session.command_source.active
+        source: Any = teleop.session.command_source
+        assert source.active
 
 
 class TestModes:
@@ -137,7 +138,8 @@ class Slow:
 
     def concurrently(self, *acts: Callable[[], object], meanwhile: Callable[[], object] = lambda: None) -> list[str]:
         """Let threads act, each after the one before has asked for its turn; returns what was raised."""
-        self.run.session.changing = self.turns
+        session: Any = self.run.session
+        session.changing = self.turns
         threads = [threading.Thread(target=self._act, args=(each,)) for each in acts]
         deadline_s = time.monotonic() + PATIENCE_S
         for number, thread in enumerate(threads, 1):
@@ -173,7 +175,8 @@ class TestOneAtATime:
         run = slow.run
         assert slow.concurrently(lambda: run.switch_mode("policy"), lambda: run.switch_mode("plan")) == []
         assert run.session.mode == "plan"
-        assert run.session.control._core.mode == "plan"
+        control: Any = run.session.control
+        assert control._core.mode == "plan"
         run.switch_mode("teleop")
         assert run.session.mode == "teleop"
         run.reset()
@@ -271,11 +274,12 @@ class TestDevices:
     def test_one_can_stop_the_robot_on_its_way_to_the_stop_pose(self, runs: Runs):
         runtime = runs.start("control_modes.teleop.teleop=lever", "control.stop=pose up", mode="teleop")
         lever = runs.parts.MADE["lever"]
-        source = runtime.session.command_source
+        source: Any = runtime.session.command_source
         read = lever.read
         lever.read = lambda measured: pressed(read(measured))
         runtime.session.finish()
-        runtime.session.control.step()
+        control: Any = runtime.session.control
+        control.step()
         source.step(runtime.session.clock.now_ns())
 
         assert runtime.session.stops == 1

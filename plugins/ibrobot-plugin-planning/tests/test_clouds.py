@@ -113,7 +113,8 @@ class Run:
         if name not in objects:
             return np.zeros((0, 3))
         assert isinstance(objects[name].shape, Voxels)
-        return objects[name].shape.centres
+        shape: Any = objects[name].shape
+        return shape.centres
 
 
 @pytest.fixture

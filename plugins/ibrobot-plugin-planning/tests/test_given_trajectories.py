@@ -12,15 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_planning.client import LocalNode, MoveIt2
-from ibrobot_planning.completion import LONGEST_S, MOST_POINTS, completed
+from ibrobot_planning.completion import MOST_POINTS, completed
 from ibrobot_planning.goal_text import Target
 from ibrobot_planning.motion import MoveResult
 from ibrobot_planning.requests import Execute, GoTo
 from ibrobot_planning.source import EXECUTE, GO_TO
+from ibrobot_planning.timing import LONGEST_S
 from ibrobot_testing.fakes import FakePlanner
 
 from ibrobot_core.api import (
-    Description,
     Header,
     Joint,
     JointTrajectory,
@@ -122,7 +122,7 @@ def through_client(runtime: Runtime, wanted: JointTrajectory) -> MoveResult:
         arm = MoveIt2(node, list(ARM), "base_link", "tip")
         arm.execute(wanted)
         done = arm.wait_until_executed()
-        error = arm.get_last_execution_error_code()
+        error: Any = arm.get_last_execution_error_code()
     return MoveResult(done, error.message, 0.0, "SUCCEEDED" if done else "PLANNING_FAILED", error.val)
 
 
@@ -198,9 +198,7 @@ def test_given_trajectory_is_followed_within_the_limits(run, fields: int):
     assert_within_limits(runtime, commands)
 
 
-ONE = Robot(
-    "one", (Joint("pan", -2.0, 2.0, max_velocity=3.0, max_acceleration=10.0),), {"arm": ("pan",)}, Description()
-)
+ONE = Robot("one", (Joint("pan", -2.0, 2.0, max_velocity=3.0, max_acceleration=10.0),), groups={"arm": ("pan",)})
 
 
 @settings(max_examples=200, deadline=None)

@@ -203,7 +203,7 @@ def test_a_cmd_pose_of_another_type_is_refused(run):
         run().session.bus.publish(CMD_POSE, String("up"))
 
 
-def call(runtime: Runtime, service: str, request: object) -> MoveResult:
+def call(runtime: Runtime, service: Any, request: object) -> MoveResult:
     """Call a service that waits from a thread of its own."""
     answers: list[MoveResult] = []
     thread = threading.Thread(target=lambda: answers.append(runtime.session.bus.call(service, request)))

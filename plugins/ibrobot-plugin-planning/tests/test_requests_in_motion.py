@@ -146,7 +146,9 @@ def test_goal_whose_motion_is_refused_when_it_blends_fails_alone(run: Run, monke
         patch.setattr(Execution, "follow", follow)
         result = finish(runtime, runtime.session.bus.call(GO_TO, "right"))
     assert (result.outcome, result.message) == ("EXECUTION_FAILED", "refused, the robot is stopping")
-    assert runtime.session.bus.call(RESULT, number).outcome == "CANCELLED"
+    ended = runtime.session.bus.call(RESULT, number)
+    assert ended is not None
+    assert ended.outcome == "CANCELLED"
     assert finish(runtime, runtime.session.bus.call(GO_TO, "up")).success
 
 

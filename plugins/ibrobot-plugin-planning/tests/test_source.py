@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from ibrobot_planning.source import GO_TO
 
@@ -101,9 +103,11 @@ def test_goals_requested_before_an_emergency_stop_do_not_begin_after_the_reset(s
     runtime = start(mode="plan", goals=("up", "pan=-0.3"))
     seconds(runtime, 0.1)
     runtime.session.control.call("estop")
+    clock: Any = runtime.session.clock
+    control: Any = runtime.session.control
     for _ in range(30):  # it brakes, and the source has no time to notice
-        runtime.session.clock.advance(20_000_000)
-        runtime.session.control.step()
+        clock.advance(20_000_000)
+        control.step()
     runtime.reset()
     seconds(runtime, 0.1)
     resting = position(runtime)

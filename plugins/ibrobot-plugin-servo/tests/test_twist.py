@@ -210,7 +210,7 @@ def test_a_stream_that_goes_on_over_a_reset_moves_nothing_before_a_zero_twist_or
         begin_operation(rig.teleop, rig.measured())
         assert not rig.follow(twist(), 2.0).any()
         for message in release:
-            rig.tick(*[message] * (message is not None))
+            rig.tick(*([] if message is None else [message]))
         assert rig.follow(twist(), 0.3).any()
 
 

@@ -168,12 +168,13 @@ def test_what_is_outside_or_malformed_is_refused(episode: Path, tmp_path: Path) 
                     continue
                 with pytest.raises(RuntimeError, match=r"outside the opened folders|control character"):
                     await answer
-            for name, facts in {
+            requests: dict[str, dict[str, Any]] = {
                 "trim": {"begin_s": 0, "end_s": 1},
                 "repair": {},
                 "restore": {"id": "x"},
                 "empty": {},
-            }.items():
+            }
+            for name, facts in requests.items():
                 with pytest.raises(RuntimeError, match=r"outside the opened folders|control character"):
                     await server.post(f"episodes/{name}", path=path, **facts)
             for name, facts in {"mark": {"outcome": "success"}, "delete": {}}.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import ClassVar, override
+from typing import Any, ClassVar, override
 
 import numpy as np
 import pytest
@@ -266,7 +266,7 @@ class RepeatsALostReply(FakeHardware):
 class AlwaysStale(FakeHardware):
     """Each reading is that of the tick before, as from a queue that nobody empties."""
 
-    queue = ()
+    queue: Any = ()
 
     def read(self):
         r = super().read()

@@ -39,7 +39,7 @@ class TestRecorder(RecorderSuite):
 
 def message_of(type_: str, fields: dict[str, Any]) -> Any:
     """The message of these plain values."""
-    made = {name: Header(**value) if name == "header" else value for name, value in fields.items()}
+    made: dict[str, Any] = {name: Header(**value) if name == "header" else value for name, value in fields.items()}
     return MESSAGE_TYPES[type_](
         **{name: tuple(v) if name == "name" else v for name, v in made.items() if name != "layout"}
     )

@@ -103,7 +103,7 @@ class Swing(FakeTeleop):
             case "exit":
                 sys.exit("a device ended it")
             case "main":  # the main thread waits in a library, without the interpreter's lock
-                signal.pthread_kill(threading.main_thread().ident, signal.SIGUSR1)
+                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
             case "link":
                 self._ctx.bus.publish = lambda *_: time.sleep(60)
 
