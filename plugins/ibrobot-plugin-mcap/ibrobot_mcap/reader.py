@@ -38,7 +38,10 @@ _SOURCES: Mapping[str, Callable[[Sequence[Path]], Source]] = {".mcap": McapSourc
 def is_rosbag2(path: Path) -> bool:
     """Whether `path` is a bag: its folder, or one of its files."""
     if path.is_dir():
-        return (path / METADATA).is_file() or any(_storage_files(path))
+        try:
+            return (path / METADATA).is_file() or any(_storage_files(path))
+        except FileNotFoundError:  # another command moved it meanwhile
+            return False
     return path.suffix in _SOURCES
 
 

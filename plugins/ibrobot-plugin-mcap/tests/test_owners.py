@@ -83,6 +83,23 @@ def test_of_two_restores_at_once_the_second_finds_nothing_to_restore(episode):
     assert len(read(episode)) == 100
 
 
+def test_what_is_restored_while_the_trash_is_listed_is_no_longer_in_it(episode, monkeypatch):
+    trash.discard(episode)
+    real = Path.iterdir
+
+    def late(self):
+        """Another command restores the episode between the look at its folder and into it."""
+        if ".trash" in self.parts and self.name == episode.name:
+            self.rename(episode)
+        return real(self)
+
+    for metadata in (episode.parent / ".trash").rglob("metadata.yaml"):  # so that its files are looked at
+        metadata.unlink()
+    monkeypatch.setattr(Path, "iterdir", late)
+    assert trash.trashed_in(episode.parent) == []
+    assert len(read(episode)) == 100
+
+
 def test_an_episode_that_was_deleted_meanwhile_is_not_there(episode, monkeypatch):
     real = Ownership.__init__
 

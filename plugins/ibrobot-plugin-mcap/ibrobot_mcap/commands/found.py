@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -63,8 +63,11 @@ def summary_of(path: Path) -> EpisodeSummary:
 
 def size_of(path: Path) -> int:
     """Total size of an episode's files [bytes]."""
-    files = path.rglob("*") if path.is_dir() else (path,)
-    return sum(file.stat().st_size for file in files if file.is_file())
+    size = 0
+    with suppress(FileNotFoundError):  # another command moved it meanwhile
+        for file in path.rglob("*") if path.is_dir() else (path,):
+            size += file.stat().st_size if file.is_file() else 0
+    return size
 
 
 def duration_s(summary: EpisodeSummary) -> float:
