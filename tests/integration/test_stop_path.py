@@ -207,9 +207,11 @@ class TestThreads:
         assert run.host.wait(PATIENCE_S) == 130
         wait_for(lambda: not is_alive(run.control), "the control process exits")
 
-    def test_the_thread_that_takes_states_that_blocks_has_the_arm_hold(self, launch):
-        run = launch("executors.arm_position.stale_timeout=60", "teleoperation.swing.trouble=link")
-        hold(run)
+    def test_the_thread_that_takes_states_that_blocks_is_a_fault_for_control(self, launch):
+        run = launch("control.stop=relax", "teleoperation.swing.trouble=link")
+        wait_for(lambda: run.log[-1][0] == "relax", "control relaxes because of the fault")
+
+        assert run.host.poll() is None
         run.host.kill()
         wait_for(lambda: not is_alive(run.control), "the control process exits")
 
