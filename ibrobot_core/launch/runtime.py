@@ -42,8 +42,11 @@ class Reset:
 
 
 SET_MODE = Service("/set_mode", SetMode, NoneType, "Enter another control mode.", alone="mode")
+"""The service `/set_mode`."""
 RESET = Service("/reset", Reset, str, "Clear faults and the emergency stop; answers with what the robot does now.")
+"""The service `/reset`."""
 ESTOP = Service("/estop", NoRequest, NoneType, "Stop the robot at once, and hold until a reset.", urgent=True)
+"""The service `/estop`."""
 _CHANGE_S = 2.0
 """How long the end of a run waits for a mode switch or reset under way [s]."""
 _PICTURES = (Image.ros_type, CompressedImage.ros_type)
