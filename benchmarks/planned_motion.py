@@ -172,9 +172,8 @@ def obstacles(number: int, seed: int) -> bool:
             arm.measured.clear()
             move = arm.go(goal)
             arm.step(when)
-            position = ", ".join(f"{value:.5f}" for value in place.tolist())
-            size = ", ".join([f"{BOX_M}"] * 3)
-            arm.call("/world/add", f"{{name: box, object: {{shape: box, size: [{size}], position: [{position}]}}}}")
+            box = {"shape": "box", "size": [BOX_M] * 3, "position": place.tolist()}
+            arm.call("/world/add", {"name": "box", "object": box})
             result = arm.finish(move)
             commands = np.array(arm.commands)
             arm.step(50)
@@ -186,7 +185,7 @@ def obstacles(number: int, seed: int) -> bool:
             stops.append(1000 * (int(moving[-1]) + 1) / rate)
             if result.code.name != "MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE" or "box" not in result.message:
                 wrong.append(f"{result.code.name}: {result.message}")
-            arm.call("/world/remove", "{name: box}")
+            arm.call("/world/remove", {"name": "box"})
         faults = arm.faults()
     hits = sum(clearance <= 0 for clearance in clearances)
     print(

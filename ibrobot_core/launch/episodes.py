@@ -20,7 +20,8 @@ class Episodes:
         """Prompt of the next episode."""
         self.begun_ns = 0
         """Start of the present episode [ns]."""
-        self._faults_before = 0
+        self.faults: tuple[str, ...] = ()
+        """The faults and emergency stops that have stopped the robot since the present or last episode began."""
 
     def begin(self) -> None:
         """Begin the next episode."""
@@ -28,13 +29,12 @@ class Episodes:
         self.number += 1
         self.running = True
         self.begun_ns = session.clock.now_ns()
-        self._faults_before = len(session.outcome.faults)
+        self.faults = ()
         session.emit("ibrobot_episode_started", episode=self.number, mode=session.mode)
 
-    @property
-    def faults(self) -> tuple[str, ...]:
-        """The faults and emergency stops since the present or last episode began."""
-        return tuple(self._session.outcome.faults[self._faults_before :])
+    def disturb(self, fault: str) -> None:
+        """Note a fault or emergency stop that has stopped the robot."""
+        self.faults = (*self.faults, fault)
 
     def judged(self, outcome: str) -> str:
         """The outcome of the present episode, of which `outcome` is said: one with a fault or stop is no success."""

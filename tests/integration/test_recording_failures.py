@@ -195,7 +195,7 @@ class TestFullDisk:
         assert FULL in done.err
         assert not (disk / "set/meta/info.json").exists()
         again = run("convert", disk / "set:0", "--out", disk / "other")
-        assert again.code == 1
+        assert again.code in (1, 2)
 
     def test_convert_stops_at_the_first_and_goes_on_where_there_is_room(
         self, run: Run, tmp_path: Path, mounted: Callable[[str], Path]
@@ -273,8 +273,7 @@ class TestReadOnlyFolder:
     def test_record(self, run: Run, read_only: Path):
         done = record_picks(run, read_only)
         assert done.code == 2
-        refused = f"{read_only}/picks cannot be written: {read_only}: {ONLY_READ}"
-        assert f"recording.root: {refused}; choose another root" in done.err
+        assert f"recording.root: {read_only} is not writable for this user" in done.err
 
     def test_convert_and_the_way_back(self, run: Run, bags: Path, dataset: Path, read_only: Path):
         done = run("convert", bags, "--out", read_only / "set")
@@ -291,7 +290,7 @@ class TestReadOnlyFolder:
             assert "Not a directory" in done.err
         done = record_picks(run, tmp_path / "file")
         assert done.code == 2
-        assert "Not a directory" in done.err
+        assert f"recording.root: {tmp_path}/file is a file, not a folder" in done.err
 
     def test_episodes_are_read_where_nothing_can_be_written(self, run: Run, bags: Path, mounted: Callable[[str], Path]):
         disk = mounted("size=4m")
