@@ -15,6 +15,8 @@ PATIENCE_S = 30.0
 FULL = 70_000
 """More than a pipe takes [bytes]."""
 
+pytestmark = pytest.mark.integration  # it exchanges the standard streams of its process
+
 
 @pytest.fixture
 def pipe() -> Iterator[tuple[io.FileIO, io.TextIOWrapper]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import itertools
 import json
 import os
 import pty
@@ -93,10 +94,14 @@ class Terminal:
     def until(self, done: Callable[[], bool], keys: str = "") -> None:
         """Type `keys` again and again, as a held key does, until `done`."""
         deadline = time.monotonic() + PATIENCE_S
+        next_s = time.monotonic()
+        pauses = itertools.chain((0.4,), itertools.repeat(0.033))  # before the first repeat, and between repeats
         while not done():
             assert time.monotonic() < deadline, self.shown[-3000:]
             assert self.process.poll() is None, self.shown[-3000:]
-            self.type(keys)
+            if time.monotonic() >= next_s:
+                self.type(keys)
+                next_s = time.monotonic() + next(pauses)
             self.read(0.03)
 
     def close(self) -> None:

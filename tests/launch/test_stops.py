@@ -410,6 +410,7 @@ class Keys:
             self.panel._handle_key(*self.panel._pressed.get())
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # a key that ends the thread
 class TestKeys:
     @pytest.fixture
     def keys(self, teleop: Runtime) -> Iterator[Keys]:

@@ -7,6 +7,7 @@ import json
 import shutil
 import sys
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -364,10 +365,15 @@ def test_plot_without_matplotlib_says_how_to_install_it(tmp_path, monkeypatch):
         run("plot", path)
 
 
-def test_delete_asks_and_takes_nothing_but_episodes(tmp_path):
+def _ended(question):
+    raise click.Abort
+
+
+def test_delete_asks_and_takes_nothing_but_episodes(tmp_path, monkeypatch):
     path = made(tmp_path)
     CliRunner().invoke(episodes, ["delete", str(path)], input="n\n")
     assert path.is_dir()
+    monkeypatch.setattr(click, "confirm", _ended)  # standard input has ended
     unanswered = CliRunner().invoke(episodes, ["delete", str(path)])
     assert (unanswered.exit_code, path.is_dir()) == (2, True)
     assert "Standard input has no answer: run it in a terminal, or give --yes" in unanswered.output
