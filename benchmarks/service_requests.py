@@ -47,9 +47,7 @@ sys.path.append(str(ROOT / "tests" / "shared"))
 from plain_requests import SECRET, Requests  # noqa: E402
 
 VALUE = "hunter2-0451"
-SHOWN = re.compile(
-    rf"{VALUE}|Traceback|the service failed|\b[A-Z]\w*(Error|Exception): |a bug|{os.environ['HOME']}/"
-)
+SHOWN = re.compile(rf"{VALUE}|Traceback|the service failed|\b[A-Z]\w*(Error|Exception): |a bug|{os.environ['HOME']}/")
 """What no answer may show."""
 WAITS = ("/moveit_gateway/move_to_pose", "/moveit_gateway/move_to_configuration")
 """They answer when the motion has ended."""
