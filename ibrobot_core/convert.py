@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -141,6 +142,8 @@ class Converter:
 
     files: Callable[[str], Path] = no_files
     """Finds the file that a text names; raises ValueError if there is none."""
+    most: float = math.inf
+    """Number of faults after which no more are looked for: each costs time."""
 
     def structure(self, value: Any, kind: Any) -> Any:
         """Convert `value` to a `kind`.
@@ -205,9 +208,10 @@ class Converter:
         if not isinstance(value, Mapping):
             raise _wrong("a mapping", value)
         known, faults = fields(kind), Faults()
-        for name in value:
-            if name not in known:
-                faults.add((name,), unknown_key(name, list(known)))
+        for name in (name for name in value if name not in known):
+            faults.add((name,), unknown_key(name, list(known)))
+            if len(faults.found) >= self.most:
+                break
         arguments = self.arguments(known, value, faults)
         faults.raise_any()
         return kind(**arguments)
@@ -236,7 +240,10 @@ class Converter:
         scalar_type = get_args(kind)[-1]
         dtype = np.dtype(scalar_type if get_origin(kind) is not np.ndarray else get_args(scalar_type)[0])
         scalar = float if dtype.kind == "f" else int
-        numbers = self._items((i, item, scalar) for i, item in enumerate(value))
+        if all(type(item) is scalar for item in value):
+            numbers = list(value)
+        else:
+            numbers = self._items((i, item, scalar) for i, item in enumerate(value))
         try:
             return np.array(numbers, dtype)
         except OverflowError:
@@ -249,6 +256,8 @@ class Converter:
         for key, item, kind in items:
             with faults.at(key):
                 found.append(self.structure(item, kind))
+            if len(faults.found) >= self.most:
+                break
         faults.raise_any()
         return found
 

@@ -88,7 +88,7 @@ class Service[Q, A]:
             if not isinstance(found, Mapping):
                 raise RequestError(f"{self.name}: expected {self._keys()}, got {shown(found)}")
             try:
-                return Converter(files).structure(found, self.request)  # type: ignore[no-any-return]
+                return Converter(files, _SHOWN + 1).structure(found, self.request)  # type: ignore[no-any-return]
             except Faults as error:
                 faults = error.found
             except (ValueError, TypeError, ArithmeticError) as error:  # values that exclude each other
@@ -102,7 +102,7 @@ class Service[Q, A]:
 
 def _listed(faults: list[tuple[Key, str]]) -> str:
     lines = [": ".join(filter(None, (".".join(map(str, key)), message))) for key, message in faults[:_SHOWN]]
-    more = [f"and {len(faults) - _SHOWN} more"] if len(faults) > _SHOWN else []
+    more = ["and more"] if len(faults) > _SHOWN else []
     return "; ".join([*lines, *more])
 
 
@@ -119,8 +119,9 @@ def _too_much(request: object, limits: RequestLimits) -> list[tuple[Key, str]]:
                 return [((), f"the request has more than {limits.values} values")]
             if value and len(key) >= limits.depth:
                 return [(key, f"more than {limits.depth} lists and mappings within one another")]
-            items = list(value.items() if isinstance(value, Mapping) else enumerate(value))
-            wrong = next((found for part, _ in items if (found := _key_misfit(part, limits))), "")
+            keys = tuple(value) if isinstance(value, Mapping) else ()
+            wrong = next((found for part in keys if (found := _key_misfit(part, limits))), "")
+            items = value.items() if isinstance(value, Mapping) else enumerate(value)
             todo += [((*key, part), item) for part, item in items]
         if wrong:
             return [(key, wrong)]
@@ -143,5 +144,5 @@ def _misfit(value: object, limits: RequestLimits) -> str:
 
 
 def _key_misfit(key: object, limits: RequestLimits) -> str:
-    """Why a key cannot be part of a request; empty if it can, or is an index."""
-    return _misfit(key, limits) if isinstance(key, str | int) else f"{shown(key)} is no key: a key is a text"
+    """Why a key cannot be part of a request; empty if it can."""
+    return _misfit(key, limits) if isinstance(key, str) else f"{shown(key)} is no key: a key is a text"

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ibrobot_core import convert
 from ibrobot_core.errors import RequestError
 from ibrobot_core.options import option
 from ibrobot_core.robot import Vector
@@ -111,7 +112,26 @@ def test_a_message_has_up_to_five_faults():
         "/order: name: expected text, got 1 (quote it: '1'); speed: 2.0 is too large, must be at most 1 m/s; "
         "part: expected a mapping, got 3"
     )
-    assert refusal({f"x{i}": 1 for i in range(9)}).endswith("; and 5 more")
+    assert refusal({f"x{i}": 1 for i in range(9)}).endswith("; and more")
+
+
+def test_no_faults_are_looked_for_beyond_those_in_the_message(monkeypatch: pytest.MonkeyPatch):
+    checked: list[object] = []
+
+    def refuse(instance: object, attribute: object, value: object) -> None:
+        checked.append(value)
+        raise ValueError("no")
+
+    step = attrs.make_class("Step", {"size": option(validator=refuse)}, frozen=True)
+    steps = attrs.make_class("Steps", {"steps": attrs.field(type=tuple[step, ...])}, frozen=True)  # type: ignore[valid-type]
+    service: Service[Any, Any] = Service("/steps", steps, int)
+    assert refusal({"steps": [{"size": 1}] * 900}, service).endswith("; and more")
+    assert len(checked) == 6
+    monkeypatch.setattr(convert, "unknown_key", lambda *names: str(checked.append(names)))
+    for request in ({f"x{i}": 1 for i in range(900)}, {"steps": [{f"x{j}": 1 for j in range(9)}] * 90}):
+        checked.clear()
+        refusal(request, service)
+        assert len(checked) == 6
 
 
 def test_nothing_is_expanded(monkeypatch: pytest.MonkeyPatch):
