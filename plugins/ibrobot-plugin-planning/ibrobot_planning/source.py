@@ -51,7 +51,9 @@ GO_TO = Service(
 RESULT: Service[Numbered, MoveResult | None] = Service(
     "/planning/result", Numbered, MoveResult | None, "The result of a goal; null while the robot moves.", "number"
 )
-CANCEL = Service("/planning/cancel", NoRequest, NoneType, "Drop all goals: the robot slows down and holds.")
+CANCEL = Service(
+    "/planning/cancel", NoRequest, NoneType, "Drop all goals: the robot slows down and holds.", urgent=True
+)
 MOVE_ACTION = Service(
     "/move_action", MoveRequest, int, "Move to the first goal that can be reached; answers with its number."
 )
@@ -220,10 +222,13 @@ class PlannerSource(SourceWorker):
         except queue.Empty:
             items = []
         with self.lock:
+            wanted = [item for item in items if not isinstance(item, Mapping)]
+            for move in filter(None, wanted[:-1]):  # as each would be planned for, a cancel would wait behind a flood
+                self._finish(move, "CANCELLED", PlanCode.PREEMPTED, _replaced(wanted[-1]))
             for item in items:
                 if isinstance(item, Mapping):
                     self._advance(item)
-                else:
+                elif item is wanted[-1]:
                     self._replace(item)
             if not self.active:
                 return
@@ -342,7 +347,7 @@ class PlannerSource(SourceWorker):
 
     def _replace(self, move: _Move | None) -> None:
         """Drop all goals in favour of `move`; None holds."""
-        why = f"replaced by goal {move.target.text}" if move is not None else "cancelled"
+        why = _replaced(move)
         dropped = list(self._queue)
         self._queue.clear()
         if move is not None:
@@ -504,6 +509,11 @@ class PlannerSource(SourceWorker):
         """End all goals, so that no caller waits for them."""
         self.end()
         self._over = True
+
+
+def _replaced(move: _Move | None) -> str:
+    """Why goals end in favour of `move`; None holds."""
+    return "cancelled" if move is None else f"replaced by goal {move.target.text}"
 
 
 def _nearest(pose: Pose) -> AnyGoal:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ibrobot_planning.goal_plans import GoalPlans
 from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Results
 from ibrobot_planning.planning_services import CARTESIAN, COMPUTE_FK, COMPUTE_IK, PLAN
 from ibrobot_planning.requests import GoTo, Numbered
@@ -103,6 +104,28 @@ def finish(runtime: Runtime, number: int, commands: list[Vector] | None = None) 
             assert isinstance(result, MoveResult)
             return result
     raise AssertionError("the goal does not end")
+
+
+def test_of_a_flood_of_goals_the_newest_is_planned_and_a_cancel_waits_for_none(
+    run: Callable[..., Runtime], monkeypatch: pytest.MonkeyPatch
+):
+    runtime, planned, plan = run(by_operator=True), [0], GoalPlans.plan
+
+    def counted(self: GoalPlans, *arguments: Any) -> Any:
+        planned[0] += 1
+        return plan(self, *arguments)
+
+    monkeypatch.setattr(GoalPlans, "plan", counted)
+    call = runtime.session.bus.call
+    numbers = [call(GO_TO, "up") for _ in range(50)]
+    call(CANCEL)
+    runtime.step()
+    assert {call(RESULT, number).message for number in numbers} == {"cancelled"}
+    assert planned[0] == 0
+    *dropped, newest = [call(GO_TO, "up") for _ in range(50)]
+    assert finish(runtime, newest).success
+    assert {call(RESULT, number).message for number in dropped} == {"replaced by goal up"}
+    assert planned[0] == 1
 
 
 def go(runtime: Runtime, goal: Any) -> MoveResult:

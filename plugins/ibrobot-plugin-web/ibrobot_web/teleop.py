@@ -60,7 +60,7 @@ class Released:
 
 
 JOG = Service("/web_teleop/jog", Jog, NoneType, "Move the robot until the next call, or for the timeout.")
-RELEASE = Service("/web_teleop/release", Released, NoneType, "Release the deadman.")
+RELEASE = Service("/web_teleop/release", Released, NoneType, "Release the deadman.", urgent=True)
 
 
 class WebTeleop(Teleop):

@@ -49,7 +49,9 @@ CHECK = Service("/task/check", RunTask, NoneType, "Check a task; fails as /task/
 RESULT: Service[Numbered, TaskResult | None] = Service(
     "/task/result", Numbered, TaskResult | None, "The result of a task; null until it has ended.", "number"
 )
-CANCEL = Service("/task/cancel", NoRequest, NoneType, "End the present task: the robot slows down and holds.")
+CANCEL = Service(
+    "/task/cancel", NoRequest, NoneType, "End the present task: the robot slows down and holds.", urgent=True
+)
 STATUS = "/task/status"
 """std_msgs/msg/String, latched: JSON with `task`, `step`, `steps`, `kind`, `name` and `state`."""
 _POLL_S = 0.01
