@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import enum
+import inspect
 import itertools
 import logging
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, get_origin
 
 import attrs
 import numpy as np
@@ -252,20 +253,28 @@ class ControlCore:
         return Phase.FAULTED if self.fault else Phase.RUNNING
 
     def handle(self, command: Mapping[str, Any]) -> dict[str, Any]:
-        """Execute a command of the host and return the reply; the reply to a refused command has the key `error`."""
+        """Execute a command of the host and return the reply; the reply to a refused command has the key `error`.
+
+        Commands come from another process: one that does not exist, or whose arguments are others, is refused, too.
+        """
+        reply = {"reply": command.get("id")}
         arguments = {key: value for key, value in command.items() if key not in ("do", "id")}
         try:
-            self._permit(command["do"])
-            result = self._commands[command["do"]](**arguments) or {}
+            result = self._permitted(command.get("do"), arguments)(**arguments) or {}
         except IbrobotError as error:
-            return {"reply": command["id"], "stops": self.stops, "error": str(error)}
-        return {"reply": command["id"], "stops": self.stops, "generation": self.generation, **result}
+            return {**reply, "stops": self.stops, "error": str(error)}
+        return {**reply, "stops": self.stops, "generation": self.generation, **result}
 
-    def _permit(self, do: str) -> None:
+    def _permitted(self, do: object, arguments: Mapping[str, Any]) -> Callable[..., Mapping[str, Any] | None]:
+        act = self._commands.get(do) if isinstance(do, str) else None
+        if act is None:
+            raise HardwareError(f"control has no command {do!r:.40}")
         phase = self.phase
         if do not in PERMITTED[phase]:
             cause = f": {self.fault}" if phase is Phase.FAULTED else ""
             raise HardwareError(f"{do}: refused {phase.value}{cause}")
+        _check_arguments(act, arguments)
+        return act
 
     def counters(self) -> dict[str, Any]:
         """Counts of all interventions and refusals by the safety layer, the executors, the hardware and the loop."""
@@ -661,3 +670,20 @@ class ControlCore:
 
     def _cancel(self) -> None:
         self._executors.cancel(self._at_tick)
+
+
+def _check_arguments(act: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
+    """Check the names and types of the arguments of a command.
+
+    Raises:
+        HardwareError: if they are others.
+    """
+    signature = inspect.signature(act, eval_str=True)
+    try:
+        signature.bind(**arguments)
+    except TypeError as error:
+        raise HardwareError(f"malformed command: {error}") from None
+    for name, value in arguments.items():
+        kind = signature.parameters[name].annotation
+        if not isinstance(value, get_origin(kind) if get_origin(kind) is Mapping else kind):
+            raise HardwareError(f"malformed command: {name} cannot be a {type(value).__name__}")

@@ -275,6 +275,7 @@ class ControlClient(ControlHost):
         except IbrobotError:
             child.channel.close()  # a process that is not ready yet stops once it is
             self._end(child)
+            self._let_go(_GONE)
             raise
         self._thread = threading.Thread(target=self._receive, args=(child,), name="control link", daemon=True)
         self._thread.start()
@@ -458,8 +459,8 @@ class ControlClient(ControlHost):
 
     def _take(self, message: Mapping[str, Any]) -> None:
         if "reply" in message:
-            self.stops = max(self.stops, message.get("stops", 0))
-            waiting = self._replies.get(message["reply"])
+            number, self.stops = message["reply"], max(self.stops, message.get("stops", 0))
+            waiting = self._replies.get(number) if isinstance(number, int) else None
             if waiting is not None:
                 waiting.put(message)
         elif message["event"] == "arrived":

@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ class ControlProcess:
 
     def __init__(
         self, core: ControlCore, clock: RealClock, channel: Channel, memory: SharedMemory, wake: int, host: int,
-        ready: Mapping[str, Any],
+        ready: Mapping[str, Any], early: Iterable[Mapping[str, Any]] = (),
     ) -> None:  # fmt: skip
         self._core = core
         self._clock = clock
@@ -48,6 +48,8 @@ class ControlProcess:
         self._wake = wake
         self._host = host
         self._ready = ready
+        self._early = early
+        """Commands that arrived with the order, before there was anything to command."""
         self._arrived = False
         self._waiting: deque[Mapping[str, Any]] = deque()
         """Commands of the host that were received and not executed yet."""
@@ -68,6 +70,8 @@ class ControlProcess:
         signal.signal(signal.SIGTERM, self._terminate)
         self._report("report")  # the first call is slow, so make it before the first tick
         self._channel.send(self._ready)
+        self._sort(self._early)
+        self._handle_commands()  # an emergency stop that came while the hardware was connected lets nothing move
         period = self._core.period_ns
         deadline = self._clock.now_ns() + period
         periods = 1
@@ -106,9 +110,12 @@ class ControlProcess:
 
     def _receive(self) -> None:
         """Receive commands; emergency stops overtake all others."""
-        for command in self._channel.receive():
-            if command["do"] == "estop":
-                self._channel.send(self._core.handle(command))
+        self._sort(self._channel.receive())
+
+    def _sort(self, commands: Iterable[Mapping[str, Any]]) -> None:
+        for command in commands:
+            if command.get("do") == "estop":
+                self._channel.send(self._core.handle({"do": "estop", "id": command.get("id")}))
             else:
                 self._waiting.append(command)
 
@@ -129,9 +136,9 @@ class ControlProcess:
         self._receive()
         while self._waiting:
             command = self._waiting.popleft()
-            if command["do"] == "stop":
+            if command.get("do") == "stop":
                 self._ends = True
-                self._core.begin_stop(unmoved=command["unmoved"])
+                self._core.begin_stop(unmoved=command.get("unmoved") is True)
             else:
                 self._channel.send(self._core.handle(command))
         return self._clock.now_ns() - begun_ns > self._core.period_ns
@@ -166,7 +173,7 @@ def main(parent: int, memory: int, wake: int) -> int:
     channel = open_parent(parent)
     core = None
     try:
-        order = channel.wait(_STARTUP_TIMEOUT_S)[0]
+        order, *early = channel.wait(_STARTUP_TIMEOUT_S)
         clock = RealClock(order["epoch_offset_ns"])
         config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"])
         core = build_core(config, installed_plugins(), clock, order["seed"])
@@ -176,7 +183,7 @@ def main(parent: int, memory: int, wake: int) -> int:
         refused = go_real_time(config.control.priority)
         signals = [[signal.topic, signal.size] for signal in core.signals]
         ready = {"event": "ready", "signals": signals, "refused": refused}
-        ControlProcess(core, clock, channel, shared, wake, order["host"], ready).run()
+        ControlProcess(core, clock, channel, shared, wake, order["host"], ready, early).run()
     except Exception as error:  # noqa: BLE001 - a bug here must still stop the robot
         if core is not None:
             core.abandon()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -267,6 +268,26 @@ class TestPhases:
             assert answer["error"].startswith(f"{do}: refused {phase.value}")
             after = phase
         assert rig.core.phase is after
+
+    @pytest.mark.parametrize(
+        ("command", "error"),
+        [
+            ({}, "control has no command None"),
+            ({"do": ["estop"]}, r"control has no command \['estop'\]"),
+            ({"do": "dance", "id": 1}, "control has no command 'dance'"),
+            ({"do": "reset", "torque": True}, "malformed command: got an unexpected keyword argument 'torque'"),
+            ({"do": "reset", "stops": "none"}, "malformed command: stops cannot be a str"),
+            ({"do": "fault"}, "malformed command: missing a required argument: 'fault'"),
+            ({"do": "fault", "fault": {"text": "x"}}, "malformed command: fault cannot be a dict"),
+            ({"do": "switch_mode", "mode": []}, "malformed command: mode cannot be a list"),
+            ({"do": "goal", "executor": "arm_trajectory", "goal_id": "1", "goal": 3}, "goal cannot be a int"),
+            ({"do": "halt", "unmoved": None}, "malformed command: unmoved cannot be a NoneType"),
+        ],
+    )
+    def test_what_is_no_command_is_refused(self, make_rig, command, error):
+        rig = make_rig({}).start()
+        assert re.search(error, rig.core.handle(command)["error"])
+        assert rig.core.phase is Phase.RUNNING
 
     def test_every_command_has_a_place(self, make_rig):
         assert set(make_rig({}).core._commands) == set(COMMANDS) == set().union(*PERMITTED.values())

@@ -218,6 +218,32 @@ class TestProcess:
         host.stop()
         assert (tmp_path / "closed").exists()
 
+    def test_an_emergency_stop_while_it_starts_is_not_lost(self, make, reports):
+        host = make(startup="pose out")
+        real = host._await_ready
+
+        def call() -> None:
+            with suppress(ComponentFailed):  # it may end before it answers
+                host.call("estop")
+
+        calling = threading.Thread(target=call)
+
+        def await_ready(child: Any) -> None:
+            calling.start()
+            real(child)
+
+        host._await_ready = await_ready
+        try:
+            host.start()
+            told = str(reports.deaths.get(timeout=PATIENCE_S))
+        except HardwareError as error:  # it has ended before it was seen to be ready
+            told = str(error)
+        calling.join()
+
+        assert told == "control.startup: pose out: emergency stop"
+        commands = [state.command for state in list_of(reports.states)]
+        assert all(np.array_equal(each, commands[0]) for each in commands), commands
+
     def test_an_emergency_stop_on_the_way_to_the_startup_pose_brakes_and_ends_it(self, make, reports):
         host = make(startup="pose out")
         host.start()
@@ -294,6 +320,15 @@ class TestProcess:
         reports.state(lambda state: state.tick > tick + 20)
         assert reports.state(lambda state: True).estop
         assert [event["event"] for event in list_of(reports.events)] == ["fault"]
+
+    def test_messages_that_are_no_commands_end_nothing_and_stop_works(self, make, reports):
+        host = make()
+        host.start()
+        for message in ({}, {"do": 1}, {"do": "stop it"}, {"do": "goal", "id": []}, {"do": "reset", "id": 1, "x": 2}):
+            host._child.channel.send(message)
+        host._child.channel.send({"do": "estop", "id": {}, "event": "log"})
+        assert reports.state(lambda state: state.stops == 1).estop
+        assert host.call("estop")["stops"] == 2
 
     def test_a_fault_is_reported_and_reset(self, make, reports):
         host = make()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ibrobot_core.errors import ComponentFailed, TeleopError
-from ibrobot_core.interfaces import TeleopCommand
+from ibrobot_core.interfaces import JointReading, TeleopCommand
 
 if TYPE_CHECKING:
     from ibrobot_core.launch.runtime import Runtime
@@ -164,3 +164,22 @@ def test_help_has_a_line_for_each_device(run: Runtime, runs: Runs, monkeypatch: 
     monkeypatch.setattr(runs.parts.MADE["left"], "help", lambda: "hold the left lever")
     monkeypatch.setattr(runs.parts.MADE["right"], "help", lambda: "hold the right lever")
     assert run.session.command_source.help() == "hold the left lever\nhold the right lever"
+
+
+def test_core_drops_positions_of_a_device_that_does_not_heed_its_own_deadman(
+    run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = runs.parts.MADE["left"]
+
+    def read(measured: JointReading) -> TeleopCommand:
+        left.deadman.report(left.pressed, measured.stamp_ns)
+        return TeleopCommand({"pan": float(measured.position[0]) + 0.01})
+
+    monkeypatch.setattr(left, "read", read)
+    assert way(run) == [False, False]
+    left.press()
+    assert way(run) == [True, False]
+    run.session.emergency_stop()
+    run.step()
+    run.reset()
+    assert way(run) == [False, False], "it is still pressed"
