@@ -22,11 +22,11 @@ from pathlib import Path
 import attrs
 import mujoco
 import numpy as np
+from ibrobot_kinematics.poses import matrix
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.rrt import RrtConnectPlanner
 from ibrobot_planning.search import Pace, Space, connect, shortened
 from ibrobot_planning.timing import Motion
-from ibrobot_planning.transforms import matrix
 from ibrobot_planning.world import Box, Cylinder, World
 from planning_scenes import ARM_JOINTS, KINDS, MAX_ACCELERATION, MAX_VELOCITY, MJCF, PADDING_M, Maker, Problem, so101
 

@@ -218,12 +218,4 @@ class Maker:
 
     def _model_tips(self, samples: Vector) -> Vector:
         """Positions of the tool, shape (N, 3)."""
-        model = self._model
-        position, rotation = np.zeros((len(samples), 3)), np.repeat(np.eye(3)[None], len(samples), axis=0)
-        for joint in model.chain:
-            position = position + rotation @ joint.position
-            x, y, z = joint.axis
-            k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-            angle = (samples[:, joint.index] - joint.reference)[:, None, None]
-            rotation = rotation @ joint.rotation @ (np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k))
-        return np.asarray(position + rotation @ model.tip_pose.position)
+        return self._model.forward(samples).position

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from ibrobot_kinematics.poses import matrix
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.rrt import RrtConnectPlanner
-from ibrobot_planning.transforms import matrix
 from ibrobot_planning.world import Box, Cylinder, World
 from PIL import Image
 

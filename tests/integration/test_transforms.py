@@ -9,27 +9,16 @@ import numpy as np
 import pytest
 import yaml
 from ibrobot_description.frames import transform
+from ibrobot_kinematics.poses import matrix
 from ibrobot_kinematics.urdf import read_urdf
 
 from ibrobot_core.config import load_config
-from ibrobot_core.messages import Quaternion, Vector3
+from ibrobot_core.messages import Pose
 
 pytestmark = pytest.mark.integration
 
 CONFIG = Path(__file__).parents[2] / "configs" / "so101_blind.yaml"
 BODIES = {"shoulder_link": "shoulder", "lower_arm_link": "lower_arm", "gripper_link": "gripper"}
-
-
-def matrix(translation: Vector3, rotation: Quaternion) -> np.ndarray:
-    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
-    result = np.eye(4)
-    result[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    result[:3, 3] = translation.x, translation.y, translation.z
-    return result
 
 
 def test_links_stand_where_mujoco_has_them() -> None:
@@ -45,7 +34,7 @@ def test_links_stand_where_mujoco_has_them() -> None:
         for joint in joints:
             if joint.parent in poses and joint.child not in poses:
                 found = transform(joint, float(at.get(joint.name, 0.0)), 0)
-                poses[joint.child] = poses[joint.parent] @ matrix(found.translation, found.rotation)
+                poses[joint.child] = poses[joint.parent] @ matrix(Pose(found.translation, found.rotation))
     model = mujoco.MjModel.from_xml_path(str(robot.description.mjcf))
     physics = mujoco.MjData(model)
     physics.qpos[:] = position

@@ -16,6 +16,7 @@ import numpy as np
 from ibrobot_core.api import Robot, Vector
 from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.model import ChainJoint, KinematicModel, TipPose
+from ibrobot_kinematics.rotations import from_quaternion
 
 _SLIDE, _HINGE = 2, 3
 """Values of mujoco.mjtJoint."""
@@ -119,7 +120,7 @@ def _chain(model: Any, site: int, order: dict[int, int], path: Path) -> tuple[tu
     position, rotation = np.zeros(3), np.eye(3)
     for body in reversed(bodies):
         position = position + rotation @ model.body_pos[body]
-        rotation = rotation @ _matrix(model.body_quat[body])
+        rotation = rotation @ _rotation(model.body_quat[body])
         first = int(model.body_jntadr[body])
         for joint in range(first, first + int(model.body_jntnum[body])):
             if model.jnt_type[joint] not in (_SLIDE, _HINGE):
@@ -138,16 +139,11 @@ def _chain(model: Any, site: int, order: dict[int, int], path: Path) -> tuple[tu
                 )
             )
             position, rotation = -anchor, np.eye(3)
-    return tuple(chain), TipPose(position + rotation @ model.site_pos[site], rotation @ _matrix(model.site_quat[site]))
-
-
-def _matrix(quaternion: Vector) -> Vector:
-    """Rotation matrix, shape (3, 3), of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+    return tuple(chain), TipPose(
+        position + rotation @ model.site_pos[site], rotation @ _rotation(model.site_quat[site])
     )
+
+
+def _rotation(quaternion: Vector) -> Vector:
+    """The matrix of MuJoCo's quaternion (w, x, y, z)."""
+    return from_quaternion(np.roll(quaternion, -1))

@@ -8,6 +8,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import Vector
+from ibrobot_kinematics.poses import homogeneous
 from ibrobot_kinematics.rotations import cross, skew
 
 
@@ -150,7 +151,7 @@ class KinematicModel:
         """
         terms = np.zeros((4, len(self.chain), 4, 4))
         for i, joint in enumerate(self.chain):
-            terms[0, i] = _homogeneous(joint.rotation, joint.position)
+            terms[0, i] = homogeneous(joint.rotation, joint.position)
             k = skew(joint.axis)
             if joint.slides:
                 terms[3, i, :3, 3] = joint.rotation @ joint.axis
@@ -166,7 +167,7 @@ class KinematicModel:
     @cached_property
     def _tip(self) -> Vector:
         """The tip in the frame of the last joint of the chain, shape (4, 4)."""
-        return _homogeneous(self.tip_pose.rotation, self.tip_pose.position)
+        return homogeneous(self.tip_pose.rotation, self.tip_pose.position)
 
     def _frames(self, q: Vector) -> tuple[TipPose, Vector, Vector]:
         """The tip, and the origins and axes of the chain's joints in the base frame, both shape (…, n, 3)."""
@@ -183,10 +184,3 @@ class KinematicModel:
         tip = frame @ self._tip
         axes = (frames[..., :3, :3] @ self._axes)[..., 0]
         return TipPose(tip[..., :3, 3], tip[..., :3, :3]), frames[..., :3, 3], axes
-
-
-def _homogeneous(rotation: Vector, position: Vector) -> Vector:
-    """A pose as a matrix, shape (4, 4)."""
-    placed = np.eye(4)
-    placed[:3, :3], placed[:3, 3] = rotation, position
-    return placed

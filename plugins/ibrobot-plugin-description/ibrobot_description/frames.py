@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import Any
 
 import attrs
+import numpy as np
+from ibrobot_kinematics.poses import orientation
+from ibrobot_kinematics.rotations import exp, from_quaternion, from_rpy
 from ibrobot_kinematics.urdf import MOVING, UrdfJoint
 
 from ibrobot_core.api import Header, Mount, Quaternion, RobotConfig, TransformStamped, Vector3
@@ -30,11 +32,9 @@ class MountedFrame:
     def transforms(self, stamp_ns: int) -> tuple[TransformStamped, ...]:
         """The frame in its parent, and a camera's optical frame in it."""
         mount = self.mount
-        rotation = from_rpy(*(mount.rpy or (0.0, 0.0, 0.0)))
-        if mount.quaternion is not None:
-            length = math.hypot(*mount.quaternion)
-            rotation = Quaternion(*(each / length for each in mount.quaternion))
-        body = TransformStamped(Header(stamp_ns, mount.parent), self.name, Vector3(*mount.xyz), rotation)
+        given = mount.quaternion
+        rotation = from_quaternion(given) if given is not None else from_rpy(*(mount.rpy or (0.0, 0.0, 0.0)))
+        body = TransformStamped(Header(stamp_ns, mount.parent), self.name, Vector3(*mount.xyz), orientation(rotation))
         if not self.optical:
             return (body,)
         return body, TransformStamped(Header(stamp_ns, self.name), self.optical, Vector3(0.0, 0.0, 0.0), OPTICAL)
@@ -52,33 +52,11 @@ def mounted(config: RobotConfig) -> Iterator[MountedFrame]:
 
 def transform(joint: UrdfJoint, position: float, stamp_ns: int) -> TransformStamped:
     """Pose of a joint's child in its parent, at a position [rad or m] if the joint moves."""
-    translation, rotation = Vector3(*joint.xyz), from_rpy(*joint.rpy)
-    x, y, z = joint.axis
+    place, rotation = np.array(joint.xyz), from_rpy(*joint.rpy)
+    way = position * np.array(joint.axis)
     if joint.type == "prismatic":
-        moved = _rotate(rotation, (x * position, y * position, z * position))
-        translation = Vector3(translation.x + moved[0], translation.y + moved[1], translation.z + moved[2])
+        place = place + rotation @ way
     elif joint.type in MOVING:
-        half = math.sin(position / 2)
-        rotation = _product(rotation, Quaternion(x * half, y * half, z * half, math.cos(position / 2)))
-    return TransformStamped(Header(stamp_ns, joint.parent), joint.child, translation, rotation)
-
-
-def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Quaternion of fixed-axis roll, pitch, yaw [rad], as in URDF."""
-    result = Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
-    result = _product(result, Quaternion(0.0, math.sin(pitch / 2), 0.0, math.cos(pitch / 2)))
-    return _product(result, Quaternion(math.sin(roll / 2), 0.0, 0.0, math.cos(roll / 2)))
-
-
-def _product(a: Quaternion, b: Quaternion) -> Quaternion:
-    return Quaternion(
-        a.w * b.x + a.x * b.w + a.y * b.z - a.z * b.y,
-        a.w * b.y - a.x * b.z + a.y * b.w + a.z * b.x,
-        a.w * b.z + a.x * b.y - a.y * b.x + a.z * b.w,
-        a.w * b.w - a.x * b.x - a.y * b.y - a.z * b.z,
-    )
-
-
-def _rotate(q: Quaternion, vector: tuple[float, float, float]) -> tuple[float, float, float]:
-    turned = _product(_product(q, Quaternion(*vector, 0.0)), Quaternion(-q.x, -q.y, -q.z, q.w))
-    return turned.x, turned.y, turned.z
+        rotation = rotation @ exp(way)
+    header, translation = Header(stamp_ns, joint.parent), Vector3(*place.tolist())
+    return TransformStamped(header, joint.child, translation, orientation(rotation))

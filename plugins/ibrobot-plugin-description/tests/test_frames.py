@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ibrobot_description.frames import MountedFrame, from_rpy, transform
+from ibrobot_description.frames import MountedFrame, transform
+from ibrobot_kinematics.poses import orientation
+from ibrobot_kinematics.rotations import from_rpy
 from ibrobot_kinematics.urdf import UrdfJoint, read_urdf
 
 from ibrobot_core.api import Mount, Vector3
@@ -73,6 +75,6 @@ def test_quaternion_of_a_mount_has_exactly_unit_length() -> None:
 def test_optical_frame_of_a_camera_looks_along_its_body() -> None:
     _, optical = mounted("top_optical_frame").transforms(0)
     assert (optical.header.frame_id, optical.child_frame_id) == ("top_frame", "top_optical_frame")
-    expected = from_rpy(-math.pi / 2, 0.0, -math.pi / 2)  # z ahead, x right, y down
+    expected = orientation(from_rpy(-math.pi / 2, 0.0, -math.pi / 2))  # z ahead, x right, y down
     for name in "xyzw":
         assert getattr(optical.rotation, name) == pytest.approx(getattr(expected, name))

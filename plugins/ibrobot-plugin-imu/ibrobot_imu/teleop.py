@@ -9,10 +9,10 @@ from typing import override
 import numpy as np
 import serial
 from ibrobot_kinematics import JogArm, JogMotion, VelocityJog
-from ibrobot_kinematics.rotations import exp, log
+from ibrobot_kinematics.rotations import from_rpy, log
 
 from ibrobot_core.api import Context, HeldKeys, JointReading, Teleop, TeleopCommand, TeleopError, Vector, ns, seconds
-from ibrobot_imu.messages import READERS, Angles
+from ibrobot_imu.messages import READERS
 from ibrobot_imu.options import TILTS, TOOL_AXES, ImuOptions
 
 _MOST_BYTES = 4096
@@ -156,7 +156,9 @@ class ImuTeleop(Teleop):
         """
         angles = self._reader.feed(port.read(min(port.in_waiting, _MOST_BYTES)))
         if angles:
-            self._orientation, self._received_ns, self._warned = _matrix(angles[-1]), now_ns, False
+            self._received_ns, self._warned = now_ns, False
+            turns = angles[-1]
+            self._orientation = from_rpy(turns.roll, turns.pitch, turns.yaw)
         elif now_ns - self._received_ns > _SILENT_NS and not self._warned:
             self._warned = True
             self._ctx.log.warning(
@@ -180,8 +182,3 @@ class ImuTeleop(Teleop):
         linear, turn = np.array([x, y, z]), np.array([yaw, pitch, roll])  # the tool points along its z
         still = np.zeros(len(self._ctx.robot.joints))
         return JogMotion(still, linear * options.speed, turn * options.turn_speed)
-
-
-def _matrix(angles: Angles) -> Vector:
-    x, y, z = np.eye(3)
-    return np.asarray(exp(angles.yaw * z) @ exp(angles.pitch * y) @ exp(angles.roll * x))

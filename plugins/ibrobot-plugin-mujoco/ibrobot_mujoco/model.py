@@ -11,6 +11,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from ibrobot_kinematics.rotations import quaternion
 from numpy.typing import NDArray
 
 from ibrobot_core.api import NS_PER_S, HardwareError, Robot, ns
@@ -223,9 +224,7 @@ def _look_at(camera: SceneCamera) -> NDArray[np.float64]:
     right = np.cross(up, backward)
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(backward, right), backward], axis=1)
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    return quaternion
+    return np.roll(quaternion(rotation), 1)
 
 
 def _strip(spec: mujoco.MjSpec) -> None:

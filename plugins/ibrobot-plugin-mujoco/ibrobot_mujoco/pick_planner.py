@@ -5,6 +5,7 @@ from __future__ import annotations
 import attrs
 import numpy as np
 from ibrobot_kinematics import KinematicModel, Target, solve
+from ibrobot_kinematics.rotations import from_quaternion
 
 from ibrobot_core.api import Vector
 from ibrobot_mujoco.policy_options import ScriptedPickOptions
@@ -27,15 +28,7 @@ class Scene:
     @classmethod
     def parse(cls, values: Vector) -> Scene:
         """Parse an observation, shape (SCENE_SIZE,)."""
-        w, x, y, z = values[3:7] / np.linalg.norm(values[3:7])
-        axes = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        return cls(values[:3], axes, values[7:])
+        return cls(values[:3], from_quaternion(np.roll(values[3:7], -1)), values[7:])
 
 
 @attrs.frozen(eq=False)

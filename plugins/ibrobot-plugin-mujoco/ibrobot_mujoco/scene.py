@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import mujoco
-import numpy as np
+from ibrobot_kinematics.poses import orientation
 
-from ibrobot_core.api import Pose, Quaternion, Robot, SceneObject, Vector3
+from ibrobot_core.api import Pose, Robot, SceneObject, Vector3
 from ibrobot_mujoco.model import BIN, CUBE, TABLE, build_model
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.state import OBJECTS_TOPIC, POSE_SIZE, SCENE_TOPIC
@@ -33,10 +33,7 @@ def scene_objects(options: MujocoOptions, robot: Robot) -> tuple[SceneObject, ..
 
 
 def _object(model: mujoco.MjModel, physics: mujoco.MjData, geom: int, topic: str, first: int) -> SceneObject:
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, physics.geom_xmat[geom])
-    w, x, y, z = quaternion.tolist()
-    pose = Pose(Vector3(*physics.geom_xpos[geom].tolist()), Quaternion(x, y, z, w))
+    pose = Pose(Vector3(*physics.geom_xpos[geom].tolist()), orientation(physics.geom_xmat[geom].reshape(3, 3)))
     name, size = model.geom(geom).name, model.geom_size[geom].tolist()
     match int(model.geom_type[geom]):
         case mujoco.mjtGeom.mjGEOM_PLANE:

@@ -13,10 +13,11 @@ from typing import Any
 
 import attrs
 import numpy as np
+from ibrobot_kinematics.poses import homogeneous
+from ibrobot_kinematics.rotations import from_quaternion
 
 from ibrobot_core.api import PlanCode, PlanningError, Robot, Vector
 from ibrobot_planning.shapes import convex, geometry
-from ibrobot_planning.transforms import rotation
 from ibrobot_planning.world import Box, Capsule, Cylinder, Plane, Shape, Sphere
 
 ADJACENT, ALWAYS, NEVER, SRDF = "Adjacent", "Always", "Never", "SRDF"
@@ -232,10 +233,8 @@ def _compiled(path: Path) -> Any:
 
 
 def _placement(position: Sequence[float] | Vector, quaternion: Sequence[float] | Vector) -> Vector:
-    placed = np.eye(4)
-    placed[:3, :3] = rotation(*quaternion)
-    placed[:3, 3] = position
-    return placed
+    """The matrix of a position and a quaternion (w, x, y, z)."""
+    return homogeneous(from_quaternion(np.roll(quaternion, -1)), np.asarray(position, dtype=float))
 
 
 def _shapes(source: Any, bodies: dict[int, tuple[int, Vector]]) -> list[LinkShape]:

@@ -7,6 +7,7 @@ from types import NoneType
 from typing import Any, override
 
 import numpy as np
+from ibrobot_kinematics.poses import matrix, pose
 
 from ibrobot_core.api import (
     CONTROL,
@@ -27,7 +28,6 @@ from ibrobot_core.api import (
 from ibrobot_planning.arm import Arm, robot_arm
 from ibrobot_planning.frames import Frames
 from ibrobot_planning.shapes import geometry
-from ibrobot_planning.transforms import matrix, pose
 from ibrobot_planning.voxels import cloud_points, depth_points, outside, voxels
 from ibrobot_planning.world import SNAPSHOT, Voxels, WorldObject
 from ibrobot_planning.world_keeper import WorldKeeper

@@ -11,11 +11,11 @@ from typing import Any
 import attrs
 import numpy as np
 import pinocchio
+from ibrobot_kinematics.poses import matrix
 
 from ibrobot_core.api import PlanCode, PlanningError, Vector
 from ibrobot_planning.arm import ADJACENT, ALWAYS, NEVER, Arm, LinkShape, Pair, reach, sorted_pair
 from ibrobot_planning.shapes import geometry
-from ibrobot_planning.transforms import matrix
 from ibrobot_planning.world import World
 
 _FEW = 4

@@ -15,7 +15,7 @@ def find_engines() -> None:
     Raises:
         MissingDependency: with the command that installs what is missing.
     """
-    missing = [name for name in ("pinocchio", "coal", "mujoco", "ibrobot_kinematics") if find_spec(name) is None]
+    missing = [name for name in ("pinocchio", "coal", "mujoco") if find_spec(name) is None]
     if missing:
         raise MissingDependency(
             f"planning around obstacles needs the Python package {missing[0]}, which is not installed",

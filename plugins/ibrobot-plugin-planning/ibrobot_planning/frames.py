@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from ibrobot_kinematics.poses import matrix
 
 from ibrobot_core.api import Bus, Pose, TFMessage, TransformStamped, Vector
-from ibrobot_planning.transforms import matrix
 
 
 class Frames:

@@ -6,6 +6,8 @@ import math
 from typing import get_args
 
 import attrs
+from ibrobot_kinematics.poses import orientation
+from ibrobot_kinematics.rotations import from_rpy
 
 from ibrobot_core.api import (
     AnyGoal,
@@ -26,7 +28,6 @@ from ibrobot_core.api import (
 )
 from ibrobot_planning.poses import named_pose
 from ibrobot_planning.timing import scaling_fault
-from ibrobot_planning.transforms import from_rpy
 
 POLICIES: tuple[str, ...] = get_args(OrientationPolicy)
 _DIRECTIONS = {"down": Vector3(0.0, 0.0, -1.0), "up": Vector3(0.0, 0.0, 1.0)}
@@ -206,8 +207,8 @@ def _tool_goal(given: dict[str, list[str]]) -> PositionGoal | PoseGoal:
     numbers = _numbers(key, values)
     if key == "quat" and abs(math.hypot(*numbers) - 1) > _NEARLY_ONE:
         raise _invalid(f"quat has length {math.hypot(*numbers):.3g}, must be 1; the order is x, y, z, w")
-    orientation = Quaternion(*numbers) if key == "quat" else from_rpy(*numbers)
-    return PoseGoal(Pose(position, orientation), beyond_reach=_policy(given.get("beyond_reach", ["refuse"])))
+    turn = Quaternion(*numbers) if key == "quat" else orientation(from_rpy(*numbers))
+    return PoseGoal(Pose(position, turn), beyond_reach=_policy(given.get("beyond_reach", ["refuse"])))
 
 
 def _policy(values: list[str]) -> OrientationPolicy:

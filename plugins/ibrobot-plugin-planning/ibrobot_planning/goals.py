@@ -7,7 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import attrs
 import numpy as np
 from ibrobot_kinematics import KinematicModel, KinematicsError, Target, TipPose, UnreachableError, solve, solve_all
-from ibrobot_kinematics.rotations import log
+from ibrobot_kinematics.poses import matrix
+from ibrobot_kinematics.rotations import between, cross, log
 
 from ibrobot_core.api import (
     JointGoal,
@@ -20,7 +21,6 @@ from ibrobot_core.api import (
     Vector,
     Vector3,
 )
-from ibrobot_planning.transforms import matrix
 
 _PITCHES = np.linspace(-np.pi / 2, np.pi / 2, 7)
 """Directions of the tool that are tried at a position without one: from straight down to straight up."""
@@ -218,7 +218,7 @@ class Tool:
     def _in_plane(self, position: Vector, axis: Vector) -> Vector:
         """The direction nearest to `axis` in the plane through the first joint's axis and `position`."""
         _, points, axes = self.model.screws(np.zeros(len(self.model.joint_names)))
-        normal = np.cross(axes[0], position - points[0])
+        normal = cross(axes[0], position - points[0])
         length = float(np.linalg.norm(normal))
         if length < 1e-6:
             return axis
@@ -363,7 +363,7 @@ def turned(tip: TipPose, rotation: Vector | None, axis: Vector | None = None) ->
     if rotation is not None:
         return float(np.linalg.norm(log(rotation.T @ tip.rotation)))
     if axis is not None:
-        return float(np.arctan2(np.linalg.norm(np.cross(axis, tip.rotation[:, 2])), axis @ tip.rotation[:, 2]))
+        return float(np.linalg.norm(between(axis, tip.rotation[:, 2])))
     return 0.0
 
 

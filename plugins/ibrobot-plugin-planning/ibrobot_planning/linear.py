@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import attrs
 import numpy as np
 from ibrobot_kinematics import KinematicModel, Target, UnreachableError, solve
-from ibrobot_kinematics.rotations import exp, log
+from ibrobot_kinematics.rotations import between, cross, exp, log
 
 from ibrobot_core.api import PlanCode, PlanningError, PoseGoal, PositionGoal, Vector
 from ibrobot_planning.goals import Tool, pose_matrix, turned, unit
@@ -20,8 +20,6 @@ _EXACT_M = 1e-4
 """Allowed distance of the tool from the line at a configuration."""
 _TURN_M = 0.1
 """Distance that corresponds to a rotation of one radian."""
-_NO_SINE = 1e-9
-"""Sine of the angle between two directions below which their cross product has no direction."""
 _LARGEST_JUMP = 0.35
 """A joint that moves further [rad] between two of them would leave the line between."""
 
@@ -93,7 +91,7 @@ def _followed(
             rows.append(weight * jacobian[3:, moving])
         elif target.axis is not None:
             axis = tip.rotation[:, 2]
-            error.append(weight * np.cross(axis, target.axis))
+            error.append(weight * cross(axis, target.axis))
             rows.append(weight * (jacobian[3:, moving] - np.outer(axis, axis @ jacobian[3:, moving])))
         step = np.linalg.lstsq(np.concatenate(rows), np.concatenate(error), rcond=1e-3)[0]
         q[moving] = np.clip(q[moving] + step, model.lower[moving], model.upper[moving])
@@ -119,17 +117,17 @@ def _targets(
         if end_rotation is not None:
             turn = log(rotation.T @ end_rotation)
         elif axis is not None:
-            turn = _between(rotation[:, 2], axis)
+            turn = between(rotation[:, 2], axis)
         angle = float(np.linalg.norm(turn))
         number = max(int(np.ceil(away / _STEP_M)), int(np.ceil(angle / _STEP_RAD)), 1)
         for share in np.arange(1, number + 1) / number:
-            between = position + share * (end - position)
+            place = position + share * (end - position)
             if end_rotation is not None:
-                target = Target(between, rotation @ exp(share * turn))
+                target = Target(place, rotation @ exp(share * turn))
             elif axis is not None:
-                target = Target(between, axis=exp(share * turn) @ rotation[:, 2])
+                target = Target(place, axis=exp(share * turn) @ rotation[:, 2])
             else:
-                target = Target(between)
+                target = Target(place)
             targets.append((target, waypoint.position_tolerance, angle_tolerance))
             lengths.append(away / number)
         position = end
@@ -157,13 +155,3 @@ def _end(waypoint: PositionGoal | PoseGoal) -> tuple[Vector, Vector | None, Vect
     if waypoint.axis is None:
         return place, None, None, waypoint.axis_tolerance
     return place, None, unit(waypoint.axis), waypoint.axis_tolerance
-
-
-def _between(a: Vector, b: Vector) -> Vector:
-    """The shortest rotation from one unit vector to another, as a rotation vector; of all half turns, any."""
-    normal = np.cross(a, b)
-    sine = float(np.linalg.norm(normal))
-    if sine < _NO_SINE:
-        # Perpendicular to the axis of the base that is most so itself.
-        normal = np.cross(a, np.eye(3)[int(np.abs(a).argmin())])
-    return np.asarray(normal * (float(np.arctan2(sine, a @ b)) / np.linalg.norm(normal)))

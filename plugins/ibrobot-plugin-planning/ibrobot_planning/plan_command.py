@@ -243,7 +243,7 @@ def _sampled(trajectory: JointTrajectory, robot: Robot, start: Vector) -> Plan:
     samples = [spline.at(ns(float(moment))) for moment in times]
     positions = np.array([sample[0] for sample in samples])
     tool = None
-    if robot.description.mjcf is not None and find_spec("ibrobot_kinematics") is not None:
+    if robot.description.mjcf is not None:
         from ibrobot_kinematics import robot_model
 
         whole = np.repeat(start[None], len(times), axis=0)

@@ -216,13 +216,11 @@ class PlanningServices:
             return FkAnswer(error.code, str(error))
 
     def _pose(self, link: str, q: Vector) -> Any:
-        from ibrobot_planning.transforms import pose
+        from ibrobot_kinematics.poses import homogeneous, pose
 
         if link == self._tool.model.tip:
             tip = self._tool.model.forward(q)
-            placed = np.eye(4)
-            placed[:3, :3], placed[:3, 3] = tip.rotation, tip.position
-            return pose(placed)
+            return pose(homogeneous(tip.rotation, tip.position))
         checked = self._checked
         return pose(checked.arm.link_pose(checked.names.get(link, link), q))
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import attrs
 import numpy as np
+from ibrobot_kinematics.poses import orientation
+from ibrobot_kinematics.rotations import from_rpy
 
 from ibrobot_core.api import (
     AnyGoal,
@@ -33,7 +35,6 @@ from ibrobot_core.api import (
 )
 from ibrobot_planning.goal_text import Target
 from ibrobot_planning.timing import LEAST_SCALING
-from ibrobot_planning.transforms import from_rpy
 
 _NEARLY_ONE = 1e-3
 """Allowed deviation of a quaternion's length from 1."""
@@ -84,14 +85,12 @@ class GoalOptions:
             return JointGoal(tuple(self.joints), np.array(list(self.joints.values())), self.joint_tolerance)
         assert self.xyz is not None
         position, axis = Vector3(*self.xyz), None if self.axis is None else Vector3(*self.axis)
-        orientation = Quaternion(*self.quaternion) if self.quaternion is not None else None
+        turn = Quaternion(*self.quaternion) if self.quaternion is not None else None
         if self.rpy is not None:
-            orientation = from_rpy(*self.rpy)
-        if orientation is None:
+            turn = orientation(from_rpy(*self.rpy))
+        if turn is None:
             return PositionGoal(position, axis, self.position_tolerance, self.axis_tolerance)
-        return PoseGoal(
-            Pose(position, orientation), self.position_tolerance, self.orientation_tolerance, self.beyond_reach
-        )
+        return PoseGoal(Pose(position, turn), self.position_tolerance, self.orientation_tolerance, self.beyond_reach)
 
 
 def _few(most: int) -> Callable[[object, attrs.Attribute[Any], Sequence[object]], None]:

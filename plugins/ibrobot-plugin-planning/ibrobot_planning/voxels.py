@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from ibrobot_kinematics.poses import matrix
 
 from ibrobot_core.api import PointCloud2, Pose, Vector
-from ibrobot_planning.transforms import matrix
 from ibrobot_planning.world import Voxels
 
 _FLOATS = {7: np.float32, 8: np.float64}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, override
 import attrs
 import numpy as np
 from ibrobot_kinematics.clearance import CLEARANCE, Configuration
+from ibrobot_kinematics.poses import matrix, pose, pose_at
 
 from ibrobot_core.api import (
     Component,
@@ -30,7 +31,6 @@ from ibrobot_core.api import (
     did_you_mean,
     resolve_path,
 )
-from ibrobot_planning.transforms import from_rpy, matrix, pose
 from ibrobot_planning.world import FLOOR, SNAPSHOT, Box, Capsule, Cylinder, Plane, Shape, Sphere, World, WorldObject
 from ibrobot_planning.world_options import Added, Allowed, Attached, Detached, Moved, Named, Touched, WorldOptions
 
@@ -238,7 +238,7 @@ class WorldKeeper(Component):
 
     def _move(self, world: World, it: Moved) -> World:
         _check_position(it.position)
-        return world.move(it.name, Pose(Vector3(*it.position), from_rpy(*it.rpy)))
+        return world.move(it.name, pose_at(it.position, it.rpy))
 
     def _attach(self, world: World, it: Attached) -> World:
         hand = self._hand() if it.link is None else ()

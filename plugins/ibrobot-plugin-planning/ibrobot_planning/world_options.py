@@ -65,8 +65,8 @@ class ObjectOptions:
         Raises:
             ValueError: for a size that cannot be meant, or a mesh that cannot be read.
         """
-        from ibrobot_core.api import Pose, Vector3
-        from ibrobot_planning.transforms import from_rpy
+        from ibrobot_kinematics.poses import pose_at
+
         from ibrobot_planning.world import Box, Capsule, Cylinder, Plane, Shape, Sphere, WorldObject, read_mesh
 
         shape: Shape
@@ -80,7 +80,7 @@ class ObjectOptions:
             shape = Sphere(self.radius)
         else:
             shape = Plane()
-        return WorldObject(shape, Pose(Vector3(*self.position), from_rpy(*self.rpy)), self.link, self.may_touch)
+        return WorldObject(shape, pose_at(self.position, self.rpy), self.link, self.may_touch)
 
 
 def _check_topic(instance: object, attribute: attrs.Attribute[str], value: str) -> None:

@@ -7,9 +7,9 @@ from itertools import pairwise
 import mujoco
 import numpy as np
 import pytest
+from ibrobot_kinematics.poses import pose, pose_at
 from ibrobot_planning.arm import ADJACENT, ALWAYS, Arm, read_arm
 from ibrobot_planning.collision import Collisions, unchecked_pairs
-from ibrobot_planning.transforms import from_rpy, pose
 from ibrobot_planning.voxels import voxels
 from ibrobot_planning.world import Box, Capsule, Cylinder, Mesh, Plane, Sphere, World, WorldObject
 
@@ -53,9 +53,7 @@ def test_padding_is_a_distance(arm, shape):
 
 
 def test_a_plane_is_solid_below(arm):
-    checks = Collisions(
-        arm, World({"ceiling": WorldObject(Plane(), Pose(Vector3(0, 0, 0.5), from_rpy(np.pi, 0, 0)))}), ARM
-    )
+    checks = Collisions(arm, World({"ceiling": WorldObject(Plane(), pose_at((0, 0, 0.5), (np.pi, 0, 0)))}), ARM)
     assert not any("ceiling" in (each.first, each.second) for each in checks.contacts(UP))
     floor = World({"floor": WorldObject(Plane(), Pose(Vector3(0, 0, 0.3)))})
     assert any(each.second == "floor" for each in Collisions(arm, floor, ARM).contacts(UP))

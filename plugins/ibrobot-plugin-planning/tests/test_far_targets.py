@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_kinematics import robot_model
+from ibrobot_kinematics.poses import pose
 from ibrobot_kinematics.rotations import exp
 from ibrobot_planning.goals import Tool
 from ibrobot_planning.linear import linear_path
@@ -18,7 +19,6 @@ from ibrobot_planning.planning_services import CARTESIAN, COMPUTE_IK, PLAN, PLAN
 from ibrobot_planning.requests import GoTo
 from ibrobot_planning.source import CMD_POSE, GO_TO, MOVE_ACTION, MOVE_TO_POSE
 from ibrobot_planning.tasks.runner import RUN
-from ibrobot_planning.transforms import pose
 
 from ibrobot_core.api import (
     ConfigError,

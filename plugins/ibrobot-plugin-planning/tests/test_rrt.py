@@ -130,7 +130,7 @@ REACHABLE = np.array([-0.9, 0.9, 0.9, 0.7, 0.4])
 
 def pose_of(planner: RrtConnectPlanner, q, turn: float = 0.0) -> Pose:
     """The pose of the tip at `q`, turned about the world's z axis."""
-    from ibrobot_planning.transforms import pose
+    from ibrobot_kinematics.poses import pose
 
     placed = tip(planner, q)
     c, s = math.cos(turn), math.sin(turn)

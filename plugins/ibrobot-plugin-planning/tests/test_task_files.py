@@ -8,23 +8,22 @@ from typing import Any
 
 import attrs
 import pytest
+from ibrobot_kinematics.poses import orientation, pose_at
+from ibrobot_kinematics.rotations import from_rpy
 from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
 from ibrobot_planning.tasks.format import MoveStep
 from ibrobot_planning.tasks.goals import move_target, upright
 from ibrobot_planning.tasks.reading import EXAMPLES, find_task, read_task
-from ibrobot_planning.transforms import from_rpy
 from ibrobot_planning.world import Sphere, World, WorldObject
 from ibrobot_planning.world_keeper import first_world, scene_objects
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import (
     ConfigError,
-    Pose,
     PoseGoal,
     PositionGoal,
     Registry,
     RobotConfig,
-    Vector3,
     installed_plugins,
     load_config,
 )
@@ -309,10 +308,10 @@ def test_bundled_tasks_are_read():
     ids=["upright", "tilted", "on its side", "upside down"],
 )
 def test_goals_at_objects_are_in_an_upright_frame(tmp_path: Path, rpy: tuple[float, float, float], yaw: float):
-    pose = Pose(Vector3(0.1, 0.2, 0.3), from_rpy(*rpy))
+    pose = pose_at((0.1, 0.2, 0.3), rpy)
     frame = upright(pose)
     assert frame[:3, 2].tolist() == [0, 0, 1]
-    turned = from_rpy(0, 0, yaw)
+    turned = orientation(from_rpy(0, 0, yaw))
     assert frame[0, 0] == pytest.approx(1 - 2 * turned.z**2, abs=0.02)
     world = World({"thing": WorldObject(Sphere(0.1), pose)})
     step = MoveStep(object="thing", xyz=(0.1, 0.0, 0.05), rpy=(0.0, 0.0, 0.0))
@@ -323,7 +322,7 @@ def test_goals_at_objects_are_in_an_upright_frame(tmp_path: Path, rpy: tuple[flo
 
 
 def test_directions_at_objects_turn_with_them(tmp_path: Path):
-    world = World({"thing": WorldObject(Sphere(0.1), Pose(Vector3(0.1, 0.2, 0.3), from_rpy(0, 0, 1.5707963)))})
+    world = World({"thing": WorldObject(Sphere(0.1), pose_at((0.1, 0.2, 0.3), (0, 0, 1.5707963)))})
     target = move_target(MoveStep(object="thing", axis=(1.0, 0.0, 0.0)), make_robot(tmp_path), ARM, world).tool
     assert isinstance(target, PositionGoal)
     assert target.axis is not None

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ibrobot_planning.transforms import from_rpy
+from ibrobot_kinematics.poses import pose_at
 from ibrobot_planning.voxels import depth_points, voxels
 
-from ibrobot_core.api import Pose, Vector3
+from ibrobot_core.api import Pose
 
 K = np.array([[100.0, 0, 20], [0, 100, 15], [0, 0, 1]])
 
@@ -32,7 +32,7 @@ def test_depth_images_become_points_of_the_cameras_frame():
     depth = np.zeros((30, 40))
     depth[15, 20], depth[15, 30], depth[0, 0], depth[1, 1] = 0.5, 1.0, np.nan, 9.0
     # The optical axis looks along the world's x, the picture's right is the world's -y.
-    camera = Pose(Vector3(0, 0, 0.2), from_rpy(-np.pi / 2, 0, -np.pi / 2))
+    camera = pose_at((0, 0, 0.2), (-np.pi / 2, 0, -np.pi / 2))
     np.testing.assert_allclose(depth_points(depth, K, camera), [[0.5, 0, 0.2], [1.0, -0.1, 0.2]], atol=1e-12)
 
 

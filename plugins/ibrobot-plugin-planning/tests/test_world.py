@@ -7,9 +7,6 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from ibrobot_planning.transforms import from_rpy, matrix, pose
 from ibrobot_planning.world import Box, Capsule, Cylinder, Mesh, Sphere, Voxels, World, WorldObject, read_mesh
 
 from ibrobot_core.api import PlanCode, PlanningError, Pose, Quaternion, Vector3
@@ -86,24 +83,6 @@ def test_changes_make_new_worlds():
     assert put.objects["can"] == CAN
     assert set(WORLD.remove("ball").objects) == {"can"}
     assert WORLD.move("ball", CAN.pose).objects["ball"].pose == CAN.pose
-
-
-numbers = st.floats(-3.0, 3.0)
-
-
-@given(st.tuples(numbers, numbers, numbers), st.tuples(numbers, numbers, numbers))
-def test_poses_and_matrices_are_the_same(position, turns):
-    there = Pose(Vector3(*position), from_rpy(*turns))
-    placed = matrix(there)
-    np.testing.assert_allclose(placed[:3, :3] @ placed[:3, :3].T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(matrix(pose(placed)), placed, atol=1e-12)
-
-
-def test_turns_are_about_the_fixed_axes_in_order():
-    # First x to x, y to z; then z to x.
-    np.testing.assert_allclose(
-        matrix(Pose(orientation=from_rpy(np.pi / 2, np.pi / 2, 0)))[:3, :3] @ [0, 1, 0], [1, 0, 0], atol=1e-12
-    )
 
 
 STL = """solid a

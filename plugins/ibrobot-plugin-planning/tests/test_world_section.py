@@ -9,10 +9,10 @@ from typing import Any, override
 import numpy as np
 import pytest
 from ibrobot_kinematics.clearance import CLEARANCE
+from ibrobot_kinematics.poses import matrix
 from ibrobot_planning import ibrobot_sections
 from ibrobot_planning.options import RrtConnectOptions
 from ibrobot_planning.rrt import RrtConnectPlanner
-from ibrobot_planning.transforms import matrix
 from ibrobot_planning.world import SNAPSHOT, Box, Capsule, Cylinder, Mesh, Plane, Sphere
 from ibrobot_planning.world_keeper import ADD, ATTACH, DETACH, MOST_OBJECTS, REMOVE, TOUCH, WorldKeeper
 from ibrobot_planning.world_options import WorldOptions

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import override
 
 from ibrobot_kinematics import KinematicModel, KinematicsError, robot_model
-from ibrobot_kinematics.rotations import quaternion
+from ibrobot_kinematics.poses import orientation
 
 from ibrobot_core.api import (
     CONTROL,
@@ -14,7 +14,6 @@ from ibrobot_core.api import (
     JointState,
     Pose,
     PoseStamped,
-    Quaternion,
     Session,
     SessionWorker,
     Subscription,
@@ -62,7 +61,7 @@ class ToolPose(SessionWorker):
         late = not 0 <= stamp_ns - due_ns < self._period_ns
         self._next_ns = (stamp_ns if late else due_ns) + self._period_ns
         tip = self._model.forward(state.position)
-        pose = Pose(Vector3(*tip.position.tolist()), Quaternion(*quaternion(tip.rotation).tolist()))
+        pose = Pose(Vector3(*tip.position.tolist()), orientation(tip.rotation))
         self.session.bus.publish(self._options.topic, PoseStamped(Header(stamp_ns, self._options.frame), pose))
 
     @override

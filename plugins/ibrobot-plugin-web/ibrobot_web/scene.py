@@ -15,6 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from ibrobot_kinematics.meshes import cluster
+from ibrobot_kinematics.rotations import from_quaternion, from_rpy, quaternion
 from numpy.typing import NDArray
 
 from ibrobot_core.api import ModelError, read_xml
@@ -35,6 +36,8 @@ _SHAPES = {
 _JOINTS = {int(mujoco.mjtJoint.mjJNT_HINGE): "hinge", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
 _FIELD_DEG = 45.0
 """Vertical field of view of cameras that the robot YAML mounts, whose own is not known [°]."""
+_LOOKING = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""A camera that looks along the x axis of its frame, with z up, as MuJoCo has cameras: along -z, with y up."""
 _log = logging.getLogger("ibrobot.web")
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
@@ -79,39 +82,24 @@ def make_scene(description: Mapping[str, Any]) -> dict[str, Any]:
 def _mounted(model: Any, description: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """The cameras that the robot YAML mounts. They look along the x axis of their frame, MuJoCo's along -z."""
     known = {str(each["frame"]): each for each in description.get("mounts") or ()}
-    looking: NDArray[np.float64] = np.empty(4)
-    mujoco.mju_mat2Quat(looking, np.array([0.0, 0.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, 0.0]))
     root = _root_link(description.get("urdf"))
     for each in known.values():
         if not each["camera"]:
             continue
-        pos, quat = np.zeros(3), looking.copy()
-        frame = each["frame"]
+        pos, rotation, frame = np.zeros(3), _LOOKING, each["frame"]
         for _ in range(len(known) + 1):  # from the camera to the body that carries it
             mount = known.get(frame)
             if mount is None:
                 break
-            turned: NDArray[np.float64] = np.empty(4)
-            outer = _quaternion(mount)
-            mujoco.mju_rotVecQuat(pos, pos.copy(), outer)
-            pos += mount["xyz"]
-            mujoco.mju_mulQuat(turned, outer, quat)
-            quat, frame = turned, mount["parent"]
+            given = mount["quaternion"]
+            turn = from_quaternion(given) if given is not None else from_rpy(*mount["rpy"])
+            pos, rotation, frame = turn @ pos + mount["xyz"], turn @ rotation, mount["parent"]
         body = 0 if frame == root else mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, frame)
         if body < 0:
             _log.warning("the page does not show where camera %s is: the model has no body %r", each["name"], frame)
             continue
+        quat = np.roll(quaternion(rotation), 1)
         yield {"body": body, "pos": pos.round(5).tolist(), "quat": quat.round(5).tolist(), "fovy": _FIELD_DEG}
-
-
-def _quaternion(mount: Mapping[str, Any]) -> NDArray[np.float64]:
-    """The rotation of a mount, wxyz."""
-    found: NDArray[np.float64] = np.empty(4)
-    if mount["quaternion"] is not None:
-        x, y, z, w = mount["quaternion"]
-        return np.array([w, x, y, z])
-    mujoco.mju_euler2Quat(found, np.array(mount["rpy"], float), "XYZ")
-    return found
 
 
 def _root_link(urdf: str | None) -> str | None:

@@ -6,6 +6,7 @@ import base64
 from pathlib import Path
 
 import numpy as np
+from ibrobot_kinematics.rotations import from_quaternion
 from ibrobot_web.scene import make_scene
 
 LINK = '<geom type="capsule" size="0.02 0.08" fromto="0 0 0 0 0 0.16" rgba="0.2 0.4 0.6 1"/>'
@@ -98,13 +99,6 @@ def test_cameras_of_the_robot_yaml_are_where_their_mounts_say(tmp_path: Path) ->
     assert down["body"] == 7
     np.testing.assert_allclose(down["pos"], [0.0, 0.1, 0.1], atol=1e-6)
     for camera, direction, up in ((ahead, [1, 0, 0], [0, 0, 1]), (down, [0, 0, -1], [0, 1, 0])):
-        w, x, y, z = camera["quat"]
-        turn = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        turn = from_quaternion(np.roll(camera["quat"], -1))
         np.testing.assert_allclose(turn @ [0, 0, -1], direction, atol=1e-4)
         np.testing.assert_allclose(turn @ [0, 1, 0], up, atol=1e-4)

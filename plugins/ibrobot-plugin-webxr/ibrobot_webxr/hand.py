@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from ibrobot_kinematics.rotations import exp, log
+from ibrobot_kinematics.rotations import exp, from_quaternion, log
 
 from ibrobot_core.api import Vector
 from ibrobot_webxr.messages import HandPose
@@ -130,16 +130,4 @@ class HandMotion:
     def _in_base(self, pose: HandPose) -> tuple[Vector, Vector]:
         """Position and rotation in the frame of the base."""
         position = np.zeros(3) if pose.position is None else self._to_base @ pose.position
-        return position, self._to_base @ _matrix(pose.orientation)
-
-
-def _matrix(quaternion: tuple[float, ...]) -> Vector:
-    """The rotation matrix of a unit quaternion (x, y, z, w)."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+        return position, self._to_base @ from_quaternion(pose.orientation)

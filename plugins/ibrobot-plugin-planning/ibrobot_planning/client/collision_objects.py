@@ -7,9 +7,10 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+from ibrobot_kinematics.rotations import from_quaternion, rpy
+
 from ibrobot_core.api import NotSupported, PlanCode, PlanningError, Pose, PoseStamped, Quaternion, Vector3
 from ibrobot_planning.client.node import BaseNode
-from ibrobot_planning.transforms import to_rpy
 
 type Position = Vector3 | Sequence[float]
 type Orientation = Quaternion | Sequence[float]
@@ -207,8 +208,8 @@ class CollisionObjects:
             raise PlanningError(
                 "the object needs a place: pose, or position and quat_xyzw", PlanCode.INVALID_OBJECT_NAME
             )
-        turned = Quaternion(*numbers(quat_xyzw, "xyzw")) if quat_xyzw is not None else Quaternion()
-        return {"position": numbers(position, "xyz"), "rpy": list(to_rpy(turned))}
+        turn = numbers(quat_xyzw, "xyzw") if quat_xyzw is not None else (0.0, 0.0, 0.0, 1.0)
+        return {"position": numbers(position, "xyz"), "rpy": rpy(from_quaternion(turn)).tolist()}
 
     def _check_frame(self, frame_id: str | None) -> None:
         if frame_id is not None and frame_id not in _BASE_FRAMES:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Collection
 
 import numpy as np
+from ibrobot_kinematics.poses import matrix, pose
+from ibrobot_kinematics.rotations import from_quaternion, from_rpy
 
 from ibrobot_core.api import (
     AnyGoal,
@@ -17,7 +19,6 @@ from ibrobot_core.api import (
     Pose,
     PoseGoal,
     PositionGoal,
-    Quaternion,
     Robot,
     Vector,
     Vector3,
@@ -25,7 +26,6 @@ from ibrobot_core.api import (
 from ibrobot_planning.goal_text import Target
 from ibrobot_planning.poses import named_pose
 from ibrobot_planning.tasks.format import GoalOptions, MoveStep
-from ibrobot_planning.transforms import from_rpy, matrix, pose
 from ibrobot_planning.world import World
 
 _DIRECTIONS = {"down": (0.0, 0.0, -1.0), "up": (0.0, 0.0, 1.0)}
@@ -65,9 +65,7 @@ def upright(thing: Pose) -> Vector:
     """
     placed = matrix(thing)
     across = placed[:3, 0] if abs(placed[2, 0]) < _UPRIGHT else placed[:3, 1]
-    yaw = math.atan2(across[1], across[0])
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    placed[:3, :3] = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    placed[:3, :3] = from_rpy(0.0, 0.0, math.atan2(across[1], across[0]))
     return placed
 
 
@@ -115,8 +113,7 @@ def _of_tool(goal: GoalOptions, world: World, tool: Vector | None) -> PositionGo
             given = _DIRECTIONS[goal.axis] if isinstance(goal.axis, str) else goal.axis
             axis = Vector3(*(frame[:3, :3] @ given).tolist())
         return PositionGoal(Vector3(*position.tolist()), axis, goal.position_tolerance, goal.angle_tolerance)
-    turn = Quaternion(*goal.quat) if goal.quat is not None else from_rpy(*(goal.rpy or (0.0, 0.0, 0.0)))
-    placed[:3, :3] = matrix(Pose(orientation=turn))[:3, :3]
+    placed[:3, :3] = from_quaternion(goal.quat) if goal.quat is not None else from_rpy(*(goal.rpy or (0.0, 0.0, 0.0)))
     return PoseGoal(pose(frame @ placed), goal.position_tolerance, goal.angle_tolerance, goal.beyond_reach)
 
 
