@@ -37,8 +37,8 @@ from typing import Any
 import numpy as np
 import yaml
 from ibrobot_kinematics import robot_model
-from ibrobot_planning.motion import MoveResult
-from ibrobot_planning.world import Box, World, WorldObject
+from ibrobot_planning.execution.results import MoveResult
+from ibrobot_planning.world.objects import Box, World, WorldObject
 from planning import Referee
 from planning_scenes import ARM_JOINTS, Maker
 
@@ -312,7 +312,7 @@ def loop(seconds: float, *, planning: bool) -> dict[str, Any]:
     problem = maker.problem("cage", 0)
 
     def plan() -> None:
-        from ibrobot_planning.search import Space, connect
+        from ibrobot_planning.planners.search import Space, connect
 
         checks = maker.checks(problem.world)
         rng = np.random.default_rng(0)

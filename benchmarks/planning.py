@@ -23,11 +23,11 @@ import attrs
 import mujoco
 import numpy as np
 from ibrobot_kinematics.poses import matrix
-from ibrobot_planning.options import RrtConnectOptions
-from ibrobot_planning.rrt import RrtConnectPlanner
-from ibrobot_planning.search import Pace, Space, connect, shortened
-from ibrobot_planning.timing import Motion
-from ibrobot_planning.world import Box, Cylinder, World
+from ibrobot_planning.planners.options import RrtConnectOptions
+from ibrobot_planning.planners.rrt import RrtConnectPlanner
+from ibrobot_planning.planners.search import Pace, Space, connect, shortened
+from ibrobot_planning.planners.timing import Motion
+from ibrobot_planning.world.objects import Box, Cylinder, World
 from planning_scenes import ARM_JOINTS, KINDS, MAX_ACCELERATION, MAX_VELOCITY, MJCF, PADDING_M, Maker, Problem, so101
 
 from ibrobot_core.api import Context, JointGoal, PlanningError, PlanRequest, PlanResult, SteppedClock, Vector

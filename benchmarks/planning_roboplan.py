@@ -12,8 +12,8 @@ from typing import Any
 import coal
 import numpy as np
 from ibrobot_kinematics.poses import matrix
-from ibrobot_planning.timing import Motion
-from ibrobot_planning.world import Box, Cylinder, World
+from ibrobot_planning.planners.timing import Motion
+from ibrobot_planning.world.objects import Box, Cylinder, World
 from planning_scenes import ARM_JOINTS, JOINTS, MAX_ACCELERATION, MAX_VELOCITY, PADDING_M, Maker, Problem, so101
 from roboplan.core import (
     JointConfiguration,

@@ -14,10 +14,10 @@ import attrs
 import numpy as np
 import so101_nexus
 from ibrobot_kinematics import read_mjcf
-from ibrobot_planning.arm import Arm, read_arm
-from ibrobot_planning.collision import Collisions, unchecked_pairs
-from ibrobot_planning.search import Space
-from ibrobot_planning.world import Box, Cylinder, World, WorldObject
+from ibrobot_planning.planners.search import Space
+from ibrobot_planning.world.arm import Arm, read_arm
+from ibrobot_planning.world.collision import Collisions, unchecked_pairs
+from ibrobot_planning.world.objects import Box, Cylinder, World, WorldObject
 
 from ibrobot_core.api import Description, Joint, Pose, Quaternion, Robot, Vector, Vector3
 

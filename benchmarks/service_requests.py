@@ -28,12 +28,12 @@ from typing import Any
 import ibrobot_data.corrections
 import ibrobot_data.episode_service
 import ibrobot_data.partial_recording
-import ibrobot_planning.clouds
-import ibrobot_planning.planning_services
-import ibrobot_planning.source
+import ibrobot_planning.execution.services
+import ibrobot_planning.execution.source
 import ibrobot_planning.tasks.runner
-import ibrobot_planning.world
-import ibrobot_planning.world_keeper
+import ibrobot_planning.world.clouds
+import ibrobot_planning.world.objects
+import ibrobot_planning.world.section
 import ibrobot_web.teleop
 from ibrobot_planning.client import Node
 from ibrobot_servo.teleop import twist_service
@@ -58,9 +58,9 @@ def declared() -> dict[str, Service[Any, Any]]:
     """The services of core and the plugins."""
     modules = [
         ibrobot_core.launch.runtime, ibrobot_core.launch.sources.policy, ibrobot_data.corrections,
-        ibrobot_data.episode_service, ibrobot_data.partial_recording, ibrobot_planning.clouds,
-        ibrobot_planning.planning_services, ibrobot_planning.source, ibrobot_planning.tasks.runner,
-        ibrobot_planning.world, ibrobot_planning.world_keeper, ibrobot_web.teleop,
+        ibrobot_data.episode_service, ibrobot_data.partial_recording, ibrobot_planning.world.clouds,
+        ibrobot_planning.execution.services, ibrobot_planning.execution.source, ibrobot_planning.tasks.runner,
+        ibrobot_planning.world.objects, ibrobot_planning.world.section, ibrobot_web.teleop,
     ]  # fmt: skip
     found = [value for module in modules for value in vars(module).values() if isinstance(value, Service)]
     return {each.name: each for each in (*found, twist_service("/servo_node/delta_twist_cmds"))}

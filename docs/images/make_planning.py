@@ -14,9 +14,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from ibrobot_kinematics.poses import matrix
-from ibrobot_planning.options import RrtConnectOptions
-from ibrobot_planning.rrt import RrtConnectPlanner
-from ibrobot_planning.world import Box, Cylinder, World
+from ibrobot_planning.planners.options import RrtConnectOptions
+from ibrobot_planning.planners.rrt import RrtConnectPlanner
+from ibrobot_planning.world.objects import Box, Cylinder, World
 from PIL import Image
 
 from ibrobot_core.api import Context, JointGoal, PlanRequest, SteppedClock, Vector

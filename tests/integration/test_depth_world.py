@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ibrobot_planning.arm import robot_arm
-from ibrobot_planning.collision import Collisions
-from ibrobot_planning.world import SNAPSHOT, Voxels, World
+from ibrobot_planning.world.arm import robot_arm
+from ibrobot_planning.world.collision import Collisions
+from ibrobot_planning.world.objects import SNAPSHOT, Voxels, World
 
 from ibrobot_core.api import (
     Float64MultiArray,

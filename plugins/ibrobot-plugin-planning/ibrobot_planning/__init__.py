@@ -16,10 +16,10 @@ from ibrobot_core.api import (
     did_you_mean,
     hookimpl,
 )
-from ibrobot_planning.engines import find_engines
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
-from ibrobot_planning.options import JointPlannerOptions, RrtConnectOptions
-from ibrobot_planning.world_options import WorldOptions
+from ibrobot_planning.planners.options import JointPlannerOptions, RrtConnectOptions
+from ibrobot_planning.world.engines import find_engines
+from ibrobot_planning.world.options import WorldOptions
 
 if TYPE_CHECKING:
     import click
@@ -37,13 +37,13 @@ if TYPE_CHECKING:
 
 
 def _joint(options: Any, ctx: Context) -> Planner:
-    from ibrobot_planning.joint import JointPlanner
+    from ibrobot_planning.planners.joint import JointPlanner
 
     return JointPlanner(options, ctx)
 
 
 def _rrt_connect(options: Any, ctx: Context) -> Planner:
-    from ibrobot_planning.rrt import RrtConnectPlanner
+    from ibrobot_planning.planners.rrt import RrtConnectPlanner
 
     return RrtConnectPlanner(options, ctx)
 
@@ -74,7 +74,7 @@ def _needs_model(options: RrtConnectOptions, robot: Robot, joints: tuple[str, ..
 
 
 def _source(session: Session, mode: ControlMode) -> SourceWorker:
-    from ibrobot_planning.source import PlannerSource
+    from ibrobot_planning.execution.source import PlannerSource
 
     return PlannerSource(session, mode)
 
@@ -117,10 +117,10 @@ def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
 
 def _world(options: WorldOptions, session: Session) -> Component:
     if options.clouds:
-        from ibrobot_planning.clouds import CloudKeeper
+        from ibrobot_planning.world.clouds import CloudKeeper
 
         return CloudKeeper(options, session)
-    from ibrobot_planning.world_keeper import WorldKeeper
+    from ibrobot_planning.world.section import WorldKeeper
 
     return WorldKeeper(options, session)
 
@@ -134,7 +134,7 @@ def _tasks(options: NoOptions, session: Session) -> Component:
 def _unknown_names(options: WorldOptions, robot: Robot) -> Iterable[OptionFault]:
     """Faults of names that are neither a link of the robot's model nor an object."""
     from ibrobot_core.api import ModelError, read_mjcf
-    from ibrobot_planning.world import FLOOR
+    from ibrobot_planning.world.objects import FLOOR
 
     mjcf = robot.description.mjcf
     if mjcf is None:
@@ -186,13 +186,13 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
 
 def _description() -> click.Command:
     find_engines()
-    from ibrobot_planning.commands import description
+    from ibrobot_planning.commands.description import description
 
     return description
 
 
 def _plan() -> click.Command:
-    from ibrobot_planning.plan_command import plan
+    from ibrobot_planning.commands.plan import plan
 
     return plan
 

@@ -11,7 +11,7 @@ from typing import override
 import attrs
 import numpy as np
 from ibrobot_kinematics import KinematicsError, Target, robot_model, solve_all
-from ibrobot_planning.world import Box, Sphere, World
+from ibrobot_planning.world.objects import Box, Sphere, World
 
 from ibrobot_core.api import (
     AnyGoal,

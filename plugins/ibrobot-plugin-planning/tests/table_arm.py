@@ -6,9 +6,9 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from ibrobot_planning.options import RrtConnectOptions
-from ibrobot_planning.rrt import RrtConnectPlanner
-from ibrobot_planning.world import Box, World, WorldObject
+from ibrobot_planning.planners.options import RrtConnectOptions
+from ibrobot_planning.planners.rrt import RrtConnectPlanner
+from ibrobot_planning.world.objects import Box, World, WorldObject
 
 from ibrobot_core.api import Context, Description, Joint, Pose, Robot, SteppedClock, Vector3
 

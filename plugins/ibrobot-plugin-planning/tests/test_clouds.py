@@ -11,10 +11,10 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_planning import ibrobot_sections
-from ibrobot_planning.clouds import CLEAR, CloudKeeper
-from ibrobot_planning.voxels import cloud_points, outside
-from ibrobot_planning.world import SNAPSHOT, Plane, Voxels
-from ibrobot_planning.world_options import WorldOptions
+from ibrobot_planning.world.clouds import CLEAR, CloudKeeper
+from ibrobot_planning.world.objects import SNAPSHOT, Plane, Voxels
+from ibrobot_planning.world.options import WorldOptions
+from ibrobot_planning.world.voxels import cloud_points, outside
 from ibrobot_testing import SectionSuite, make_session
 
 from ibrobot_core.api import (
@@ -303,7 +303,7 @@ def test_cloud_with_the_name_of_an_object_is_refused(tmp_path: Path):
 
 
 def test_planes_hide_what_is_below_them():
-    from ibrobot_planning.shapes import geometry
+    from ibrobot_planning.world.coal_shapes import geometry
 
     cells = Voxels(0.02, np.array([[0, 0, -9], [0, 0, 0], [0, 0, 9]]))
     left = outside(cells, [(geometry(Plane()), np.eye(4))], 0.01)

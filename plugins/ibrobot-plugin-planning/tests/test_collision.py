@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 from ibrobot_kinematics.poses import pose, pose_at
-from ibrobot_planning.arm import ADJACENT, ALWAYS, Arm, read_arm
-from ibrobot_planning.collision import Collisions, unchecked_pairs
-from ibrobot_planning.voxels import voxels
-from ibrobot_planning.world import Box, Capsule, Cylinder, Mesh, Plane, Sphere, World, WorldObject
+from ibrobot_planning.world.arm import ADJACENT, ALWAYS, Arm, read_arm
+from ibrobot_planning.world.collision import Collisions, unchecked_pairs
+from ibrobot_planning.world.objects import Box, Capsule, Cylinder, Mesh, Plane, Sphere, World, WorldObject
+from ibrobot_planning.world.voxels import voxels
 
 from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector3
 

@@ -7,13 +7,13 @@ from typing import override
 import attrs
 import numpy as np
 import pytest
-from ibrobot_planning.arm import robot_arm
-from ibrobot_planning.collision import Collisions, unchecked_pairs
-from ibrobot_planning.engines import find_engines
-from ibrobot_planning.joint import JointPlanner
-from ibrobot_planning.options import JointPlannerOptions, RrtConnectOptions
-from ibrobot_planning.rrt import RrtConnectPlanner
-from ibrobot_planning.world import World
+from ibrobot_planning.planners.joint import JointPlanner
+from ibrobot_planning.planners.options import JointPlannerOptions, RrtConnectOptions
+from ibrobot_planning.planners.rrt import RrtConnectPlanner
+from ibrobot_planning.world.arm import robot_arm
+from ibrobot_planning.world.collision import Collisions, unchecked_pairs
+from ibrobot_planning.world.engines import find_engines
+from ibrobot_planning.world.objects import World
 from ibrobot_testing import PlannerSuite
 
 from ibrobot_core.api import Context, JointGoal, MissingDependency, PlanRequest

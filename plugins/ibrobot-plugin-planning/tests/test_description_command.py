@@ -10,8 +10,8 @@ import pytest
 from click.testing import CliRunner, Result
 from ibrobot_kinematics.srdf import Srdf, read_srdf
 from ibrobot_kinematics.urdf import read_urdf
-from ibrobot_planning.commands import description
-from ibrobot_planning.goal_text import target
+from ibrobot_planning.commands.description import description
+from ibrobot_planning.goals.text import target
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import ConfigError, PlanningError, installed_plugins, load_config

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_planning.client import LocalNode, MoveIt2
-from ibrobot_planning.completion import MOST_POINTS, completed
-from ibrobot_planning.goal_text import Target
-from ibrobot_planning.motion import MoveResult
-from ibrobot_planning.requests import Execute, GoTo
-from ibrobot_planning.source import EXECUTE, GO_TO
-from ibrobot_planning.timing import LONGEST_S
+from ibrobot_planning.execution.requests import Execute, GoTo
+from ibrobot_planning.execution.results import MoveResult
+from ibrobot_planning.execution.source import EXECUTE, GO_TO
+from ibrobot_planning.goals.text import Target
+from ibrobot_planning.planners.completion import MOST_POINTS, completed
+from ibrobot_planning.planners.timing import LONGEST_S
 from ibrobot_testing.fakes import FakePlanner
 
 from ibrobot_core.api import (

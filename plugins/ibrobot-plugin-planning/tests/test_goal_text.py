@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from ibrobot_planning.goal_text import target
+from ibrobot_planning.goals.text import target
 
 from ibrobot_core.api import (
     AnyGoal,

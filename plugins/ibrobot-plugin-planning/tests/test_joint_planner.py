@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_planning import ibrobot_planners
-from ibrobot_planning.joint import JointPlanner
-from ibrobot_planning.options import JointPlannerOptions
+from ibrobot_planning.planners.joint import JointPlanner
+from ibrobot_planning.planners.options import JointPlannerOptions
 
 from ibrobot_core.api import (
     Context,

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ibrobot_planning.goal_plans import GoalPlans
-from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Results
-from ibrobot_planning.planning_services import CARTESIAN, COMPUTE_FK, COMPUTE_IK, PLAN
-from ibrobot_planning.requests import GoTo, Numbered
-from ibrobot_planning.source import (
+from ibrobot_planning.execution.plans import GoalPlans
+from ibrobot_planning.execution.requests import GoTo, Numbered
+from ibrobot_planning.execution.results import MoveResult, MoveToConfiguration, MoveToPose, Results
+from ibrobot_planning.execution.services import CARTESIAN, COMPUTE_FK, COMPUTE_IK, PLAN
+from ibrobot_planning.execution.source import (
     CANCEL,
     CMD_POSE,
     GO_TO,

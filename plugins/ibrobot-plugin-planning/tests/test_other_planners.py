@@ -13,9 +13,9 @@ import pytest
 from click.testing import CliRunner
 from ibrobot_planning import ibrobot_planners
 from ibrobot_planning.client import LocalNode, MoveIt2
-from ibrobot_planning.plan_command import plan
-from ibrobot_planning.requests import GoTo
-from ibrobot_planning.source import GO_TO
+from ibrobot_planning.commands.plan import plan
+from ibrobot_planning.execution.requests import GoTo
+from ibrobot_planning.execution.source import GO_TO
 from ibrobot_testing import PlannerSuite
 from ibrobot_testing.site import made_up_site
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
-from ibrobot_planning.plan_command import plan
+from ibrobot_planning.commands.plan import plan
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import ConfigError, IbrobotError, MissingDependency, NotSupported, PlanningError
@@ -139,7 +139,7 @@ def test_mode_must_be_named_where_several_plan(yaml: Path):
 
 
 def test_plot_needs_matplotlib(yaml: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("ibrobot_planning.plan_command.find_spec", lambda name: None)
+    monkeypatch.setattr("ibrobot_planning.commands.plan.find_spec", lambda name: None)
     result = run(yaml, "--from", "up", "--goal", "left", "--plot", "a.png")
     assert isinstance(result.exception, MissingDependency)
     assert "pip install 'ibrobot-plugin-planning[plot]'" in str(result.exception)

@@ -13,9 +13,9 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from ibrobot_kinematics.clearance import CLEARANCE
-from ibrobot_planning.execution import Execution
-from ibrobot_planning.source import GO_TO, MOVE_TO_CONFIGURATION, MOVE_TO_POSE, RESULT
-from ibrobot_planning.world import SNAPSHOT, World
+from ibrobot_planning.execution.source import GO_TO, MOVE_TO_CONFIGURATION, MOVE_TO_POSE, RESULT
+from ibrobot_planning.execution.tracks import Execution
+from ibrobot_planning.world.objects import SNAPSHOT, World
 from ibrobot_testing.fakes import FakePlanner
 
 from ibrobot_core.api import (

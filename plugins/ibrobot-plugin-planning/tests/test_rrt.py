@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 import pytest
 from ibrobot_kinematics import robot_model
-from ibrobot_planning.collision import Collisions, unchecked_pairs
-from ibrobot_planning.goals import Tool
-from ibrobot_planning.rrt import RrtConnectPlanner
-from ibrobot_planning.timing import Motion
-from ibrobot_planning.world import Sphere, World, WorldObject
+from ibrobot_planning.goals.tool import Tool
+from ibrobot_planning.planners.rrt import RrtConnectPlanner
+from ibrobot_planning.planners.timing import Motion
+from ibrobot_planning.world.collision import Collisions, unchecked_pairs
+from ibrobot_planning.world.objects import Sphere, World, WorldObject
 
 from ibrobot_core.api import (
     AnyGoal,

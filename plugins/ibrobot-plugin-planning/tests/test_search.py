@@ -7,8 +7,8 @@ from itertools import pairwise
 import attrs
 import numpy as np
 import pytest
-from ibrobot_planning.search import Pace, Space, connect, length, shortened
-from ibrobot_planning.timing import timed
+from ibrobot_planning.planners.search import Pace, Space, connect, length, shortened
+from ibrobot_planning.planners.timing import timed
 
 from ibrobot_core.api import Vector
 

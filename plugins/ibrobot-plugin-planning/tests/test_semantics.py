@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from ibrobot_kinematics.srdf import read_srdf
 from ibrobot_kinematics.urdf import read_urdf
-from ibrobot_planning.arm import robot_arm
-from ibrobot_planning.collision import unchecked_pairs
-from ibrobot_planning.goal_text import target
-from ibrobot_planning.options import RrtConnectOptions
-from ibrobot_planning.poses import named_pose, pose_names
-from ibrobot_planning.rrt import RrtConnectPlanner
-from ibrobot_planning.semantics import srdf, urdf_names
+from ibrobot_planning.goals.named_poses import named_pose, pose_names
+from ibrobot_planning.goals.text import target
+from ibrobot_planning.planners.options import RrtConnectOptions
+from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.tasks.format import MoveStep
 from ibrobot_planning.tasks.goals import move_target
-from ibrobot_planning.world import World
+from ibrobot_planning.world.arm import robot_arm
+from ibrobot_planning.world.collision import unchecked_pairs
+from ibrobot_planning.world.objects import World
+from ibrobot_planning.world.semantics import srdf, urdf_names
 
 from ibrobot_core.api import Context, NamedGoal, PlanningError, PlanRequest, SteppedClock
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from ibrobot_planning.source import GO_TO
+from ibrobot_planning.execution.source import GO_TO
 
 from ibrobot_core.api import PlanningError, Runtime, TransportError
 

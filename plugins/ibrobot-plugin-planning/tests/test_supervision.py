@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from ibrobot_kinematics import robot_model
-from ibrobot_planning.arm import robot_arm
-from ibrobot_planning.blend import Limits, joined
-from ibrobot_planning.collision import Collisions
-from ibrobot_planning.source import GO_TO, RESULT
-from ibrobot_planning.timing import timed
-from ibrobot_planning.world import SNAPSHOT
+from ibrobot_planning.execution.source import GO_TO, RESULT
+from ibrobot_planning.planners.blend import Limits, joined
+from ibrobot_planning.planners.timing import timed
+from ibrobot_planning.world.arm import robot_arm
+from ibrobot_planning.world.collision import Collisions
+from ibrobot_planning.world.objects import SNAPSHOT
 
 from ibrobot_core.api import HardwareError, PlanCode, Runtime, Vector
 

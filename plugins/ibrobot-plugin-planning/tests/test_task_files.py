@@ -14,8 +14,8 @@ from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
 from ibrobot_planning.tasks.format import MoveStep
 from ibrobot_planning.tasks.goals import move_target, upright
 from ibrobot_planning.tasks.reading import EXAMPLES, find_task, read_task
-from ibrobot_planning.world import Sphere, World, WorldObject
-from ibrobot_planning.world_keeper import first_world, scene_objects
+from ibrobot_planning.world.objects import Sphere, World, WorldObject
+from ibrobot_planning.world.section import first_world, scene_objects
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import (

@@ -12,7 +12,7 @@ import pytest
 from ibrobot_planning.tasks.reading import read_task
 from ibrobot_planning.tasks.result import TaskResult
 from ibrobot_planning.tasks.runner import CANCEL, CHECK, RESULT, RUN, STATUS, TaskRunner
-from ibrobot_planning.world import SNAPSHOT
+from ibrobot_planning.world.objects import SNAPSHOT
 from ibrobot_testing import SectionSuite
 
 from ibrobot_core.api import ConfigError, PlanningError, RequestError, Runtime, String

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ibrobot_planning.timing import Motion, timed
+from ibrobot_planning.planners.timing import Motion, timed
 
 VELOCITY, ACCELERATION = np.array([3.0, 1.0, 2.0]), np.array([10.0, 20.0, 5.0])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ibrobot_kinematics.poses import pose_at
-from ibrobot_planning.voxels import depth_points, voxels
+from ibrobot_planning.world.voxels import depth_points, voxels
 
 from ibrobot_core.api import Pose
 

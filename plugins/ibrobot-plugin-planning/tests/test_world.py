@@ -7,7 +7,7 @@ import struct
 
 import numpy as np
 import pytest
-from ibrobot_planning.world import Box, Capsule, Cylinder, Mesh, Sphere, Voxels, World, WorldObject, read_mesh
+from ibrobot_planning.world.objects import Box, Capsule, Cylinder, Mesh, Sphere, Voxels, World, WorldObject, read_mesh
 
 from ibrobot_core.api import PlanCode, PlanningError, Pose, Quaternion, Vector3
 

@@ -11,11 +11,11 @@ import pytest
 from ibrobot_kinematics.clearance import CLEARANCE
 from ibrobot_kinematics.poses import matrix
 from ibrobot_planning import ibrobot_sections
-from ibrobot_planning.options import RrtConnectOptions
-from ibrobot_planning.rrt import RrtConnectPlanner
-from ibrobot_planning.world import SNAPSHOT, Box, Capsule, Cylinder, Mesh, Plane, Sphere
-from ibrobot_planning.world_keeper import ADD, ATTACH, DETACH, MOST_OBJECTS, REMOVE, TOUCH, WorldKeeper
-from ibrobot_planning.world_options import WorldOptions
+from ibrobot_planning.planners.options import RrtConnectOptions
+from ibrobot_planning.planners.rrt import RrtConnectPlanner
+from ibrobot_planning.world.objects import SNAPSHOT, Box, Capsule, Cylinder, Mesh, Plane, Sphere
+from ibrobot_planning.world.options import WorldOptions
+from ibrobot_planning.world.section import ADD, ATTACH, DETACH, MOST_OBJECTS, REMOVE, TOUCH, WorldKeeper
 from ibrobot_testing import SectionSuite, make_session
 
 from ibrobot_core.api import (

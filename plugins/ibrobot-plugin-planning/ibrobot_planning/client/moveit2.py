@@ -27,7 +27,7 @@ from ibrobot_planning.client.motion import (
     positions_of,
 )
 from ibrobot_planning.client.node import BaseNode
-from ibrobot_planning.source import EXECUTE
+from ibrobot_planning.execution.source import EXECUTE
 
 __all__ = ["MoveIt2", "MoveIt2State", "MoveItErrorCodes"]
 

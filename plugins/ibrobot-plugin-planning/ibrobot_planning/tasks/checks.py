@@ -16,7 +16,7 @@ from ibrobot_core.api import (
     Vector,
     check_models,
 )
-from ibrobot_planning.poses import named_pose, pose_names
+from ibrobot_planning.goals.named_poses import named_pose, pose_names
 from ibrobot_planning.tasks.format import (
     AlternativesStep,
     GoalOptions,
@@ -31,7 +31,7 @@ from ibrobot_planning.tasks.format import (
 from ibrobot_planning.tasks.goals import move_target
 from ibrobot_planning.tasks.reach import Reach
 from ibrobot_planning.tasks.reading import TaskFile
-from ibrobot_planning.world import World
+from ibrobot_planning.world.objects import World
 
 type Key = tuple[str | int, ...]
 

@@ -24,12 +24,12 @@ from ibrobot_core.api import (
     run_overrides,
     run_robot,
 )
-from ibrobot_planning.requests import Numbered
+from ibrobot_planning.execution.requests import Numbered
 from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
 from ibrobot_planning.tasks.reading import TaskFile, find_task, read_task
 from ibrobot_planning.tasks.result import TaskResult
 from ibrobot_planning.tasks.runner import RESULT, TaskRunner
-from ibrobot_planning.world_keeper import SECTION, first_world, scene_objects
+from ibrobot_planning.world.section import SECTION, first_world, scene_objects
 
 TASKS = "tasks"
 """The section whose component performs tasks."""

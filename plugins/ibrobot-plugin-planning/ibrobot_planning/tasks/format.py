@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, override
 import attrs
 
 from ibrobot_core.api import OrientationPolicy, documented, option
-from ibrobot_planning.timing import LEAST_SCALING
+from ibrobot_planning.goals.text import LEAST_SCALING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

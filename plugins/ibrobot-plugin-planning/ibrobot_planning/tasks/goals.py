@@ -23,10 +23,10 @@ from ibrobot_core.api import (
     Vector,
     Vector3,
 )
-from ibrobot_planning.goal_text import Target
-from ibrobot_planning.poses import named_pose
+from ibrobot_planning.goals.named_poses import named_pose
+from ibrobot_planning.goals.text import Target
 from ibrobot_planning.tasks.format import GoalOptions, MoveStep
-from ibrobot_planning.world import World
+from ibrobot_planning.world.objects import World
 
 _DIRECTIONS = {"down": (0.0, 0.0, -1.0), "up": (0.0, 0.0, 1.0)}
 _UPRIGHT = math.cos(math.radians(45.0))

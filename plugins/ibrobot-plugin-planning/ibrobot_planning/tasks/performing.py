@@ -20,14 +20,14 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
+from ibrobot_planning.execution.requests import GoTo, Numbered, PlanAhead, PlanAnswer
+from ibrobot_planning.execution.results import MoveResult
+from ibrobot_planning.execution.services import PLAN_GOAL
+from ibrobot_planning.execution.source import CANCEL as CANCEL_MOTION
+from ibrobot_planning.execution.source import GO_TO
+from ibrobot_planning.execution.source import RESULT as MOTION_RESULT
 from ibrobot_planning.executors.options import GripperOptions
-from ibrobot_planning.goal_text import Target
-from ibrobot_planning.motion import MoveResult
-from ibrobot_planning.planning_services import PLAN_GOAL
-from ibrobot_planning.requests import GoTo, Numbered, PlanAhead, PlanAnswer
-from ibrobot_planning.source import CANCEL as CANCEL_MOTION
-from ibrobot_planning.source import GO_TO
-from ibrobot_planning.source import RESULT as MOTION_RESULT
+from ibrobot_planning.goals.text import Target
 from ibrobot_planning.tasks.checks import CheckedTask
 from ibrobot_planning.tasks.format import (
     Action,
@@ -42,9 +42,9 @@ from ibrobot_planning.tasks.format import (
 )
 from ibrobot_planning.tasks.goals import move_target
 from ibrobot_planning.tasks.result import StepOutcome, StepResult
-from ibrobot_planning.world import SNAPSHOT, World
-from ibrobot_planning.world_keeper import ATTACH, DETACH, TOUCH
-from ibrobot_planning.world_options import Attached, Detached, Touched
+from ibrobot_planning.world.objects import SNAPSHOT, World
+from ibrobot_planning.world.options import Attached, Detached, Touched
+from ibrobot_planning.world.section import ATTACH, DETACH, TOUCH
 
 BEGIN_EPISODE, END_EPISODE = "/record_episode/start", "/record_episode/stop"
 """Services of a run that records: take a prompt, and an outcome."""

@@ -9,7 +9,7 @@ import numpy as np
 from ibrobot_core.api import AnyGoal, Goal, LinearGoal, PlanningError, PoseGoal, PositionGoal, Robot, Vector
 
 if TYPE_CHECKING:
-    from ibrobot_planning.goals import Tool
+    from ibrobot_planning.goals.tool import Tool
 
 
 class Reach:
@@ -51,7 +51,7 @@ class Reach:
         if self._tool is None:
             from ibrobot_kinematics import KinematicsError, robot_model
 
-            from ibrobot_planning.goals import Tool
+            from ibrobot_planning.goals.tool import Tool
 
             try:
                 self._tool = Tool(robot_model(self._robot))

@@ -25,14 +25,14 @@ from ibrobot_core.api import (
     option,
     seconds,
 )
-from ibrobot_planning.requests import Numbered
+from ibrobot_planning.execution.requests import Numbered
 from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
 from ibrobot_planning.tasks.format import Step
 from ibrobot_planning.tasks.performing import Performance
 from ibrobot_planning.tasks.reading import TaskFile, read_task
 from ibrobot_planning.tasks.result import TaskResult
-from ibrobot_planning.world import SNAPSHOT
-from ibrobot_planning.world_keeper import SECTION, scene_objects
+from ibrobot_planning.world.objects import SNAPSHOT
+from ibrobot_planning.world.section import SECTION, scene_objects
 
 
 @documented

@@ -22,8 +22,8 @@ from ibrobot_core.api import (
     seconds,
     trajectory_goal,
 )
-from ibrobot_planning.blend import Limits, braking, cut, joined, motion_of, trajectory_of
-from ibrobot_planning.timing import Motion
+from ibrobot_planning.planners.blend import Limits, braking, cut, joined, motion_of, trajectory_of
+from ibrobot_planning.planners.timing import Motion
 
 _LATENCY_S = 0.04
 """How far ahead a trajectory takes over from the running one: it must arrive there in time."""

@@ -9,7 +9,7 @@ import numpy as np
 from ibrobot_kinematics.poses import matrix
 
 from ibrobot_core.api import PointCloud2, Pose, Vector
-from ibrobot_planning.world import Voxels
+from ibrobot_planning.world.objects import Voxels
 
 _FLOATS = {7: np.float32, 8: np.float64}
 """Datatype of sensor_msgs/msg/PointField -> type of its values."""
@@ -109,7 +109,7 @@ def outside(cells: Voxels, shapes: Iterable[tuple[Any, Vector]], margin: float) 
 
     Args:
         cells: the cells.
-        shapes: shapes of `ibrobot_planning.shapes`, each with its pose in the frame of the cells, shape (4, 4).
+        shapes: shapes of Coal, each with its pose in the frame of the cells, shape (4, 4).
         margin: [m].
     """
     import coal

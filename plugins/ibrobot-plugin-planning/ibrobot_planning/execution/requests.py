@@ -33,8 +33,7 @@ from ibrobot_core.api import (
     documented,
     option,
 )
-from ibrobot_planning.goal_text import Target
-from ibrobot_planning.timing import LEAST_SCALING
+from ibrobot_planning.goals.text import LEAST_SCALING, Target
 
 _NEARLY_ONE = 1e-3
 """Allowed deviation of a quaternion's length from 1."""

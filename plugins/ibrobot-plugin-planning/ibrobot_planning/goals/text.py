@@ -26,9 +26,10 @@ from ibrobot_core.api import (
     Robot,
     Vector3,
 )
-from ibrobot_planning.poses import named_pose
-from ibrobot_planning.timing import scaling_fault
+from ibrobot_planning.goals.named_poses import named_pose
 
+LEAST_SCALING = 0.01
+"""Least fraction of the limits of velocity and acceleration that a goal may ask for."""
 POLICIES: tuple[str, ...] = get_args(OrientationPolicy)
 _DIRECTIONS = {"down": Vector3(0.0, 0.0, -1.0), "up": Vector3(0.0, 0.0, 1.0)}
 _SIZES = {"xyz": 3, "axis": 3, "rpy": 3, "quat": 4}
@@ -97,6 +98,18 @@ def target(goal: str | Goal | Target, robot: Robot, velocity_scaling: float = 1.
         "a goal is a text such as 'home' or 'xyz=0.2,0.0,0.1', or a goal of ibrobot_core.api;"
         f" got {type(goal).__name__}"
     )
+
+
+def scaling_fault(name: str, scaling: float) -> str:
+    """Why a fraction of the limits cannot be planned with; empty if it can.
+
+    Args:
+        name: its name, e.g. `velocity_scaling`.
+        scaling: the fraction.
+    """
+    if LEAST_SCALING <= scaling <= 1:  # NaN is no such number
+        return ""
+    return f"{name} is {scaling}, must be from {LEAST_SCALING} to 1"
 
 
 def _described(goal: Goal) -> str:

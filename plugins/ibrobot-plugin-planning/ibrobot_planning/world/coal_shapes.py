@@ -8,7 +8,7 @@ import coal
 import numpy as np
 
 from ibrobot_core.api import Vector
-from ibrobot_planning.world import Box, Capsule, Cylinder, Mesh, Plane, Shape, Sphere, Voxels
+from ibrobot_planning.world.objects import Box, Capsule, Cylinder, Mesh, Plane, Shape, Sphere, Voxels
 
 type Triangles = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 

@@ -10,10 +10,10 @@ from ibrobot_kinematics.srdf import Srdf, read_srdf
 from ibrobot_kinematics.urdf import read_urdf
 
 from ibrobot_core.api import Robot
-from ibrobot_planning.arm import SRDF, Arm, Pair, robot_arm, sorted_pair
-from ibrobot_planning.collision import unchecked_pairs
-from ibrobot_planning.hulls import with_hulls
-from ibrobot_planning.semantics import urdf_names
+from ibrobot_planning.world.arm import SRDF, Arm, Pair, robot_arm, sorted_pair
+from ibrobot_planning.world.collision import unchecked_pairs
+from ibrobot_planning.world.hulls import with_hulls
+from ibrobot_planning.world.semantics import urdf_names
 
 
 @attrs.frozen(eq=False)

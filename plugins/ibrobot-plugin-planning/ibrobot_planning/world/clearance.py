@@ -7,9 +7,9 @@ import math
 import pinocchio
 
 from ibrobot_core.api import Vector
-from ibrobot_planning.arm import Arm
-from ibrobot_planning.collision import Collisions
-from ibrobot_planning.world import World
+from ibrobot_planning.world.arm import Arm
+from ibrobot_planning.world.collision import Collisions
+from ibrobot_planning.world.objects import World
 
 
 class Clearance:

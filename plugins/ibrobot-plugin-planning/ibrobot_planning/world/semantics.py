@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 from ibrobot_kinematics.urdf import Urdf
 
 from ibrobot_core.api import Robot
-from ibrobot_planning.arm import Arm, Pair, sorted_pair
+from ibrobot_planning.world.arm import Arm, Pair, sorted_pair
 
 
 def urdf_names(arm: Arm, urdf: Urdf) -> dict[str, str]:

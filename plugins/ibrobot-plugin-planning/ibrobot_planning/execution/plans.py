@@ -28,10 +28,10 @@ from ibrobot_core.api import (
     Vector,
     ns,
 )
-from ibrobot_planning.completion import check_size, completed
-from ibrobot_planning.execution import ExecutorGoal
-from ibrobot_planning.goal_text import Target
-from ibrobot_planning.poses import named_pose
+from ibrobot_planning.execution.tracks import ExecutorGoal
+from ibrobot_planning.goals.named_poses import named_pose
+from ibrobot_planning.goals.text import Target
+from ibrobot_planning.planners.completion import check_size, completed
 
 
 class GoalPlans:

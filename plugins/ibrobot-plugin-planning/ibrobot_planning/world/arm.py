@@ -17,8 +17,8 @@ from ibrobot_kinematics.poses import homogeneous
 from ibrobot_kinematics.rotations import from_quaternion
 
 from ibrobot_core.api import PlanCode, PlanningError, Robot, Vector
-from ibrobot_planning.shapes import convex, geometry
-from ibrobot_planning.world import Box, Capsule, Cylinder, Plane, Shape, Sphere
+from ibrobot_planning.world.coal_shapes import convex, geometry
+from ibrobot_planning.world.objects import Box, Capsule, Cylinder, Plane, Shape, Sphere
 
 ADJACENT, ALWAYS, NEVER, SRDF = "Adjacent", "Always", "Never", "SRDF"
 """Reasons not to check a pair of links; the first three are those of MoveIt's setup assistant."""

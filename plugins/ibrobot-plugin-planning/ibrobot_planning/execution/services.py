@@ -27,11 +27,8 @@ from ibrobot_core.api import (
     Session,
     Vector,
 )
-from ibrobot_planning.engines import find_engines
-from ibrobot_planning.goal_plans import GoalPlans
-from ibrobot_planning.goal_text import target
-from ibrobot_planning.options import RrtConnectOptions
-from ibrobot_planning.requests import (
+from ibrobot_planning.execution.plans import GoalPlans
+from ibrobot_planning.execution.requests import (
     CartesianQuery,
     FkAnswer,
     FkQuery,
@@ -44,11 +41,14 @@ from ibrobot_planning.requests import (
     PlanQuery,
     any_goal,
 )
-from ibrobot_planning.world import SNAPSHOT, World
+from ibrobot_planning.goals.text import target
+from ibrobot_planning.planners.options import RrtConnectOptions
+from ibrobot_planning.world.engines import find_engines
+from ibrobot_planning.world.objects import SNAPSHOT, World
 
 if TYPE_CHECKING:
-    from ibrobot_planning.checked_arm import CheckedArm
-    from ibrobot_planning.goals import Tool
+    from ibrobot_planning.goals.tool import Tool
+    from ibrobot_planning.world.checked_arm import CheckedArm
 
 COMPUTE_IK = Service("/compute_ik", IkQuery, IkAnswer, "Joint positions for a position or pose of the tool.")
 COMPUTE_FK = Service("/compute_fk", FkQuery, FkAnswer, "Poses of links.")
@@ -93,14 +93,14 @@ class PlanningServices:
         find_engines()
         from ibrobot_kinematics import robot_model
 
-        from ibrobot_planning.goals import Tool
+        from ibrobot_planning.goals.tool import Tool
 
         return Tool(robot_model(self._robot))
 
     @cached_property
     def _checked(self) -> CheckedArm:
         find_engines()
-        from ibrobot_planning.checked_arm import checked_arm
+        from ibrobot_planning.world.checked_arm import checked_arm
 
         return checked_arm(self._robot, self._session.log)
 
@@ -187,7 +187,7 @@ class PlanningServices:
         Raises:
             PlanningError: where all of them touch something.
         """
-        from ibrobot_planning.collision import Collisions
+        from ibrobot_planning.world.collision import Collisions
 
         planner, padding, self_padding = self._mode.planner, 0.0, 0.0
         if planner is not None and isinstance(planner.options, RrtConnectOptions):
@@ -225,7 +225,7 @@ class PlanningServices:
         return pose(checked.arm.link_pose(checked.names.get(link, link), q))
 
     def _links(self) -> tuple[str, ...]:
-        from ibrobot_planning.arm import robot_arm
+        from ibrobot_planning.world.arm import robot_arm
 
         return tuple(robot_arm(self._robot).frames)
 

@@ -15,7 +15,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import Header, JointTrajectory, JointTrajectoryPoint, Vector, ns, seconds
-from ibrobot_planning.timing import Motion
+from ibrobot_planning.planners.timing import Motion
 
 STEP_S = 0.01
 """Time between the points of the motions made here."""

@@ -43,8 +43,8 @@ from ibrobot_core.api import (
     seconds,
     wrong_input,
 )
-from ibrobot_planning.goal_text import Target, target
-from ibrobot_planning.world import SNAPSHOT, World
+from ibrobot_planning.goals.text import Target, target
+from ibrobot_planning.world.objects import SNAPSHOT, World
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -261,8 +261,8 @@ def _clearance(
     assert isinstance(world, World)
     if not world.objects:
         return None
-    from ibrobot_planning.checked_arm import checked_arm
-    from ibrobot_planning.collision import Collisions
+    from ibrobot_planning.world.checked_arm import checked_arm
+    from ibrobot_planning.world.collision import Collisions
 
     checked = checked_arm(session.config.robot, session.log)
     checks = Collisions(checked.arm, world, joints, others, unchecked=checked.unchecked)

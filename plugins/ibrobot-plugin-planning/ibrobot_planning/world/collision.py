@@ -14,9 +14,9 @@ import pinocchio
 from ibrobot_kinematics.poses import matrix
 
 from ibrobot_core.api import PlanCode, PlanningError, Vector
-from ibrobot_planning.arm import ADJACENT, ALWAYS, NEVER, Arm, LinkShape, Pair, reach, sorted_pair
-from ibrobot_planning.shapes import geometry
-from ibrobot_planning.world import World
+from ibrobot_planning.world.arm import ADJACENT, ALWAYS, NEVER, Arm, LinkShape, Pair, reach, sorted_pair
+from ibrobot_planning.world.coal_shapes import geometry
+from ibrobot_planning.world.objects import World
 
 _FEW = 4
 """Lines of so few configurations are checked one by one."""

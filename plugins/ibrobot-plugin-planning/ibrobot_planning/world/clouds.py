@@ -25,13 +25,13 @@ from ibrobot_core.api import (
     ns,
     pixels,
 )
-from ibrobot_planning.arm import Arm, robot_arm
-from ibrobot_planning.frames import Frames
-from ibrobot_planning.shapes import geometry
-from ibrobot_planning.voxels import cloud_points, depth_points, outside, voxels
-from ibrobot_planning.world import SNAPSHOT, Voxels, WorldObject
-from ibrobot_planning.world_keeper import WorldKeeper
-from ibrobot_planning.world_options import CloudOptions, WorldOptions
+from ibrobot_planning.world.arm import Arm, robot_arm
+from ibrobot_planning.world.coal_shapes import geometry
+from ibrobot_planning.world.frames import Frames
+from ibrobot_planning.world.objects import SNAPSHOT, Voxels, WorldObject
+from ibrobot_planning.world.options import CloudOptions, WorldOptions
+from ibrobot_planning.world.section import WorldKeeper
+from ibrobot_planning.world.voxels import cloud_points, depth_points, outside, voxels
 
 CLEAR = Service("/clear_octomap", NoRequest, NoneType, "Remove the cells of all clouds until the next message.")
 """MoveIt's name."""

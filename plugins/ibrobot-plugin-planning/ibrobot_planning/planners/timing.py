@@ -23,8 +23,6 @@ _BLEND_POINTS = 8
 """Grid intervals in a blend."""
 _SAMPLE_S = 0.001
 """Time between samples of the motion before it is averaged."""
-LEAST_SCALING = 0.01
-"""Least fraction of the limits of velocity and acceleration that a goal may ask for."""
 LONGEST_S = 300.0
 """Duration of a motion, at most: it is computed, checked and sent in samples."""
 _STILL = 1e-9
@@ -185,18 +183,6 @@ def _without_repeats(path: Vector, blends: Vector) -> tuple[Vector, Vector]:
     if len(kept) > 1:
         kept[-1] = len(path) - 1
     return path[kept], blends[kept][1:-1]
-
-
-def scaling_fault(name: str, scaling: float) -> str:
-    """Why a fraction of the limits cannot be planned with; empty if it can.
-
-    Args:
-        name: its name, e.g. `velocity_scaling`.
-        scaling: the fraction.
-    """
-    if LEAST_SCALING <= scaling <= 1:  # NaN is no such number
-        return ""
-    return f"{name} is {scaling}, must be from {LEAST_SCALING} to 1"
 
 
 def check_duration(duration: float) -> None:

@@ -31,12 +31,23 @@ from ibrobot_core.api import (
     did_you_mean,
     resolve_path,
 )
-from ibrobot_planning.world import FLOOR, SNAPSHOT, Box, Capsule, Cylinder, Plane, Shape, Sphere, World, WorldObject
-from ibrobot_planning.world_options import Added, Allowed, Attached, Detached, Moved, Named, Touched, WorldOptions
+from ibrobot_planning.world.objects import (
+    FLOOR,
+    SNAPSHOT,
+    Box,
+    Capsule,
+    Cylinder,
+    Plane,
+    Shape,
+    Sphere,
+    World,
+    WorldObject,
+)
+from ibrobot_planning.world.options import Added, Allowed, Attached, Detached, Moved, Named, Touched, WorldOptions
 
 if TYPE_CHECKING:
-    from ibrobot_planning.arm import Arm
-    from ibrobot_planning.clearance import Clearance
+    from ibrobot_planning.world.arm import Arm
+    from ibrobot_planning.world.clearance import Clearance
 
 SECTION = "world"
 MOST_OBJECTS = 200
@@ -258,7 +269,7 @@ class WorldKeeper(Component):
         return world
 
     def _robot(self) -> Arm:
-        from ibrobot_planning.arm import robot_arm
+        from ibrobot_planning.world.arm import robot_arm
 
         if self._arm is None:
             self._arm = robot_arm(self._session.config.robot)
@@ -277,7 +288,7 @@ class WorldKeeper(Component):
 
     def _distance(self, request: Configuration) -> float:
         """Distance of the arm from the nearest object [m], where joints not given are where they are measured."""
-        from ibrobot_planning.clearance import Clearance
+        from ibrobot_planning.world.clearance import Clearance
 
         q = self._session.measured().position.copy()
         robot, positions = self._session.config.robot, request.positions

@@ -35,16 +35,17 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_planning.arm import Arm, Pair
-from ibrobot_planning.blend import motion_of
-from ibrobot_planning.checked_arm import checked_arm
-from ibrobot_planning.collision import Collisions, Contact
-from ibrobot_planning.goals import Candidate, Tool, joint_target
-from ibrobot_planning.linear import linear_path
-from ibrobot_planning.options import RrtConnectOptions
-from ibrobot_planning.search import Pace, Space, connect, shortened
-from ibrobot_planning.timing import Motion, scaling_fault, timed
-from ibrobot_planning.world import FLOOR, SNAPSHOT, Plane, World, WorldObject
+from ibrobot_planning.goals.text import scaling_fault
+from ibrobot_planning.goals.tool import Candidate, Tool, joint_target
+from ibrobot_planning.planners.blend import motion_of
+from ibrobot_planning.planners.linear import linear_path
+from ibrobot_planning.planners.options import RrtConnectOptions
+from ibrobot_planning.planners.search import Pace, Space, connect, shortened
+from ibrobot_planning.planners.timing import Motion, timed
+from ibrobot_planning.world.arm import Arm, Pair
+from ibrobot_planning.world.checked_arm import checked_arm
+from ibrobot_planning.world.collision import Collisions, Contact
+from ibrobot_planning.world.objects import FLOOR, SNAPSHOT, Plane, World, WorldObject
 
 _RESOLUTIONS_M = (0.05, 0.02, 0.005)
 """Maximum motion of the arm between checks of the search; finer ones follow if the timed motion touches."""

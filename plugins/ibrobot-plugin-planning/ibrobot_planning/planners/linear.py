@@ -10,7 +10,7 @@ from ibrobot_kinematics import KinematicModel, Target, UnreachableError, solve
 from ibrobot_kinematics.rotations import between, cross, exp, log
 
 from ibrobot_core.api import PlanCode, PlanningError, PoseGoal, PositionGoal, Vector
-from ibrobot_planning.goals import Tool, pose_matrix, turned, unit
+from ibrobot_planning.goals.tool import Tool, pose_matrix, turned, unit
 
 _STEP_M = 0.004
 _STEP_RAD = 0.05

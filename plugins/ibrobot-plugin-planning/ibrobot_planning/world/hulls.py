@@ -8,10 +8,10 @@ from collections.abc import Collection, Sequence
 import attrs
 import numpy as np
 
-from ibrobot_planning.arm import Arm, LinkShape, Pair
-from ibrobot_planning.collision import Collisions
-from ibrobot_planning.shapes import enclosing, hull
-from ibrobot_planning.world import World
+from ibrobot_planning.world.arm import Arm, LinkShape, Pair
+from ibrobot_planning.world.coal_shapes import enclosing, hull
+from ibrobot_planning.world.collision import Collisions
+from ibrobot_planning.world.objects import World
 
 _SAMPLES = 200
 """Number of configurations that determine which hulls are of use."""

@@ -11,7 +11,7 @@ import attrs
 from ibrobot_core.api import documented, option
 
 if TYPE_CHECKING:
-    from ibrobot_planning.world import WorldObject
+    from ibrobot_planning.world.objects import WorldObject
 
 FURTHEST = 1000.0
 """The largest number of a position [m] or an angle [rad] that can be meant."""
@@ -67,7 +67,7 @@ class ObjectOptions:
         """
         from ibrobot_kinematics.poses import pose_at
 
-        from ibrobot_planning.world import Box, Capsule, Cylinder, Plane, Shape, Sphere, WorldObject, read_mesh
+        from ibrobot_planning.world.objects import Box, Capsule, Cylinder, Plane, Shape, Sphere, WorldObject, read_mesh
 
         shape: Shape
         if self.size is not None:

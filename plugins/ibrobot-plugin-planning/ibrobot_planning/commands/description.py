@@ -32,10 +32,10 @@ def srdf(config: str, samples: int, seed: int, output: Path | None) -> None:
     from ibrobot_kinematics.urdf import read_urdf
 
     from ibrobot_core.api import find_config, installed_plugins, load_config
-    from ibrobot_planning.arm import robot_arm
-    from ibrobot_planning.collision import unchecked_pairs
-    from ibrobot_planning.semantics import srdf as written
-    from ibrobot_planning.semantics import urdf_names
+    from ibrobot_planning.world.arm import robot_arm
+    from ibrobot_planning.world.collision import unchecked_pairs
+    from ibrobot_planning.world.semantics import srdf as written
+    from ibrobot_planning.world.semantics import urdf_names
 
     registry = installed_plugins()
     robot = load_config(find_config(config, registry), sim=True, registry=registry).robot

@@ -38,12 +38,12 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_planning.execution import Execution
-from ibrobot_planning.goal_plans import GoalPlans
-from ibrobot_planning.goal_text import Target, target
-from ibrobot_planning.motion import MoveResult, MoveToConfiguration, MoveToPose, Outcome, results_of
-from ibrobot_planning.planning_services import PlanningServices
-from ibrobot_planning.requests import Execute, GoTo, MoveRequest, Numbered
+from ibrobot_planning.execution.plans import GoalPlans
+from ibrobot_planning.execution.requests import Execute, GoTo, MoveRequest, Numbered
+from ibrobot_planning.execution.results import MoveResult, MoveToConfiguration, MoveToPose, Outcome, results_of
+from ibrobot_planning.execution.services import PlanningServices
+from ibrobot_planning.execution.tracks import Execution
+from ibrobot_planning.goals.text import Target, target
 
 GO_TO = Service(
     "/planning/go_to", GoTo, int, "Move to a goal, which replaces the present one; answers with its number.", "goal"

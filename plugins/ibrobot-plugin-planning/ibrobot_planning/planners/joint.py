@@ -24,9 +24,10 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_planning.options import JointPlannerOptions
-from ibrobot_planning.profile import RestToRest
-from ibrobot_planning.timing import check_duration, scaling_fault
+from ibrobot_planning.goals.text import scaling_fault
+from ibrobot_planning.planners.options import JointPlannerOptions
+from ibrobot_planning.planners.profile import RestToRest
+from ibrobot_planning.planners.timing import check_duration
 
 _SHORTEST_PHASE_S = 1e-5
 """Shorter phases of the profile get no point of their own: interpolation would divide by their time."""

@@ -1,0 +1,1 @@
+"""`ibrobot plan` and `ibrobot description`."""

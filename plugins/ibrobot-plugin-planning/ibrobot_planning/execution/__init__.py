@@ -1,0 +1,1 @@
+"""Modes with a planner: goals of services and commands become motions of the executors."""

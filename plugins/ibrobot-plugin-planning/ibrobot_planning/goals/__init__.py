@@ -1,0 +1,1 @@
+"""Goals: how users write them, and the joint positions that reach them."""

@@ -1,0 +1,1 @@
+"""The planners `joint` and `rrt_connect`: search, timing, and changes between motions."""
