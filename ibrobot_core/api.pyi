@@ -182,6 +182,7 @@ from ibrobot_core.component import (
     Worker as Worker,
     error_line as error_line,
     error_text as error_text,
+    raise_thread_priority as raise_thread_priority,
 )
 from ibrobot_core.launch.session import (
     CommandSource as CommandSource,

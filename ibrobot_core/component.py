@@ -62,7 +62,12 @@ class Worker(Component):
         on_failure: called with the exception that ended the thread.
         lockstep: whether `step` does the work, without a thread.
         ready_timeout_s: time for which `start` waits until the worker is ready [s].
+
+    Attributes:
+        urgent: whether its thread calls `raise_thread_priority`: only for a class whose units of work are short.
     """
+
+    urgent = False
 
     def __init__(
         self, name: str, summary: str, needs: tuple[str, ...] = (), *,
@@ -142,8 +147,8 @@ class Worker(Component):
             self.teardown()
 
     def _run(self) -> None:
-        # Raise all workers: one preempted by another program while it holds the GIL would block all others.
-        raise_thread_priority()
+        if self.urgent:
+            raise_thread_priority()
         try:
             try:
                 self.setup()
@@ -184,9 +189,10 @@ def exit_code(error: BaseException) -> int:
 def raise_thread_priority() -> None:
     """Give the calling thread the lowest real-time priority (SCHED_RR), if the machine permits it.
 
-    The thread and the threads it starts then take precedence over ordinary programs, but not over the control loop.
-    Use it for threads that work for a bounded time and then wait. Refusals are not reported here, but by the control
-    loop.
+    The thread then takes precedence over ordinary programs, but not over the control loop. Threads and processes that
+    it starts have the ordinary priority. Use it for threads that work for a bounded time and then wait. Refusals are
+    not reported here, but by the control loop.
     """
     with suppress(AttributeError, OSError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(os.sched_get_priority_min(os.SCHED_RR)))
+        lowest = os.sched_get_priority_min(os.SCHED_RR)
+        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(lowest))

@@ -18,6 +18,8 @@ _RATE_WINDOW = 31
 class SensorWorker(SessionWorker):
     """Opens a sensor and publishes its messages; ready after the first message."""
 
+    urgent = True
+
     def __init__(self, session: Session, peripheral: PeripheralConfig, needs: tuple[str, ...]) -> None:
         super().__init__(
             session, f"sensor:{peripheral.name}", f"{peripheral.kind} {peripheral.type}", needs,

@@ -8,10 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from ibrobot_core.component import Worker
 from ibrobot_core.launch.perception import SensorWorker
 
 if TYPE_CHECKING:
     from tests.launch.conftest import Runs
+
+
+class Patient(Worker):
+    """A worker whose units of work may be long."""
+
+    def work(self, timeout_s: float) -> None:
+        self.pause(timeout_s)
 
 
 @pytest.fixture
@@ -36,7 +44,14 @@ def test_a_sensor_is_read_at_the_lowest_real_time_priority(runs: Runs, scheduled
     worker = sensor(runs, lockstep=False)
     worker.start()
     worker.stop()
-    assert scheduled == [("sensor:top", os.SCHED_RR, 1)]
+    assert scheduled == [("sensor:top", os.SCHED_RR | os.SCHED_RESET_ON_FORK, 1)]
+
+
+def test_a_worker_that_does_not_opt_in_has_the_ordinary_priority(scheduled: list[tuple[str, int, int]]):
+    worker = Patient("search", "", on_failure=lambda *_: None, lockstep=False)
+    worker.start()
+    worker.stop()
+    assert scheduled == []
 
 
 def test_in_lockstep_no_thread_is_preferred(runs: Runs, scheduled: list[tuple[str, int, int]]):

@@ -28,6 +28,8 @@ _OF_DISPATCH = (
 class Status(SessionWorker):
     """Publishes the reports of control and the dispatcher, five times a second."""
 
+    urgent = True
+
     def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
         super().__init__(session, "status", "/robot_status and /diagnostics", needs)
         self._next_ns = 0

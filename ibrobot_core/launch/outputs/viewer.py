@@ -16,6 +16,7 @@ class ViewerWorker(SessionWorker):
     """Updates a viewer 30 times a second; closing the window ends the run."""
 
     sends_stops = True
+    urgent = True
 
     def __init__(self, session: Session, component: ComponentConfig, needs: tuple[str, ...]) -> None:
         super().__init__(session, "viewer", component.type, needs)

@@ -102,6 +102,7 @@ class PolicySource(SourceWorker):
     """Runs the dispatcher on the contract's ticks, with chunks from a model."""
 
     autonomous = True
+    urgent = True
 
     def __init__(
         self,

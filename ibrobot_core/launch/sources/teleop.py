@@ -57,6 +57,7 @@ class TeleopSource(SourceWorker):
     """
 
     sends_stops = True
+    urgent = True
 
     def __init__(self, session: Session, mode: ControlMode) -> None:
         self._devices = OperatorDevices(session, mode.devices)

@@ -26,6 +26,7 @@ from ibrobot_core.api import (
     SensorError,
     SteppedClock,
     ns,
+    raise_thread_priority,
 )
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
@@ -172,6 +173,7 @@ class _Live:
         self._thread.join(_CLOSE_S)
 
     def _run(self, capture: Capture) -> None:
+        raise_thread_priority()
         warned = False
         try:
             while not self._ended.is_set():

@@ -15,7 +15,17 @@ from ibrobot_camera.camera import to_image
 from ibrobot_camera.capture import Pixels
 from ibrobot_camera.librealsense import load_library
 from ibrobot_camera.options import RealSenseOptions
-from ibrobot_core.api import CameraInfo, CompressedImage, Context, Header, Image, Message, Sensor, SensorError
+from ibrobot_core.api import (
+    CameraInfo,
+    CompressedImage,
+    Context,
+    Header,
+    Image,
+    Message,
+    Sensor,
+    SensorError,
+    raise_thread_priority,
+)
 
 _WAIT_MS = 200
 _CLOSE_S = 5.0
@@ -127,6 +137,7 @@ class _Device:
         return profile if (video.width(), video.height(), float(profile.fps())) == self.size else None
 
     def _run(self) -> None:
+        raise_thread_priority()
         rs, heard = self._rs, time.monotonic()
         while not self._ended.is_set():
             try:

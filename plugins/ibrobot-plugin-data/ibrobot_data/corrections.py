@@ -61,6 +61,7 @@ class Corrections(SourceWorker):
     """
 
     autonomous = True
+    urgent = True
 
     def __init__(self, session: Session, mode: ControlMode, policy: PolicySource) -> None:
         assert mode.inference is not None

@@ -58,6 +58,8 @@ class RecordingWorker(SessionWorker):
     there to make room.
     """
 
+    urgent = True
+
     def __init__(self, session: Session, config: RecordingConfig) -> None:
         super().__init__(session, "recording", f"{config.type} into {config.root}")
         self._config = config

@@ -49,6 +49,7 @@ class ReplaySource(SourceWorker):
     """
 
     autonomous = True
+    urgent = True
 
     def __init__(self, session: Session, mode: ControlMode, replay: Replay) -> None:
         super().__init__(session, mode, f"{replay.source}, {replay.playback.duration / replay.speed:.1f} s")

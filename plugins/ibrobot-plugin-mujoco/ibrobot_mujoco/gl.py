@@ -69,6 +69,9 @@ def check_asked() -> str:
     Raises:
         MissingDependency: if there is no such backend, or it does not work on this machine.
     """
+    # Mesa's software renderer draws in the thread that asks for a picture. In threads of its own it would have neither
+    # that thread's priority nor, beside a busy program, a picture in time.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
     asked = os.environ.get("MUJOCO_GL", "").strip().lower()
     known = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa", "glfw")
     if asked and asked not in known:

@@ -25,6 +25,8 @@ from ibrobot_servo.options import ToolPoseOptions
 class ToolPose(SessionWorker):
     """Publishes the pose of the tool in the base frame."""
 
+    urgent = True
+
     def __init__(self, options: ToolPoseOptions, session: Session) -> None:
         super().__init__(session, "tool_pose", f"the tool's pose on {options.topic}", (CONTROL,))
         self._options = options

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from ibrobot_core.api import IbrobotError, PlanningError, Session, error_text, seconds
+from ibrobot_core.api import IbrobotError, PlanningError, Session, error_text, raise_thread_priority, seconds
 from ibrobot_web.messages import (
     BeginEpisode,
     Cancel,
@@ -102,6 +102,7 @@ class Commands:
 
     def _work_on_stops(self) -> None:
         """Stop the robot once for all stops that wait."""
+        raise_thread_priority()
         while (first := self._stops.get()) is not None:
             numbers = [first, *_waiting(self._stops)]
             reply = self._outcome_of(self._session.emergency_stop)

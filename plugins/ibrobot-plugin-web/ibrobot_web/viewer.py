@@ -23,6 +23,7 @@ from ibrobot_core.api import (
     Subscription,
     Viewer,
     error_text,
+    raise_thread_priority,
 )
 from ibrobot_web.commands import Commands
 from ibrobot_web.desktop import has_desktop
@@ -182,6 +183,7 @@ class WebViewer(Viewer):
 
     def _receive(self, child: Child) -> None:
         """Take messages until the server or the viewer ends. Without this thread the page's STOP would be deaf."""
+        raise_thread_priority()
         try:
             while not child.channel.closed and self._child is child:
                 self._take(child)
