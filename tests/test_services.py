@@ -127,7 +127,12 @@ def test_no_faults_are_looked_for_beyond_those_in_the_message(monkeypatch: pytes
     service: Service[Any, Any] = Service("/steps", steps, int)
     assert refusal({"steps": [{"size": 1}] * 900}, service).endswith("; and more")
     assert len(checked) == 6
-    monkeypatch.setattr(convert, "unknown_key", lambda *names: str(checked.append(names)))
+
+    def unknown_key(word: str, known: list[str]) -> str:
+        checked.append(word)
+        return "unknown key"
+
+    monkeypatch.setattr(convert, "unknown_key", unknown_key)
     for request in ({f"x{i}": 1 for i in range(900)}, {"steps": [{f"x{j}": 1 for j in range(9)}] * 90}):
         checked.clear()
         refusal(request, service)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from pathlib import Path
 from typing import Any, override
 
@@ -13,9 +14,9 @@ from ibrobot_kinematics.poses import matrix
 from ibrobot_planning import ibrobot_sections
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
-from ibrobot_planning.world.objects import SNAPSHOT, Box, Capsule, Cylinder, Mesh, Plane, Sphere
+from ibrobot_planning.world.objects import SNAPSHOT, Box, Capsule, Cylinder, Mesh, Plane, Sphere, read_mesh
 from ibrobot_planning.world.options import WorldOptions
-from ibrobot_planning.world.section import ADD, ATTACH, DETACH, MOST_OBJECTS, REMOVE, TOUCH, WorldKeeper
+from ibrobot_planning.world.section import ADD, ATTACH, DETACH, LARGEST_MESH, MOST_OBJECTS, REMOVE, TOUCH, WorldKeeper
 from ibrobot_testing import SectionSuite, make_session
 
 from ibrobot_core.api import (
@@ -306,6 +307,36 @@ def test_requests_name_meshes_of_packages_and_of_the_folder_that_the_yaml_allows
                 session.bus.call(ADD, mesh(file))
         with pytest.raises(RequestError, match=r"the Python package 'ibrobot_planning' has no file 'part\.stl'"):
             session.bus.call(ADD, mesh("package://ibrobot_planning/part.stl"))
+    finally:
+        keeper.stop()
+
+
+def test_meshes_of_requests_are_limited_and_the_world_is_served_while_one_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "part.stl").write_text(STL)
+    (tmp_path / "large.stl").write_bytes(bytes(LARGEST_MESH + 1))
+    session = make_session()
+    keeper = WorldKeeper(options(f"meshes: {tmp_path}"), session)
+    keeper.start()
+    served: list[object] = []
+
+    def slow(*arguments: Any, **more: Any) -> Mesh:
+        watching = threading.Thread(target=lambda: served.append(session.bus.call(SNAPSHOT)))
+        watching.start()
+        watching.join(10)
+        return read_mesh(*arguments, **more)
+
+    try:
+        with pytest.raises(RequestError, match=f"has {LARGEST_MESH + 1} bytes; a request names meshes of up to"):
+            session.bus.call(ADD, mesh("large.stl"))
+        monkeypatch.setattr("ibrobot_planning.world.objects.read_mesh", slow)
+        assert session.bus.call(ADD, mesh("part.stl")) == ["part"]
+        assert len(served) == 1
+        monkeypatch.setattr("ibrobot_planning.world.section.MOST_TRIANGLES", 1)
+        with pytest.raises(PlanningError, match=r"the meshes would have \d+ triangles; 1 are checked in time"):
+            session.bus.call(ADD, mesh("part.stl") | {"name": "other"})
+        assert session.bus.call(ADD, {"name": "table", "object": {"shape": "plane"}}) == ["part", "table"]
     finally:
         keeper.stop()
 

@@ -37,6 +37,7 @@ from ibrobot_planning.world.objects import (
     Box,
     Capsule,
     Cylinder,
+    Mesh,
     Plane,
     Shape,
     Sphere,
@@ -52,6 +53,10 @@ if TYPE_CHECKING:
 SECTION = "world"
 MOST_OBJECTS = 200
 """Objects that requests can bring the world to."""
+MOST_TRIANGLES = 200_000
+"""Triangles that requests can bring the meshes of the world to."""
+LARGEST_MESH = 4_000_000
+"""Size of the file of a mesh that a request names, at most [bytes]."""
 _MESHES = (".stl", ".obj", ".ply")
 _ANSWER = " Answers with the names of all objects."
 ADD = Service("/world/add", Added, list, "Add an object." + _ANSWER)
@@ -122,6 +127,7 @@ class WorldKeeper(Component):
         self._session = session
         self._meshes = options.meshes
         self._lock = threading.RLock()
+        self._measuring = threading.Lock()
         self._arm: Arm | None = None
         self._moving = {thing.name: thing for thing in scene if thing.topic}
         """Objects of the scene that may move."""
@@ -129,7 +135,7 @@ class WorldKeeper(Component):
         self._touched: tuple[str, ...] = ()
         self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
             SNAPSHOT: lambda _: self._snapshot(),
-            ADD: self._changing(self._add),
+            ADD: self._add,
             REMOVE: self._changing(lambda world, it: world.remove(it.name)),
             MOVE: self._changing(self._move),
             ATTACH: self._changing(self._attach),
@@ -224,13 +230,28 @@ class WorldKeeper(Component):
 
         return handler
 
-    def _add(self, world: World, it: Added) -> World:
-        if it.replace and it.name in world.objects:
-            world = world.remove(it.name)
+    def _add(self, it: Added) -> list[str]:
         _check_position(it.object.position)
-        if len(world.objects) >= MOST_OBJECTS:
-            raise PlanningError(f"there are {MOST_OBJECTS} objects already, more are not checked in time")
-        return world.add(it.name, it.object.made())
+        try:
+            thing = it.object.made()  # reading a mesh takes a moment, in which motions are still watched
+        except ValueError as error:
+            raise PlanningError(str(error)) from error
+
+        def change(world: World, it: Added) -> World:
+            if it.replace and it.name in world.objects:
+                world = world.remove(it.name)
+            if len(world.objects) >= MOST_OBJECTS:
+                raise PlanningError(f"there are {MOST_OBJECTS} objects already, more are not checked in time")
+            world = world.add(it.name, thing)
+            meshes = [each.shape for each in world.objects.values() if isinstance(each.shape, Mesh)]
+            triangles = sum(len(mesh.triangles) for mesh in meshes)
+            if isinstance(thing.shape, Mesh) and triangles > MOST_TRIANGLES:
+                raise PlanningError(
+                    f"the meshes would have {triangles} triangles; {MOST_TRIANGLES} are checked in time"
+                )
+            return world
+
+        return self._changing(change)(it)
 
     def _mesh_file(self, text: str) -> Path:
         """The file of a mesh that a request names: of a package, or in the folder that the YAML allows.
@@ -240,11 +261,15 @@ class WorldKeeper(Component):
         """
         if Path(text).suffix.lower() not in _MESHES:
             raise ValueError(f"a mesh is a file {', '.join(_MESHES)}, got {text!r}")
-        if text.startswith("package://"):
-            return resolve_path(text, Path())
         folder = self._meshes.resolve() if self._meshes is not None else None
-        if folder is None or not (path := (folder / text).resolve()).is_relative_to(folder):
+        if text.startswith("package://"):
+            path = resolve_path(text, Path())
+        elif folder is None or not (path := (folder / text).resolve()).is_relative_to(folder):
             raise ValueError(f"{text!r}: a request names package://PACKAGE/path, or a mesh in the folder world.meshes")
+        if path.is_file() and path.stat().st_size > LARGEST_MESH:
+            raise ValueError(
+                f"{text!r} has {path.stat().st_size} bytes; a request names meshes of up to {LARGEST_MESH}"
+            )
         return path
 
     def _move(self, world: World, it: Moved) -> World:
@@ -297,8 +322,8 @@ class WorldKeeper(Component):
                 known = did_you_mean(name, robot.joint_names, "the joints are")
                 raise PlanningError(f"no joint {name!r}{known}", PlanCode.INVALID_ROBOT_STATE)
         q[robot.indices(tuple(positions))] = list(positions.values())
-        with self._lock:
-            world = self._snapshot()
+        world = self._snapshot()
+        with self._measuring:
             if self._near is None or self._near[0] != world:
                 self._near = world, Clearance(self._robot(), world)
             return self._near[1](q)
