@@ -47,7 +47,8 @@ def emulate(link: Path, prefix: str, *, leader: bool) -> None:
     from ibrobot_feetech.calibration import save_calibration
     from ibrobot_feetech.emulator import Emulator
 
-    from ibrobot_core.api import Calibration, JointCalibration, go_real_time
+    from ibrobot_core.api import Calibration, JointCalibration
+    from ibrobot_core.app import go_real_time
 
     ended = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ended.set())

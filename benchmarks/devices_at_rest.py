@@ -27,7 +27,8 @@ from ibrobot_kinematics.rotations import exp, quaternion
 from ibrobot_webxr.messages import HandPose
 from takeovers import CONFIG, WithHand, WithPad
 
-from ibrobot_core.api import LaunchRequest, Runtime, Session, Vector, installed_plugins, load_config
+from ibrobot_core.api import Vector
+from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 
 MOST_RAD, LEAST_RAD = 1e-5, 0.03
 RATE_HZ = 100

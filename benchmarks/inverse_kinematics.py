@@ -26,7 +26,8 @@ from ibrobot_kinematics import KinematicModel, Target, UnreachableError, read_mj
 from ibrobot_kinematics.model import TipPose
 from ibrobot_kinematics.search import search
 
-from ibrobot_core.api import Vector, load_config
+from ibrobot_core.api import Vector
+from ibrobot_core.app import load_config
 
 DIGITS = 4
 MEDIAN_MS, REFUSAL_MS = 0.3, 20.0

@@ -31,15 +31,12 @@ from ibrobot_planning.tasks.reading import find_task
 from ibrobot_planning.tasks.result import TaskResult
 from ibrobot_planning.tasks.runner import RESULT, RUN
 
-from ibrobot_core.api import (
-    Float64MultiArray,
-    HardwareError,
+from ibrobot_core.api import Float64MultiArray, HardwareError, Robot, Vector
+from ibrobot_core.app import (
     LaunchRequest,
-    Robot,
     Runtime,
     Session,
     Subscription,
-    Vector,
     installed_plugins,
     load_config,
     single_options,

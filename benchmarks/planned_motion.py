@@ -42,16 +42,8 @@ from ibrobot_planning.world.objects import Box, World, WorldObject
 from planning import Referee
 from planning_scenes import ARM_JOINTS, Maker
 
-from ibrobot_core.api import (
-    LaunchRequest,
-    Pose,
-    Runtime,
-    Session,
-    Vector,
-    Vector3,
-    installed_plugins,
-    load_config,
-)
+from ibrobot_core.api import Pose, Vector, Vector3
+from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101_blind.yaml"
 MODE = "moveit_planning"

@@ -40,7 +40,8 @@ from ibrobot_servo.teleop import twist_service
 
 import ibrobot_core.launch.runtime
 import ibrobot_core.launch.sources.policy
-from ibrobot_core.api import IbrobotError, Service
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import Service
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "tests" / "shared"))

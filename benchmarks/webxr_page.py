@@ -28,7 +28,8 @@ from typing import Any
 import numpy as np
 from playwright.sync_api import CDPSession, Page, sync_playwright
 
-from ibrobot_core.api import Float64MultiArray, LaunchRequest, Runtime, Session, Vector, installed_plugins, load_config
+from ibrobot_core.api import Float64MultiArray, Vector
+from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101_blind.yaml"
 TOPIC = "/arm_position_controller/commands"

@@ -1,22 +1,31 @@
-"""The reference page of `ibrobot_core.api`: every public name, grouped by the module that it lives in."""
+"""The reference page of core's public interface: both floors, in the groups of their stubs."""
 
 from __future__ import annotations
 
+import ast
 import inspect
 from collections.abc import Iterator
-from importlib import import_module
+from pathlib import Path
+from types import ModuleType
 
-from ibrobot_core import api
+from ibrobot_core import api, app
 
 ELSEWHERE = {"ibrobot_core.interfaces": "interfaces", "ibrobot_core.descriptors": "hooks"}
-"""Module -> the page that describes it whole."""
+"""Package or module -> the page that describes it whole."""
 
 STABILITY = """# Public API
 
-Plugins import core through one flat module:
+Plugins import core through two flat modules. `ibrobot_core.api` is the floor for devices, models and formats:
 
 ```python
 from ibrobot_core.api import Context, Teleop, TeleopCommand, TeleopDescriptor, hookimpl, option
+```
+
+`ibrobot_core.app` is the floor for what reaches into a run: commands, sections of the robot YAML, command sources,
+sessions and topics.
+
+```python
+from ibrobot_core.app import Command, Component, SectionDescriptor, Session
 ```
 
 A name is imported from its module when it is first used. Listing plugins therefore loads no heavy package.
@@ -36,26 +45,40 @@ The official plugins use nothing else of core. `lint-imports` checks it.
 """
 
 
+def groups(floor: ModuleType) -> Iterator[tuple[str, list[str]]]:
+    """The title and the names of each group of a floor: comments of its stub are titles of what follows."""
+    stub = Path(str(floor.__file__)).with_suffix(".pyi").read_text(encoding="utf-8")
+    titles = [number for number, line in enumerate(stub.splitlines(), start=1) if line.startswith("# ")]
+    imports = [node for node in ast.parse(stub).body if isinstance(node, ast.ImportFrom)]
+    for number, following in zip(titles, [*titles[1:], len(stub)], strict=True):
+        inside = [node for node in imports if number < node.lineno < following]
+        yield stub.splitlines()[number - 1].removeprefix("# "), [alias.name for node in inside for alias in node.names]
+
+
 def api_page() -> Iterator[str]:
     """Lines of the page."""
     yield STABILITY
-    names: dict[str, list[str]] = {}
-    for name in api.__all__:
-        home = api.home_of(name)
-        group = "ibrobot_core.interfaces" if home.startswith("ibrobot_core.interfaces") else home
-        names.setdefault(group, []).append(name)
-    for module, found in names.items():
-        yield f"## {module.removeprefix('ibrobot_core.')}\n"
-        yield f"{(inspect.getdoc(import_module(module)) or '').split('\n\n', maxsplit=1)[0]}\n"
-        if module in ELSEWHERE:
-            page = ELSEWHERE[module]
-            yield f"[{page.capitalize()}]({page}.md) describes them: {', '.join(f'`{name}`' for name in found)}.\n"
-            continue
-        yield "```{eval-rst}"
-        for name in found:
-            value = getattr(api, name)
-            kind = "class" if inspect.isclass(value) else "function" if inspect.isroutine(value) else "data"
-            yield f".. auto{kind}:: {module}.{name}"
-            if kind == "data":
-                yield "   :no-value:"
-        yield "```\n"
+    for floor in (api, app):
+        yield f"## {floor.__name__}\n"
+        for title, names in groups(floor):
+            yield f"### {title}\n"
+            homes = {name: floor.home_of(name) for name in names}
+            for module, page in ELSEWHERE.items():
+                found = [name for name, home in homes.items() if f"{home}.".startswith(f"{module}.")]
+                if found:
+                    listed = ", ".join(f"`{name}`" for name in found)
+                    yield f"[{page.capitalize()}]({page}.md) describes: {listed}.\n"
+                homes = {name: home for name, home in homes.items() if name not in found}
+            if homes:
+                yield from _described(floor, homes)
+
+
+def _described(floor: ModuleType, homes: dict[str, str]) -> Iterator[str]:
+    yield "```{eval-rst}"
+    for name, home in homes.items():
+        value = getattr(floor, name)
+        kind = "class" if inspect.isclass(value) else "function" if inspect.isroutine(value) else "data"
+        yield f".. auto{kind}:: {home}.{name}"
+        if kind == "data":
+            yield "   :no-value:"
+    yield "```\n"

@@ -1,4 +1,4 @@
-"""The public interface: what the stub names exists, is imported late, and is documented."""
+"""The public interface: what the stubs name exists, is imported late, and is documented."""
 
 from __future__ import annotations
 
@@ -9,35 +9,48 @@ from typing import get_origin
 
 import pytest
 
-from ibrobot_core import api
+from ibrobot_core import api, app
+
+NAMES = [(floor, name) for floor in (api, app) for name in floor.__all__]
 
 
-@pytest.mark.parametrize("name", api.__all__)
-def test_every_name_is_there(name: str) -> None:
-    assert getattr(api, name) is not None
+@pytest.mark.parametrize(("floor", "name"), NAMES)
+def test_every_name_is_there(floor, name: str) -> None:
+    assert getattr(floor, name) is not None
 
 
-def test_a_name_stands_for_one_thing() -> None:
-    assert len(api.__all__) == len(set(api.__all__))
+def test_a_name_stands_for_one_thing_on_one_floor() -> None:
+    names = [name for _, name in NAMES]
+    assert len(names) == len(set(names))
 
 
-def test_an_unknown_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="no attribute 'Hardwear'"):
-        _ = api.Hardwear  # type: ignore[attr-defined]
+def test_the_floor_for_devices_reaches_into_no_run() -> None:
+    homes = {api.home_of(name) for name in api.__all__}
+    inside = ("cli", "control", "dispatch", "inference", "launch", "plugins", "run_hooks", "services", "component")
+    assert [home for home in homes if home.split(".")[1] in inside] == []
 
 
-def test_names_are_listed() -> None:
-    assert set(api.__all__) <= set(dir(api))
+@pytest.mark.parametrize("floor", [api, app])
+def test_an_unknown_name_is_an_attribute_error(floor) -> None:
+    with pytest.raises(AttributeError, match=f"module '{floor.__name__}' has no attribute 'Hardwear'"):
+        _ = floor.Hardwear
 
 
-def test_importing_it_imports_nothing_else_of_core() -> None:
-    code = "import sys, ibrobot_core.api; print([m for m in sys.modules if m.startswith(('ibrobot_core.', 'numpy'))])"
+@pytest.mark.parametrize("floor", [api, app])
+def test_names_are_listed(floor) -> None:
+    assert set(floor.__all__) <= set(dir(floor))
+
+
+@pytest.mark.parametrize("floor", [api, app])
+def test_importing_it_imports_nothing_else_of_core(floor) -> None:
+    code = f"import sys, {floor.__name__}; print([m for m in sys.modules if m.startswith(('ibrobot_core.', 'numpy'))])"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert loaded.strip() == "['ibrobot_core.api']"
+    assert loaded.strip() == f"['ibrobot_core.late', '{floor.__name__}']"
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in api.__all__ if callable(found := getattr(api, name)) and get_origin(found) is None]
+    ("floor", "name"),
+    [(floor, name) for floor, name in NAMES if callable(found := getattr(floor, name)) and get_origin(found) is None],
 )
-def test_every_class_and_function_is_documented(name: str) -> None:
-    assert inspect.getdoc(getattr(api, name)), f"{name} has no docstring"
+def test_every_class_and_function_is_documented(floor, name: str) -> None:
+    assert inspect.getdoc(getattr(floor, name)), f"{name} has no docstring"

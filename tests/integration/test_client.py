@@ -17,16 +17,8 @@ from ibrobot_planning.client.rclpy import Node, ReentrantCallbackGroup
 from ibrobot_testing import host_context
 from ibrobot_testing.ports import free_port
 
-from ibrobot_core.api import (
-    Int8,
-    LaunchRequest,
-    Runtime,
-    Session,
-    TransportError,
-    find_config,
-    installed_plugins,
-    load_config,
-)
+from ibrobot_core.api import Int8, TransportError
+from ibrobot_core.app import LaunchRequest, Runtime, Session, find_config, installed_plugins, load_config
 
 pytestmark = pytest.mark.integration
 robot = ibrobot_robots.so101

@@ -25,7 +25,7 @@ from recordings import CONTRACT, JOINTS, SIZE, START_NS, numbered, record
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ibrobot_core.api import Ownership
+from ibrobot_core.app import Ownership
 from ibrobot_core.messages import (
     Float64MultiArray,
     Header,

@@ -24,7 +24,7 @@ from ibrobot_lerobot.layout import open_dataset
 from killed_process import KILLED, killing
 from recordings import record
 
-from ibrobot_core.api import Ownership, installed_plugins
+from ibrobot_core.app import Ownership, installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 

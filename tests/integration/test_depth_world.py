@@ -8,15 +8,8 @@ from ibrobot_planning.world.arm import robot_arm
 from ibrobot_planning.world.collision import Collisions
 from ibrobot_planning.world.objects import SNAPSHOT, Voxels, World
 
-from ibrobot_core.api import (
-    Float64MultiArray,
-    LaunchRequest,
-    Runtime,
-    Session,
-    find_config,
-    installed_plugins,
-    load_config,
-)
+from ibrobot_core.api import Float64MultiArray
+from ibrobot_core.app import LaunchRequest, Runtime, Session, find_config, installed_plugins, load_config
 
 pytestmark = [
     pytest.mark.integration,

@@ -8,7 +8,8 @@ import attrs
 import pytest
 from ibrobot_testing import check_descriptor
 
-from ibrobot_core.api import Descriptor, installed_plugins
+from ibrobot_core.api import Descriptor
+from ibrobot_core.app import installed_plugins
 from ibrobot_core.plugins import KINDS
 
 pytestmark = pytest.mark.integration

@@ -13,16 +13,8 @@ from ibrobot_data.ticks import Ticks
 from ibrobot_planning.tasks.result import TaskResult
 from pick_and_place import perform
 
-from ibrobot_core.api import (
-    Contract,
-    LaunchRequest,
-    Runtime,
-    Session,
-    Vector,
-    find_config,
-    installed_plugins,
-    load_config,
-)
+from ibrobot_core.api import Contract, Vector
+from ibrobot_core.app import LaunchRequest, Runtime, Session, find_config, installed_plugins, load_config
 
 pytestmark = pytest.mark.integration
 

@@ -9,16 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ibrobot_core.api import (
-    EpisodeEnd,
-    EpisodeStart,
-    Float64MultiArray,
-    Header,
-    Image,
-    JointState,
-    RealClock,
-    installed_plugins,
-)
+from ibrobot_core.api import EpisodeEnd, EpisodeStart, Float64MultiArray, Header, Image, JointState, RealClock
+from ibrobot_core.app import installed_plugins
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 20_000_000

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 import attrs
 
-from ibrobot_core.api import Bus, Service, Vector, documented, option
+from ibrobot_core.api import Vector, documented, option
+from ibrobot_core.app import Bus, Service
 
 
 @documented

@@ -5,7 +5,8 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from ibrobot_core.api import Bus, Robot, TeleopError, Vector, ns
+from ibrobot_core.api import Robot, TeleopError, Vector, ns
+from ibrobot_core.app import Bus
 from ibrobot_kinematics.clearance import world_clearance
 from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.mjcf import robot_model

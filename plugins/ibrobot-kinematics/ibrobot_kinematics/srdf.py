@@ -8,7 +8,8 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.api import ModelError, XmlElement, did_you_mean, read_xml
+from ibrobot_core.api import did_you_mean
+from ibrobot_core.app import ModelError, XmlElement, read_xml
 from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.urdf import MOVING, Urdf, required
 

@@ -7,21 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_camera.device import realsense_stream, video_device
 from ibrobot_camera.options import OpenCvOptions, RealSenseOptions, picture_size
-from ibrobot_core.api import (
-    Check,
-    Command,
-    DecoderDescriptor,
-    GuideDescriptor,
-    OptionFault,
-    SensorDescriptor,
-    SensorError,
-    hookimpl,
-)
+from ibrobot_core.api import Check, DecoderDescriptor, OptionFault, SensorDescriptor, SensorError, hookimpl
+from ibrobot_core.app import Command, GuideDescriptor
 
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import CompressedImage, Context, Guide, Image, Robot, Sensor
+    from ibrobot_core.api import CompressedImage, Context, Image, Robot, Sensor
+    from ibrobot_core.app import Guide
 
 
 def _opencv(options: Any, ctx: Context) -> Sensor:

@@ -26,8 +26,8 @@ from ibrobot_core.api import (
     SensorError,
     SteppedClock,
     ns,
-    raise_thread_priority,
 )
+from ibrobot_core.app import raise_thread_priority
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
 """Time between attempts to reopen a lost source."""

@@ -8,7 +8,8 @@ import cv2
 
 from ibrobot_camera import v4l2
 from ibrobot_camera.commands.sources import decoded, opened, pixels
-from ibrobot_core.api import Guide, SensorError
+from ibrobot_core.api import SensorError
+from ibrobot_core.app import Guide
 
 _WAIT_S = 5.0
 _QUALITY = 80

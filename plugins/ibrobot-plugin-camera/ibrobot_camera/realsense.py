@@ -15,17 +15,8 @@ from ibrobot_camera.camera import to_image
 from ibrobot_camera.capture import Pixels
 from ibrobot_camera.librealsense import load_library
 from ibrobot_camera.options import RealSenseOptions
-from ibrobot_core.api import (
-    CameraInfo,
-    CompressedImage,
-    Context,
-    Header,
-    Image,
-    Message,
-    Sensor,
-    SensorError,
-    raise_thread_priority,
-)
+from ibrobot_core.api import CameraInfo, CompressedImage, Context, Header, Image, Message, Sensor, SensorError
+from ibrobot_core.app import raise_thread_priority
 
 _WAIT_MS = 200
 _CLOSE_S = 5.0

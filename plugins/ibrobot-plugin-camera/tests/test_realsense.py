@@ -26,8 +26,8 @@ from ibrobot_core.api import (
     RealClock,
     Sensor,
     SensorError,
-    installed_plugins,
 )
+from ibrobot_core.app import installed_plugins
 
 WIDTH, HEIGHT = 64, 48
 PATIENCE_S = 30.0

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import Command, SectionDescriptor, SourceDescriptor, hookimpl
+from ibrobot_core.api import hookimpl
+from ibrobot_core.app import Command, SectionDescriptor, SourceDescriptor
 from ibrobot_data.options import EpisodesOptions, check_keys
 
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import Component, ControlMode, PolicySource, RobotConfig, Session, SourceWorker
+    from ibrobot_core.app import Component, ControlMode, PolicySource, RobotConfig, Session, SourceWorker
 
 
 def _convert() -> click.Command:

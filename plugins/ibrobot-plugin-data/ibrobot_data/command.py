@@ -18,24 +18,14 @@ import attrs
 import click
 from click.core import ParameterSource
 
-from ibrobot_core.api import (
-    NORM_MODES,
-    Contract,
-    DatasetDescriptor,
-    DatasetError,
-    EpisodePath,
-    Flag,
-    echo,
-    installed_plugins,
-    with_closed_ends,
-    wrong_input,
-)
+from ibrobot_core.api import Contract, DatasetDescriptor, DatasetError, Flag
+from ibrobot_core.app import NORM_MODES, EpisodePath, echo, installed_plugins, with_closed_ends, wrong_input
 from ibrobot_data.prompt import check_prompt
 from ibrobot_data.request import MISSING, ONLY, OUTCOMES, ConversionRequest, EpisodeReport, Report
 from ibrobot_data.words import plural
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import RobotConfig
+    from ibrobot_core.app import RobotConfig
 
 _Progress = Callable[[int], AbstractContextManager[Any]]
 """Receives the number of episodes, and gives the function that shows the progress."""
@@ -219,13 +209,13 @@ def cores() -> int:
 
 
 def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:
-    from ibrobot_core.api import single_options
+    from ibrobot_core.app import single_options
 
     return single_options(installed_plugins().find(kind, type_).options, overrides, type_)
 
 
 def _robot(config: str) -> RobotConfig:
-    from ibrobot_core.api import find_config
+    from ibrobot_core.app import find_config
     from ibrobot_data.given import load_contract
 
     return load_contract(find_config(config, installed_plugins()))
@@ -300,7 +290,7 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from ibrobot_core.api import Screen, styled
+    from ibrobot_core.app import Screen, styled
 
     counts, speed = (TextColumn(each, markup=False) for each in ("{task.description}", "{task.fields[rate]}"))
     with Progress(counts, BarColumn(), speed, TimeRemainingColumn(), console=Screen(stderr=True)) as bar:

@@ -8,15 +8,7 @@ from typing import override
 import attrs
 
 from ibrobot_core.api import (
-    CONTROL,
-    ControlMode,
-    ControlState,
     NotSupported,
-    OperatorDevices,
-    PolicySource,
-    Service,
-    Session,
-    SourceWorker,
     String,
     TeleopCommand,
     TeleopDescriptor,
@@ -24,6 +16,16 @@ from ibrobot_core.api import (
     documented,
     option,
     seconds,
+)
+from ibrobot_core.app import (
+    CONTROL,
+    ControlMode,
+    ControlState,
+    OperatorDevices,
+    PolicySource,
+    Service,
+    Session,
+    SourceWorker,
 )
 from ibrobot_data.handover import Handover
 from ibrobot_data.options import COMMANDER, HANDOVER, OPERATOR, POLICY, EpisodesOptions, options_of

@@ -19,14 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
-    TASK_KEY,
     Calibration,
     Context,
     Contract,
     ContractError,
     DatasetError,
     DatasetWriter,
-    DiskFull,
     EpisodeAddress,
     EpisodeReader,
     EpisodeSummary,
@@ -34,12 +32,11 @@ from ibrobot_core.api import (
     IbrobotError,
     JointCalibration,
     JointUnits,
-    Ownership,
     RealClock,
     RecorderError,
     Robot,
-    installed_plugins,
 )
+from ibrobot_core.app import TASK_KEY, DiskFull, Ownership, installed_plugins
 from ibrobot_data.commanders import Commanders, stretches
 from ibrobot_data.identity import identity
 from ibrobot_data.options import OPERATOR, POLICY

@@ -10,7 +10,8 @@ from typing import Any
 
 import yaml
 
-from ibrobot_core.api import Contract, Ownership, RecorderError
+from ibrobot_core.api import Contract, RecorderError
+from ibrobot_core.app import Ownership
 
 _WAIT_S = 10.0
 """Others change `dataset.yaml` within milliseconds."""

@@ -10,20 +10,8 @@ from typing import TYPE_CHECKING, Any, override
 
 import attrs
 
-from ibrobot_core.api import (
-    Contract,
-    DiskFull,
-    Episodes,
-    NoRequest,
-    NotSupported,
-    RecorderError,
-    Service,
-    Session,
-    documented,
-    option,
-    seconds,
-    wrong_input,
-)
+from ibrobot_core.api import Contract, NotSupported, RecorderError, documented, option, seconds
+from ibrobot_core.app import DiskFull, Episodes, NoRequest, Service, Session, wrong_input
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_start import is_kept
 from ibrobot_data.prompt import check_prompt

@@ -9,17 +9,8 @@ from pathlib import Path
 from uuid import NAMESPACE_OID, uuid4, uuid5
 
 import ibrobot_core
-from ibrobot_core.api import (
-    Contract,
-    EpisodeStart,
-    InUse,
-    Ownership,
-    RecorderError,
-    RecordingConfig,
-    RobotConfig,
-    String,
-    calibrations,
-)
+from ibrobot_core.api import Contract, EpisodeStart, RecorderError, String
+from ibrobot_core.app import InUse, Ownership, RecordingConfig, RobotConfig, calibrations
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.options import COMMANDER
 

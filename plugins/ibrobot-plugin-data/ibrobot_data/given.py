@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.api import (
-    Contract,
+from ibrobot_core.api import Contract, Robot
+from ibrobot_core.app import (
     ExecutorConfig,
-    Robot,
     RobotConfig,
     contract_alone,
     load_config,

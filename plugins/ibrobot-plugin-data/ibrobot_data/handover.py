@@ -7,7 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ibrobot_core.api import ControlState, Session, Vector, ns, seconds
+from ibrobot_core.api import Vector, ns, seconds
+from ibrobot_core.app import ControlState, Session
 
 _BRAKE_SHARE, _FADE_SHARE = 0.75, 0.5
 """Fraction of the limits used for braking, and for moving to the positions of a device."""

@@ -6,17 +6,8 @@ from collections.abc import Callable
 from math import inf
 from typing import override
 
-from ibrobot_core.api import (
-    DiskFull,
-    IbrobotError,
-    NotSupported,
-    OperatorEvent,
-    RunHooks,
-    Session,
-    TeleopDescriptor,
-    ViewerDescriptor,
-    seconds,
-)
+from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, TeleopDescriptor, ViewerDescriptor, seconds
+from ibrobot_core.app import DiskFull, RunHooks, Session
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.words import plural
 

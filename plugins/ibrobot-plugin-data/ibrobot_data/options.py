@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import RUN_KEYS, OptionFault, TeleopDescriptor, check_key, documented, installed_plugins, option
+from ibrobot_core.api import OptionFault, TeleopDescriptor, documented, option
+from ibrobot_core.app import RUN_KEYS, check_key, installed_plugins
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import RobotConfig
+    from ibrobot_core.app import RobotConfig
 
 COMMANDER = "/commander"
 """std_msgs/msg/String: who commands the robot at a state of control, in modes with `intervene`."""

@@ -8,17 +8,8 @@ from functools import partial
 from types import NoneType
 from typing import override
 
-from ibrobot_core.api import (
-    EpisodeEnd,
-    NoRequest,
-    Received,
-    RecorderError,
-    RecordingConfig,
-    Service,
-    Session,
-    String,
-    ns,
-)
+from ibrobot_core.api import EpisodeEnd, RecorderError, String, ns
+from ibrobot_core.app import NoRequest, Received, RecordingConfig, Service, Session
 from ibrobot_data.options import COMMANDER, POLICY, EpisodesOptions
 from ibrobot_data.recording_worker import RecordingWorker
 

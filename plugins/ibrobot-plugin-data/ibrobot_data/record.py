@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ibrobot_core.api import (
+from ibrobot_core.app import (
     LaunchRequest,
     RobotConfig,
     Runtime,

@@ -10,23 +10,8 @@ from typing import override
 
 import attrs
 
-from ibrobot_core.api import (
-    NS_PER_S,
-    Component,
-    Contract,
-    EpisodeEnd,
-    EpisodeStart,
-    Message,
-    Ownership,
-    Received,
-    Recorder,
-    RecorderError,
-    RecordingConfig,
-    Session,
-    SessionWorker,
-    error_line,
-    seconds,
-)
+from ibrobot_core.api import NS_PER_S, Contract, EpisodeEnd, EpisodeStart, Message, Recorder, RecorderError, seconds
+from ibrobot_core.app import Component, Ownership, Received, RecordingConfig, Session, SessionWorker, error_line
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.episode_start import episode_start, is_kept, take_next_folder
 

@@ -11,23 +11,17 @@ import attrs
 import click
 import numpy as np
 
-from ibrobot_core.api import (
+from ibrobot_core.api import Contract, ContractError, EpisodeSummary, RecorderError, Robot, load_calibration, ns
+from ibrobot_core.app import (
     NORM_MODES,
-    Contract,
-    ContractError,
     EpisodePath,
-    EpisodeSummary,
     LaunchRequest,
-    RecorderError,
-    Robot,
     RobotConfig,
     echo,
     find_config,
     from_document,
     installed_plugins,
-    load_calibration,
     load_config,
-    ns,
     run_options,
     run_overrides,
     run_robot,

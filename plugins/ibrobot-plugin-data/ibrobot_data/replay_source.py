@@ -7,18 +7,8 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.api import (
-    NS_PER_S,
-    ControlMode,
-    ControlState,
-    HardwareError,
-    Session,
-    SourceWorker,
-    StateWatch,
-    Vector,
-    ns,
-    seconds,
-)
+from ibrobot_core.api import NS_PER_S, HardwareError, Vector, ns, seconds
+from ibrobot_core.app import ControlMode, ControlState, Session, SourceWorker, StateWatch
 from ibrobot_data.playback import Playback, Track
 
 _APPROACH_SPEED = 0.5

@@ -8,7 +8,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import NORM_MODES, Contract, documented, option
+from ibrobot_core.api import Contract, documented, option
+from ibrobot_core.app import NORM_MODES
 
 MISSING = ("refuse", "skip", "hold")
 OUTCOMES = ("success", "failure", "unknown")

@@ -23,19 +23,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import (
-    Contract,
-    DatasetError,
-    DatasetSummary,
-    DiskFull,
-    EpisodeAddress,
-    IbrobotError,
-    Ownership,
-    end_signals,
-    installed_plugins,
-    seconds,
-    set_malloc,
-)
+from ibrobot_core.api import Contract, DatasetError, DatasetSummary, EpisodeAddress, IbrobotError, seconds
+from ibrobot_core.app import DiskFull, Ownership, end_signals, installed_plugins, set_malloc
 from ibrobot_data.commanders import is_labelled
 from ibrobot_data.episode import (
     INTERVENTION,

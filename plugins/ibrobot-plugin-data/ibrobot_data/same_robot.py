@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import attrs
 
-from ibrobot_core.api import RobotConfig, calibrations
+from ibrobot_core.app import RobotConfig, calibrations
 from ibrobot_data.episode import Unit
 
 

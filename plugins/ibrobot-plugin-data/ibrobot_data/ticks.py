@@ -12,25 +12,21 @@ import attrs
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
-    TASK_KEY,
     ActionPart,
-    Align,
     Contract,
     ContractError,
     EpisodeReader,
     Feature,
     Frame,
-    FrameAssembler,
     Int32,
     Message,
     ObservationPart,
     Recorded,
     RecorderError,
-    SignalPart,
     ns,
     seconds,
-    value_at,
 )
+from ibrobot_core.app import TASK_KEY, Align, FrameAssembler, SignalPart, value_at
 
 ACTION = "action"
 _LONGEST_SILENCE_S = 60

@@ -18,19 +18,17 @@ from ibrobot_core.api import (
     Context,
     Contract,
     ContractError,
-    DiskFull,
     EpisodeEnd,
     EpisodeReader,
     EpisodeStart,
     EpisodeSummary,
     IbrobotError,
-    Ownership,
     Recorder,
     RecorderError,
     Robot,
     SteppedClock,
-    installed_plugins,
 )
+from ibrobot_core.app import DiskFull, Ownership, installed_plugins
 from ibrobot_data.episode import stop_if_full
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_start import episode_folder

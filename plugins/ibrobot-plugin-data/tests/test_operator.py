@@ -14,16 +14,8 @@ from ibrobot_data.operator import Operator
 from ibrobot_testing.fakes import FakeRecorder
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.api import (
-    LaunchRequest,
-    NotSupported,
-    RecorderError,
-    Runtime,
-    Session,
-    SourceWorker,
-    installed_plugins,
-    load_config,
-)
+from ibrobot_core.api import NotSupported, RecorderError
+from ibrobot_core.app import LaunchRequest, Runtime, Session, SourceWorker, installed_plugins, load_config
 
 ROBOT = """\
 robot:

@@ -13,7 +13,8 @@ from ibrobot_data.playback import Playback, Track
 from ibrobot_data.replay_source import Replay, ReplaySource
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.api import LaunchRequest, Runtime, Session, Vector, installed_plugins, load_config
+from ibrobot_core.api import Vector
+from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 
 ROBOT = """\
 robot:

@@ -10,7 +10,8 @@ import pytest
 from ibrobot_data.given import load_contract
 from ibrobot_data.ticks import frames
 
-from ibrobot_core.api import Contract, ContractError, FrameAssembler, Header, JointState
+from ibrobot_core.api import Contract, ContractError, Header, JointState
+from ibrobot_core.app import FrameAssembler
 
 CONTRACT = """\
 contract:

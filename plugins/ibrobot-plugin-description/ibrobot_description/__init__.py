@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import SectionDescriptor, hookimpl
+from ibrobot_core.api import hookimpl
+from ibrobot_core.app import SectionDescriptor
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Component, NoOptions, OptionFault, RobotConfig, Session
+    from ibrobot_core.api import NoOptions, OptionFault
+    from ibrobot_core.app import Component, RobotConfig, Session
 
 
 def _publisher(options: NoOptions | None, session: Session) -> Component:

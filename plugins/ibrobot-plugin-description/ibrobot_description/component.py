@@ -8,7 +8,8 @@ from typing import override
 from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.urdf import MOVING, read_urdf
 
-from ibrobot_core.api import CONTROL, JointState, Session, SessionWorker, String, Subscription, TFMessage
+from ibrobot_core.api import JointState, String, TFMessage
+from ibrobot_core.app import CONTROL, Session, SessionWorker, Subscription
 from ibrobot_description.frames import mounted, transform
 
 

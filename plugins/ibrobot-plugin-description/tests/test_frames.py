@@ -12,7 +12,8 @@ from ibrobot_kinematics.poses import orientation
 from ibrobot_kinematics.rotations import from_rpy
 from ibrobot_kinematics.urdf import UrdfJoint, read_urdf
 
-from ibrobot_core.api import Mount, Vector3
+from ibrobot_core.api import Vector3
+from ibrobot_core.app import Mount
 
 URDF = """<robot name="r">
   <link name="base"/><link name="arm"/><link name="slide"/><link name="tool"/>

@@ -14,21 +14,8 @@ from ibrobot_description import ibrobot_sections
 from ibrobot_description.component import DescriptionPublisher
 from ibrobot_testing import SectionSuite, check_descriptor, make_robot, make_session
 
-from ibrobot_core.api import (
-    Component,
-    ConfigError,
-    HardwareDescriptor,
-    Header,
-    JointState,
-    NoOptions,
-    Registry,
-    RobotConfig,
-    SensorDescriptor,
-    Session,
-    TFMessage,
-    installed_plugins,
-    load_config,
-)
+from ibrobot_core.api import HardwareDescriptor, Header, JointState, NoOptions, SensorDescriptor, TFMessage
+from ibrobot_core.app import Component, ConfigError, Registry, RobotConfig, Session, installed_plugins, load_config
 
 URDF = textwrap.dedent("""\
     <robot name="tester">

@@ -6,16 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import (
-    Check,
-    Command,
-    GuideDescriptor,
-    HardwareDescriptor,
-    PanelDescriptor,
-    SensorDescriptor,
-    TeleopDescriptor,
-    hookimpl,
-)
+from ibrobot_core.api import Check, HardwareDescriptor, SensorDescriptor, TeleopDescriptor, hookimpl
+from ibrobot_core.app import Command, GuideDescriptor, PanelDescriptor
 from ibrobot_feetech.options import (
     EmulatedSignalOptions,
     FollowerOptions,
@@ -31,7 +23,8 @@ from ibrobot_feetech.options import (
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import Context, Guide, Hardware, Question, Sensor, Session, Teleop
+    from ibrobot_core.api import Context, Hardware, Sensor, Teleop
+    from ibrobot_core.app import Guide, Question, Session
 
 
 def _follower(options: Any, ctx: Context) -> Hardware:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ibrobot_core.api import Session
+from ibrobot_core.app import Session
 
 _QUANTITIES = {"temperature": "{:.0f} °C", "voltage": "{:.1f} V", "current": "{:.2f} A", "load": "{:.0%}"}
 

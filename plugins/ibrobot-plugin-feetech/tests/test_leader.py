@@ -27,9 +27,8 @@ from ibrobot_core.api import (
     TeleopCommand,
     TeleopError,
     Vector,
-    begin_operation,
-    operate,
 )
+from ibrobot_core.app import begin_operation, operate
 
 from .conftest import JOINTS, OFFSETS, arm_calibration, prepare
 from .line import Line

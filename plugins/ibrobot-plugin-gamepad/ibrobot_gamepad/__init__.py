@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import Check, Command, TeleopDescriptor, hookimpl
+from ibrobot_core.api import Check, TeleopDescriptor, hookimpl
+from ibrobot_core.app import Command
 from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
 
 if TYPE_CHECKING:

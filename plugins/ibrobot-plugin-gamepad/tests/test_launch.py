@@ -15,7 +15,8 @@ import pytest
 import yaml
 from ibrobot_gamepad.options import GamepadOptions
 
-from ibrobot_core.api import LaunchRequest, Runtime, Session, Vector, installed_plugins, load_config
+from ibrobot_core.api import Vector
+from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 
 from .fake_hid import DUALSENSE, SPACEMOUSE, FakeHidapi, Plugged, dualsense, mouse_buttons, spacemouse
 from .test_teleop import Rig

@@ -13,7 +13,8 @@ from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
 from ibrobot_testing import make_robot
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.api import ConfigError, Description, Joint, Robot, TeleopError, load_config
+from ibrobot_core.api import Description, Joint, Robot, TeleopError
+from ibrobot_core.app import ConfigError, load_config
 
 ROBOT = """\
 robot:

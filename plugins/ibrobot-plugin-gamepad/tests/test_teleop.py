@@ -17,18 +17,8 @@ from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
 from ibrobot_gamepad.teleop import JogTeleop
 from ibrobot_testing import TeleopSuite, host_context, make_robot
 
-from ibrobot_core.api import (
-    Context,
-    JointReading,
-    OperatorEvent,
-    Robot,
-    Teleop,
-    TeleopCommand,
-    TeleopError,
-    begin_operation,
-    ns,
-    operate,
-)
+from ibrobot_core.api import Context, JointReading, OperatorEvent, Robot, Teleop, TeleopCommand, TeleopError, ns
+from ibrobot_core.app import begin_operation, operate
 
 from .fake_hid import DUALSENSE, SPACEMOUSE, FakeHidapi, Plugged, dualsense, mouse_buttons, spacemouse
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import yaml
 
-from ibrobot_core.api import LaunchRequest, Runtime, Session, Vector, installed_plugins, load_config
+from ibrobot_core.api import Vector
+from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 
 from .sensor import Sensor
 

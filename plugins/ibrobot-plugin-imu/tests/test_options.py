@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.api import ConfigError, installed_plugins, load_config
+from ibrobot_core.app import ConfigError, installed_plugins, load_config
 
 ROBOT = """\
 robot:

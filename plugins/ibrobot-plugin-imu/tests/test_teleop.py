@@ -15,18 +15,8 @@ from ibrobot_imu.teleop import ImuTeleop
 from ibrobot_kinematics import robot_model
 from ibrobot_testing import TeleopSuite, host_context
 
-from ibrobot_core.api import (
-    Context,
-    JointReading,
-    Robot,
-    Teleop,
-    TeleopCommand,
-    TeleopError,
-    Vector,
-    begin_operation,
-    ns,
-    operate,
-)
+from ibrobot_core.api import Context, JointReading, Robot, Teleop, TeleopCommand, TeleopError, Vector, ns
+from ibrobot_core.app import begin_operation, operate
 
 from .sensor import Sensor
 

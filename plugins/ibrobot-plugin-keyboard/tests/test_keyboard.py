@@ -14,20 +14,8 @@ from ibrobot_keyboard.options import KeyboardOptions
 from ibrobot_keyboard.teleop import KeyboardTeleop
 from ibrobot_testing import TeleopSuite, host_context, make_robot
 
-from ibrobot_core.api import (
-    Context,
-    Description,
-    Joint,
-    JointReading,
-    KeyReader,
-    Robot,
-    Teleop,
-    TeleopCommand,
-    TeleopError,
-    begin_operation,
-    ns,
-    operate,
-)
+from ibrobot_core.api import Context, Description, Joint, JointReading, Robot, Teleop, TeleopCommand, TeleopError, ns
+from ibrobot_core.app import KeyReader, begin_operation, operate
 
 JOINTS = make_robot().joint_names
 MIDDLE = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])

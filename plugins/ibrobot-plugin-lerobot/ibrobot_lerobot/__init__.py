@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import Command, DatasetDescriptor, Flag, PolicyDescriptor, ReaderDescriptor, hookimpl
+from ibrobot_core.api import DatasetDescriptor, Flag, PolicyDescriptor, ReaderDescriptor, hookimpl
+from ibrobot_core.app import Command
 from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions
 
 if TYPE_CHECKING:

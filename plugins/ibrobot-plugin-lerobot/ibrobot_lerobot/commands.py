@@ -10,7 +10,7 @@ from typing import Any
 import click
 from rich.table import Table
 
-from ibrobot_core.api import Screen, echo, wrong_input
+from ibrobot_core.app import Screen, echo, wrong_input
 
 
 @click.group()

@@ -18,11 +18,10 @@ from ibrobot_core.api import (
     Header,
     Image,
     JointState,
-    Leaf,
     Message,
     ObservationPart,
-    Selection,
 )
+from ibrobot_core.app import Leaf, Selection
 
 _ACTION = "action"
 _DEPTH: Mapping[str, type[np.generic]] = {"16UC1": np.uint16, "32FC1": np.float32}

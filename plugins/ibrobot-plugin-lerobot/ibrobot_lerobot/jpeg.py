@@ -8,7 +8,8 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from ibrobot_core.api import PictureCodec, WireError
+from ibrobot_core.api import PictureCodec
+from ibrobot_core.app import WireError
 
 _SPACES = {3: "RGB", 1: "GRAY"}
 

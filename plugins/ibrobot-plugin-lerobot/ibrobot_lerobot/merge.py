@@ -14,7 +14,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ibrobot_core.api import DatasetError, Ownership
+from ibrobot_core.api import DatasetError
+from ibrobot_core.app import Ownership
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.arrow import table_of, to_array, to_numpy
 from ibrobot_lerobot.episode import counter_stats, plain

@@ -9,7 +9,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import CalibrationError, Contract, ContractError, RecorderError, robot_metadata
+from ibrobot_core.api import CalibrationError, Contract, ContractError, RecorderError
+from ibrobot_core.app import robot_metadata
 
 
 @attrs.frozen

@@ -17,7 +17,8 @@ from typing import Any
 
 import click
 
-from ibrobot_core.api import DatasetError, MissingDependency, echo, wrong_input
+from ibrobot_core.api import DatasetError, MissingDependency
+from ibrobot_core.app import echo, wrong_input
 from ibrobot_lerobot.pretrained import check_policy
 from ibrobot_lerobot.training_checkpoints import TrainingCheckpoint, begun_in_vain, check_same, newest_checkpoint
 

@@ -19,7 +19,6 @@ from safetensors.numpy import save_file
 
 from ibrobot_core.api import (
     ActionPart,
-    Align,
     Contract,
     Feature,
     Float64MultiArray,
@@ -28,6 +27,7 @@ from ibrobot_core.api import (
     ObservationPart,
     PolicyError,
 )
+from ibrobot_core.app import Align
 
 STATE, TOP = "observation.state", "observation.images.top"
 JOINTS = ARM + GRIPPER

@@ -11,17 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from ibrobot_lerobot.compose import Composer
 
-from ibrobot_core.api import (
-    ActionPart,
-    Align,
-    Contract,
-    ContractError,
-    Feature,
-    FrameAssembler,
-    ImageSpec,
-    ObservationPart,
-    Selection,
-)
+from ibrobot_core.api import ActionPart, Contract, ContractError, Feature, ObservationPart
+from ibrobot_core.app import Align, FrameAssembler, ImageSpec, Selection
 from ibrobot_core.contract.image import ENCODINGS
 
 STAMP_NS = 5_000_000_000

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_lerobot.jpeg import Jpeg
 
-from ibrobot_core.api import WireError
+from ibrobot_core.app import WireError
 
 CODEC = Jpeg(90)
 

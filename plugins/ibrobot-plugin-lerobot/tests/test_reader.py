@@ -16,7 +16,6 @@ from ibrobot_lerobot.reader import LeRobotReader
 
 from ibrobot_core.api import (
     ActionPart,
-    Align,
     CalibrationError,
     Contract,
     ContractError,
@@ -25,14 +24,13 @@ from ibrobot_core.api import (
     Feature,
     Float64MultiArray,
     Image,
-    ImageSpec,
     JointState,
     ObservationPart,
     RecorderError,
-    installed_plugins,
     lerobot_to_radians,
     pixels,
 )
+from ibrobot_core.app import Align, ImageSpec, installed_plugins
 
 from .conftest import CAMERA, FPS, picture, values, write
 

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import Command, DecoderDescriptor, ReaderDescriptor, RecorderDescriptor, hookimpl
+from ibrobot_core.api import DecoderDescriptor, ReaderDescriptor, RecorderDescriptor, hookimpl
+from ibrobot_core.app import Command
 from ibrobot_mcap.options import McapOptions
 
 if TYPE_CHECKING:

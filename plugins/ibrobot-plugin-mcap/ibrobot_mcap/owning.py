@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ibrobot_core.api import InUse, Ownership, RecorderError
+from ibrobot_core.api import RecorderError
+from ibrobot_core.app import InUse, Ownership
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
 
 TRIMMING, REPAIRING, UNFINISHED, DELETING = ".trimming", ".repairing", ".unfinished", ".deleting"

@@ -12,7 +12,8 @@ from ibrobot_mcap import trash
 from ibrobot_mcap.commands import episodes
 from killed_process import KILLED, killing
 
-from ibrobot_core.api import InUse, Ownership, RecorderError
+from ibrobot_core.api import RecorderError
+from ibrobot_core.app import InUse, Ownership
 
 from .conftest import Bench, read, summary
 

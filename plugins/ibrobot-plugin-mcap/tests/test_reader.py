@@ -23,11 +23,9 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ibrobot_core.api import (
-    Align,
     CompressedImage,
     Contract,
     Feature,
-    FrameAssembler,
     Header,
     IbrobotError,
     Image,
@@ -35,9 +33,9 @@ from ibrobot_core.api import (
     Message,
     ObservationPart,
     RecorderError,
-    installed_plugins,
     pixels,
 )
+from ibrobot_core.app import Align, FrameAssembler, installed_plugins
 
 from .conftest import CAMERA, JOINTS, Bench, joints, picture, read, reading, stamp, summary
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import SectionDescriptor, hookimpl
+from ibrobot_core.api import hookimpl
+from ibrobot_core.app import SectionDescriptor
 from ibrobot_metrics.options import MetricsOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Component, Session
+    from ibrobot_core.app import Component, Session
 
 
 def _port(options: MetricsOptions, session: Session) -> Component:

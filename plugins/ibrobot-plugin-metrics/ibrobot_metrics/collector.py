@@ -10,7 +10,7 @@ from typing import Any, override
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from ibrobot_core.api import Session
+from ibrobot_core.app import Session
 
 _NAMED_BY_KEY = {"interventions": "joint", "bus drops": "topic"}
 """Groups whose keys are names of joints or topics, which become labels."""

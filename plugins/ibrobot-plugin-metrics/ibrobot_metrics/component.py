@@ -7,7 +7,7 @@ from typing import override
 from ibrobot_monitoring import Probes, ProbeServer
 from prometheus_client import generate_latest
 
-from ibrobot_core.api import CONTROL, Component, Session
+from ibrobot_core.app import CONTROL, Component, Session
 from ibrobot_metrics.collector import RunCollector
 from ibrobot_metrics.options import MetricsOptions
 

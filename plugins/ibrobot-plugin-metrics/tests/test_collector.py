@@ -12,7 +12,7 @@ from ibrobot_testing import make_session
 from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from ibrobot_core.api import Session
+from ibrobot_core.app import Session
 
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=60)
 HOSTILE = 'a"} 1\nibrobot_forged{x="\\'

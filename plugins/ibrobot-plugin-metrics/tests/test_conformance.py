@@ -13,7 +13,8 @@ from ibrobot_metrics.component import MetricsPort
 from ibrobot_metrics.options import MetricsOptions
 from ibrobot_testing import SectionSuite, check_descriptor, make_session
 
-from ibrobot_core.api import Component, IbrobotError, SensorError, Session
+from ibrobot_core.api import IbrobotError, SensorError
+from ibrobot_core.app import Component, Session
 
 
 class TestMetricsPort(SectionSuite):

@@ -11,18 +11,8 @@ import numpy as np
 from ibrobot_ros2.jpeg import to_jpeg
 from numpy.typing import NDArray
 
-from ibrobot_core.api import (
-    CameraInfo,
-    CompressedImage,
-    Context,
-    Header,
-    Image,
-    Message,
-    Sensor,
-    SensorError,
-    Subscription,
-    ns,
-)
+from ibrobot_core.api import CameraInfo, CompressedImage, Context, Header, Image, Message, Sensor, SensorError, ns
+from ibrobot_core.app import Subscription
 from ibrobot_mujoco.model import build_model
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.render import Renderer

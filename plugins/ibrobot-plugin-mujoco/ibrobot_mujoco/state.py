@@ -5,7 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from ibrobot_core.api import NS_PER_S, Float64MultiArray, SensorError, Subscription, Vector
+from ibrobot_core.api import NS_PER_S, Float64MultiArray, SensorError, Vector
+from ibrobot_core.app import Subscription
 
 PHYSICS_TOPIC = "/simulation/physics"
 """Stamp as whole seconds and remaining nanoseconds (2, each exact as a float), then MuJoCo's state (nq)."""

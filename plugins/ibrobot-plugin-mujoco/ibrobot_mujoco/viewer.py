@@ -8,7 +8,8 @@ from typing import Any, override
 
 import mujoco
 
-from ibrobot_core.api import Context, IbrobotError, Subscription, Viewer
+from ibrobot_core.api import Context, IbrobotError, Viewer
+from ibrobot_core.app import Subscription
 from ibrobot_mujoco.model import build_model
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.state import PHYSICS_TOPIC, newest, pose_scene

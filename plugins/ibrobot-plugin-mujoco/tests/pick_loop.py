@@ -16,18 +16,8 @@ from ibrobot_mujoco.scripted_pick import SCENE, STATE, ScriptedPick
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import PHYSICS_TOPIC, SCENE_TOPIC, pose_scene
 
-from ibrobot_core.api import (
-    NS_PER_S,
-    Context,
-    EpisodeSetup,
-    Executor,
-    Frame,
-    Plan,
-    SteppedClock,
-    Vector,
-    installed_plugins,
-    seconds,
-)
+from ibrobot_core.api import NS_PER_S, Context, EpisodeSetup, Executor, Frame, Plan, SteppedClock, Vector, seconds
+from ibrobot_core.app import installed_plugins
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.dispatch.smoother import TemporalSmoother
 

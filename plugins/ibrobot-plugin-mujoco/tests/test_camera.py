@@ -29,8 +29,8 @@ from ibrobot_core.api import (
     Sensor,
     SensorError,
     Vector,
-    installed_plugins,
 )
+from ibrobot_core.app import installed_plugins
 
 MISSING = installed_plugins().missing("sensor", "mujoco")
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=str(MISSING))

@@ -15,7 +15,8 @@ from ibrobot_mujoco.policy_options import ScriptedPickOptions
 from ibrobot_mujoco.so101 import MJCF, so101
 from ibrobot_testing import control_context
 
-from ibrobot_core.api import Joint, MissingDependency, installed_plugins
+from ibrobot_core.api import Joint, MissingDependency
+from ibrobot_core.app import installed_plugins
 
 
 def test_importing_the_plugin_imports_nothing_heavy() -> None:

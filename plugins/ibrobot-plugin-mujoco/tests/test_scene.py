@@ -13,16 +13,8 @@ from ibrobot_mujoco.scene import scene_objects
 from ibrobot_mujoco.so101 import so101
 from ibrobot_testing import SimulatedHardwareSuite, control_context
 
-from ibrobot_core.api import (
-    ConfigError,
-    Context,
-    EpisodeSetup,
-    Hardware,
-    HardwareError,
-    SceneObject,
-    Vector,
-    single_options,
-)
+from ibrobot_core.api import Context, EpisodeSetup, Hardware, HardwareError, SceneObject, Vector
+from ibrobot_core.app import ConfigError, single_options
 
 ROBOT = so101()
 OBJECTS = """objects:

@@ -5,17 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import (
-    Command,
-    ExecutorDescriptor,
-    NoOptions,
-    OptionFault,
-    PlannerDescriptor,
-    SectionDescriptor,
-    SourceDescriptor,
-    did_you_mean,
-    hookimpl,
-)
+from ibrobot_core.api import ExecutorDescriptor, NoOptions, OptionFault, PlannerDescriptor, did_you_mean, hookimpl
+from ibrobot_core.app import Command, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.planners.options import JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
@@ -24,16 +15,8 @@ from ibrobot_planning.world.options import WorldOptions
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import (
-        Component,
-        Context,
-        ControlMode,
-        Executor,
-        Planner,
-        Robot,
-        Session,
-        SourceWorker,
-    )
+    from ibrobot_core.api import Context, Executor, Planner, Robot
+    from ibrobot_core.app import Component, ControlMode, Session, SourceWorker
 
 
 def _joint(options: Any, ctx: Context) -> Planner:
@@ -133,7 +116,7 @@ def _tasks(options: NoOptions, session: Session) -> Component:
 
 def _unknown_names(options: WorldOptions, robot: Robot) -> Iterable[OptionFault]:
     """Faults of names that are neither a link of the robot's model nor an object."""
-    from ibrobot_core.api import ModelError, read_mjcf
+    from ibrobot_core.app import ModelError, read_mjcf
     from ibrobot_planning.world.objects import FLOOR
 
     mjcf = robot.description.mjcf

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.api import LaunchRequest, Runtime, Session, installed_plugins, load_config
+from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 
 ROBOT = """\
 robot:

@@ -23,9 +23,9 @@ from ibrobot_core.api import (
     Pose,
     PoseStamped,
     Quaternion,
-    Runtime,
     Vector3,
 )
+from ibrobot_core.app import Runtime
 
 from .conftest import Make
 from .table_arm import ARM

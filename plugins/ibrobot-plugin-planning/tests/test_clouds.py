@@ -19,22 +19,19 @@ from ibrobot_testing import SectionSuite, make_session
 
 from ibrobot_core.api import (
     CameraInfo,
-    Component,
-    ConfigError,
     Header,
     Image,
     Message,
     PointCloud2,
     PointField,
     Quaternion,
-    Session,
     TFMessage,
     TransformStamped,
     Vector,
     Vector3,
     ns,
-    single_options,
 )
+from ibrobot_core.app import Component, ConfigError, Session, single_options
 
 from .table_arm import make_robot
 

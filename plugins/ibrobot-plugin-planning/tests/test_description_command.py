@@ -14,7 +14,8 @@ from ibrobot_planning.commands.description import description
 from ibrobot_planning.goals.text import target
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.api import ConfigError, PlanningError, installed_plugins, load_config
+from ibrobot_core.api import PlanningError
+from ibrobot_core.app import ConfigError, installed_plugins, load_config
 
 from .table_arm import ARM
 from .test_motion import robot_yaml

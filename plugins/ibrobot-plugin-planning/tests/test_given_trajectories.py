@@ -30,11 +30,10 @@ from ibrobot_core.api import (
     PlanRequest,
     PlanResult,
     Robot,
-    Runtime,
-    Spline,
     Vector,
     ns,
 )
+from ibrobot_core.app import Runtime, Spline
 
 from .conftest import Make
 from .table_arm import ARM, WALL, make_planner

@@ -36,13 +36,12 @@ from ibrobot_core.api import (
     PoseStamped,
     PositionGoal,
     Quaternion,
-    RequestError,
-    Runtime,
     String,
     TransportError,
     Vector,
     Vector3,
 )
+from ibrobot_core.app import RequestError, Runtime
 
 from .conftest import Make
 from .table_arm import JOINTS, make_robot

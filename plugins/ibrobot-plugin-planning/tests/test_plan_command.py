@@ -12,7 +12,8 @@ from click.testing import CliRunner, Result
 from ibrobot_planning.commands.plan import plan
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.api import ConfigError, IbrobotError, MissingDependency, NotSupported, PlanningError
+from ibrobot_core.api import IbrobotError, MissingDependency, NotSupported, PlanningError
+from ibrobot_core.app import ConfigError
 
 from .test_motion import robot_yaml
 

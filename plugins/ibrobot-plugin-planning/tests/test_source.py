@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from ibrobot_planning.execution.source import GO_TO
 
-from ibrobot_core.api import PlanningError, Runtime, TransportError
+from ibrobot_core.api import PlanningError, TransportError
+from ibrobot_core.app import Runtime
 
 from .conftest import Make
 

@@ -15,7 +15,8 @@ from ibrobot_planning.tasks.runner import CANCEL, CHECK, RESULT, RUN, STATUS, Ta
 from ibrobot_planning.world.objects import SNAPSHOT
 from ibrobot_testing import SectionSuite
 
-from ibrobot_core.api import ConfigError, PlanningError, RequestError, Runtime, String
+from ibrobot_core.api import PlanningError, String
+from ibrobot_core.app import ConfigError, RequestError, Runtime
 
 from .conftest import Make
 from .test_motion import RATE_HZ, robot_yaml

@@ -19,17 +19,8 @@ from ibrobot_planning.world.options import WorldOptions
 from ibrobot_planning.world.section import ADD, ATTACH, DETACH, LARGEST_MESH, MOST_OBJECTS, REMOVE, TOUCH, WorldKeeper
 from ibrobot_testing import SectionSuite, make_session
 
-from ibrobot_core.api import (
-    ConfigError,
-    Context,
-    Float64MultiArray,
-    JointGoal,
-    PlanningError,
-    PlanRequest,
-    RequestError,
-    SteppedClock,
-    single_options,
-)
+from ibrobot_core.api import Context, Float64MultiArray, JointGoal, PlanningError, PlanRequest, SteppedClock
+from ibrobot_core.app import ConfigError, RequestError, single_options
 
 from .parts import POSES
 from .table_arm import ARM, make_robot

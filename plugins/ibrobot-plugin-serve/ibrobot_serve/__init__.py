@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import Command, EngineDescriptor, hookimpl
+from ibrobot_core.api import EngineDescriptor, hookimpl
+from ibrobot_core.app import Command
 from ibrobot_serve.options import DistributedOptions, ProcessOptions
 
 if TYPE_CHECKING:

@@ -15,17 +15,12 @@ from typing import Any
 import click
 from ibrobot_monitoring import ProbeServer
 
-from ibrobot_core.api import (
+from ibrobot_core.api import Context, Policy, RealClock, Robot, Transport, TransportDescriptor
+from ibrobot_core.app import (
     ConfigError,
-    Context,
     LogFormatter,
-    Policy,
     Problem,
-    RealClock,
     Registry,
-    Robot,
-    Transport,
-    TransportDescriptor,
     apply_overrides,
     build_policy,
     echo,
@@ -244,7 +239,7 @@ def _show(service: InferenceService, stopping: threading.Event) -> None:
         return
     from rich.live import Live
 
-    from ibrobot_core.api import Screen
+    from ibrobot_core.app import Screen
 
     with Live(console=Screen(), auto_refresh=False) as display:
         while not stopping.wait(_PANEL_PERIOD_S):

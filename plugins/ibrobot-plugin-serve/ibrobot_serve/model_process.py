@@ -15,11 +15,11 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.api import (
+from ibrobot_core.api import Policy
+from ibrobot_core.app import (
     Channel,
     ComponentFailed,
     Failure,
-    Policy,
     build_policy,
     error_text,
     from_document,

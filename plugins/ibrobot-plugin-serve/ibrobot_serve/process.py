@@ -10,17 +10,8 @@ import time
 from collections.abc import Mapping
 from typing import Any, Self, override
 
-from ibrobot_core.api import (
-    NS_PER_S,
-    Child,
-    ComponentFailed,
-    Context,
-    Engine,
-    PolicyError,
-    RobotConfig,
-    Tensors,
-    create_memory,
-)
+from ibrobot_core.api import NS_PER_S, Context, Engine, PolicyError, Tensors
+from ibrobot_core.app import Child, ComponentFailed, RobotConfig, create_memory
 from ibrobot_serve.options import ProcessOptions
 from ibrobot_serve.weights import check_weights
 from ibrobot_serve.wire import WIRE_LIMITS, WireDecoder, WireEncoder, WireKind, WireMessage

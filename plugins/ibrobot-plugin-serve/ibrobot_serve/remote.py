@@ -23,8 +23,8 @@ from ibrobot_core.api import (
     Tensors,
     Transport,
     TransportError,
-    WireError,
 )
+from ibrobot_core.app import WireError
 from ibrobot_serve.options import DistributedOptions
 from ibrobot_serve.weights import check_weights
 from ibrobot_serve.wire import (

@@ -15,18 +15,8 @@ from typing import Any
 import attrs
 import numpy as np
 
-from ibrobot_core.api import (
-    NS_PER_S,
-    IbrobotError,
-    Payload,
-    PictureCodec,
-    Policy,
-    PolicyError,
-    Tensors,
-    Transport,
-    WireError,
-    copied_tensors,
-)
+from ibrobot_core.api import NS_PER_S, IbrobotError, Payload, PictureCodec, Policy, PolicyError, Tensors, Transport
+from ibrobot_core.app import WireError, copied_tensors
 from ibrobot_serve.fair_queue import FairQueue
 from ibrobot_serve.pacing import Pacing
 from ibrobot_serve.wire import (

@@ -19,7 +19,8 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import Payload, PictureCodec, Tensors, WireError
+from ibrobot_core.api import Payload, PictureCodec, Tensors
+from ibrobot_core.app import WireError
 
 MAGIC = b"IBRW"
 VERSION = 1

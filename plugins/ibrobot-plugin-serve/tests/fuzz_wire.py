@@ -33,12 +33,8 @@ from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy, FakeTransport
 from ibrobot_testing.ports import free_port
 
-from ibrobot_core.api import (
-    Handler,
-    Tensors,
-    Transport,
-    installed_plugins,
-)
+from ibrobot_core.api import Handler, Tensors, Transport
+from ibrobot_core.app import installed_plugins
 
 GROWTH_MIB = 64
 """What the process may grow by: threads' stacks and arenas, and the counts of 256 robots."""

@@ -14,7 +14,8 @@ from ibrobot_serve.service import InferenceService
 from ibrobot_testing import EngineSuite, check_descriptor, host_context
 from ibrobot_testing.fakes import FakePolicy, FakeTransport
 
-from ibrobot_core.api import Context, Engine, EngineDescriptor, ModelContext, RobotConfig, load_config
+from ibrobot_core.api import Context, Engine, EngineDescriptor, ModelContext
+from ibrobot_core.app import RobotConfig, load_config
 
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site

@@ -16,7 +16,8 @@ from ibrobot_serve.process import ProcessEngine
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
-from ibrobot_core.api import PolicyError, RobotConfig, Tensors, load_config
+from ibrobot_core.api import PolicyError, Tensors
+from ibrobot_core.app import RobotConfig, load_config
 
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site

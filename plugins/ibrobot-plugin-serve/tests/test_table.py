@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_serve.command import _table
 
-from ibrobot_core.api import Screen
+from ibrobot_core.app import Screen
 
 HOSTILE = st.lists(
     st.sampled_from(

@@ -27,7 +27,8 @@ from ibrobot_serve.wire import (
     encode,
 )
 
-from ibrobot_core.api import PictureCodec, WireError
+from ibrobot_core.api import PictureCodec
+from ibrobot_core.app import WireError
 
 PAGE = Path(__file__).parents[3] / "docs/reference/wire.md"
 DTYPES = st.sampled_from(["?", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8", ">f4", ">i2"])

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import OptionFault, SectionDescriptor, TeleopDescriptor, hookimpl
+from ibrobot_core.api import OptionFault, TeleopDescriptor, hookimpl
+from ibrobot_core.app import SectionDescriptor
 from ibrobot_servo.options import ToolPoseOptions, TwistOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Component, Context, Robot, RobotConfig, Session, Teleop
+    from ibrobot_core.api import Context, Robot, Teleop
+    from ibrobot_core.app import Component, RobotConfig, Session
 
 
 def _twist(options: TwistOptions, ctx: Context) -> Teleop:

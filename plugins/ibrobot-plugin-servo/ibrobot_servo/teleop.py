@@ -16,9 +16,6 @@ from ibrobot_core.api import (
     JointReading,
     KeyValue,
     Message,
-    Received,
-    Service,
-    Subscription,
     Teleop,
     TeleopCommand,
     TeleopError,
@@ -27,6 +24,7 @@ from ibrobot_core.api import (
     Vector3,
     ns,
 )
+from ibrobot_core.app import Received, Service, Subscription
 from ibrobot_servo.options import TwistOptions
 
 _STATUS_S = 0.1

@@ -7,18 +7,8 @@ from typing import override
 from ibrobot_kinematics import KinematicModel, KinematicsError, robot_model
 from ibrobot_kinematics.poses import orientation
 
-from ibrobot_core.api import (
-    CONTROL,
-    NS_PER_S,
-    Header,
-    JointState,
-    Pose,
-    PoseStamped,
-    Session,
-    SessionWorker,
-    Subscription,
-    Vector3,
-)
+from ibrobot_core.api import NS_PER_S, Header, JointState, Pose, PoseStamped, Vector3
+from ibrobot_core.app import CONTROL, Session, SessionWorker, Subscription
 from ibrobot_servo.options import ToolPoseOptions
 
 

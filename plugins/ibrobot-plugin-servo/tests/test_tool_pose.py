@@ -13,7 +13,8 @@ from ibrobot_servo import ibrobot_sections
 from ibrobot_servo.options import ToolPoseOptions
 from ibrobot_testing import SectionSuite, make_robot, make_session
 
-from ibrobot_core.api import Component, Description, Header, JointState, PoseStamped, Session, ns
+from ibrobot_core.api import Description, Header, JointState, PoseStamped, ns
+from ibrobot_core.app import Component, Session
 
 MJCF = """<mujoco><worldbody>
 <body pos="0 0 0.1"><joint name="shoulder_pan" axis="0 0 1"/><geom size="0.01"/>

@@ -25,7 +25,6 @@ from ibrobot_core.api import (
     Joint,
     JointReading,
     Message,
-    RequestError,
     Robot,
     Teleop,
     TeleopError,
@@ -34,10 +33,9 @@ from ibrobot_core.api import (
     TwistStamped,
     Vector,
     Vector3,
-    begin_operation,
     ns,
-    operate,
 )
+from ibrobot_core.app import RequestError, begin_operation, operate
 
 AXES = {"shoulder_pan": "0 0 1", "shoulder_lift": "0 1 0", "elbow_flex": "0 1 0", "wrist_flex": "0 1 0",
         "wrist_roll": "1 0 0", "gripper": "0 0 1"}  # fmt: skip

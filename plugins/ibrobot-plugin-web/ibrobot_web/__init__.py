@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import Command, OptionFault, TeleopDescriptor, ViewerDescriptor, hookimpl
+from ibrobot_core.api import OptionFault, TeleopDescriptor, ViewerDescriptor, hookimpl
+from ibrobot_core.app import Command
 from ibrobot_web.options import WebOptions, WebTeleopOptions
 
 if TYPE_CHECKING:

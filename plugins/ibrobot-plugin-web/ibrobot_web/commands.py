@@ -9,7 +9,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from ibrobot_core.api import IbrobotError, PlanningError, Session, error_text, raise_thread_priority, seconds
+from ibrobot_core.api import IbrobotError, PlanningError, seconds
+from ibrobot_core.app import Session, error_text, raise_thread_priority
 from ibrobot_web.messages import (
     BeginEpisode,
     Cancel,

@@ -15,7 +15,8 @@ from typing import Any, Literal
 
 import attrs
 
-from ibrobot_core.api import IbrobotError, RequestError, RequestLimits, Service, option
+from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.app import RequestError, RequestLimits, Service
 
 LARGEST_MESSAGE = 16_384
 """Largest message of a page [bytes]."""

@@ -8,16 +8,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import (
-    Float64MultiArray,
-    HardwareDescriptor,
-    IbrobotError,
-    Pose,
-    SceneObject,
-    Session,
-    Subscription,
-    Vector,
-)
+from ibrobot_core.api import Float64MultiArray, HardwareDescriptor, IbrobotError, Pose, SceneObject, Vector
+from ibrobot_core.app import Session, Subscription
 
 WORLD = "/world/snapshot"
 """Answers with the objects around the robot, of which the page shows those with simple shapes."""

@@ -26,10 +26,9 @@ from ibrobot_core.api import (
     Image,
     JointState,
     Recorded,
-    from_document,
-    installed_plugins,
     resolve_path,
 )
+from ibrobot_core.app import from_document, installed_plugins
 from ibrobot_web.objects import place_of
 from ibrobot_web.pictures import Picture, to_picture
 from ibrobot_web.status import numbers_of

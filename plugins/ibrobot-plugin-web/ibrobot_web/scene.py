@@ -18,7 +18,7 @@ from ibrobot_kinematics.meshes import cluster
 from ibrobot_kinematics.rotations import from_quaternion, from_rpy, quaternion
 from numpy.typing import NDArray
 
-from ibrobot_core.api import ModelError, read_xml
+from ibrobot_core.app import ModelError, read_xml
 
 _GRID_M = 0.0035
 """Grid on which the vertices of meshes are merged, for robots of up to 1 m; larger ones have a larger one."""

@@ -13,7 +13,8 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.api import NS_PER_S, ControlMode, ControlState, JointState, Message, Session, Vector, error_text
+from ibrobot_core.api import NS_PER_S, JointState, Message, Vector
+from ibrobot_core.app import ControlMode, ControlState, Session, error_text
 
 _TOKEN = re.compile(r"(?<=[?&]token=)[\w-]+")
 _LOG_LINES = 100

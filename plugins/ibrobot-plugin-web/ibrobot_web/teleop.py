@@ -14,7 +14,6 @@ from ibrobot_kinematics import JogArm, JogMotion, VelocityJog
 from ibrobot_core.api import (
     Context,
     JointReading,
-    Service,
     Teleop,
     TeleopCommand,
     TeleopError,
@@ -24,6 +23,7 @@ from ibrobot_core.api import (
     option,
     seconds,
 )
+from ibrobot_core.app import Service
 from ibrobot_web.messages import within_one
 from ibrobot_web.options import WebTeleopOptions
 

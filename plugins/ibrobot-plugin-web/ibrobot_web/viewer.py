@@ -11,20 +11,8 @@ import webbrowser
 from collections.abc import Mapping
 from typing import Any, override
 
-from ibrobot_core.api import (
-    Child,
-    ComponentFailed,
-    CompressedImage,
-    Context,
-    ContractError,
-    IbrobotError,
-    Image,
-    Session,
-    Subscription,
-    Viewer,
-    error_text,
-    raise_thread_priority,
-)
+from ibrobot_core.api import CompressedImage, Context, ContractError, IbrobotError, Image, Viewer
+from ibrobot_core.app import Child, ComponentFailed, Session, Subscription, error_text, raise_thread_priority
 from ibrobot_web.commands import Commands
 from ibrobot_web.desktop import has_desktop
 from ibrobot_web.link import FIRST_PICTURE, PLAN, SAMPLES, STATE, STATUS, FrameSender

@@ -9,7 +9,7 @@ import pytest
 from page_run import client, page_run
 from seven_joints import CAMERAS, JOINTS, write_seven_joints
 
-from ibrobot_core.api import installed_plugins
+from ibrobot_core.app import installed_plugins
 
 pytestmark = [
     pytest.mark.integration,

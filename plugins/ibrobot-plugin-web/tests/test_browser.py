@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from ibrobot_core.api import installed_plugins
+from ibrobot_core.app import installed_plugins
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]

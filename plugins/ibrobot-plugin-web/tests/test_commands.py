@@ -13,7 +13,8 @@ from ibrobot_web import messages
 from ibrobot_web.commands import Commands
 from ibrobot_web.messages import RunCommand, Sent
 
-from ibrobot_core.api import IbrobotError, Session
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import Session
 
 _WAIT_S = 60.0
 SERVICES: dict[str, tuple[RunCommand, Any]] = {

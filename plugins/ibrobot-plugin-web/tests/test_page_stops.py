@@ -19,7 +19,7 @@ import pytest
 from page_run import SO101, PageClient, client, page_run
 from slow_link import SlowLink
 
-from ibrobot_core.api import installed_plugins
+from ibrobot_core.app import installed_plugins
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]

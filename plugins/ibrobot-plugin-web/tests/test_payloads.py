@@ -29,14 +29,13 @@ from ibrobot_core.api import (
     Image,
     Imu,
     JointState,
-    PanelDescriptor,
     Pose,
     Quaternion,
     SceneObject,
-    Session,
     String,
     Vector3,
 )
+from ibrobot_core.app import PanelDescriptor, Session
 
 
 def gradient(encoding: str) -> Image:

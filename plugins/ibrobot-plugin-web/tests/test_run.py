@@ -14,7 +14,7 @@ import pytest
 from ibrobot_web.messages import clock_ms
 from page_run import SO101, PageClient, client, page_run
 
-from ibrobot_core.api import installed_plugins
+from ibrobot_core.app import installed_plugins
 
 pytestmark = [
     pytest.mark.integration,

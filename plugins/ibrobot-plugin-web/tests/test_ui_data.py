@@ -17,7 +17,8 @@ from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.server import routes_of
 from ui_server import UiServer, run_ui
 
-from ibrobot_core.api import IbrobotError, find_config, installed_plugins
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import find_config, installed_plugins
 
 CONFIG = Path(find_config("so101_blind", installed_plugins()))
 needs_data = pytest.mark.skipif("convert" not in installed_plugins().commands, reason="needs ibrobot-plugin-data")
@@ -198,7 +199,8 @@ def test_an_episode_is_converted_and_its_dataset_shown_and_played(tmp_path: Path
     pytest.importorskip("ibrobot_mcap", reason="needs ibrobot-plugin-mcap")
     from made_episodes import JOINTS, make_episode
 
-    from ibrobot_core.api import Align, Contract, Feature, JointState, ObservationPart
+    from ibrobot_core.api import Contract, Feature, JointState, ObservationPart
+    from ibrobot_core.app import Align
 
     names = ("pan", "tilt")
     state = ObservationPart(

@@ -17,7 +17,8 @@ from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.recordings import episodes_of, find_recordings
 from ui_server import UiServer, run_ui
 
-from ibrobot_core.api import IbrobotError, find_config, installed_plugins
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import find_config, installed_plugins
 
 pytest.importorskip("ibrobot_mcap", reason="needs ibrobot-plugin-mcap")
 TOP = "/camera/top/image_raw"

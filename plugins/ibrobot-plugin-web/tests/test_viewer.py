@@ -21,7 +21,8 @@ from ibrobot_web import ibrobot_viewers
 from ibrobot_web.options import WebOptions
 from ibrobot_web.viewer import WebViewer
 
-from ibrobot_core.api import ComponentFailed, Context, ControlState, Header, IbrobotError, JointState, Message, Viewer
+from ibrobot_core.api import Context, Header, IbrobotError, JointState, Message, Viewer
+from ibrobot_core.app import ComponentFailed, ControlState
 
 OPTIONS = WebOptions(port=0, browser=False, rate_hz=60)
 

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 
 from ibrobot_ros2.jpeg import fits_jpeg, is_jpeg, to_jpeg
 
-from ibrobot_core.api import Bus, CompressedImage, ContractError, Image, Message, Subscription
+from ibrobot_core.api import CompressedImage, ContractError, Image, Message
+from ibrobot_core.app import Bus, Subscription
 
 _TOPIC = re.compile(r"/camera/([^/]+)/image_raw")
 _TYPES = (Image.ros_type, CompressedImage.ros_type)

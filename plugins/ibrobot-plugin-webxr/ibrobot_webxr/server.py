@@ -18,7 +18,8 @@ from typing import Any
 import attrs
 from aiohttp import WSMsgType, web
 
-from ibrobot_core.api import ESTOP, Bus, Clock, RobotStatus, TeleopError, error_text
+from ibrobot_core.api import Clock, RobotStatus, TeleopError
+from ibrobot_core.app import ESTOP, Bus, error_text
 from ibrobot_webxr.certificate import CERTIFICATE, own_folder, server_names, tls_context
 from ibrobot_webxr.exchange import Delays, Exchange
 from ibrobot_webxr.guard import Guard, Refused, Request

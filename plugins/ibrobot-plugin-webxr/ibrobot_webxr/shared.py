@@ -6,7 +6,8 @@ import threading
 
 import attrs
 
-from ibrobot_core.api import Context, TeleopError, echo
+from ibrobot_core.api import Context, TeleopError
+from ibrobot_core.app import echo
 from ibrobot_webxr.options import WebxrOptions
 from ibrobot_webxr.qr import qr_code
 from ibrobot_webxr.server import PageServer

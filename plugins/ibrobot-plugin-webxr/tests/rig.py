@@ -16,19 +16,8 @@ from ibrobot_webxr.server import PageServer
 from ibrobot_webxr.shared import close_page, open_page
 from ibrobot_webxr.teleop import WebxrTeleop
 
-from ibrobot_core.api import (
-    Context,
-    Description,
-    Joint,
-    JointReading,
-    Robot,
-    SteppedClock,
-    TeleopCommand,
-    Vector,
-    begin_operation,
-    ns,
-    operate,
-)
+from ibrobot_core.api import Context, Description, Joint, JointReading, Robot, SteppedClock, TeleopCommand, Vector, ns
+from ibrobot_core.app import begin_operation, operate
 
 from .conftest import AXES
 

@@ -12,7 +12,7 @@ from ibrobot_webxr import ibrobot_teleop
 from ibrobot_webxr.certificate import server_names
 from ibrobot_webxr.options import WebxrOptions
 
-from ibrobot_core.api import ConfigError, load_config
+from ibrobot_core.app import ConfigError, load_config
 
 ROBOT = """\
 robot:

@@ -22,20 +22,18 @@ from ibrobot_webxr.server import PageServer
 from ibrobot_webxr.teleop import WebxrTeleop
 
 from ibrobot_core.api import (
-    ESTOP,
     Bool,
     Context,
     Header,
     Image,
     JointReading,
-    NoRequest,
     RealClock,
     RobotStatus,
     SteppedClock,
     TeleopError,
     ns,
-    operate,
 )
+from ibrobot_core.app import ESTOP, NoRequest, operate
 
 from .browser import Browser, hand, hands
 from .rig import ANY_PORT, BENT, page_of, robot_of

@@ -18,7 +18,8 @@ from ibrobot_webxr.one_euro import PoseFilter, delay
 from ibrobot_webxr.options import WebxrOptions
 from ibrobot_webxr.teleop import WebxrTeleop
 
-from ibrobot_core.api import Context, Teleop, TeleopCommand, TeleopError, begin_operation
+from ibrobot_core.api import Context, Teleop, TeleopCommand, TeleopError
+from ibrobot_core.app import begin_operation
 
 from .rig import ANY_PORT, TICK_S, UPRIGHT, Rig, page_of, robot_of
 

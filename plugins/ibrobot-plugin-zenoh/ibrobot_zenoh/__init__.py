@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import Command, DecoderDescriptor, PanelDescriptor, TransportDescriptor, hookimpl
+from ibrobot_core.api import DecoderDescriptor, TransportDescriptor, hookimpl
+from ibrobot_core.app import Command, PanelDescriptor
 from ibrobot_zenoh.options import Share, ZenohOptions, check_files, server_options
 
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import Component, CompressedImage, Context, Image, Session, Transport, TransportLink
+    from ibrobot_core.api import CompressedImage, Context, Image, Transport
+    from ibrobot_core.app import Component, Session, TransportLink
 
 
 def _zenoh(options: Any, ctx: Context) -> Transport:

@@ -14,7 +14,8 @@ from weakref import WeakSet
 
 import zenoh
 
-from ibrobot_core.api import TransportError, set_malloc
+from ibrobot_core.api import TransportError
+from ibrobot_core.app import set_malloc
 from ibrobot_zenoh.access import restrict
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.reasons import tls_context, why_not

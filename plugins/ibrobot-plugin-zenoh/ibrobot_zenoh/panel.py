@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import zenoh
 
-from ibrobot_core.api import Session, TransportError
+from ibrobot_core.api import TransportError
+from ibrobot_core.app import Session
 from ibrobot_zenoh.connection import Connection, open_connections
 
 

@@ -8,21 +8,8 @@ from typing import override
 
 from ibrobot_ros2.services import SERVICES, Answer, decode_call, encode_answer, endpoint
 
-from ibrobot_core.api import (
-    NS_PER_S,
-    Component,
-    Handler,
-    IbrobotError,
-    Message,
-    NotSupported,
-    Payload,
-    Session,
-    SessionWorker,
-    Subscription,
-    Transport,
-    TransportLink,
-    did_you_mean,
-)
+from ibrobot_core.api import NS_PER_S, Handler, IbrobotError, Message, NotSupported, Payload, Transport, did_you_mean
+from ibrobot_core.app import Component, Session, SessionWorker, Subscription, TransportLink
 from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.ros2 import SharedTopic
 

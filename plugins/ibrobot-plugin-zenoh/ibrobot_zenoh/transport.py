@@ -10,14 +10,8 @@ from typing import Any, override
 
 import zenoh
 
-from ibrobot_core.api import (
-    HANDLER_THREADS,
-    Context,
-    Handler,
-    Message,
-    Payload,
-    TransportError,
-)
+from ibrobot_core.api import Context, Handler, Message, Payload, TransportError
+from ibrobot_core.app import HANDLER_THREADS
 from ibrobot_zenoh.access import ANYBODY, SERVED, SERVICES, TOPICS
 from ibrobot_zenoh.connection import Connection, first_line
 from ibrobot_zenoh.identity import own_identity

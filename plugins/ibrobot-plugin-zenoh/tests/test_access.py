@@ -19,8 +19,9 @@ from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.ros2 import Node, typed
 from ibrobot_zenoh.transport import ZenohTransport
 
-from ibrobot_core.api import Int32, Payload, single_options
+from ibrobot_core.api import Int32, Payload
 from ibrobot_core.api import Message as RosMessage
+from ibrobot_core.app import single_options
 
 from .pair import WAIT_S, free_endpoint, keep
 

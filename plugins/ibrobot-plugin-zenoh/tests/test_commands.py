@@ -24,7 +24,6 @@ from ibrobot_zenoh.transport import ZenohTransport
 
 from ibrobot_core.api import (
     Bool,
-    ConfigError,
     Float64MultiArray,
     Header,
     IbrobotError,
@@ -33,9 +32,8 @@ from ibrobot_core.api import (
     NoOptions,
     NotSupported,
     Robot,
-    RobotConfig,
-    TransportConfig,
 )
+from ibrobot_core.app import ConfigError, RobotConfig, TransportConfig
 
 from .pair import WAIT_S, free_endpoint, router, wait_for
 
@@ -201,8 +199,8 @@ def use_config(monkeypatch: pytest.MonkeyPatch, transport: TransportConfig | Non
     config = RobotConfig(
         robot=Robot("r", ()), executors={}, control_modes={}, default_control_mode="m", transport=transport
     )
-    monkeypatch.setattr("ibrobot_core.api.find_config", lambda name, registry: Path(name))
-    monkeypatch.setattr("ibrobot_core.api.load_config", lambda path, communicates: config)
+    monkeypatch.setattr("ibrobot_core.app.find_config", lambda name, registry: Path(name))
+    monkeypatch.setattr("ibrobot_core.app.load_config", lambda path, communicates: config)
 
 
 def test_messages_from_text():

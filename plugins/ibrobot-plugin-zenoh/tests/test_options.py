@@ -10,7 +10,8 @@ import pytest
 from ibrobot_testing import host_context
 from ibrobot_zenoh.options import Tls, ZenohOptions
 
-from ibrobot_core.api import TransportError, installed_plugins
+from ibrobot_core.api import TransportError
+from ibrobot_core.app import installed_plugins
 
 from .pair import WAIT_S, client, free_endpoint, make, router, settle, wait_for
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from ibrobot_core.api import NS_PER_S, Bus, Clock, Context, Description, Joint, Robot, SteppedClock
+from ibrobot_core.api import NS_PER_S, Clock, Context, Description, Joint, Robot, SteppedClock
+from ibrobot_core.app import Bus
 
 START_NS = 1_700_000_000 * NS_PER_S
 """Initial time of a test's stepped clock [ns]: a plausible date, so that stamps near zero are conspicuous."""

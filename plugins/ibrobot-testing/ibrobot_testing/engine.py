@@ -13,18 +13,8 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.api import (
-    Context,
-    Engine,
-    Frame,
-    ModelContext,
-    Policy,
-    PolicyError,
-    RobotConfig,
-    Tensors,
-    copied_tensors,
-    ns,
-)
+from ibrobot_core.api import Context, Engine, Frame, ModelContext, Policy, PolicyError, Tensors, ns
+from ibrobot_core.app import RobotConfig, copied_tensors
 from ibrobot_testing.contexts import host_context
 from ibrobot_testing.fakes import FakePolicy
 from ibrobot_testing.suite import Suite

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ibrobot_core.api import Context, Frame, Policy, PolicyError, PolicySpec, Tensors, copied_tensors
+from ibrobot_core.api import Context, Frame, Policy, PolicyError, PolicySpec, Tensors
+from ibrobot_core.app import copied_tensors
 from ibrobot_testing.suite import Suite
 
 _STEP_NS = 33_333_333

@@ -9,7 +9,8 @@ from typing import Any, cast
 import attrs
 import numpy as np
 
-from ibrobot_core.api import Component, Header, JointState, LaunchRequest, Registry, RobotConfig, Session
+from ibrobot_core.api import Header, JointState
+from ibrobot_core.app import Component, LaunchRequest, Registry, RobotConfig, Session
 from ibrobot_testing.contexts import make_robot
 from ibrobot_testing.suite import Suite
 

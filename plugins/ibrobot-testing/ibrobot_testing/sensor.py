@@ -10,17 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from ibrobot_core.api import (
-    MESSAGE_TYPES,
-    CameraInfo,
-    CompressedImage,
-    Context,
-    Image,
-    Message,
-    Sensor,
-    SensorError,
-    installed_plugins,
-)
+from ibrobot_core.api import MESSAGE_TYPES, CameraInfo, CompressedImage, Context, Image, Message, Sensor, SensorError
+from ibrobot_core.app import installed_plugins
 from ibrobot_testing.suite import Suite
 
 _BYTES_PER_PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "mono16": 2, "16UC1": 2, "32FC1": 4}

@@ -8,7 +8,7 @@ from typing import Any, override
 
 import attrs
 
-from ibrobot_core.api import NoRequest, Service
+from ibrobot_core.app import NoRequest, Service
 
 
 @attrs.frozen(eq=False)

@@ -13,7 +13,7 @@ from pathlib import Path
 import attrs
 import pytest
 
-from ibrobot_core.api import installed_plugins
+from ibrobot_core.app import installed_plugins
 
 
 @attrs.define

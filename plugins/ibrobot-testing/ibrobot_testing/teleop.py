@@ -9,19 +9,8 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from ibrobot_core.api import (
-    HOLD_S,
-    Context,
-    JointReading,
-    OperatorEvent,
-    Teleop,
-    TeleopCommand,
-    TeleopError,
-    Vector,
-    begin_operation,
-    ns,
-    operate,
-)
+from ibrobot_core.api import Context, JointReading, OperatorEvent, Teleop, TeleopCommand, TeleopError, Vector, ns
+from ibrobot_core.app import HOLD_S, begin_operation, operate
 from ibrobot_testing.suite import Suite
 
 

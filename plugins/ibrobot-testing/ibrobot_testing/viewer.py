@@ -8,7 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from ibrobot_core.api import Bus, Context, Header, JointState, Message, String, Viewer
+from ibrobot_core.api import Context, Header, JointState, Message, String, Viewer
+from ibrobot_core.app import Bus
 from ibrobot_testing.suite import Suite
 
 

@@ -7,7 +7,8 @@ from typing import override
 import pytest
 from ibrobot_testing import SectionSuite, checks, failed_checks
 
-from ibrobot_core.api import CONTROL, Int32, NoRequest, Service, SessionWorker
+from ibrobot_core.api import Int32
+from ibrobot_core.app import CONTROL, NoRequest, Service, SessionWorker
 
 RESET_COUNT = Service("/reset_count", NoRequest, str, "Count from 0 again.")
 

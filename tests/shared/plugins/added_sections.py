@@ -6,17 +6,8 @@ from typing import override
 
 import attrs
 
-from ibrobot_core.api import (
-    CONTROL,
-    Int32,
-    NoRequest,
-    SectionDescriptor,
-    Service,
-    SessionWorker,
-    String,
-    hookimpl,
-    option,
-)
+from ibrobot_core.api import Int32, String, hookimpl, option
+from ibrobot_core.app import CONTROL, NoRequest, SectionDescriptor, Service, SessionWorker
 
 RESET_COUNT = Service("/reset_count", NoRequest, str, "Count from 0 again.")
 

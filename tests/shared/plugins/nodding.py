@@ -8,14 +8,14 @@ from typing import Any, override
 import click
 import numpy as np
 
-from ibrobot_core.api import (
+from ibrobot_core.api import hookimpl
+from ibrobot_core.app import (
     Command,
     ControlMode,
     LaunchRequest,
     Session,
     SourceWorker,
     find_config,
-    hookimpl,
     installed_plugins,
     load_config,
     run_options,

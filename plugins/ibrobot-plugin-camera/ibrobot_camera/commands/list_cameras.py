@@ -9,7 +9,7 @@ import click
 from rich.table import Table
 
 from ibrobot_camera import v4l2
-from ibrobot_core.api import Screen, echo, styled
+from ibrobot_core.app import Screen, echo, styled
 
 
 @click.command("list")

@@ -12,7 +12,8 @@ from urllib.parse import parse_qs, urlsplit
 import click
 import cv2
 
-from ibrobot_core.api import CompressedImage, Image, echo, on_signals
+from ibrobot_core.api import CompressedImage, Image
+from ibrobot_core.app import echo, on_signals
 
 if TYPE_CHECKING:
     from ibrobot_camera.camera import OpenCvCamera

@@ -10,7 +10,8 @@ from pathlib import Path
 import click
 import cv2
 
-from ibrobot_core.api import NS_PER_S, CompressedImage, Image, SensorError, echo, wrong_input
+from ibrobot_core.api import NS_PER_S, CompressedImage, Image, SensorError
+from ibrobot_core.app import echo, wrong_input
 
 _WAIT_S = 10.0
 

@@ -13,18 +13,8 @@ from numpy.typing import NDArray
 
 from ibrobot_camera.camera import OpenCvCamera
 from ibrobot_camera.options import OpenCvOptions
-from ibrobot_core.api import (
-    CompressedImage,
-    Context,
-    Image,
-    RealClock,
-    Robot,
-    SensorError,
-    find_config,
-    installed_plugins,
-    load_config,
-    wrong_input,
-)
+from ibrobot_core.api import CompressedImage, Context, Image, RealClock, Robot, SensorError
+from ibrobot_core.app import find_config, installed_plugins, load_config, wrong_input
 
 _TO_BGR = {"bgr8": None, "rgb8": cv2.COLOR_RGB2BGR, "mono8": cv2.COLOR_GRAY2BGR}
 

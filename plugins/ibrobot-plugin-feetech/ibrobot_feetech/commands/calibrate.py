@@ -13,13 +13,12 @@ from ibrobot_core.api import (
     ZERO_AT,
     ZERO_AT_POSE,
     Calibration,
-    Declined,
-    Guide,
     HardwareError,
     IbrobotError,
     JointCalibration,
     calibration_path,
 )
+from ibrobot_core.app import Declined, Guide
 from ibrobot_feetech.arm import relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.calibration import save_calibration

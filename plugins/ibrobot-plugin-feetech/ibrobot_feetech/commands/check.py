@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import attrs
 import click
 
-from ibrobot_core.api import Calibration, Declined, Guide, load_calibration
+from ibrobot_core.api import Calibration, load_calibration
+from ibrobot_core.app import Declined, Guide
 from ibrobot_feetech.arm import write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import TerminalGuide

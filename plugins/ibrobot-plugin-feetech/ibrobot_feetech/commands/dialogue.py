@@ -14,7 +14,8 @@ from rich.box import SIMPLE_HEAD
 from rich.live import Live
 from rich.table import Table
 
-from ibrobot_core.api import Guide, IbrobotError, KeyReader, Screen, echo
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import Guide, KeyReader, Screen, echo
 
 _PERIOD_S = 0.03
 """Time between two updates of a table [s]."""

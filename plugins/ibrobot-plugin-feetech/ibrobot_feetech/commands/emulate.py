@@ -19,15 +19,15 @@ from ibrobot_core.api import (
     Calibration,
     JointCalibration,
     calibration_path,
-    echo,
     load_calibration,
-    on_signals,
 )
+from ibrobot_core.app import echo, on_signals
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.commands.joints import SO101
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Robot, RobotConfig
+    from ibrobot_core.api import Robot
+    from ibrobot_core.app import RobotConfig
     from ibrobot_feetech.emulator import Emulator
     from ibrobot_feetech.emulator.physics import PhysicsArm
 
@@ -104,7 +104,7 @@ def emulate(
 
 def _hurry() -> None:
     """Raise the priority, so that the servos answer in time on a busy machine, as real ones do."""
-    from ibrobot_core.api import go_real_time
+    from ibrobot_core.app import go_real_time
 
     sys.setswitchinterval(_SWITCH_S)
     for refused in go_real_time(_PRIORITY):
@@ -123,14 +123,14 @@ def _wait(ended: threading.Event, arm: PhysicsArm | None) -> None:
 
 
 def _config(name: str) -> RobotConfig:
-    from ibrobot_core.api import find_config, installed_plugins, load_config
+    from ibrobot_core.app import find_config, installed_plugins, load_config
 
     registry = installed_plugins()
     return load_config(find_config(name, registry), sim=True, registry=registry)
 
 
 def _physics(config: RobotConfig, calibration: Calibration, emulator: Emulator, seed: int) -> PhysicsArm:
-    from ibrobot_core.api import installed_plugins
+    from ibrobot_core.app import installed_plugins
     from ibrobot_feetech.arm import Arm
     from ibrobot_feetech.emulator.physics import PhysicsArm
 

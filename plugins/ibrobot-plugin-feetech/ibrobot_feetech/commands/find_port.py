@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import click
 
-from ibrobot_core.api import Guide, HardwareError
+from ibrobot_core.api import HardwareError
+from ibrobot_core.app import Guide
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.usb import UsbPort, usb_ports
 

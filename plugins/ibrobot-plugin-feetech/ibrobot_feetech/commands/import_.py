@@ -5,7 +5,8 @@ from __future__ import annotations
 import attrs
 import click
 
-from ibrobot_core.api import ZERO_AT, Declined, HardwareError, calibration_path, echo, load_calibration
+from ibrobot_core.api import ZERO_AT, HardwareError, calibration_path, load_calibration
+from ibrobot_core.app import Declined, echo
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.commands.calibrate import backup
 from ibrobot_feetech.commands.dialogue import agree

@@ -48,7 +48,7 @@ def joints_of(robot: str | None = None, calibration: str | None = None, prefix: 
     limits: Mapping[str, tuple[float, float]] = {f"{prefix}{joint}": ends for joint, ends in SO101.items()}
     anchored: tuple[str, ...] = (f"{prefix}gripper",)
     if robot is not None:
-        from ibrobot_core.api import find_config, installed_plugins, load_config
+        from ibrobot_core.app import find_config, installed_plugins, load_config
 
         config = load_config(find_config(robot, installed_plugins()))
         arms = [arm for arm in config.hardware.values() if isinstance(arm.options, FollowerOptions)]

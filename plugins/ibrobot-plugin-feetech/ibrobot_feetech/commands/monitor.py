@@ -12,7 +12,8 @@ from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
-from ibrobot_core.api import Screen, degrees, echo, styled, ticks_to_radians
+from ibrobot_core.api import degrees, ticks_to_radians
+from ibrobot_core.app import Screen, echo, styled
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import table
 from ibrobot_feetech.commands.joints import Joint, by_servo, joints_of

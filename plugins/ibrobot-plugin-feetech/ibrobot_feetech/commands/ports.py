@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from ibrobot_core.api import HardwareError, echo, wrong_input
+from ibrobot_core.api import HardwareError
+from ibrobot_core.app import echo, wrong_input
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.usb import ADAPTER_VENDOR, usb_ports
 

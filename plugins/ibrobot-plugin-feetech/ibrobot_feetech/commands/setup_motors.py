@@ -7,7 +7,8 @@ from contextlib import suppress
 
 import click
 
-from ibrobot_core.api import Declined, Guide, HardwareError
+from ibrobot_core.api import HardwareError
+from ibrobot_core.app import Declined, Guide
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from ibrobot_core.api import Declined, echo
+from ibrobot_core.app import Declined, echo
 from ibrobot_feetech.arm import hold, relax
 from ibrobot_feetech.commands.dialogue import agree
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of

@@ -8,17 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ibrobot_core.api import (
-    Context,
-    EpisodeSetup,
-    IbrobotError,
-    RealClock,
-    Registry,
-    RobotConfig,
-    SimulatedHardware,
-    ns,
-    radians_to_ticks,
-)
+from ibrobot_core.api import Context, EpisodeSetup, IbrobotError, RealClock, SimulatedHardware, ns, radians_to_ticks
+from ibrobot_core.app import Registry, RobotConfig
 from ibrobot_feetech.arm import Arm
 from ibrobot_feetech.emulator.pty import Emulator
 from ibrobot_feetech.emulator.signals import SignalServer

@@ -6,7 +6,7 @@ import json
 
 import click
 
-from ibrobot_core.api import echo
+from ibrobot_core.app import echo
 from ibrobot_gamepad.commands.chosen import find_all
 
 _VIA = {"hid": "its own reports", "sdl": "SDL"}

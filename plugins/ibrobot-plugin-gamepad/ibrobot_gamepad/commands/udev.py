@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from ibrobot_core.api import echo
+from ibrobot_core.app import echo
 from ibrobot_gamepad.permissions import udev_rules
 
 

@@ -17,7 +17,7 @@ import attrs
 import numpy as np
 from tests.guest.kernel_devices import HidDevice, Joystick, descriptor
 
-from ibrobot_core.api import LaunchRequest, Runtime, Session, installed_plugins, load_config
+from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 from tests import fake_hid
 
 CONFIG = Path(__file__).parents[4] / "configs" / "so101_blind.yaml"

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import Declined, EpisodePath, RecorderError, echo, wrong_input
+from ibrobot_core.api import RecorderError
+from ibrobot_core.app import Declined, EpisodePath, echo, wrong_input
 
 
 @click.command()

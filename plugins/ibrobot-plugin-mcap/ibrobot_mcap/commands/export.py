@@ -12,7 +12,8 @@ import attrs
 import click
 import numpy as np
 
-from ibrobot_core.api import EpisodePath, Image, Message, RecorderError, echo, wrong_input
+from ibrobot_core.api import Image, Message, RecorderError
+from ibrobot_core.app import EpisodePath, echo, wrong_input
 
 _TO_RGB = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, 3), "bgra8": (2, 1, 0, 3)}
 """Encoding -> its channels in PNG order."""

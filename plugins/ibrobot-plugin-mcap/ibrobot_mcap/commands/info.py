@@ -10,7 +10,7 @@ import attrs
 import click
 from rich.table import Table
 
-from ibrobot_core.api import EpisodePath, Screen, echo, wrong_input
+from ibrobot_core.app import EpisodePath, Screen, echo, wrong_input
 
 _LONG = 200
 """For longer metadata, only the length is printed [characters]."""

@@ -9,7 +9,8 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from ibrobot_core.api import EpisodePath, RecorderError, Screen, echo, styled, wrong_input
+from ibrobot_core.api import RecorderError
+from ibrobot_core.app import EpisodePath, Screen, echo, styled, wrong_input
 
 _WIDE = 100
 """Width of a terminal with enough room for prompts and years [columns]."""
@@ -25,7 +26,7 @@ def list_episodes(path: Path, as_json: bool) -> None:
     PATH is a folder of datasets (by default `episodes`), a dataset, or an episode. All commands take the names that it
     prints, e.g. pick:1.
     """
-    from ibrobot_core.api import short_name
+    from ibrobot_core.app import short_name
     from ibrobot_mcap.commands.found import (
         date_of,
         duration_s,

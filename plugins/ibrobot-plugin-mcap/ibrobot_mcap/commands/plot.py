@@ -10,17 +10,8 @@ from typing import Any
 import click
 import numpy as np
 
-from ibrobot_core.api import (
-    NS_PER_S,
-    Contract,
-    EpisodePath,
-    Float64MultiArray,
-    Image,
-    JointState,
-    RecorderError,
-    echo,
-    wrong_input,
-)
+from ibrobot_core.api import NS_PER_S, Contract, Float64MultiArray, Image, JointState, RecorderError
+from ibrobot_core.app import EpisodePath, echo, wrong_input
 
 _THUMBNAILS = 8
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import EpisodePath, EpisodeSummary, InUse, RecorderError, echo, wrong_input
+from ibrobot_core.api import EpisodeSummary, RecorderError
+from ibrobot_core.app import EpisodePath, InUse, echo, wrong_input
 
 
 @click.command()

@@ -12,18 +12,8 @@ from typing import Any, Self, override
 import attrs
 from ibrobot_ros2.services import Answer, Call, decode_answer, decode_call, encode_answer, encode_call, endpoint
 
-from ibrobot_core.api import (
-    Context,
-    IbrobotError,
-    PlanningError,
-    RealClock,
-    Robot,
-    Runtime,
-    Transport,
-    TransportDescriptor,
-    installed_plugins,
-    single_options,
-)
+from ibrobot_core.api import Context, IbrobotError, PlanningError, RealClock, Robot, Transport, TransportDescriptor
+from ibrobot_core.app import Runtime, installed_plugins, single_options
 
 _DEFAULT = "connect=[tcp/127.0.0.1:7447]"
 _TIMEOUT_S = 60.0

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import echo
+from ibrobot_core.app import echo
 
 
 @click.group()
@@ -31,7 +31,7 @@ def srdf(config: str, samples: int, seed: int, output: Path | None) -> None:
     """
     from ibrobot_kinematics.urdf import read_urdf
 
-    from ibrobot_core.api import find_config, installed_plugins, load_config
+    from ibrobot_core.app import find_config, installed_plugins, load_config
     from ibrobot_planning.world.arm import robot_arm
     from ibrobot_planning.world.collision import unchecked_pairs
     from ibrobot_planning.world.semantics import srdf as written

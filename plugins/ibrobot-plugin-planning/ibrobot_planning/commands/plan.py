@@ -16,11 +16,9 @@ import click
 import numpy as np
 
 from ibrobot_core.api import (
-    ControlMode,
     Goal,
     JointGoal,
     JointTrajectory,
-    LaunchRequest,
     MissingDependency,
     NotSupported,
     PlanCode,
@@ -30,17 +28,21 @@ from ibrobot_core.api import (
     PoseGoal,
     PositionGoal,
     Robot,
+    Vector,
+    ns,
+    seconds,
+)
+from ibrobot_core.app import (
+    ControlMode,
+    LaunchRequest,
     RobotConfig,
     Session,
     Spline,
-    Vector,
     echo,
     find_config,
     installed_plugins,
     load_config,
-    ns,
     run_options,
-    seconds,
     wrong_input,
 )
 from ibrobot_planning.goals.text import Target, target

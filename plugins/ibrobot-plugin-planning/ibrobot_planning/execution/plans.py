@@ -10,7 +10,6 @@ import numpy as np
 
 from ibrobot_core.api import (
     AnyGoal,
-    ControlMode,
     Goal,
     IbrobotError,
     JointGoal,
@@ -24,10 +23,10 @@ from ibrobot_core.api import (
     PlanResult,
     PoseGoal,
     PositionGoal,
-    Session,
     Vector,
     ns,
 )
+from ibrobot_core.app import ControlMode, Session
 from ibrobot_planning.execution.tracks import ExecutorGoal
 from ibrobot_planning.goals.named_poses import named_pose
 from ibrobot_planning.goals.text import Target

@@ -8,7 +8,8 @@ from weakref import WeakKeyDictionary
 
 import attrs
 
-from ibrobot_core.api import Header, JointState, PlanCode, PlanningError, Pose, Session, Vector, documented, option
+from ibrobot_core.api import Header, JointState, PlanCode, PlanningError, Pose, Vector, documented, option
+from ibrobot_core.app import Session
 
 type Outcome = Literal["SUCCEEDED", "REJECTED", "PLANNING_FAILED", "EXECUTION_FAILED", "CANCELLED"]
 

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ibrobot_core.api import (
-    ControlMode,
     Goal,
     Header,
     IbrobotError,
     JointState,
-    NoRequest,
     PlanCode,
     PlanningError,
     PlanRequest,
@@ -23,10 +21,9 @@ from ibrobot_core.api import (
     PoseGoal,
     PoseStamped,
     PositionGoal,
-    Service,
-    Session,
     Vector,
 )
+from ibrobot_core.app import ControlMode, NoRequest, Service, Session
 from ibrobot_planning.execution.plans import GoalPlans
 from ibrobot_planning.execution.requests import (
     CartesianQuery,

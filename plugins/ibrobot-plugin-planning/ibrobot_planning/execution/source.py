@@ -15,12 +15,9 @@ import numpy as np
 
 from ibrobot_core.api import (
     AnyGoal,
-    ControlMode,
-    ControlState,
     Goal,
     HardwareError,
     JointGoal,
-    NoRequest,
     NotSupported,
     OrientationPolicy,
     PlanCode,
@@ -30,14 +27,11 @@ from ibrobot_core.api import (
     Pose,
     PoseGoal,
     PoseStamped,
-    RequestLimits,
-    Service,
-    Session,
-    SourceWorker,
     String,
     ns,
     seconds,
 )
+from ibrobot_core.app import ControlMode, ControlState, NoRequest, RequestLimits, Service, Session, SourceWorker
 from ibrobot_planning.execution.plans import GoalPlans
 from ibrobot_planning.execution.requests import Execute, GoTo, MoveRequest, Numbered
 from ibrobot_planning.execution.results import MoveResult, MoveToConfiguration, MoveToPose, Outcome, results_of

@@ -16,12 +16,12 @@ from ibrobot_core.api import (
     JointTrajectory,
     JointTrajectoryPoint,
     Planner,
-    Session,
     Vector,
     ns,
     seconds,
     trajectory_goal,
 )
+from ibrobot_core.app import Session
 from ibrobot_planning.planners.blend import Limits, braking, cut, joined, motion_of, trajectory_of
 from ibrobot_planning.planners.timing import Motion
 

@@ -10,17 +10,8 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import (
-    Context,
-    Executor,
-    GoalRejected,
-    GoalState,
-    GoalStatus,
-    JointReading,
-    Spline,
-    Vector,
-    seconds,
-)
+from ibrobot_core.api import Context, Executor, GoalRejected, GoalState, GoalStatus, JointReading, Vector, seconds
+from ibrobot_core.app import Spline
 from ibrobot_planning.executors.options import TrajectoryOptions
 from ibrobot_planning.executors.trajectory_goal import Takeover, TrajectoryGoal, parse_goal
 

@@ -6,16 +6,8 @@ from collections.abc import Collection, Iterator
 
 import attrs
 
-from ibrobot_core.api import (
-    ControlMode,
-    IbrobotError,
-    PlannerDescriptor,
-    PlanningError,
-    Registry,
-    RobotConfig,
-    Vector,
-    check_models,
-)
+from ibrobot_core.api import IbrobotError, PlannerDescriptor, PlanningError, Vector
+from ibrobot_core.app import ControlMode, Registry, RobotConfig, check_models
 from ibrobot_planning.goals.named_poses import named_pose, pose_names
 from ibrobot_planning.tasks.format import (
     AlternativesStep,

@@ -7,9 +7,9 @@ from typing import Any, override
 
 import click
 
-from ibrobot_core.api import (
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import (
     ConfigError,
-    IbrobotError,
     LaunchRequest,
     Problem,
     Registry,

@@ -8,18 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ibrobot_core.api import (
-    SET_MODE,
-    CompressedImage,
-    IbrobotError,
-    Image,
-    PlanningError,
-    Session,
-    SetMode,
-    Vector,
-    ns,
-    seconds,
-)
+from ibrobot_core.api import CompressedImage, IbrobotError, Image, PlanningError, Vector, ns, seconds
+from ibrobot_core.app import SET_MODE, Session, SetMode
 from ibrobot_planning.execution.requests import GoTo, Numbered, PlanAhead, PlanAnswer
 from ibrobot_planning.execution.results import MoveResult
 from ibrobot_planning.execution.services import PLAN_GOAL

@@ -10,7 +10,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import ConfigError, Document, Problem, did_you_mean, parse_yaml, single_options
+from ibrobot_core.api import did_you_mean
+from ibrobot_core.app import ConfigError, Document, Problem, parse_yaml, single_options
 from ibrobot_planning.tasks.format import Task
 
 EXAMPLES = Path(__file__).with_name("examples")

@@ -12,19 +12,8 @@ from typing import Any, override
 
 import attrs
 
-from ibrobot_core.api import (
-    CONTROL,
-    NoRequest,
-    PlanningError,
-    RequestLimits,
-    Service,
-    Session,
-    SessionWorker,
-    String,
-    documented,
-    option,
-    seconds,
-)
+from ibrobot_core.api import PlanningError, String, documented, option, seconds
+from ibrobot_core.app import CONTROL, NoRequest, RequestLimits, Service, Session, SessionWorker
 from ibrobot_planning.execution.requests import Numbered
 from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
 from ibrobot_planning.tasks.format import Step

@@ -9,22 +9,8 @@ from typing import Any, override
 import numpy as np
 from ibrobot_kinematics.poses import matrix, pose
 
-from ibrobot_core.api import (
-    CONTROL,
-    CameraInfo,
-    ContractError,
-    Image,
-    Message,
-    NoRequest,
-    PointCloud2,
-    Received,
-    Service,
-    Session,
-    SessionWorker,
-    Vector,
-    ns,
-    pixels,
-)
+from ibrobot_core.api import CameraInfo, ContractError, Image, Message, PointCloud2, Vector, ns, pixels
+from ibrobot_core.app import CONTROL, NoRequest, Received, Service, Session, SessionWorker
 from ibrobot_planning.world.arm import Arm, robot_arm
 from ibrobot_planning.world.coal_shapes import geometry
 from ibrobot_planning.world.frames import Frames

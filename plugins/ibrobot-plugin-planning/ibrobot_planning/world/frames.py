@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from ibrobot_kinematics.poses import matrix
 
-from ibrobot_core.api import Bus, Pose, TFMessage, TransformStamped, Vector
+from ibrobot_core.api import Pose, TFMessage, TransformStamped, Vector
+from ibrobot_core.app import Bus
 
 
 class Frames:

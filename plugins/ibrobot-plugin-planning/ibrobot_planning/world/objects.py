@@ -12,7 +12,8 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ibrobot_core.api import NoRequest, PlanCode, PlanningError, Pose, Service, Vector
+from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector
+from ibrobot_core.app import NoRequest, Service
 
 FLOOR = "floor"
 """Name of the object that the option `floor` of a planner adds."""

@@ -13,24 +13,19 @@ from ibrobot_kinematics.clearance import CLEARANCE, Configuration
 from ibrobot_kinematics.poses import matrix, pose, pose_at
 
 from ibrobot_core.api import (
-    Component,
     Float64MultiArray,
     HardwareDescriptor,
     PlanCode,
     PlanningError,
     Pose,
     Quaternion,
-    Registry,
-    RobotConfig,
     SceneObject,
-    Service,
-    Session,
-    Subscription,
     Vector,
     Vector3,
     did_you_mean,
     resolve_path,
 )
+from ibrobot_core.app import Component, Registry, RobotConfig, Service, Session, Subscription
 from ibrobot_planning.world.objects import (
     FLOOR,
     SNAPSHOT,

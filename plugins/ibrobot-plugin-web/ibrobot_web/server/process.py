@@ -25,7 +25,8 @@ from typing import Any
 import attrs
 from aiohttp import web
 
-from ibrobot_core.api import Channel, Failure, IbrobotError, open_parent
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import Channel, Failure, open_parent
 from ibrobot_web.link import ALIVE_S, FIRST_PICTURE, STATUS, receive_frame
 from ibrobot_web.messages import Alive, FromServer, Pages, Release, RunCommand, Sent, StopRun, to_run
 from ibrobot_web.pictures import as_jpeg

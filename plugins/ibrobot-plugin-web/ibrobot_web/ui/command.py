@@ -14,7 +14,7 @@ from pathlib import Path
 import click
 from aiohttp import web
 
-from ibrobot_core.api import LogFormatter, echo, end_signals
+from ibrobot_core.app import LogFormatter, echo, end_signals
 from ibrobot_web.desktop import has_desktop
 from ibrobot_web.options import WebOptions
 from ibrobot_web.server.guard import Guard

@@ -8,7 +8,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import RequestError, RequestLimits, Service, option
+from ibrobot_core.api import option
+from ibrobot_core.app import RequestError, RequestLimits, Service
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
 

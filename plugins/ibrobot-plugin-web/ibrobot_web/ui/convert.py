@@ -8,7 +8,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import NORM_MODES, IbrobotError, NoRequest, installed_plugins, option
+from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.app import NORM_MODES, NoRequest, installed_plugins
 from ibrobot_web.ui.context import NamesPaths, Route, Ui
 from ibrobot_web.ui.job_runner import Reader
 from ibrobot_web.ui.recordings import find_recordings, paths_of

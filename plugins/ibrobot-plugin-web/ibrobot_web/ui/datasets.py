@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from ibrobot_core.api import IbrobotError, NoRequest, installed_plugins
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import NoRequest, installed_plugins
 from ibrobot_web.ui import episodes
 from ibrobot_web.ui.context import NamesPath, Route, Ui
 from ibrobot_web.ui.recordings import find_recordings, run_command

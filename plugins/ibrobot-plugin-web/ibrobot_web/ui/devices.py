@@ -9,16 +9,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import (
-    Child,
-    ComponentFailed,
-    GuideDescriptor,
-    IbrobotError,
-    NoRequest,
-    Question,
-    installed_plugins,
-    option,
-)
+from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.app import Child, ComponentFailed, GuideDescriptor, NoRequest, Question, installed_plugins
 from ibrobot_web.ui.context import Blob, Route, Ui
 
 _MODULE = "ibrobot_web.ui.guide_process"

@@ -8,7 +8,8 @@ from typing import Any, Literal
 
 import attrs
 
-from ibrobot_core.api import IbrobotError, NoRequest, option
+from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.app import NoRequest
 from ibrobot_web.ui.context import Blob, NamesPath, NamesPaths, Route, Ui
 from ibrobot_web.ui.recordings import episodes_of, find_recordings, paths_of, playback, run_command
 

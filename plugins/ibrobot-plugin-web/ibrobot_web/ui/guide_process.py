@@ -16,7 +16,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, override
 
-from ibrobot_core.api import Channel, Failure, Guide, IbrobotError, error_text, installed_plugins, open_parent
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import Channel, Failure, Guide, error_text, installed_plugins, open_parent
 
 _POLL_S = 0.03
 _ROWS_S = 0.1

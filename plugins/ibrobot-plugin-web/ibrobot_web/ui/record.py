@@ -10,7 +10,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import IbrobotError, installed_plugins, option
+from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.app import installed_plugins
 from ibrobot_web.ui.context import Route, Ui
 from ibrobot_web.ui.robots import RUN_DONE, Launch, read_address, run_arguments
 

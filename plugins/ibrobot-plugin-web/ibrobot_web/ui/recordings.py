@@ -11,7 +11,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import NS_PER_S, IbrobotError, installed_plugins
+from ibrobot_core.api import NS_PER_S, IbrobotError
+from ibrobot_core.app import installed_plugins
 from ibrobot_web.playback import Playback, problems_of
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.job_runner import IBROBOT

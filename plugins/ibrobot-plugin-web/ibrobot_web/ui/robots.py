@@ -10,9 +10,9 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import (
+from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.app import (
     ConfigError,
-    IbrobotError,
     NoRequest,
     RobotConfig,
     absent_sensors,
@@ -20,7 +20,6 @@ from ibrobot_core.api import (
     find_config,
     installed_plugins,
     load_config,
-    option,
     shipped_configs,
     unavailable_modes,
 )

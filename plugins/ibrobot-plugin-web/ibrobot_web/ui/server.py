@@ -14,7 +14,8 @@ from typing import Any
 import attrs
 from aiohttp import WSMsgType, web
 
-from ibrobot_core.api import ConfigError, IbrobotError, error_text
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import ConfigError, error_text
 from ibrobot_web.server.app import STATIC, Files
 from ibrobot_web.server.guard import Guard
 from ibrobot_web.server.listening import REQUEST_S

@@ -12,16 +12,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import (
-    ConfigError,
-    IbrobotError,
-    NoRequest,
-    find_config,
-    from_document,
-    installed_plugins,
-    option,
-    parse_yaml,
-)
+from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.app import ConfigError, NoRequest, find_config, from_document, installed_plugins, parse_yaml
 from ibrobot_web.model_edit import ModelEdit, with_model
 from ibrobot_web.ui.context import Route, Ui
 from ibrobot_web.ui.convert import parse_event

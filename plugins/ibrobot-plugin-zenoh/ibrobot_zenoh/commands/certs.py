@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import TransportError, echo, wrong_input
+from ibrobot_core.api import TransportError
+from ibrobot_core.app import echo, wrong_input
 from ibrobot_zenoh.certificates import CA, CERTIFICATE, KEY, ROBOTS, Authority
 from ibrobot_zenoh.options import check_robot_name
 

@@ -47,7 +47,7 @@ def options_from(config: str | None, endpoints: tuple[str, ...], domain: int | N
         except ValueError as error:
             reason = "certificates are given by --config" if "needs tls" in str(error) else error
             raise click.UsageError(f"--endpoint: {reason}") from None
-    from ibrobot_core.api import find_config, installed_plugins, load_config
+    from ibrobot_core.app import find_config, installed_plugins, load_config
 
     found = load_config(find_config(config, installed_plugins()), communicates=True)
     if found.transport is None or not isinstance(found.transport.options, ZenohOptions):

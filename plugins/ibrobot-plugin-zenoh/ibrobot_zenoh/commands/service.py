@@ -9,7 +9,8 @@ from typing import Any
 import click
 from ibrobot_ros2.services import SERVICES, Call, decode_answer, encode_call, endpoint
 
-from ibrobot_core.api import NotSupported, dump_yaml, echo, parse_yaml
+from ibrobot_core.api import NotSupported
+from ibrobot_core.app import dump_yaml, echo, parse_yaml
 from ibrobot_zenoh.commands.network import connected, network_options
 from ibrobot_zenoh.transport import ZenohTransport
 

@@ -8,7 +8,8 @@ from typing import Any
 import attrs
 import numpy as np
 
-from ibrobot_core.api import MESSAGE_TYPES, Message, NotSupported, dump_yaml, single_options
+from ibrobot_core.api import MESSAGE_TYPES, Message, NotSupported
+from ibrobot_core.app import dump_yaml, single_options
 
 _SHOWN = 16
 """Number of array elements to show."""

@@ -12,7 +12,8 @@ from typing import Any
 
 import click
 
-from ibrobot_core.api import Message, TransportError, echo
+from ibrobot_core.api import Message, TransportError
+from ibrobot_core.app import echo
 from ibrobot_zenoh.commands.network import connected, network_options
 from ibrobot_zenoh.commands.text import message_from, shown
 from ibrobot_zenoh.transport import ZenohTransport

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import (
     Context,
-    ControlMode,
     Engine,
     Frame,
     Header,
@@ -30,9 +29,6 @@ from ibrobot_core.api import (
     PolicySpec,
     Sensor,
     SensorError,
-    Session,
-    SourceWorker,
-    Subscription,
     Teleop,
     TeleopCommand,
     TeleopError,
@@ -42,6 +38,7 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
+from ibrobot_core.app import ControlMode, Session, SourceWorker, Subscription
 
 
 class FakeSensor(Sensor):

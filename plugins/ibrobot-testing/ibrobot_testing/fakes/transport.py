@@ -12,7 +12,8 @@ from typing import override
 
 import attrs
 
-from ibrobot_core.api import HANDLER_THREADS, Handler, Payload, Transport, TransportError
+from ibrobot_core.api import Handler, Payload, Transport, TransportError
+from ibrobot_core.app import HANDLER_THREADS
 
 
 @attrs.frozen(eq=False)

@@ -1,0 +1,144 @@
+"""Where each name of `ibrobot_core.app` lives, in the groups of its page, for type checkers and `app.py`."""
+
+# What a plugin adds to a run
+from ibrobot_core.descriptors import (
+    Command as Command,
+    SectionDescriptor as SectionDescriptor,
+    SourceDescriptor as SourceDescriptor,
+    PanelDescriptor as PanelDescriptor,
+    GuideDescriptor as GuideDescriptor,
+    ConfigFile as ConfigFile,
+)
+
+# The robot YAML
+from ibrobot_core.config import (
+    RobotConfig as RobotConfig,
+    find_config as find_config,
+    load_config as load_config,
+    from_document as from_document,
+)
+from ibrobot_core.config.schema import (
+    ControlMode as ControlMode,
+    ExecutorConfig as ExecutorConfig,
+    RecordingConfig as RecordingConfig,
+    TransportConfig as TransportConfig,
+    Mount as Mount,
+    Align as Align,
+    ImageSpec as ImageSpec,
+    TASK_KEY as TASK_KEY,
+)
+from ibrobot_core.config.load import (
+    shipped_configs as shipped_configs,
+    read_document as read_document,
+    contract_alone as contract_alone,
+)
+from ibrobot_core.config.overrides import apply_overrides as apply_overrides, single_options as single_options
+from ibrobot_core.config.missing import unavailable_modes as unavailable_modes
+from ibrobot_core.config.yaml_nodes import Document as Document, parse_yaml as parse_yaml
+from ibrobot_core.config.show import dump_yaml as dump_yaml
+from ibrobot_core.config.models import (
+    ModelError as ModelError,
+    XmlElement as XmlElement,
+    read_xml as read_xml,
+    read_mjcf as read_mjcf,
+)
+
+# Installed plugins
+from ibrobot_core.plugins import (
+    Registry as Registry,
+    installed_plugins as installed_plugins,
+    example_type as example_type,
+)
+
+# A run
+from ibrobot_core.launch.session import (
+    LaunchRequest as LaunchRequest,
+    Session as Session,
+    SessionWorker as SessionWorker,
+    StateWatch as StateWatch,
+)
+from ibrobot_core.launch.runtime import Runtime as Runtime
+from ibrobot_core.component import (
+    Component as Component,
+    Worker as Worker,
+    CONTROL as CONTROL,
+    error_line as error_line,
+    error_text as error_text,
+)
+from ibrobot_core.control.link import ControlState as ControlState
+from ibrobot_core.run_hooks import RunHooks as RunHooks, RUN_KEYS as RUN_KEYS
+from ibrobot_core.launch.episodes import Episodes as Episodes
+from ibrobot_core.launch.transport import TransportLink as TransportLink
+from ibrobot_core.launch.models import check_models as check_models
+from ibrobot_core.inference.build import build_policy as build_policy
+from ibrobot_core.launch.absence import absent_sensors as absent_sensors, describe_absent as describe_absent
+
+# Sources
+from ibrobot_core.launch.session import CommandSource as CommandSource
+from ibrobot_core.launch.sources.source_worker import SourceWorker as SourceWorker
+from ibrobot_core.launch.sources.policy import PolicySource as PolicySource
+from ibrobot_core.launch.sources.operator_devices import OperatorDevices as OperatorDevices
+from ibrobot_core.interfaces import operate as operate, begin_operation as begin_operation
+from ibrobot_core.deadman import HOLD_S as HOLD_S
+from ibrobot_core.control.spline import Spline as Spline
+
+# Topics and services
+from ibrobot_core.bus import Bus as Bus, Subscription as Subscription, Received as Received
+from ibrobot_core.services import (
+    Service as Service,
+    NoRequest as NoRequest,
+    Plain as Plain,
+    RequestLimits as RequestLimits,
+)
+from ibrobot_core.launch.runtime import SET_MODE as SET_MODE, SetMode as SetMode, ESTOP as ESTOP, RESET as RESET
+from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
+from ibrobot_core.interfaces.policy import copied_tensors as copied_tensors
+
+# Episodes and datasets
+from ibrobot_core.ownership import Ownership as Ownership
+from ibrobot_core.interfaces import find_episode as find_episode, short_name as short_name
+from ibrobot_core.contract.metadata import robot_metadata as robot_metadata
+from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler
+from ibrobot_core.selection import Selection as Selection, Leaf as Leaf, value_at as value_at
+from ibrobot_core.contract.specs import SignalPart as SignalPart
+from ibrobot_core.contract.joint_units import calibrations as calibrations, with_closed_ends as with_closed_ends
+from ibrobot_core.units import NORM_MODES as NORM_MODES
+
+# Commands
+from ibrobot_core.cli.run import run_robot as run_robot
+from ibrobot_core.cli.options import (
+    run_options as run_options,
+    run_overrides as run_overrides,
+    EpisodePath as EpisodePath,
+)
+from ibrobot_core.outside import echo as echo, LogFormatter as LogFormatter
+from ibrobot_core.screen import Screen as Screen, styled as styled
+from ibrobot_core.terminal import KeyReader as KeyReader, check_key as check_key
+from ibrobot_core.signals import on_signals as on_signals, end_signals as end_signals
+
+# Guides
+from ibrobot_core.interfaces import Guide as Guide, Question as Question
+
+# Processes
+from ibrobot_core.child import Child as Child, Channel as Channel, Failure as Failure, open_parent as open_parent
+from ibrobot_core.memory import create_memory as create_memory, set_malloc as set_malloc
+from ibrobot_core.control.realtime import go_real_time as go_real_time
+from ibrobot_core.component import raise_thread_priority as raise_thread_priority
+
+# Errors
+from ibrobot_core.errors import (
+    ConfigError as ConfigError,
+    Problem as Problem,
+    RequestError as RequestError,
+    ComponentFailed as ComponentFailed,
+    PluginError as PluginError,
+    InUse as InUse,
+    DiskFull as DiskFull,
+    Declined as Declined,
+    WireError as WireError,
+    wrong_input as wrong_input,
+)
+
+__all__: list[str]
+
+def home_of(name: str) -> str: ...
