@@ -15,8 +15,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import pinocchio
+from ibrobot_planning.world.checked_arm import with_hulls
 from ibrobot_planning.world.collision import Collisions
-from ibrobot_planning.world.hulls import with_hulls
 from planning import Referee
 from planning_scenes import ARM_JOINTS, KINDS, PADDING_M, Maker, so101
 

@@ -250,7 +250,11 @@ WRONG: list[tuple[Callable[[MoveIt2], Any], type[Exception], str]] = [
     (lambda arm: arm.move_to_pose(POSE), PlanningError, "frame 'camera' is not the base"),
     (lambda arm: arm.move_to_pose(position=(0.2, 0.1)), PlanningError, "expected x, y, z, got 2 numbers"),
     (lambda arm: arm.move_to_pose(position=(0.2, 0, 0.1), target_link="hand"), PlanningError, "'hand' is not the"),
-    (lambda arm: arm.move_to_pose(quat_xyzw=DOWN), PlanningError, "a goal has one of pose, joints and xyz"),
+    (
+        lambda arm: arm.move_to_pose(quat_xyzw=DOWN),
+        PlanningError,
+        "a goal has one of pose, joints, xyz or object",
+    ),
     (lambda arm: arm.move_to_pose(), PlanningError, "a request needs at least one goal"),
     (lambda arm: arm.move_to_configuration([0.0] * 6), PlanningError, "6 positions for 5 joints"),
     (lambda arm: arm.move_to_configuration([0.1], ["tilt"]), PlanningError, "no joint 'tilt'; the joints are: pan"),

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from ibrobot_kinematics import robot_model
 from ibrobot_kinematics.poses import pose
 from ibrobot_kinematics.rotations import exp
-from ibrobot_planning.execution.requests import GoTo
-from ibrobot_planning.execution.results import MoveToPose
+from ibrobot_planning.execution.requests import GoTo, MoveToPose
 from ibrobot_planning.execution.services import CARTESIAN, COMPUTE_IK, PLAN, PLAN_GOAL
 from ibrobot_planning.execution.source import CMD_POSE, GO_TO, MOVE_ACTION, MOVE_TO_POSE
 from ibrobot_planning.goals.tool import Tool

@@ -52,7 +52,7 @@ def test_pose_by_angles_and_by_a_quaternion(robot):
     assert turned.beyond_reach == "nearest"
     q = turned.pose.orientation
     assert (q.x, q.y, q.z, q.w) == pytest.approx((0, 0, 1, 0), abs=1e-9)
-    goal = target("xyz=0.2,0,0.1 quat=0,0,0,1", robot).tool
+    goal = target("xyz=0.2,0,0.1 quaternion=0,0,0,1", robot).tool
     assert isinstance(goal, PoseGoal)
     assert (goal.pose.orientation, goal.beyond_reach) == (Quaternion(), "refuse")
 
@@ -80,7 +80,7 @@ NAMES = ", ".join(JOINTS)
         ("pan=1,pan=2", "pan is given twice"),
         (
             "0.5 pan=1",
-            "'0.5' is neither a joint nor xyz, axis, rpy, quat, beyond_reach, each followed by = and its value",
+            "'0.5' is neither a joint nor xyz, axis, rpy, quaternion, beyond_reach, each followed by = and its value",
         ),
         ("xyz=0.2,0.1", "xyz takes 3 numbers, got 2"),
         ("xyz=0.2,0.1,high", "xyz: 'high' is not a finite number"),
@@ -88,13 +88,14 @@ NAMES = ", ".join(JOINTS)
         ("axis=down", "axis needs a position, e.g. xyz=0.2,0.0,0.1"),
         ("rpy=0,0,0", "rpy needs a position, e.g. xyz=0.2,0.0,0.1"),
         ("xyz=0,0,1 axis=left", "axis is down or up or 3 numbers, got 'left'"),
-        ("xyz=0,0,1 axis=0,0,0", "axis has no length; give a direction, e.g. axis=0,0,-1 for down"),
+        ("xyz=0,0,1 axis=0,0,0", "axis has no length; give a direction, e.g. down, or 0, 0, -1"),
         ("xyz=0,0,1 axis=0,1", "axis takes 3 numbers, got 2"),
         ("xyz=0,0,1 rpy=0,1", "rpy takes 3 numbers, got 2"),
-        ("xyz=0,0,1 quat=0,0,1", "quat takes 4 numbers, got 3"),
-        ("xyz=0,0,1 quat=0,0,0,2", "quat has length 2, must be 1; the order is x, y, z, w"),
+        ("xyz=0,0,1 quat=0,0,0,1", "quat is called quaternion"),
+        ("xyz=0,0,1 quaternion=0,0,1", "quaternion takes 4 numbers, got 3"),
+        ("xyz=0,0,1 quaternion=0,0,0,2", "quaternion has length 2, must be 1; the order is x, y, z, w"),
         ("xyz=0,0,1 axis=down rpy=0,0,0", "axis and rpy exclude each other"),
-        ("xyz=0,0,1 beyond_reach=nearest", "beyond_reach needs an orientation: rpy or quat"),
+        ("xyz=0,0,1 beyond_reach=nearest", "beyond_reach needs an orientation: rpy or quaternion"),
         (
             "xyz=0,0,1 rpy=0,0,0 beyond_reach=near",
             "beyond_reach is one of refuse, nearest, keep_axis, arm_plane, current, free; got 'near'",

@@ -8,8 +8,8 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_planning.world.arm import Arm, read_arm
+from ibrobot_planning.world.checked_arm import with_hulls
 from ibrobot_planning.world.collision import Collisions, unchecked_pairs
-from ibrobot_planning.world.hulls import with_hulls
 from ibrobot_planning.world.objects import Cylinder, Sphere, World, WorldObject
 
 from ibrobot_core.api import Pose, Vector3

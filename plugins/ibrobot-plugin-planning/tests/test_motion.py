@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from ibrobot_planning.execution.plans import GoalPlans
-from ibrobot_planning.execution.requests import GoTo, Numbered
-from ibrobot_planning.execution.results import MoveResult, MoveToConfiguration, MoveToPose, Results
+from ibrobot_planning.execution.requests import GoTo, MoveToConfiguration, MoveToPose, Numbered
+from ibrobot_planning.execution.results import MoveResult, Results
 from ibrobot_planning.execution.services import CARTESIAN, COMPUTE_FK, COMPUTE_IK, PLAN
 from ibrobot_planning.execution.source import (
     CANCEL,
@@ -206,7 +206,7 @@ def test_cmd_pose_is_a_goal(run, stamped: bool):
         ),
         (
             Pose(Vector3(0.2, 0.0, 0.1), Quaternion(1.0, 0.0, 0.0, 1.0)),
-            "INVALID_GOAL_CONSTRAINTS: the orientation is a quaternion of length 1.41, must be 1",
+            "INVALID_GOAL_CONSTRAINTS: the orientation of the goal is a quaternion of length 1.41, must be 1",
         ),
     ],
 )
@@ -262,7 +262,10 @@ def test_request_that_makes_no_sense_is_rejected(run):
     result = call(runtime, MOVE_TO_POSE, MoveToPose(Pose(), 1.5))
     assert result.message == "velocity_scaling is 1.5, must be from 0.01 to 1"
     result = call(runtime, MOVE_TO_POSE, MoveToPose(Pose(Vector3(0.2, 0.0, 0.1), Quaternion(w=0.0))))
-    assert (result.outcome, result.message) == ("REJECTED", "the orientation is a quaternion of length 0, must be 1")
+    assert (result.outcome, result.message) == (
+        "REJECTED",
+        "the orientation of the goal is a quaternion of length 0, must be 1",
+    )
 
 
 def test_end_of_the_run_ends_a_service_that_waits(run):
@@ -486,3 +489,26 @@ def test_poses_on_the_axis_of_the_base_are_planned_or_refused(run, policy: str, 
     goal = {"xyz": list(xyz), "quaternion": [0, 0, 0, 1], "beyond_reach": policy}
     for answer in (bus.call(PLAN, {"goals": [goal]}), bus.call(COMPUTE_IK, {"goal": goal})):
         assert "Error" not in answer.message
+
+
+def test_goals_of_services_have_the_keys_of_task_files(start, tmp_path):
+    """One grammar: relative to an object, relative to the tool, a direction by its name."""
+    cup = "world: {objects: {cup: {shape: sphere, radius: 0.02, position: [0.2, 0.1, 0.05]}}}\n"
+    bus = start(text=robot_yaml(tmp_path) + cup).session.bus
+    tool = bus.call(COMPUTE_FK).poses[0].pose.position
+    goals = {
+        (0.2, 0.1, 0.15): {"object": "cup", "xyz": [0.0, 0.0, 0.1]},
+        (tool.x, tool.y, tool.z - 0.02): {"xyz": [0.0, 0.0, -0.02], "relative": True},
+        (0.2, 0.05, 0.1): {"xyz": [0.2, 0.05, 0.1], "axis": "down", "angle_tolerance": 0.02},
+    }
+    for place, goal in goals.items():
+        answer = bus.call(COMPUTE_IK, {"goal": goal})
+        assert answer.code is PlanCode.SUCCESS, answer.message
+        joints = dict(zip(answer.joint_state.name, answer.joint_state.position.tolist(), strict=True))
+        reached = bus.call(COMPUTE_FK, {"joints": joints}).poses[0].pose.position
+        assert (reached.x, reached.y, reached.z) == pytest.approx(place, abs=2e-3)
+        assert bus.call(PLAN, {"goals": [goal]}).code is PlanCode.SUCCESS
+    answer = bus.call(PLAN, {"goals": [{"object": "mug"}]})
+    assert (answer.code, answer.message) == (PlanCode.INVALID_OBJECT_NAME, "no object 'mug'; the objects are: cup")
+    with pytest.raises(RequestError, match=r"goals\.0\.quat: unknown key; known keys: .*, quaternion, "):
+        bus.call(PLAN, {"goals": [{"xyz": [0.2, 0.0, 0.1], "quat": [0, 0, 0, 1]}]})

@@ -69,7 +69,7 @@ def test_world_with_clouds_has_no_cells_without_a_run(yaml: Path, no_leaks: None
         ("pan=0.3", "joints"),
         ("xyz=0.2,0.05,0.1", "position"),
         ("xyz=0.2,0.05,0.1 axis=down", "position with axis"),
-        ("xyz=0.2,0.05,0.1 quat=1,0,0,0 beyond_reach=free", "pose"),
+        ("xyz=0.2,0.05,0.1 quaternion=1,0,0,0 beyond_reach=free", "pose"),
     ],
 )
 def test_kinds_of_goals(yaml: Path, goal: str, kind: str):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from ibrobot_planning.planners.profile import RestToRest
+from ibrobot_planning.planners.joint import RestToRest
 
 
 def powers_of_ten(low: float, high: float) -> st.SearchStrategy[float]:

@@ -13,8 +13,8 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from ibrobot_kinematics.clearance import CLEARANCE
+from ibrobot_planning.execution.motions import Execution
 from ibrobot_planning.execution.source import GO_TO, MOVE_TO_CONFIGURATION, MOVE_TO_POSE, RESULT
-from ibrobot_planning.execution.tracks import Execution
 from ibrobot_planning.world.objects import SNAPSHOT, World
 from ibrobot_testing.fakes import FakePlanner
 
@@ -180,7 +180,7 @@ def some(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
 POLICIES = st.sampled_from(["refuse", "nearest", "keep_axis", "arm_plane", "current", "free", "no"])
 GOAL = some(
     pose=NAMES, joints=JOINT_VALUES, xyz=THREE, axis=THREE, rpy=THREE, quaternion=st.lists(NUMBERS, max_size=4),
-    joint_tolerance=NUMBERS, position_tolerance=NUMBERS, axis_tolerance=NUMBERS, beyond_reach=POLICIES,
+    joint_tolerance=NUMBERS, position_tolerance=NUMBERS, angle_tolerance=NUMBERS, beyond_reach=POLICIES,
 )  # fmt: skip
 TOOL = st.fixed_dictionaries({"xyz": st.tuples(NUMBERS, NUMBERS, NUMBERS).map(list)}, optional={"axis": THREE})
 GOALS = st.one_of(GOAL, TOOL)

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from ibrobot_kinematics.srdf import read_srdf
 from ibrobot_kinematics.urdf import read_urdf
-from ibrobot_planning.goals.named_poses import named_pose, pose_names
+from ibrobot_planning.commands.description import srdf_of as srdf
+from ibrobot_planning.goals.joints import named_pose, pose_names
 from ibrobot_planning.goals.text import target
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.tasks.format import MoveStep
-from ibrobot_planning.tasks.goals import move_target
 from ibrobot_planning.world.arm import robot_arm
+from ibrobot_planning.world.checked_arm import urdf_names
 from ibrobot_planning.world.collision import unchecked_pairs
 from ibrobot_planning.world.objects import World
-from ibrobot_planning.world.semantics import srdf, urdf_names
 
 from ibrobot_core.api import Context, NamedGoal, PlanningError, PlanRequest, SteppedClock
 
@@ -114,7 +114,7 @@ def test_group_states_of_all_groups_are_one_pose(described, tmp_path):
 
 def test_group_state_is_a_goal_of_a_step_with_the_joints_of_the_arm(described, tmp_path):
     robot = with_states(described, tmp_path / "arm.srdf", PAN, JAW)
-    assert move_target(MoveStep(pose="aside"), robot, ARM, World()).joints == {"pan": 0.7, "lift": 0.1}
+    assert MoveStep(pose="aside").target(robot, ARM, World()).joints == {"pan": 0.7, "lift": 0.1}
 
 
 def test_group_states_that_contradict_each_other_are_named(described, tmp_path):

@@ -76,19 +76,23 @@ def test_goals_of_the_request_count_once(start: Make):
     assert position(runtime)[0] == pytest.approx(0.0, abs=0.1)
 
 
-@pytest.mark.parametrize("goal", ["pan=5", "grip=0.1"], ids=["outside limits", "no executor"])
+@pytest.mark.parametrize(
+    ("goal", "code"),
+    [("pan=5", "INVALID_GOAL_CONSTRAINTS"), ("grip=0.1", "PLANNING_FAILED")],
+    ids=["outside limits", "no executor"],
+)
 def test_goal_that_cannot_be_reached_is_counted_and_the_next_one_tried(
-    start: Make, goal: str, caplog: pytest.LogCaptureFixture
+    start: Make, goal: str, code: str, caplog: pytest.LogCaptureFixture
 ):
     runtime = start(mode="plan", goals=(goal, "up"))
     to_the_end(runtime)
     summary = runtime.summary()
     assert summary["goals_failed"] == 1
-    assert [(each["goal"], each["code"]) for each in summary["goals"]] == [(goal, "PLANNING_FAILED"), ("up", "SUCCESS")]
-    assert f"goal {goal} failed: PLANNING_FAILED: " in caplog.text
+    assert [(each["goal"], each["code"]) for each in summary["goals"]] == [(goal, code), ("up", "SUCCESS")]
+    assert f"goal {goal} failed: {code}: " in caplog.text
     rows = runtime.plan.mode.source.summary_rows()
     assert rows[0] == ("goals", "1 of 2 reached")
-    assert rows[1][1].startswith(f"{goal}: PLANNING_FAILED: ")
+    assert rows[1][1].startswith(f"{goal}: {code}: ")
     assert position(runtime)[0] == pytest.approx(0.4, abs=0.03)
 
 

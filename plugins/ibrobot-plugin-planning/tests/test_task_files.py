@@ -10,9 +10,9 @@ import attrs
 import pytest
 from ibrobot_kinematics.poses import orientation, pose_at
 from ibrobot_kinematics.rotations import from_rpy
+from ibrobot_planning.goals.grammar import upright
 from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
 from ibrobot_planning.tasks.format import MoveStep
-from ibrobot_planning.tasks.goals import move_target, upright
 from ibrobot_planning.tasks.reading import EXAMPLES, find_task, read_task
 from ibrobot_planning.world.objects import Sphere, World, WorldObject
 from ibrobot_planning.world.section import first_world, scene_objects
@@ -102,8 +102,12 @@ MALFORMED = {
         "steps.0.move.axis: expected a list or down or up, got 'left'",
     ),
     "quaternion of another length": (
-        move("{xyz: [0, 0, 1], quat: [1, 1, 0, 0]}"),
-        "steps.0.move: quat has length 1.41",
+        move("{xyz: [0, 0, 1], quaternion: [1, 1, 0, 0]}"),
+        "steps.0.move: quaternion has length 1.41",
+    ),
+    "another name of the quaternion": (
+        move("{xyz: [0, 0, 1], quat: [0, 0, 0, 1]}"),
+        "steps.0.move.quat: unknown key; known keys: pose, joints, xyz, object, relative, axis, rpy, quaternion",
     ),
     "policy for no orientation": (move("{xyz: [0, 0, 1], beyond_reach: free}"), "beyond_reach needs an orientation"),
     "unknown policy": (
@@ -308,7 +312,7 @@ def test_goals_at_objects_are_in_an_upright_frame(tmp_path: Path, rpy: tuple[flo
     assert frame[0, 0] == pytest.approx(1 - 2 * turned.z**2, abs=0.02)
     world = World({"thing": WorldObject(Sphere(0.1), pose)})
     step = MoveStep(object="thing", xyz=(0.1, 0.0, 0.05), rpy=(0.0, 0.0, 0.0))
-    target = move_target(step, make_robot(tmp_path), ARM, world).tool
+    target = step.target(make_robot(tmp_path), ARM, world).tool
     assert isinstance(target, PoseGoal)
     assert target.pose.position.z == pytest.approx(0.35)
     assert target.pose.orientation.z == pytest.approx(turned.z, abs=0.02)
@@ -316,7 +320,7 @@ def test_goals_at_objects_are_in_an_upright_frame(tmp_path: Path, rpy: tuple[flo
 
 def test_directions_at_objects_turn_with_them(tmp_path: Path):
     world = World({"thing": WorldObject(Sphere(0.1), pose_at((0.1, 0.2, 0.3), (0, 0, 1.5707963)))})
-    target = move_target(MoveStep(object="thing", axis=(1.0, 0.0, 0.0)), make_robot(tmp_path), ARM, world).tool
+    target = MoveStep(object="thing", axis=(1.0, 0.0, 0.0)).target(make_robot(tmp_path), ARM, world).tool
     assert isinstance(target, PositionGoal)
     assert target.axis is not None
     assert (target.axis.x, target.axis.y) == pytest.approx((0, 1), abs=1e-6)

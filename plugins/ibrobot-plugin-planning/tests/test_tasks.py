@@ -102,7 +102,7 @@ def test_every_kind_of_move(run):
         f"move: {DOWN}",
         "move: {xyz: [0.2, 0, 0.1]}",
         "move: {xyz: [0.2, 0, 0.1], rpy: [3.14159, 0, 0], beyond_reach: keep_axis}",
-        "move: {xyz: [0.2, 0, 0.1], quat: [1, 0, 0, 0], beyond_reach: nearest}",
+        "move: {xyz: [0.2, 0, 0.1], quaternion: [1, 0, 0, 0], beyond_reach: nearest}",
         "move: {any: [{xyz: [9, 0, 0]}, {pose: up}]}",
         f"move: {DOWN}",
         "move: {line: [{xyz: [0.2, -0.05, 0.1], axis: down}]}",

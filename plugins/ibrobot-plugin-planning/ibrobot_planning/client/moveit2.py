@@ -6,14 +6,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any, overload
 
-from ibrobot_core.api import (
-    JointState,
-    JointTrajectory,
-    NotSupported,
-    PlanCode,
-    PlanningError,
-    PoseStamped,
-)
+from ibrobot_core.api import JointState, JointTrajectory, NotSupported, PlanCode, PlanningError, PoseStamped
 from ibrobot_planning.client.collision_objects import AnyPose, CollisionObjects, Orientation, Position, numbers
 from ibrobot_planning.client.motion import (
     ExecutionFuture,
@@ -260,7 +253,7 @@ class MoveIt2(CollisionObjects):
         self._check_frame(frame_id)
         self._check_link(target_link)
         least = tolerance if isinstance(tolerance, int | float) else min(tolerance)
-        self._goals[-1] |= {"quaternion": numbers(quat_xyzw, "xyzw"), "orientation_tolerance": float(least)}
+        self._goals[-1] |= {"quaternion": numbers(quat_xyzw, "xyzw"), "angle_tolerance": float(least)}
 
     def set_joint_goal(
         self,

@@ -16,15 +16,11 @@ import click
 import numpy as np
 
 from ibrobot_core.api import (
-    Goal,
-    JointGoal,
     JointTrajectory,
     MissingDependency,
     NotSupported,
     PlanCode,
-    Planner,
     PlanningError,
-    PlanRequest,
     PoseGoal,
     PositionGoal,
     Robot,
@@ -45,8 +41,9 @@ from ibrobot_core.app import (
     run_options,
     wrong_input,
 )
+from ibrobot_planning.execution.plans import GoalPlans, arm_joints
 from ibrobot_planning.goals.text import Target, target
-from ibrobot_planning.world.objects import SNAPSHOT, World
+from ibrobot_planning.world.objects import world_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -74,7 +71,12 @@ class Plan:
 
 @click.command()
 @click.option("--from", "start", required=True, metavar="START", help="A pose, or joint=rad,… (others at 0).")
-@click.option("--goal", required=True, metavar="GOAL", help="A pose, joint=rad,…, or xyz=X,Y,Z with axis, rpy or quat.")
+@click.option(
+    "--goal",
+    required=True,
+    metavar="GOAL",
+    help="A pose, joint=rad,…, or xyz=X,Y,Z with axis, rpy or quaternion.",
+)
 @click.option(
     "--speed",
     type=click.FloatRange(0, 1, min_open=True),
@@ -97,7 +99,7 @@ def plan(start: str, goal: str, speed: float, plot: Path | None, config: str | N
             _check_plot(plot)
         loaded, mode = _loaded(config, options)
         robot = loaded.robot
-        joints = _arm(loaded, mode)
+        joints = arm_joints(loaded, mode)
         from_ = _positions(start, robot)
         wanted = target(goal, robot, speed)
     facts: dict[str, Any] = {
@@ -144,14 +146,6 @@ def _loaded(config: str | None, options: dict[str, Any]) -> tuple[RobotConfig, C
     return loaded, loaded.control_modes[name]
 
 
-def _arm(config: RobotConfig, mode: ControlMode) -> tuple[str, ...]:
-    executors = [config.executors[name] for name in mode.executors]
-    arms = [executor.joints for executor in executors if executor.goals == "trajectory"]
-    if len(arms) != 1:
-        raise NotSupported(f"mode {mode.name} has {len(arms)} executors of trajectories, a plan needs one")
-    return arms[0]
-
-
 def _positions(text: str, robot: Robot) -> Vector:
     """Positions of all joints [rad], shape (J,)."""
     parsed = target(text, robot)
@@ -178,24 +172,19 @@ def _planned(
         PlanningError: if there is none.
     """
     robot = config.robot
-    goal: Goal | None = wanted.tool
-    mine = {name: value for name, value in wanted.joints.items() if name in joints}
-    if goal is None:
-        if not mine:
-            raise PlanningError(f"goal {wanted.text!r} moves no joint of the arm: {', '.join(joints)}")
-        goal = JointGoal(tuple(mine), np.array(list(mine.values())))
-    assert mode.planner is not None
     with _session(config, seed) as session:
-        planner: Planner = session.make("planner", mode.planner, mode.planner.type)
+        plans = GoalPlans(session, mode)
+        planner = plans.make()
         planner.load()
         begun = time.monotonic()
-        others = dict(zip(robot.joint_names, start.tolist(), strict=True))
-        result = planner.plan(
-            PlanRequest(joints, start[robot.indices(joints)], goal, wanted.velocity_scaling, others=others)
-        )
+        plans.check(wanted)
+        result = plans.plan(wanted, start)[1]
         elapsed_s = time.monotonic() - begun
         planner.close()
+        if result is None:
+            raise PlanningError(f"goal {wanted.text!r} moves no joint of the arm: {', '.join(joints)}")
         found = _sampled(result.trajectory, robot, start)
+        others = dict(zip(robot.joint_names, start.tolist(), strict=True))
         clearance = _clearance(session, joints, others, found)
     limits = robot.max_velocity[robot.indices(joints)]
     peaks = np.abs(found.velocities).max(axis=0)
@@ -258,9 +247,7 @@ def _clearance(
     session: Session, joints: tuple[str, ...], others: dict[str, float], found: Plan
 ) -> dict[str, Any] | None:
     """The least distance of the arm, and of what it carries, from objects; None without objects or collision checks."""
-    bus = session.bus
-    world = bus.call(SNAPSHOT) if bus.serves(SNAPSHOT) else World()
-    assert isinstance(world, World)
+    world = world_of(session.bus)
     if not world.objects:
         return None
     from ibrobot_planning.world.checked_arm import checked_arm

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 
 import attrs
 import numpy as np
+from ibrobot_kinematics import robot_model
 
 from ibrobot_core.api import (
     AnyGoal,
@@ -14,23 +16,24 @@ from ibrobot_core.api import (
     IbrobotError,
     JointGoal,
     JointTrajectory,
-    NamedGoal,
     PlanCode,
     Planner,
     PlannerDescriptor,
     PlanningError,
     PlanRequest,
     PlanResult,
-    PoseGoal,
-    PositionGoal,
     Vector,
     ns,
 )
-from ibrobot_core.app import ControlMode, Session
-from ibrobot_planning.execution.tracks import ExecutorGoal
-from ibrobot_planning.goals.named_poses import named_pose
+from ibrobot_core.app import ControlMode, Registry, RobotConfig, Session
+from ibrobot_planning.execution.motions import ExecutorGoal
+from ibrobot_planning.goals.errors import invalid_goal
+from ibrobot_planning.goals.grammar import GoalOptions
+from ibrobot_planning.goals.joints import without_names
 from ibrobot_planning.goals.text import Target
+from ibrobot_planning.goals.tool import Tool
 from ibrobot_planning.planners.completion import check_size, completed
+from ibrobot_planning.world.objects import World, world_of
 
 
 class GoalPlans:
@@ -41,7 +44,7 @@ class GoalPlans:
         mode: a mode with a planner.
 
     Attributes:
-        planner: the loaded planner, once the mode has begun.
+        planner: the mode's planner, once `make` was called.
     """
 
     planner: Planner
@@ -51,6 +54,37 @@ class GoalPlans:
         self._mode = mode
         self._lock = threading.Lock()
         """Held while the planner plans."""
+
+    def make(self) -> Planner:
+        """Make the planner; its `load` takes a moment."""
+        assert self._mode.planner is not None
+        self.planner = self._session.make("planner", self._mode.planner, self._mode.planner.type)
+        return self.planner
+
+    @cached_property
+    def tool(self) -> Tool:
+        """Inverse kinematics of the tool.
+
+        Raises:
+            KinematicsError: without a model of the robot.
+        """
+        return Tool(robot_model(self._session.config.robot))
+
+    def surroundings(self, goals: Sequence[GoalOptions], start: Vector) -> tuple[World, Vector | None]:
+        """The objects, and the position of the tool [m], shape (3,), at `start` if a goal is relative to it."""
+        relative = any(each.relative for each in goals)
+        return world_of(self._session.bus), self.tool.model.forward(start).position if relative else None
+
+    def any_goal(self, goals: Sequence[GoalOptions], start: Vector) -> Goal:
+        """One goal as it is, several as alternatives.
+
+        Raises:
+            PlanningError: without goals, or as `GoalOptions.goal`.
+        """
+        if not goals:
+            raise invalid_goal("a request needs at least one goal")
+        place = self.surroundings(goals, start)
+        return goals[0].goal(*place) if len(goals) == 1 else AnyGoal(tuple(each.goal(*place) for each in goals))
 
     def check(self, target: Target) -> None:
         """Check that the mode can reach for a goal of this kind.
@@ -64,8 +98,7 @@ class GoalPlans:
 
     def _check_planner(self, target: Target) -> None:
         """Refuse a goal of the tool, or alternatives, where the planner takes joint positions only."""
-        planners = self._session.registry.of_kind("planner")
-        takes = [each.type for each in planners if isinstance(each, PlannerDescriptor) and each.tool_goals]
+        takes = tool_planners(self._session.registry)
         assert self._mode.planner is not None
         if self._mode.planner.type not in takes:
             raise PlanningError(
@@ -112,29 +145,8 @@ class GoalPlans:
         joints = executors[arms[0]].joints
         if arms[0] in found:
             given = ", ".join(joint for joint in target.joints if joint in joints)
-            raise PlanningError(
-                f"goal {target.text!r}: {given} moves the tool, and cannot be given beside its position",
-                PlanCode.INVALID_GOAL_CONSTRAINTS,
-            )
-        return {arms[0]: self.with_states(target.tool, joints), **found}
-
-    def with_states(self, goal: Goal, joints: tuple[str, ...]) -> Goal:
-        """A goal whose alternatives have positions of `joints` in place of group states of the SRDF.
-
-        Raises:
-            PlanningError: for an unknown pose.
-        """
-        robot = self._session.config.robot
-        if not isinstance(goal, AnyGoal):
-            return goal
-        goals: list[JointGoal | NamedGoal | PositionGoal | PoseGoal] = []
-        for each in goal.goals:
-            if isinstance(each, NamedGoal) and each.name not in robot.description.poses:
-                state = {joint: value for joint, value in named_pose(robot, each.name).items() if joint in joints}
-                goals.append(JointGoal(tuple(state), np.array(list(state.values()))))
-            else:
-                goals.append(each)
-        return attrs.evolve(goal, goals=tuple(goals))
+            raise invalid_goal(f"goal {target.text!r}: {given} moves the tool, and cannot be given beside its position")
+        return {arms[0]: target.tool, **found}
 
     def plan(self, target: Target, start: Vector) -> tuple[dict[str, ExecutorGoal], PlanResult | None]:
         """Plan a goal.
@@ -194,12 +206,35 @@ class GoalPlans:
         Raises:
             PlanningError: with MoveIt's code.
         """
+        goal = without_names(request.goal, self._session.config.robot, request.joints)
         with self._lock:
             try:
-                return self.planner.plan(request)
+                return self.planner.plan(attrs.evolve(request, goal=goal))
             except IbrobotError:
                 raise
             except Exception as error:
                 # A request that no planner foresaw must not end the run of a robot.
                 self._session.log.exception("a bug of planner %s; please report it", type(self.planner).__name__)
                 raise PlanningError(f"the planner failed: {type(error).__name__}: {error}", PlanCode.FAILURE) from error
+
+
+def tool_planners(registry: Registry) -> list[str]:
+    """The types of planners that take goals of the tool."""
+    planners = registry.of_kind("planner")
+    return [each.type for each in planners if isinstance(each, PlannerDescriptor) and each.tool_goals]
+
+
+def arm_joints(config: RobotConfig, mode: ControlMode) -> tuple[str, ...]:
+    """The joints of the arm.
+
+    Raises:
+        PlanningError: where the mode has not exactly one executor of trajectories.
+    """
+    executors = [config.executors[name] for name in mode.executors]
+    arms = [executor.joints for executor in executors if executor.goals == "trajectory"]
+    if len(arms) != 1:
+        raise PlanningError(
+            f"mode {mode.name} has {len(arms)} executors of trajectories, planning needs one",
+            PlanCode.INVALID_GROUP_NAME,
+        )
+    return arms[0]

@@ -2,94 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import attrs
-import numpy as np
-from ibrobot_kinematics.poses import orientation
-from ibrobot_kinematics.rotations import from_rpy
 
 from ibrobot_core.api import (
-    AnyGoal,
     Goal,
     Header,
-    JointGoal,
     JointState,
     JointTrajectory,
     JointTrajectoryPoint,
-    LinearGoal,
-    NamedGoal,
-    OrientationPolicy,
     PlanCode,
-    PlanningError,
     Pose,
-    PoseGoal,
     PoseStamped,
-    PositionGoal,
-    Quaternion,
-    Vector3,
+    Vector,
     documented,
     option,
 )
-from ibrobot_planning.goals.text import LEAST_SCALING, Target
-
-_NEARLY_ONE = 1e-3
-"""Allowed deviation of a quaternion's length from 1."""
-
-
-@documented
-@attrs.frozen
-class GoalOptions:
-    """A goal: a named pose, joints, or a position of the tool, alone or with a direction or an orientation."""
-
-    pose: str | None = option(None, help="a pose of the robot YAML or the SRDF")
-    joints: Mapping[str, float] | None = option(None, unit="rad", help="positions of joints; the others stay")
-    xyz: tuple[float, float, float] | None = option(None, unit="m", help="position of the tool in the base frame")
-    axis: tuple[float, float, float] | None = option(None, help="direction of the tool's z axis, e.g. [0, 0, -1]")
-    rpy: tuple[float, float, float] | None = option(None, unit="rad", help="orientation of the tool")
-    quaternion: tuple[float, float, float, float] | None = option(None, help="x, y, z, w, in place of rpy")
-    joint_tolerance: float = option(0.0, unit="rad", ge=0, help="allowed deviation if the joints' goal is blocked")
-    position_tolerance: float = option(0.001, unit="m", gt=0, help="of the tool")
-    axis_tolerance: float = option(0.01, unit="rad", gt=0, help="of the axis")
-    orientation_tolerance: float = option(0.01, unit="rad", gt=0, help="of the orientation")
-    beyond_reach: OrientationPolicy = option("refuse", help="how to treat an orientation that the arm cannot take")
-
-    def __attrs_post_init__(self) -> None:
-        goals = {"pose": self.pose, "joints": self.joints, "xyz": self.xyz}
-        given = [key for key, value in goals.items() if value is not None]
-        if len(given) != 1:
-            raise ValueError(f"a goal has one of pose, joints and xyz; got {' and '.join(given) or 'none'}")
-        turns = {"axis": self.axis, "rpy": self.rpy, "quaternion": self.quaternion}
-        turned = [key for key, value in turns.items() if value is not None]
-        if turned and self.xyz is None:
-            raise ValueError(f"{turned[0]} needs a position: xyz")
-        if len(turned) > 1:
-            raise ValueError(f"{turned[0]} and {turned[1]} exclude each other")
-        if self.beyond_reach != "refuse" and turned not in (["rpy"], ["quaternion"]):
-            raise ValueError("beyond_reach needs an orientation: rpy or quaternion")
-        if self.axis is not None and not any(self.axis):
-            raise ValueError("axis has no length; give a direction, e.g. [0, 0, -1] for down")
-        if self.quaternion is not None and abs(math.hypot(*self.quaternion) - 1) > _NEARLY_ONE:
-            raise ValueError(
-                f"quaternion has length {math.hypot(*self.quaternion):.3g}, must be 1; the order is x, y, z, w"
-            )
-
-    def goal(self) -> JointGoal | NamedGoal | PositionGoal | PoseGoal:
-        """The goal as planners take it."""
-        if self.pose is not None:
-            return NamedGoal(self.pose)
-        if self.joints is not None:
-            return JointGoal(tuple(self.joints), np.array(list(self.joints.values())), self.joint_tolerance)
-        assert self.xyz is not None
-        position, axis = Vector3(*self.xyz), None if self.axis is None else Vector3(*self.axis)
-        turn = Quaternion(*self.quaternion) if self.quaternion is not None else None
-        if self.rpy is not None:
-            turn = orientation(from_rpy(*self.rpy))
-        if turn is None:
-            return PositionGoal(position, axis, self.position_tolerance, self.axis_tolerance)
-        return PoseGoal(Pose(position, turn), self.position_tolerance, self.orientation_tolerance, self.beyond_reach)
+from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions
+from ibrobot_planning.goals.text import Target
 
 
 def _few(most: int) -> Callable[[object, attrs.Attribute[Any], Sequence[object]], None]:
@@ -114,14 +46,6 @@ class MoveRequest:
     goals: tuple[GoalOptions, ...] = option(validator=_few(20), help="alternatives, in order of preference")
     velocity_scaling: float = _scaling("velocity")
     acceleration_scaling: float = _scaling("acceleration")
-
-    def goal(self) -> Goal:
-        """The goal as planners take it.
-
-        Raises:
-            PlanningError: without goals.
-        """
-        return any_goal(self.goals)
 
 
 @documented
@@ -154,6 +78,38 @@ class PlanAhead:
 
 @documented
 @attrs.frozen
+class MoveToPose:
+    """Request of ibrobot_msgs/srv/MoveToPose."""
+
+    target_pose: Pose = option(help="of the tool centre point, in the base frame")
+    velocity_scaling: float = option(0.0, help="fraction of the velocity limits, in (0, 1]; 0 means 1")
+
+
+@attrs.frozen(eq=False)
+class JointTarget:
+    """A sensor_msgs/msg/JointState as a goal, of which only names and positions are read."""
+
+    name: tuple[str, ...]
+    position: Vector
+    """One for each joint [rad]."""
+    velocity: Vector | None = None
+    effort: Vector | None = None
+    header: Header = Header()
+
+
+@documented
+@attrs.frozen
+class MoveToConfiguration:
+    """Request of ibrobot_msgs/srv/MoveToConfiguration."""
+
+    target_joint_state: JointState | JointTarget = option(
+        plain=JointTarget, help="names and positions [rad]; all other joints stay"
+    )
+    velocity_scaling: float = option(0.0, help="fraction of the velocity limits, in (0, 1]; 0 means 1")
+
+
+@documented
+@attrs.frozen
 class Numbered:
     """A request to `/planning/result`."""
 
@@ -172,22 +128,6 @@ class CartesianQuery:
     start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints are where they are")
     velocity_scaling: float = _scaling("velocity")
     acceleration_scaling: float = _scaling("acceleration")
-
-    def goal(self) -> LinearGoal:
-        """The goal as planners take it.
-
-        Raises:
-            PlanningError: without waypoints, or for one that is not a position of the tool.
-        """
-        waypoints = tuple(each.goal() for each in self.waypoints)
-        if not waypoints:
-            raise PlanningError("a straight path needs at least one waypoint", PlanCode.INVALID_GOAL_CONSTRAINTS)
-        for number, each in enumerate(waypoints):
-            if not isinstance(each, PositionGoal | PoseGoal):
-                raise PlanningError(
-                    f"waypoint {number} is not a position of the tool: give xyz", PlanCode.INVALID_GOAL_CONSTRAINTS
-                )
-        return LinearGoal(waypoints, self.least_fraction)  # type: ignore[arg-type]
 
 
 @documented
@@ -293,14 +233,3 @@ class Execute:
     def trajectory(self) -> JointTrajectory:
         """The trajectory."""
         return JointTrajectory(Header(), self.joint_names, self.points)
-
-
-def any_goal(goals: tuple[GoalOptions, ...]) -> Goal:
-    """One goal as it is, several as alternatives.
-
-    Raises:
-        PlanningError: without goals.
-    """
-    if not goals:
-        raise PlanningError("a request needs at least one goal", PlanCode.INVALID_GOAL_CONSTRAINTS)
-    return goals[0].goal() if len(goals) == 1 else AnyGoal(tuple(each.goal() for each in goals))

@@ -1,4 +1,4 @@
-"""Requests and result of the services of a planning mode: those of IB-Robot as attrs classes."""
+"""Results of the goals of a run."""
 
 from __future__ import annotations
 
@@ -8,42 +8,10 @@ from weakref import WeakKeyDictionary
 
 import attrs
 
-from ibrobot_core.api import Header, JointState, PlanCode, PlanningError, Pose, Vector, documented, option
+from ibrobot_core.api import PlanCode, PlanningError
 from ibrobot_core.app import Session
 
 type Outcome = Literal["SUCCEEDED", "REJECTED", "PLANNING_FAILED", "EXECUTION_FAILED", "CANCELLED"]
-
-
-@documented
-@attrs.frozen
-class MoveToPose:
-    """Request of ibrobot_msgs/srv/MoveToPose."""
-
-    target_pose: Pose = option(help="of the tool centre point, in the base frame")
-    velocity_scaling: float = option(0.0, help="fraction of the velocity limits, in (0, 1]; 0 means 1")
-
-
-@attrs.frozen(eq=False)
-class JointTarget:
-    """A sensor_msgs/msg/JointState as a goal, of which only names and positions are read."""
-
-    name: tuple[str, ...]
-    position: Vector
-    """One for each joint [rad]."""
-    velocity: Vector | None = None
-    effort: Vector | None = None
-    header: Header = Header()
-
-
-@documented
-@attrs.frozen
-class MoveToConfiguration:
-    """Request of ibrobot_msgs/srv/MoveToConfiguration."""
-
-    target_joint_state: JointState | JointTarget = option(
-        plain=JointTarget, help="names and positions [rad]; all other joints stay"
-    )
-    velocity_scaling: float = option(0.0, help="fraction of the velocity limits, in (0, 1]; 0 means 1")
 
 
 @attrs.frozen

@@ -18,13 +18,12 @@ from ibrobot_core.api import (
     PlanningError,
     PlanRequest,
     PlanResult,
-    PoseGoal,
     PoseStamped,
-    PositionGoal,
     Vector,
 )
 from ibrobot_core.app import ControlMode, NoRequest, Service, Session
-from ibrobot_planning.execution.plans import GoalPlans
+from ibrobot_planning.execution.motions import commanded
+from ibrobot_planning.execution.plans import GoalPlans, arm_joints
 from ibrobot_planning.execution.requests import (
     CartesianQuery,
     FkAnswer,
@@ -36,15 +35,16 @@ from ibrobot_planning.execution.requests import (
     PlanAnswer,
     PlanningScene,
     PlanQuery,
-    any_goal,
 )
+from ibrobot_planning.goals.errors import invalid_goal
+from ibrobot_planning.goals.grammar import line_goal
 from ibrobot_planning.goals.text import target
+from ibrobot_planning.goals.tool import Candidate
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
-from ibrobot_planning.world.objects import SNAPSHOT, World
+from ibrobot_planning.world.objects import world_of
 
 if TYPE_CHECKING:
-    from ibrobot_planning.goals.tool import Tool
     from ibrobot_planning.world.checked_arm import CheckedArm
 
 COMPUTE_IK = Service("/compute_ik", IkQuery, IkAnswer, "Joint positions for a position or pose of the tool.")
@@ -86,15 +86,6 @@ class PlanningServices:
         }
 
     @cached_property
-    def _tool(self) -> Tool:
-        find_engines()
-        from ibrobot_kinematics import robot_model
-
-        from ibrobot_planning.goals.tool import Tool
-
-        return Tool(robot_model(self._robot))
-
-    @cached_property
     def _checked(self) -> CheckedArm:
         find_engines()
         from ibrobot_planning.world.checked_arm import checked_arm
@@ -102,8 +93,7 @@ class PlanningServices:
         return checked_arm(self._robot, self._session.log)
 
     def _plan(self, query: PlanQuery) -> PlanAnswer:
-        scaling = query.velocity_scaling, query.acceleration_scaling
-        return self._planned(lambda: any_goal(query.goals), query.start, *scaling)
+        return self._planned(lambda start: self._plans.any_goal(query.goals, start), query)
 
     def _plan_goal(self, query: PlanAhead) -> PlanAnswer:
         def planned() -> PlanResult:
@@ -111,46 +101,29 @@ class PlanningServices:
             self._plans.check(aim)
             found = self._plans.plan(aim, self._start(query.start))[1]
             if found is None:
-                raise PlanningError(f"goal {aim.text!r} needs no plan", PlanCode.INVALID_GOAL_CONSTRAINTS)
+                raise invalid_goal(f"goal {aim.text!r} needs no plan")
             return found
 
         return _answer(planned)
 
     def _cartesian(self, query: CartesianQuery) -> PlanAnswer:
-        return self._planned(query.goal, query.start, query.velocity_scaling, query.acceleration_scaling)
+        def goal(start: Vector) -> Goal:
+            return line_goal(query.waypoints, query.least_fraction, *self._plans.surroundings(query.waypoints, start))
 
-    def _planned(
-        self, goal: Callable[[], Goal], start: Mapping[str, float], velocity: float, acceleration: float
-    ) -> PlanAnswer:
+        return self._planned(goal, query)
+
+    def _planned(self, goal: Callable[[Vector], Goal], query: PlanQuery | CartesianQuery) -> PlanAnswer:
         def planned() -> PlanResult:
-            joints, whole = self._joints(), self._start(start)
+            joints, whole = arm_joints(self._session.config, self._mode), self._start(query.start)
             others = dict(zip(self._robot.joint_names, whole.tolist(), strict=True))
-            aim = self._plans.with_states(goal(), joints)
-            first = whole[self._robot.indices(joints)]
-            return self._plans.planned(PlanRequest(joints, first, aim, velocity, acceleration, others))
+            first, scalings = whole[self._robot.indices(joints)], (query.velocity_scaling, query.acceleration_scaling)
+            return self._plans.planned(PlanRequest(joints, first, goal(whole), *scalings, others))
 
         return _answer(planned)
 
-    def _joints(self) -> tuple[str, ...]:
-        """The joints of the arm.
-
-        Raises:
-            PlanningError: where the mode has not exactly one executor of trajectories.
-        """
-        executors = [self._session.config.executors[name] for name in self._mode.executors]
-        arms = [executor.joints for executor in executors if executor.goals == "trajectory"]
-        if len(arms) != 1:
-            raise PlanningError(
-                f"mode {self._mode.name} has {len(arms)} executors of trajectories, planning needs one",
-                PlanCode.INVALID_GROUP_NAME,
-            )
-        return arms[0]
-
     def _start(self, given: Mapping[str, float]) -> Vector:
         """Present or given positions of all joints [rad], shape (J,)."""
-        state = self._session.state
-        # From the commanded positions, as motions begin there.
-        start = (state.command if state is not None else self._session.measured().position).copy()
+        start = commanded(self._session).copy()
         for name, value in given.items():
             if name not in self._robot.joint_names:
                 raise PlanningError(
@@ -164,12 +137,9 @@ class PlanningServices:
 
     def _ik(self, query: IkQuery) -> IkAnswer:
         try:
-            goal = query.goal.goal()
-            if not isinstance(goal, PositionGoal | PoseGoal):
-                raise PlanningError(
-                    "the goal is not a position of the tool: give xyz", PlanCode.INVALID_GOAL_CONSTRAINTS
-                )
-            found = self._tool.candidates(goal, self._start(query.start))
+            start = self._start(query.start)
+            goal = query.goal.tool_goal(*self._plans.surroundings((query.goal,), start))
+            found = self._plans.tool.candidates(goal, start)
             if query.avoid_collisions:
                 found = self._free(found)
         except PlanningError as error:
@@ -178,7 +148,7 @@ class PlanningServices:
         state = JointState(Header(self._session.clock.now_ns()), self._robot.joint_names, best.joints)
         return IkAnswer(PlanCode.SUCCESS, "", state, best.position_error, best.orientation_error)
 
-    def _free(self, candidates: list[Any]) -> list[Any]:
+    def _free(self, candidates: list[Candidate]) -> list[Candidate]:
         """The candidates without contacts.
 
         Raises:
@@ -191,7 +161,7 @@ class PlanningServices:
             padding, self_padding = planner.options.padding, planner.options.self_padding
         checked = self._checked
         checks = Collisions(
-            checked.arm, self._world(), self._robot.joint_names,
+            checked.arm, world_of(self._session.bus), self._robot.joint_names,
             padding=padding, self_padding=self_padding, unchecked=checked.unchecked,
         )  # fmt: skip
         free = [each for each in candidates if checks.free(each.joints)]
@@ -207,7 +177,7 @@ class PlanningServices:
         try:
             q = self._start(query.joints) if query.joints else self._session.measured().position
             header = Header(self._session.clock.now_ns(), BASE_FRAME)
-            links = query.links or (self._tool.model.tip,)
+            links = query.links or (self._plans.tool.model.tip,)
             return FkAnswer(PlanCode.SUCCESS, "", tuple(PoseStamped(header, self._pose(link, q)) for link in links))
         except PlanningError as error:
             return FkAnswer(error.code, str(error))
@@ -215,8 +185,8 @@ class PlanningServices:
     def _pose(self, link: str, q: Vector) -> Any:
         from ibrobot_kinematics.poses import homogeneous, pose
 
-        if link == self._tool.model.tip:
-            tip = self._tool.model.forward(q)
+        if link == self._plans.tool.model.tip:
+            tip = self._plans.tool.model.forward(q)
             return pose(homogeneous(tip.rotation, tip.position))
         checked = self._checked
         return pose(checked.arm.link_pose(checked.names.get(link, link), q))
@@ -226,18 +196,14 @@ class PlanningServices:
 
         return tuple(robot_arm(self._robot).frames)
 
-    def _world(self) -> World:
-        bus = self._session.bus
-        return bus.call(SNAPSHOT) if bus.serves(SNAPSHOT) else World()
-
     def _scene(self, request: NoRequest) -> PlanningScene:
         robot, reading = self._robot, self._session.measured()
         objects = {
             name: ObjectSummary(type(each.shape).__name__.lower(), each.pose, each.link, tuple(sorted(each.may_touch)))
-            for name, each in self._world().objects.items()
+            for name, each in world_of(self._session.bus).objects.items()
         }
         try:
-            tip, links = self._tool.model.tip, self._links()
+            tip, links = self._plans.tool.model.tip, self._links()
         except IbrobotError:  # a robot without a model can still move its joints
             tip, links = "", ()
         state = JointState(Header(reading.stamp_ns), robot.joint_names, reading.position, reading.velocity)

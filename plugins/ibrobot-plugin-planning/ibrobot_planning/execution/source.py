@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import queue
 import threading
 from collections import deque
@@ -21,7 +20,6 @@ from ibrobot_core.api import (
     NotSupported,
     OrientationPolicy,
     PlanCode,
-    Planner,
     PlanningError,
     PlanResult,
     Pose,
@@ -32,12 +30,13 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_core.app import ControlMode, ControlState, NoRequest, RequestLimits, Service, Session, SourceWorker
+from ibrobot_planning.execution.motions import Execution, commanded
 from ibrobot_planning.execution.plans import GoalPlans
-from ibrobot_planning.execution.requests import Execute, GoTo, MoveRequest, Numbered
-from ibrobot_planning.execution.results import MoveResult, MoveToConfiguration, MoveToPose, Outcome, results_of
+from ibrobot_planning.execution.requests import Execute, GoTo, MoveRequest, MoveToConfiguration, MoveToPose, Numbered
+from ibrobot_planning.execution.results import MoveResult, Outcome, results_of
 from ibrobot_planning.execution.services import PlanningServices
-from ibrobot_planning.execution.tracks import Execution
 from ibrobot_planning.goals.text import Target, target
+from ibrobot_planning.goals.tool import pose_matrix
 
 GO_TO = Service(
     "/planning/go_to", GoTo, int, "Move to a goal, which replaces the present one; answers with its number.", "goal"
@@ -79,8 +78,6 @@ _WATCH_S = 0.02
 _ENDED = MoveResult(False, "the mode or the run ended, or control was reset", 0.0, "CANCELLED", PlanCode.PREEMPTED)
 _STILL_RAD = 1e-4
 """Commands that change less between two checks are at rest."""
-_NEARLY_ONE = 1e-3
-"""Allowed deviation of a quaternion's length from 1."""
 _POLICIES: tuple[OrientationPolicy, ...] = ("keep_axis", "arm_plane", "current", "free")
 
 
@@ -119,7 +116,6 @@ class PlannerSource(SourceWorker):
     def __init__(self, session: Session, mode: ControlMode) -> None:
         assert mode.planner is not None
         super().__init__(session, mode, f"planner {mode.planner.type}")
-        self._component = mode.planner
         self._plans = GoalPlans(session, mode)
         self._results = results_of(session)
         self._inbox: queue.SimpleQueue[Mapping[str, Any] | _Move | None] = queue.SimpleQueue()
@@ -158,9 +154,8 @@ class PlannerSource(SourceWorker):
 
     @override
     def setup(self) -> None:
-        planner: Planner = self.session.make("planner", self._component, self._component.type)
+        planner = self._plans.make()
         self.on_end.callback(planner.close)
-        self._plans.planner = planner
         self._execution = Execution(self.session, planner)
         self._poses = self.session.bus.subscribe(CMD_POSE, 1, PoseStamped, Pose)
         self.on_end.callback(self._poses.close)
@@ -260,21 +255,17 @@ class PlannerSource(SourceWorker):
 
     def _submit(self, goal: str | Goal | Target, velocity_scaling: float = 1.0) -> _Move:
         """Replace all goals by this one."""
-        return self._submitted(self._new(goal, velocity_scaling))
-
-    def _submitted(self, move: _Move) -> _Move:
-        self._inbox.put(self._accepted(move))
+        move = self._accepted(self._new(goal, velocity_scaling))
+        self._inbox.put(move)
         return move
 
     def _move_action(self, wanted: MoveRequest) -> int:
-        move = self._new(wanted.goal(), wanted.velocity_scaling)
-        move.target = attrs.evolve(move.target, acceleration_scaling=wanted.acceleration_scaling)
-        return self._submitted(move).number
+        goal = self._plans.any_goal(wanted.goals, commanded(self.session))
+        parsed = target(goal, self.session.config.robot, wanted.velocity_scaling)
+        return self._submit(attrs.evolve(parsed, acceleration_scaling=wanted.acceleration_scaling)).number
 
     def _execute(self, request: Execute) -> int:
-        parsed = Target("trajectory", trajectory=request.trajectory())
-        self._plans.check(parsed)
-        return self._submitted(_Move(self._results.number(), parsed)).number
+        return self._submit(Target("trajectory", trajectory=request.trajectory())).number
 
     def _accepted(self, move: _Move) -> _Move:
         """A goal that may be followed.
@@ -424,7 +415,7 @@ class PlannerSource(SourceWorker):
         move.begun_ns = self.session.clock.now_ns()
         self._show("executing")
         try:
-            goals, move.planned = self._plans.plan(move.target, self._execution.commanded())
+            goals, move.planned = self._plans.plan(move.target, commanded(self.session))
             with self._choosing:
                 self._move = move
             self._execution.begin(move.number, goals, move.stops)
@@ -514,13 +505,8 @@ def _nearest(pose: Pose) -> AnyGoal:
     """A pose with the orientation policies of IB-Robot's gateway, in their order.
 
     Raises:
-        PlanningError: for a quaternion whose length is not 1.
+        PlanningError: for a pose that is not finite or whose quaternion is not of length 1.
     """
-    q = pose.orientation
-    length = math.hypot(q.x, q.y, q.z, q.w)
-    # Written so that NaN fails it.
-    if not abs(length - 1) <= _NEARLY_ONE:
-        raise PlanningError(
-            f"the orientation is a quaternion of length {length:.3g}, must be 1", PlanCode.INVALID_GOAL_CONSTRAINTS
-        )
-    return AnyGoal(tuple(PoseGoal(pose, beyond_reach=policy) for policy in _POLICIES))
+    goals = tuple(PoseGoal(pose, beyond_reach=policy) for policy in _POLICIES)
+    pose_matrix(goals[0])
+    return AnyGoal(goals)

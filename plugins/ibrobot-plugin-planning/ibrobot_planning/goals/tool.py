@@ -1,4 +1,4 @@
-"""Goals as configurations: what an arm can do of what was asked."""
+"""Joint positions that reach positions and poses of the tool."""
 
 from __future__ import annotations
 
@@ -10,17 +10,8 @@ from ibrobot_kinematics import KinematicModel, KinematicsError, Target, TipPose,
 from ibrobot_kinematics.poses import matrix
 from ibrobot_kinematics.rotations import between, cross, log
 
-from ibrobot_core.api import (
-    JointGoal,
-    NamedGoal,
-    PlanCode,
-    PlanningError,
-    PoseGoal,
-    PositionGoal,
-    Robot,
-    Vector,
-    Vector3,
-)
+from ibrobot_core.api import PoseGoal, PositionGoal, Vector, Vector3
+from ibrobot_planning.goals.errors import invalid_goal, unreachable
 
 _PITCHES = np.linspace(-np.pi / 2, np.pi / 2, 7)
 """Directions of the tool that are tried at a position without one: from straight down to straight up."""
@@ -56,59 +47,22 @@ class Candidate:
     """[rad]."""
 
 
-def joint_target(goal: JointGoal | NamedGoal, robot: Robot, joints: Sequence[str], start: Vector) -> Vector:
-    """Where the planned `joints` end [rad], shape (len(joints),).
+def vector(value: Vector3, what: str) -> Vector:
+    """A vector of a goal, shape (3,).
 
     Raises:
-        PlanningError: for unknown poses and joints, wrong shapes, and positions outside the limits.
+        PlanningError: for one that is not finite.
     """
-    if isinstance(goal, NamedGoal):
-        try:
-            whole = robot.pose(goal.name)
-        except KeyError as error:
-            raise PlanningError(str(error.args[0]), PlanCode.INVALID_GOAL_CONSTRAINTS) from None
-        goal = JointGoal(tuple(joints), whole[robot.indices(joints)])
-    positions = np.asarray(goal.positions, dtype=float)
-    if positions.shape != (len(goal.joints),):
-        raise _invalid(f"goal has {len(goal.joints)} joints but positions of shape {positions.shape}")
-    if not 0 <= goal.tolerance < np.inf:
-        raise _invalid(f"goal has a tolerance of {goal.tolerance} rad, must be at least 0")
-    target = np.array(start, dtype=float)
-    limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
-    for i, (name, value) in enumerate(zip(goal.joints, positions.tolist(), strict=True)):
-        if name not in limits:
-            raise _invalid(f"no joint {name!r}; the joints are: {', '.join(limits)}")
-        if name not in joints:
-            raise _invalid(f"goal names joint {name!r}, which is not planned: {', '.join(joints)}")
-        if name in goal.joints[:i]:
-            raise _invalid(f"goal names joint {name!r} twice")
-        lower, upper = limits[name]
-        # Written so that NaN fails it.
-        if not lower <= value <= upper:
-            raise _invalid(f"goal of joint {name} is {value} rad, must be within {lower} .. {upper} rad")
-        target[joints.index(name)] = value
-    return target
-
-
-def _invalid(message: str) -> PlanningError:
-    return PlanningError(message, PlanCode.INVALID_GOAL_CONSTRAINTS)
-
-
-def _unreachable(message: str) -> PlanningError:
-    return PlanningError(message, PlanCode.NO_IK_SOLUTION)
-
-
-def _vector(value: Vector3, what: str) -> Vector:
-    vector = np.array([value.x, value.y, value.z], dtype=float)
-    if not np.isfinite(vector).all():
-        raise _invalid(f"{what} of the goal is {vector.tolist()}, must be finite")
-    return vector
+    numbers = np.array([value.x, value.y, value.z], dtype=float)
+    if not np.isfinite(numbers).all():
+        raise invalid_goal(f"{what} of the goal is {numbers.tolist()}, must be finite")
+    return numbers
 
 
 def _tolerances(**values: float) -> None:
     for name, value in values.items():
         if not 0 < value <= _WIDEST:
-            raise _invalid(f"{name} of the goal is {value}, must be above 0 and at most {_WIDEST:g}")
+            raise invalid_goal(f"{name} of the goal is {value}, must be above 0 and at most {_WIDEST:g}")
 
 
 def unit(value: Vector3) -> Vector:
@@ -117,12 +71,12 @@ def unit(value: Vector3) -> Vector:
     Raises:
         PlanningError: for one that is not finite or has no length.
     """
-    vector = _vector(value, "the axis")
-    largest = float(np.abs(vector).max())
+    direction = vector(value, "the axis")
+    largest = float(np.abs(direction).max())
     if largest < 1e-9:
-        raise _invalid("the axis of the goal has no length; give a direction, e.g. (0, 0, -1) for down")
-    vector /= largest  # first, as the squares of large numbers overflow
-    return np.asarray(vector / np.linalg.norm(vector))
+        raise invalid_goal("the axis of the goal has no length; give a direction, e.g. (0, 0, -1) for down")
+    direction /= largest  # first, as the squares of large numbers overflow
+    return np.asarray(direction / np.linalg.norm(direction))
 
 
 def pose_matrix(goal: PoseGoal) -> Vector:
@@ -131,13 +85,13 @@ def pose_matrix(goal: PoseGoal) -> Vector:
     Raises:
         PlanningError: for a pose that is not finite or whose quaternion is not of length 1.
     """
-    _vector(goal.pose.position, "the position")
+    vector(goal.pose.position, "the position")
     q = goal.pose.orientation
     quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
     length = float(np.linalg.norm(quaternion))
     # Written so that NaN fails it.
     if not abs(length - 1) <= _NEARLY_ONE:
-        raise _invalid(f"the orientation of the goal is a quaternion of length {length:.3g}, must be 1")
+        raise invalid_goal(f"the orientation of the goal is a quaternion of length {length:.3g}, must be 1")
     return matrix(goal.pose)
 
 
@@ -158,7 +112,7 @@ class Tool:
             PlanningError: for a goal that makes no sense, or that the arm cannot reach, with how far off it is.
         """
         if isinstance(goal, PositionGoal):
-            position = _vector(goal.position, "the position")
+            position = vector(goal.position, "the position")
             _tolerances(position_tolerance=goal.position_tolerance, axis_tolerance=goal.axis_tolerance)
             axis = None if goal.axis is None else unit(goal.axis)
             self.check_reach(position, start)
@@ -184,20 +138,20 @@ class Tool:
             try:
                 solve(self.model, Target(position), start)
             except UnreachableError as error:
-                raise _unreachable(str(error)) from error
+                raise unreachable(str(error)) from error
 
     def _beyond(
         self, goal: PoseGoal, position: Vector, rotation: Vector, start: Vector, found: list[Candidate]
     ) -> list[Candidate]:
-        """What the goal's policy makes of an orientation that the arm cannot take."""
+        """Handle an unreachable orientation by the goal's policy."""
         tolerance = goal.position_tolerance
         policy = goal.beyond_reach
         if policy in ("refuse", "nearest") or not found:
             if not found:
-                self._at(position, None, start, tolerance, 0.01)  # tells how far off the position is
+                self._at(position, None, start, tolerance, 0.01)  # the error says how far off the position is
             if policy == "refuse" or not found:
                 off = np.degrees(found[0].orientation_error) if found else 180.0
-                raise _unreachable(
+                raise unreachable(
                     f"{self.model.tip} cannot take this orientation at {_text(position)};"
                     f" the nearest found is {off:.1f} degrees off (beyond_reach chooses what to do then)"
                 )
@@ -212,7 +166,7 @@ class Tool:
         else:
             taken = self._posed(position, self.model.forward(start).rotation, start, tolerance)
             if not taken:
-                raise _unreachable(f"{self.model.tip} cannot keep its orientation at {_text(position)}")
+                raise unreachable(f"{self.model.tip} cannot keep its orientation at {_text(position)}")
         return [self._compared(each.joints, position, rotation) for each in taken]
 
     def _in_plane(self, position: Vector, axis: Vector) -> Vector:
@@ -239,8 +193,8 @@ class Tool:
             target = Target(position, axis=asked)
             try:
                 found += solve_all(self.model, target, start, **tolerances)
-            except UnreachableError as unreachable:
-                error = error or unreachable
+            except UnreachableError as failure:
+                error = error or failure
                 if asked is None:
                     break
             except KinematicsError:  # no closed form
@@ -250,7 +204,7 @@ class Tool:
         distinct = _distinct(found)
         if not distinct:
             assert error is not None
-            raise _unreachable(str(error)) from error
+            raise unreachable(str(error)) from error
         return [self._compared(q, position, None, axis) for q in distinct]
 
     def _pitched(self, position: Vector) -> Iterator[Vector]:
@@ -296,9 +250,9 @@ class Tool:
         for begin in (start, *self._seeds(start)):
             try:
                 found.append(solve(self.model, target, begin, **tolerances))
-            except UnreachableError as unreachable:
+            except UnreachableError as failure:
                 # Each of these searched from many configurations.
-                return found, unreachable
+                return found, failure
         return found, error
 
     def _seeds(self, start: Vector) -> Iterator[Vector]:

@@ -14,7 +14,7 @@ from itertools import product
 import attrs
 import numpy as np
 
-from ibrobot_core.api import Header, JointTrajectory, JointTrajectoryPoint, Vector, ns, seconds
+from ibrobot_core.api import Vector
 from ibrobot_planning.planners.timing import Motion
 
 STEP_S = 0.01
@@ -62,26 +62,6 @@ class Limits:
             and (np.abs(velocities) <= more * self.velocity).all()
             and (np.abs(accelerations) <= more * self.acceleration).all()
         )
-
-
-def motion_of(trajectory: JointTrajectory) -> Motion | None:
-    """A trajectory as a motion; None if it lacks velocities or accelerations."""
-    points = trajectory.points
-    if len(points) < 2 or not all(point.velocities.size and point.accelerations.size for point in points):
-        return None
-    return Motion(
-        np.array([seconds(point.time_from_start_ns) for point in points]),
-        np.array([point.positions for point in points]),
-        np.array([point.velocities for point in points]),
-        np.array([point.accelerations for point in points]),
-    )
-
-
-def trajectory_of(made: Motion, joints: tuple[str, ...], stamp_ns: int) -> JointTrajectory:
-    """A motion as a message."""
-    rows = zip(made.times.tolist(), made.positions, made.velocities, made.accelerations, strict=True)
-    points = tuple(JointTrajectoryPoint(ns(time), *row) for time, *row in rows)
-    return JointTrajectory(Header(stamp_ns=stamp_ns), joints, points)
 
 
 def braking(old: Motion, begin_s: float, brake_s: float, acceleration: Vector) -> Motion:

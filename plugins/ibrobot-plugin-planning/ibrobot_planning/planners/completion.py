@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import JointTrajectory, PlanCode, PlanningError, Robot, Vector, ns, seconds
-from ibrobot_planning.planners.blend import motion_of, trajectory_of
-from ibrobot_planning.planners.timing import LONGEST_S, Motion
+from ibrobot_planning.planners.timing import LONGEST_S, Motion, motion_of, trajectory_of
 
 START_RAD = 0.01
 """Allowed distance between the start of a trajectory and the robot, that of MoveIt."""

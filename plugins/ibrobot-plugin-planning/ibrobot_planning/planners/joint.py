@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import override
 
 import numpy as np
@@ -15,18 +16,18 @@ from ibrobot_core.api import (
     JointGoal,
     JointTrajectory,
     JointTrajectoryPoint,
+    NamedGoal,
     PlanCode,
     Planner,
     PlanningError,
     PlanRequest,
     PlanResult,
-    Vector,
     ns,
     seconds,
 )
-from ibrobot_planning.goals.text import scaling_fault
+from ibrobot_planning.goals.grammar import scaling_fault
+from ibrobot_planning.goals.joints import joint_target
 from ibrobot_planning.planners.options import JointPlannerOptions
-from ibrobot_planning.planners.profile import RestToRest
 from ibrobot_planning.planners.timing import check_duration
 
 _SHORTEST_PHASE_S = 1e-5
@@ -44,6 +45,7 @@ class JointPlanner(Planner):
 
     def __init__(self, options: JointPlannerOptions, ctx: Context) -> None:
         self._options = options
+        self._robot = ctx.robot
         self._joints = {joint.name: joint for joint in ctx.robot.joints}
         self._clock = ctx.clock
         self._period_ns = ctx.period_ns
@@ -51,7 +53,13 @@ class JointPlanner(Planner):
     @override
     def plan(self, request: PlanRequest) -> PlanResult:
         joints = self._check_start(request)
-        delta = self._goal(request, joints) - request.start
+        if not isinstance(request.goal, JointGoal | NamedGoal):
+            raise PlanningError(
+                "planner type 'joint' knows joint goals only, not poses of the tool: "
+                "name a pose of robot.description.poses, or use another type of planner, one for Cartesian goals",
+                PlanCode.UNRECOGNIZED_GOAL_TYPE,
+            )
+        delta = joint_target(request.goal, self._robot, request.joints, request.start) - request.start
         velocity = self._options.velocity_scaling * _fraction("velocity_scaling", request.velocity_scaling)
         acceleration = self._options.acceleration_scaling * _fraction(
             "acceleration_scaling", request.acceleration_scaling
@@ -95,40 +103,61 @@ class JointPlanner(Planner):
                 raise PlanningError(f"start of joint {joint.name} is {value}, must be finite")
         return joints
 
-    def _goal(self, request: PlanRequest, joints: list[Joint]) -> Vector:
-        """Goal position of every joint of the request [rad], shape (J,)."""
-        goal = request.goal
-        if not isinstance(goal, JointGoal):
-            raise PlanningError(
-                "planner type 'joint' knows joint goals only, not poses of the tool: "
-                "name a pose of robot.description.poses, or use another type of planner, one for Cartesian goals",
-                PlanCode.UNRECOGNIZED_GOAL_TYPE,
-            )
-        self._check_goal(goal)
-        target = np.array(request.start, dtype=float)
-        for name, value in zip(goal.joints, goal.positions, strict=True):
-            if name not in request.joints:
-                raise PlanningError(f"goal names joint {name!r}, which is not planned: {', '.join(request.joints)}")
-            target[request.joints.index(name)] = value
-        return target
-
-    def _check_goal(self, goal: JointGoal) -> None:
-        if np.shape(goal.positions) != (len(goal.joints),):
-            raise PlanningError(f"goal has {len(goal.joints)} joints but positions of shape {np.shape(goal.positions)}")
-        for i, (name, value) in enumerate(zip(goal.joints, goal.positions, strict=True)):
-            joint = self._joint(name)
-            if name in goal.joints[:i]:
-                raise PlanningError(f"goal names joint {name!r} twice")
-            # Written so that NaN fails it.
-            if not joint.lower <= value <= joint.upper:
-                raise PlanningError(
-                    f"goal of joint {name} is {value} rad, must be within {joint.lower} .. {joint.upper} rad"
-                )
-
     def _joint(self, name: str) -> Joint:
         if name not in self._joints:
             raise PlanningError(f"no joint {name!r}; the joints are: {', '.join(self._joints)}")
         return self._joints[name]
+
+
+class RestToRest:
+    """A symmetric profile of seven phases, each of constant jerk; some have no length.
+
+    Speed rises over three phases (jerk `+j`, 0, `-j`), stays, and falls as it rose. Of the three limits those hold that
+    the distance lets the motion reach.
+
+    Args:
+        distance: way from rest to rest, above 0.
+        max_velocity: greatest speed, above 0.
+        max_acceleration: greatest rate of change of speed, above 0.
+        max_jerk: greatest rate of change of acceleration, above 0.
+
+    Attributes:
+        ends: when each phase ends [s], 7 times.
+    """
+
+    def __init__(self, distance: float, max_velocity: float, max_acceleration: float, max_jerk: float) -> None:
+        self.distance = distance
+        speed = min(max_velocity, _peak_speed(distance, max_acceleration, max_jerk))
+        # The acceleration is a trapezium over time, or a triangle where the speed is reached before the limit.
+        ramp = min(max_acceleration / max_jerk, math.sqrt(speed / max_jerk))
+        plateau = max(speed / (max_jerk * ramp) - ramp, 0.0)
+        cruise = max(distance / speed - 2 * ramp - plateau, 0.0)
+        self.ends = tuple(accumulate([ramp, plateau, ramp, cruise, ramp, plateau, ramp]))
+        self._times = (ramp, plateau, ramp, 0.5 * cruise)
+        self._jerks = (max_jerk, 0.0, -max_jerk, 0.0)
+
+    def at(self, time: float) -> tuple[float, float, float]:
+        """Way, speed and acceleration at `time` [s], from 0 to the last of `ends`."""
+        if 2 * time > self.ends[-1]:
+            way, speed, acceleration = self.at(self.ends[-1] - time)
+            return self.distance - way, speed, -acceleration
+        way = speed = acceleration = 0.0
+        for length, jerk in zip(self._times, self._jerks, strict=True):
+            t = min(length, time)
+            way += t * (speed + t * (acceleration / 2 + t * jerk / 6))
+            speed += t * (acceleration + t * jerk / 2)
+            acceleration += t * jerk
+            time -= t
+        return way, speed, acceleration
+
+
+def _peak_speed(distance: float, max_acceleration: float, max_jerk: float) -> float:
+    """The peak speed without a velocity limit."""
+    ramp = max_acceleration / max_jerk
+    if distance <= 2 * max_acceleration * ramp**2:  # slows down before the acceleration reaches its limit
+        return math.cbrt(distance**2 * max_jerk / 4)
+    # From distance = speed * (speed / max_acceleration + ramp).
+    return max_acceleration * (math.sqrt(ramp**2 / 4 + distance / max_acceleration) - ramp / 2)
 
 
 def _fraction(name: str, value: float) -> float:

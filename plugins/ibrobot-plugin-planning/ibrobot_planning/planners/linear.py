@@ -9,8 +9,9 @@ import numpy as np
 from ibrobot_kinematics import KinematicModel, Target, UnreachableError, solve
 from ibrobot_kinematics.rotations import between, cross, exp, log
 
-from ibrobot_core.api import PlanCode, PlanningError, PoseGoal, PositionGoal, Vector
-from ibrobot_planning.goals.tool import Tool, pose_matrix, turned, unit
+from ibrobot_core.api import PoseGoal, PositionGoal, Vector
+from ibrobot_planning.goals.errors import invalid_goal
+from ibrobot_planning.goals.tool import Tool, pose_matrix, turned, unit, vector
 
 _STEP_M = 0.004
 _STEP_RAD = 0.05
@@ -50,7 +51,7 @@ def linear_path(tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start:
         PlanningError: for no waypoints, or one that makes no sense.
     """
     if not waypoints:
-        raise PlanningError("a straight path needs at least one waypoint", PlanCode.INVALID_GOAL_CONSTRAINTS)
+        raise invalid_goal("a straight path needs at least one waypoint")
     targets, lengths = _targets(tool, waypoints, start)
     total = sum(lengths)
     joints, fractions, errors, reason, covered = [start], [0.0], [0.0], "", 0.0
@@ -147,11 +148,7 @@ def _end(waypoint: PositionGoal | PoseGoal) -> tuple[Vector, Vector | None, Vect
             return placed[:3, 3], None, placed[:3, 2], waypoint.orientation_tolerance
         tolerance = waypoint.orientation_tolerance if waypoint.beyond_reach == "refuse" else np.pi
         return placed[:3, 3], placed[:3, :3], None, tolerance
-    place = np.array([waypoint.position.x, waypoint.position.y, waypoint.position.z])
-    if not np.isfinite(place).all():
-        raise PlanningError(
-            f"the position of a waypoint is {place.tolist()}, must be finite", PlanCode.INVALID_GOAL_CONSTRAINTS
-        )
+    place = vector(waypoint.position, "the position")
     if waypoint.axis is None:
         return place, None, None, waypoint.axis_tolerance
     return place, None, unit(waypoint.axis), waypoint.axis_tolerance

@@ -10,16 +10,13 @@ from typing import override
 
 import attrs
 import numpy as np
-from ibrobot_kinematics import KinematicModel, KinematicsError, robot_model
-from ibrobot_kinematics.srdf import Srdf
+from ibrobot_kinematics import KinematicModel, robot_model
 
 from ibrobot_core.api import (
     AnyGoal,
     Context,
-    Header,
     JointGoal,
     JointTrajectory,
-    JointTrajectoryPoint,
     LinearGoal,
     NamedGoal,
     PlanCode,
@@ -32,16 +29,16 @@ from ibrobot_core.api import (
     PositionGoal,
     Vector,
     Vector3,
-    ns,
     seconds,
 )
-from ibrobot_planning.goals.text import scaling_fault
-from ibrobot_planning.goals.tool import Candidate, Tool, joint_target
-from ibrobot_planning.planners.blend import motion_of
+from ibrobot_planning.goals.errors import invalid_goal
+from ibrobot_planning.goals.grammar import scaling_fault
+from ibrobot_planning.goals.joints import joint_target
+from ibrobot_planning.goals.tool import Candidate, Tool
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.search import Pace, Space, connect, shortened
-from ibrobot_planning.planners.timing import Motion, timed
+from ibrobot_planning.planners.timing import Motion, motion_of, timed, trajectory_of
 from ibrobot_planning.world.arm import Arm, Pair
 from ibrobot_planning.world.checked_arm import checked_arm
 from ibrobot_planning.world.collision import Collisions, Contact
@@ -83,14 +80,13 @@ class RrtConnectPlanner(Planner):
         self._arm: Arm | None = None
         self._tool: Tool | None = None
         self._unchecked: Mapping[Pair, str] = {}
-        self._srdf: Srdf | None = None
         self._checked: deque[tuple[JointTrajectory, World]] = deque(maxlen=8)
         """Trajectories found free, each with the world in which it is."""
 
     @override
     def load(self) -> None:
         checked = checked_arm(self._ctx.robot, self._ctx.log)
-        self._arm, self._unchecked, self._srdf = checked.arm, checked.unchecked, checked.srdf
+        self._arm, self._unchecked = checked.arm, checked.unchecked
         self._tool = Tool(robot_model(self._ctx.robot))
 
     @property
@@ -107,7 +103,7 @@ class RrtConnectPlanner(Planner):
         world = self._snapshot()
         checks = self._collisions(world, request.joints, request.others)
         deadline = begun + self._options.planning_time
-        plan = _Plan(self._ctx, self._options, request, start, checks, self._srdf, deadline)
+        plan = _Plan(self._ctx, self._options, request, start, checks, deadline)
         assert self._tool is not None
         result = plan.solve(self._tool)
         self._checked.append((result.trajectory, world))
@@ -140,9 +136,8 @@ class RrtConnectPlanner(Planner):
         )  # fmt: skip
 
     def _snapshot(self) -> World:
-        bus, world = self._ctx.bus, self.world
-        if bus is not None and bus.serves(SNAPSHOT):
-            world = bus.call(SNAPSHOT)
+        bus = self._ctx.bus
+        world = bus.call(SNAPSHOT) if bus is not None and bus.serves(SNAPSHOT) else self.world
         floor = self._options.floor
         if floor is None or FLOOR in world.objects:
             return world
@@ -187,7 +182,6 @@ class _Plan:
     request: PlanRequest
     start: Vector
     checks: Collisions
-    srdf: Srdf | None
     deadline: float
 
     def solve(self, tool: Tool) -> PlanResult:
@@ -197,7 +191,7 @@ class _Plan:
         way_out = self._way_out()
         alternatives = goal.goals if isinstance(goal, AnyGoal) else (goal,)
         if not alternatives:
-            raise PlanningError("the goal has no alternatives", PlanCode.INVALID_GOAL_CONSTRAINTS)
+            raise invalid_goal("the goal has no alternatives")
         failures: list[PlanningError] = []
         for number, alternative in enumerate(alternatives):
             try:
@@ -254,8 +248,6 @@ class _Plan:
 
     def _candidates(self, tool: Tool, goal: object) -> list[Candidate]:
         robot = self.ctx.robot
-        if isinstance(goal, NamedGoal) and goal.name not in robot.description.poses and self.srdf is not None:
-            goal = self._state(goal.name, self.srdf)
         if isinstance(goal, JointGoal | NamedGoal):
             whole = self._whole()
             whole[self._order] = joint_target(goal, robot, self.request.joints, self.start)
@@ -268,15 +260,6 @@ class _Plan:
             " PoseGoal, AnyGoal and LinearGoal",
             PlanCode.UNRECOGNIZED_GOAL_TYPE,
         )
-
-    def _state(self, name: str, srdf: Srdf) -> JointGoal:
-        """A pose of the SRDF, of the planned joints."""
-        try:
-            state = srdf.state(name).positions
-        except KinematicsError as error:
-            raise PlanningError(str(error), PlanCode.INVALID_GOAL_CONSTRAINTS) from error
-        joints = tuple(joint for joint in self.request.joints if joint in state)
-        return JointGoal(joints, np.array([state[joint] for joint in joints]))
 
     def _check_chain(self, model: KinematicModel) -> None:
         missing = [model.joint_names[i] for i in model.moving if model.joint_names[i] not in self.request.joints]
@@ -352,10 +335,7 @@ class _Plan:
     def _linear(self, tool: Tool, goal: LinearGoal) -> PlanResult:
         self._check_chain(tool.model)
         if not 0 < goal.least_fraction <= 1:
-            raise PlanningError(
-                f"least_fraction is {goal.least_fraction}, must be above 0 and at most 1",
-                PlanCode.INVALID_GOAL_CONSTRAINTS,
-            )
+            raise invalid_goal(f"least_fraction is {goal.least_fraction}, must be above 0 and at most 1")
         touching = self.checks.contacts(self.start)
         if touching:
             raise PlanningError(f"the start is in collision: {_sentence(touching)}", PlanCode.START_STATE_IN_COLLISION)
@@ -475,13 +455,8 @@ class _Plan:
         # Rounding may leave the limits, which executors refuse.
         lower, upper = self._limits
         positions = np.clip(motion.positions, np.minimum(lower, self.start), np.maximum(upper, self.start))
-        points = tuple(
-            JointTrajectoryPoint(ns(stamp), position, velocity, acceleration)
-            for stamp, position, velocity, acceleration in zip(
-                motion.times.tolist(), positions, motion.velocities, motion.accelerations, strict=True
-            )
-        )
-        trajectory = JointTrajectory(Header(stamp_ns=self.ctx.clock.now_ns()), self.request.joints, points)
+        inside = attrs.evolve(motion, positions=positions)
+        trajectory = trajectory_of(inside, self.request.joints, self.ctx.clock.now_ns())
         return PlanResult(trajectory, fraction, number, end.position_error, end.orientation_error)
 
 

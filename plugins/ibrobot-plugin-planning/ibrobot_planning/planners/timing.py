@@ -15,7 +15,7 @@ from itertools import pairwise
 import attrs
 import numpy as np
 
-from ibrobot_core.api import PlanningError, Vector
+from ibrobot_core.api import Header, JointTrajectory, JointTrajectoryPoint, PlanningError, Vector, ns, seconds
 
 _GRID = 0.02
 """Greatest distance [rad] between grid points on straight parts."""
@@ -118,6 +118,26 @@ class Motion:
             -15 * way + 8 * v0 + 7 * v1 + 1.5 * a0 - a1,
             6 * way - 3 * v0 - 3 * v1 - 0.5 * a0 + 0.5 * a1,
         ])  # fmt: skip
+
+
+def motion_of(trajectory: JointTrajectory) -> Motion | None:
+    """A trajectory as a motion; None if it lacks velocities or accelerations."""
+    points = trajectory.points
+    if len(points) < 2 or not all(point.velocities.size and point.accelerations.size for point in points):
+        return None
+    return Motion(
+        np.array([seconds(point.time_from_start_ns) for point in points]),
+        np.array([point.positions for point in points]),
+        np.array([point.velocities for point in points]),
+        np.array([point.accelerations for point in points]),
+    )
+
+
+def trajectory_of(made: Motion, joints: tuple[str, ...], stamp_ns: int) -> JointTrajectory:
+    """A motion as a message."""
+    rows = zip(made.times.tolist(), made.positions, made.velocities, made.accelerations, strict=True)
+    points = tuple(JointTrajectoryPoint(ns(time), *row) for time, *row in rows)
+    return JointTrajectory(Header(stamp_ns=stamp_ns), joints, points)
 
 
 @cache

@@ -6,12 +6,13 @@ from collections.abc import Collection, Iterator
 
 import attrs
 
-from ibrobot_core.api import IbrobotError, PlannerDescriptor, PlanningError, Vector
+from ibrobot_core.api import IbrobotError, PlanningError, Vector
 from ibrobot_core.app import ControlMode, Registry, RobotConfig, check_models
-from ibrobot_planning.goals.named_poses import named_pose, pose_names
+from ibrobot_planning.execution.plans import tool_planners
+from ibrobot_planning.goals.grammar import GoalOptions
+from ibrobot_planning.goals.joints import named_pose, pose_names
 from ibrobot_planning.tasks.format import (
     AlternativesStep,
-    GoalOptions,
     GripperStep,
     LookStep,
     MoveStep,
@@ -20,7 +21,6 @@ from ibrobot_planning.tasks.format import (
     Step,
     WaitStep,
 )
-from ibrobot_planning.tasks.goals import move_target
 from ibrobot_planning.tasks.reach import Reach
 from ibrobot_planning.tasks.reading import TaskFile
 from ibrobot_planning.world.objects import World
@@ -72,10 +72,7 @@ class _Checks:
     def __init__(self, file: TaskFile, given: Circumstances) -> None:
         self._file, self._document, self._given = file, file.document, given
         self._within_reach = Reach(given.config.robot, given.start)
-        planners = given.registry.of_kind("planner")
-        self._tool_planners = [
-            each.type for each in planners if isinstance(each, PlannerDescriptor) and each.tool_goals
-        ]
+        self._tool_planners = tool_planners(given.registry)
         self._moved = set(given.elsewhere)
         """Objects that are not where the world has them."""
         self._held: str | None = None
@@ -243,7 +240,7 @@ class _Checks:
         """Check by inverse kinematics that the tool can be where a step wants it."""
         try:
             world = self._given.world or World()
-            goal = move_target(step, self._given.config.robot, self._arm, world).tool
+            goal = step.target(self._given.config.robot, self._arm, world).tool
             if goal is not None:
                 self._within_reach.check(goal)
         except IbrobotError as error:

@@ -2,82 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal, override
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Literal, override
 
 import attrs
 
-from ibrobot_core.api import OrientationPolicy, documented, option
-from ibrobot_planning.goals.text import LEAST_SCALING
+from ibrobot_core.api import AnyGoal, Goal, Robot, Vector, documented, option
+from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions, exactly_one, line_goal
+from ibrobot_planning.goals.joints import named_pose
+from ibrobot_planning.goals.text import Target
+from ibrobot_planning.world.objects import World
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-Vec3 = tuple[float, float, float]
 MOST_STEPS = 200
-_NEARLY_ONE = 1e-3
-"""Allowed deviation of a quaternion's length from 1."""
-
-
-def _exactly_one(what: str, names: Sequence[str], given: Sequence[str]) -> None:
-    if len(given) != 1:
-        found = f"{' and '.join(given)} exclude each other" if given else "there is none"
-        raise ValueError(f"{what} has one of {', '.join(names)}; {found}")
-
-
-@documented
-@attrs.frozen
-class GoalOptions:
-    """A goal of the arm: a named pose, joints, or a position of the tool."""
-
-    pose: str | None = option(None, help="a pose of `robot.description.poses`; joints outside the arm stay")
-    joints: Mapping[str, float] = option(factory=dict, unit="rad", help="joint -> position; the others stay")
-    xyz: Vec3 | None = option(None, unit="m", help="position of the tool, in the base frame or relative to `object`")
-    object: str | None = option(
-        None, help="object of the world: position, axis and orientation are relative to its centre and its turn about z"
-    )
-    relative: bool = option(False, help="whether `xyz` is added to the tool's present position, in the base frame")
-    axis: Vec3 | Literal["down", "up"] | None = option(None, help="direction of the tool's z axis")
-    rpy: Vec3 | None = option(None, unit="rad", help="orientation of the tool: roll, pitch, yaw")
-    quat: tuple[float, float, float, float] | None = option(None, help="orientation of the tool: x, y, z, w")
-    beyond_reach: OrientationPolicy = option("refuse", help="what to do about an orientation that the arm cannot take")
-    position_tolerance: float = option(0.001, unit="m", gt=0, help="allowed distance from the position")
-    angle_tolerance: float = option(0.01, unit="rad", gt=0, help="allowed angle from the axis or orientation")
-
-    def __attrs_post_init__(self) -> None:
-        self.check_kind(("pose", "joints", "xyz or object"), [])
-        turned = [name for name, value in self._turns().items() if value is not None]
-        if len(turned) > 1:
-            raise ValueError(f"{' and '.join(turned)} exclude each other")
-        if turned and not self.of_tool:
-            raise ValueError(f"{turned[0]} needs a position: xyz or object")
-        if self.relative and (self.xyz is None or self.object is not None):
-            raise ValueError("relative needs xyz, and no object")
-        if self.beyond_reach != "refuse" and (not turned or turned == ["axis"]):
-            raise ValueError("beyond_reach needs an orientation: rpy or quat")
-        if isinstance(self.axis, tuple) and not any(self.axis):
-            raise ValueError("axis has no length; give a direction, e.g. [0, 0, -1], or down")
-        if self.quat is not None and abs(math.hypot(*self.quat) - 1) > _NEARLY_ONE:
-            raise ValueError(f"quat has length {math.hypot(*self.quat):.3g}, must be 1; the order is x, y, z, w")
-
-    @property
-    def of_tool(self) -> bool:
-        """Whether it is a position of the tool."""
-        return self.xyz is not None or self.object is not None
-
-    def check_kind(self, names: Sequence[str], more: Sequence[str]) -> None:
-        """Check that exactly one kind of goal is given; `more` has those of a subclass."""
-        given = [*(["pose"] if self.pose is not None else []), *(["joints"] if self.joints else [])]
-        given += [*(["xyz or object"] if self.of_tool else []), *more]
-        _exactly_one("a goal", names, given)
-
-    def given(self) -> Mapping[str, Any]:
-        """Key -> value."""
-        return attrs.asdict(self, recurse=False)
-
-    def _turns(self) -> dict[str, Any]:
-        return {"axis": self.axis, "rpy": self.rpy, "quat": self.quat}
 
 
 @documented
@@ -92,18 +28,48 @@ class MoveStep(GoalOptions):
     touch: tuple[str, ...] = option((), help="objects that the gripper, and what it carries, may touch on the way")
 
     def __attrs_post_init__(self) -> None:
-        several = [name for name, goals in (("any", self.any), ("line", self.line)) if goals]
-        self.check_kind(("pose", "joints", "xyz or object", "any", "line"), several)
-        if not several:
-            super().__attrs_post_init__()
+        several = next((name for name, goals in (("any", self.any), ("line", self.line)) if goals), "")
+        given = attrs.asdict(self, recurse=False)
+        # With several goals, the other keys of a goal belong to each of these.
         for field in attrs.fields(GoalOptions) if several else ():
-            if field.name != "joints" and self.given()[field.name] != field.default:
-                raise ValueError(f"{field.name} belongs to the goals in {several[0]}")
+            if given[field.name] not in (field.default, {}) and not self.kinds().get(field.name):
+                raise ValueError(f"{field.name} belongs to the goals in {several}")
+        super().__attrs_post_init__()
         if self.least_fraction != 1 and not self.line:
             raise ValueError("least_fraction belongs to line")
         for i, each in enumerate(self.line):
             if not each.of_tool:
                 raise ValueError(f"line.{i}: a straight line goes to a position: xyz or object")
+
+    @override
+    def kinds(self) -> dict[str, bool]:
+        return {**super().kinds(), "any": bool(self.any), "line": bool(self.line)}
+
+    def target(self, robot: Robot, arm: Collection[str], world: World, tool: Vector | None = None) -> Target:
+        """The goal of the step.
+
+        Args:
+            robot: the robot.
+            arm: the joints that a motion may move; those of a named pose are limited to them.
+            world: the objects that goals refer to, where they are now.
+            tool: present position of the tool [m], shape (3,), for relative goals.
+
+        Raises:
+            PlanningError: for an unknown pose or object.
+        """
+        text, joints = self.text, dict(self.joints)
+        goal: Goal | None = None
+        if self.any:
+            text = f"{self.any[0].text} or {len(self.any) - 1} others"
+            goal = AnyGoal(tuple(each.goal(world, tool) for each in self.any))
+        elif self.line:
+            text = f"line to {self.line[-1].text}"
+            goal = line_goal(self.line, self.least_fraction, world, tool)
+        elif self.pose is not None:
+            joints = {joint: value for joint, value in named_pose(robot, self.pose).items() if joint in arm}
+        elif self.of_tool or self.joint_tolerance:
+            goal, joints = self.goal(world, tool), {}
+        return Target(text, goal, joints, self.speed)
 
 
 @documented
@@ -155,14 +121,11 @@ class LookStep:
     timeout: float = option(5.0, unit="s", gt=0, le=600, help="longest wait for the image")
 
     def __attrs_post_init__(self) -> None:
-        _exactly_one("a look", ("object", "camera"), [name for name in ("object", "camera") if self._has(name)])
+        exactly_one("a look", {"object": self.object is not None, "camera": self.camera is not None})
         if (self.near is None) != (self.within is None):
             raise ValueError("near and within go together: the object, and the distance from it")
         if self.near is not None and self.object is None:
             raise ValueError("near needs an object")
-
-    def _has(self, name: str) -> bool:
-        return (self.object if name == "object" else self.camera) is not None
 
 
 @documented
@@ -200,8 +163,7 @@ class Step:
     record: RecordStep | None = option(None, help="what follows is recorded as an episode")
 
     def __attrs_post_init__(self) -> None:
-        actions = self._actions()
-        _exactly_one("a step", list(actions), [kind for kind, action in actions.items() if action is not None])
+        exactly_one("a step", {kind: action is not None for kind, action in self._actions().items()})
 
     @property
     def kind(self) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ibrobot_core.api import CompressedImage, IbrobotError, Image, PlanningError, Vector, ns, seconds
 from ibrobot_core.app import SET_MODE, Session, SetMode
+from ibrobot_planning.execution.motions import commanded
 from ibrobot_planning.execution.requests import GoTo, Numbered, PlanAhead, PlanAnswer
 from ibrobot_planning.execution.results import MoveResult
 from ibrobot_planning.execution.services import PLAN_GOAL
@@ -17,6 +18,7 @@ from ibrobot_planning.execution.source import CANCEL as CANCEL_MOTION
 from ibrobot_planning.execution.source import GO_TO
 from ibrobot_planning.execution.source import RESULT as MOTION_RESULT
 from ibrobot_planning.executors.options import GripperOptions
+from ibrobot_planning.goals.grammar import object_pose
 from ibrobot_planning.goals.text import Target
 from ibrobot_planning.tasks.checks import CheckedTask
 from ibrobot_planning.tasks.format import (
@@ -30,9 +32,8 @@ from ibrobot_planning.tasks.format import (
     Step,
     WaitStep,
 )
-from ibrobot_planning.tasks.goals import move_target
 from ibrobot_planning.tasks.result import StepOutcome, StepResult
-from ibrobot_planning.world.objects import SNAPSHOT, World
+from ibrobot_planning.world.objects import World, world_of
 from ibrobot_planning.world.options import Attached, Detached, Touched
 from ibrobot_planning.world.section import ATTACH, DETACH, TOUCH
 
@@ -157,18 +158,6 @@ class Performance:
         if self._session.faults:
             raise StepFailed(f"the robot stopped: {self._session.faults[-1]}")
 
-    def _world(self) -> World:
-        if not self._session.bus.serves(SNAPSHOT):
-            return World()
-        world = self._session.bus.call(SNAPSHOT)
-        assert isinstance(world, World)
-        return world
-
-    def _commanded(self) -> Vector:
-        """Present positions of all joints, as commanded [rad], shape (J,)."""
-        session = self._session
-        return session.state.command if session.state is not None else session.measured().position
-
     def _enter(self, mode: str) -> None:
         if self._session.mode != mode:
             self._session.bus.call(SET_MODE, SetMode(mode))
@@ -206,7 +195,7 @@ class Performance:
             StepFailed: if one cannot be planned.
         """
         robot, bus = self._session.config.robot, self._session.bus
-        q = self._commanded().copy()
+        q = commanded(self._session).copy()
         for step in steps:
             action = step.action
             if isinstance(action, GripperStep | PolicyStep):
@@ -228,7 +217,7 @@ class Performance:
         robot, tool = self._session.config.robot, None
         if any(goal.relative for goal in (step, *step.any, *step.line)):
             tool = robot_model(robot).forward(q).position
-        return move_target(step, robot, self.checked.arm, self._world(), tool)
+        return step.target(robot, self.checked.arm, world_of(self._session.bus), tool)
 
     @contextmanager
     def _touching(self, step: MoveStep) -> Iterator[None]:
@@ -262,7 +251,7 @@ class Performance:
         return result
 
     def _move(self, step: MoveStep) -> Steps:
-        target = self._target(step, self._commanded())
+        target = self._target(step, commanded(self._session))
         with self._touching(step):
             result = yield from self._go(target)
         facts: dict[str, Any] = {
@@ -335,7 +324,7 @@ class Performance:
         if step.camera is not None:
             return (yield from self._image(step.camera, step.timeout))
         assert step.object is not None
-        world = self._world()
+        world = world_of(self._session.bus)
         place = _place(world, step.object)
         facts: dict[str, Any] = {"position_m": np.round(place, 4).tolist()}
         if step.near is not None and step.within is not None:
@@ -396,11 +385,8 @@ def _code(error: Exception) -> str:
 
 
 def _place(world: World, name: str) -> Vector:
-    thing = world.named(name)
-    if thing.link is not None:
-        raise StepFailed(f"{name!r} is attached to {thing.link}; release it before a look")
-    p = thing.pose.position
-    return np.array([p.x, p.y, p.z])
+    position = object_pose(world, name).position
+    return np.array([position.x, position.y, position.z])
 
 
 def _text(step: Step) -> str:

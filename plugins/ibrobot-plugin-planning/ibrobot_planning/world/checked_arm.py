@@ -1,19 +1,29 @@
-"""A robot's arm with the pairs of links that need no check, and what its SRDF adds."""
+"""A robot's arm for collision checks: pairs of links that need none, and hulls that make the others quick.
+
+Where nothing touches the convex hull of a link, nothing touches the shapes in it.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 
 import attrs
-from ibrobot_kinematics.srdf import Srdf, read_srdf
-from ibrobot_kinematics.urdf import read_urdf
+import numpy as np
+from ibrobot_kinematics.srdf import read_srdf
+from ibrobot_kinematics.urdf import Urdf, read_urdf
 
 from ibrobot_core.api import Robot
-from ibrobot_planning.world.arm import SRDF, Arm, Pair, robot_arm, sorted_pair
-from ibrobot_planning.world.collision import unchecked_pairs
-from ibrobot_planning.world.hulls import with_hulls
-from ibrobot_planning.world.semantics import urdf_names
+from ibrobot_planning.world.arm import SRDF, Arm, LinkShape, Pair, robot_arm, sorted_pair
+from ibrobot_planning.world.coal_shapes import enclosing, hull
+from ibrobot_planning.world.collision import Collisions, unchecked_pairs
+from ibrobot_planning.world.objects import World
+
+_SAMPLES = 200
+"""Number of configurations that determine which hulls are of use."""
+_VAIN_SHARE = 0.05
+"""A link whose hull touches another link in more of the free configurations keeps its shapes."""
 
 
 @attrs.frozen(eq=False)
@@ -25,7 +35,6 @@ class CheckedArm:
     """Pairs of links that need no check, with the reason."""
     names: Mapping[str, str]
     """Link of the URDF -> link of the MJCF; empty without a URDF."""
-    srdf: Srdf | None = None
 
 
 def checked_arm(robot: Robot, log: logging.Logger) -> CheckedArm:
@@ -52,4 +61,70 @@ def checked_arm(robot: Robot, log: logging.Logger) -> CheckedArm:
             log.warning(message, srdf.path, *pair, unknown[0])
         else:
             unchecked[sorted_pair(links[pair[0]], links[pair[1]])] = SRDF
-    return CheckedArm(arm, unchecked, links, srdf)
+    return CheckedArm(arm, unchecked, links)
+
+
+def urdf_names(arm: Arm, urdf: Urdf) -> dict[str, str]:
+    """Link of the MJCF -> link of the URDF, of the links that the same joints carry, and of the base."""
+    children = {joint.name: joint.child for joint in urdf.joints}
+    numbers = {int(number): name for number, name in zip(arm.numbers, arm.joint_names, strict=True)}
+    names: dict[str, str] = {}
+    named: set[int] = set()
+    for link, (joint, _) in arm.frames.items():
+        # The first link of a joint, from the base outwards, is the one that it carries; others are fixed to it.
+        if link == "world" or joint in named:
+            continue
+        named.add(joint)
+        if joint == 0:
+            names[link] = urdf.root
+        elif numbers[joint] in children:
+            names[link] = children[numbers[joint]]
+    return names
+
+
+def with_hulls(arm: Arm, unchecked: Collection[Pair]) -> Arm:
+    """The arm with one hull in place of the shapes of each link, where that is of use.
+
+    Args:
+        arm: the arm.
+        unchecked: pairs of links that may touch.
+    """
+    checks = Collisions(arm, World(), arm.joint_names, unchecked=unchecked)
+    samples = np.random.default_rng(0).uniform(arm.lower, arm.upper, (_SAMPLES, len(arm.joint_names)))
+    free = [q for q in samples if checks.free(q)]
+    of_links: dict[str, list[LinkShape]] = {}
+    for shape in arm.shapes:
+        of_links.setdefault(shape.link, []).append(shape)
+    hulls: dict[str, Sequence[LinkShape]] = {link: _hulls(shapes) for link, shapes in of_links.items()}
+    while True:
+        few = tuple(shape for shapes in hulls.values() for shape in shapes)
+        if len(few) == len(arm.shapes):
+            return arm
+        coarse = Collisions(attrs.evolve(arm, shapes=few), World(), arm.joint_names, unchecked=unchecked)
+        touching = Counter(
+            link for q in free for link in {name for each in coarse.contacts(q) for name in (each.first, each.second)}
+        )
+        vain = [
+            (number, link)
+            for link, number in touching.items()
+            if number > _VAIN_SHARE * len(free) and len(hulls[link]) < len(of_links[link])
+        ]
+        if not vain:
+            return attrs.evolve(arm, hulls=few)
+        # The link that touches most is at fault; the others may be good without it.
+        _, link = max(vain)
+        hulls[link] = of_links[link]
+
+
+def _hulls(shapes: Sequence[LinkShape]) -> Sequence[LinkShape]:
+    """One shape that contains the shapes of a link; shapes that are not convex stay."""
+    points, others = [], []
+    for shape in shapes:
+        corners = enclosing(shape.geometry)
+        if corners is None:
+            others.append(shape)
+        else:
+            points.append(corners @ shape.placement[:3, :3].T + shape.placement[:3, 3])
+    if len(points) < 2:
+        return shapes
+    return [LinkShape(shapes[0].link, shapes[0].joint, np.eye(4), hull(np.concatenate(points))), *others]

@@ -9,12 +9,23 @@ from typing import Any, override
 import numpy as np
 from ibrobot_kinematics.poses import matrix, pose
 
-from ibrobot_core.api import CameraInfo, ContractError, Image, Message, PointCloud2, Vector, ns, pixels
-from ibrobot_core.app import CONTROL, NoRequest, Received, Service, Session, SessionWorker
+from ibrobot_core.api import (
+    CameraInfo,
+    ContractError,
+    Image,
+    Message,
+    PointCloud2,
+    Pose,
+    TFMessage,
+    TransformStamped,
+    Vector,
+    ns,
+    pixels,
+)
+from ibrobot_core.app import CONTROL, Bus, NoRequest, Received, Service, Session, SessionWorker
 from ibrobot_planning.world.arm import Arm, robot_arm
 from ibrobot_planning.world.coal_shapes import geometry
-from ibrobot_planning.world.frames import Frames
-from ibrobot_planning.world.objects import SNAPSHOT, Voxels, WorldObject
+from ibrobot_planning.world.objects import Voxels, WorldObject, world_of
 from ibrobot_planning.world.options import CloudOptions, WorldOptions
 from ibrobot_planning.world.section import WorldKeeper
 from ibrobot_planning.world.voxels import cloud_points, depth_points, outside, voxels
@@ -43,7 +54,7 @@ class CloudKeeper(SessionWorker):
         self._arm = robot_arm(self.session.config.robot)
         self._keeper.start()
         self.on_end.callback(self._keeper.stop)
-        self._frames = Frames(self.session.bus)
+        self._frames = _Frames(self.session.bus)
         self.on_end.callback(self._frames.close)
         for cloud in self._clouds.values():
             cloud.open()
@@ -71,7 +82,7 @@ class CloudKeeper(SessionWorker):
         """The cells that neither the arm nor an object occupies."""
         arm = self._arm
         assert arm is not None
-        world = self.session.bus.call(SNAPSHOT)
+        world = world_of(self.session.bus)
         q = self.session.measured().position
         arm_shapes = arm.placed_shapes(q)
         others: list[tuple[Any, Vector]] = []
@@ -120,7 +131,7 @@ class _Cloud:
         self._due_ns = received.received_ns + ns(1.0 / self.options.rate)
         return received
 
-    def cells(self, received: Received, frames: Frames) -> Voxels | None:
+    def cells(self, received: Received, frames: _Frames) -> Voxels | None:
         """The cells that a message occupies in the base frame.
 
         Raises:
@@ -187,3 +198,41 @@ class _Cloud:
         if message != self._reported:
             self._reported = message
             self._session.log.warning("world.clouds.%s: %s: %s", self._name, self.options.topic, message)
+
+
+class _Frames:
+    """The newest transforms on `/tf` and `/tf_static`: where a sensor is in the base frame."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._subscriptions = [bus.subscribe(topic, 10, TFMessage) for topic in ("/tf_static", "/tf")]
+        self._newest: dict[str, TransformStamped] = {}
+
+    def pose(self, frame: str) -> Vector:
+        """Pose of a frame in the frame at the root of its tree, shape (4, 4).
+
+        Raises:
+            ValueError: for an unknown frame.
+        """
+        for subscription in self._subscriptions:
+            for received in subscription.drain():
+                message = received.message
+                assert isinstance(message, TFMessage)
+                self._newest.update((each.child_frame_id, each) for each in message.transforms)
+        if frame not in self._newest:
+            raise ValueError(
+                f"no transform of frame {frame!r}; peripherals[].transform says where a camera is mounted;"
+                f" known frames: {', '.join(self._newest) or 'none'}"
+            )
+        placed = np.eye(4)
+        for _ in self._newest:
+            if frame not in self._newest:
+                break
+            found = self._newest[frame]
+            placed = matrix(Pose(found.translation, found.rotation)) @ placed
+            frame = found.header.frame_id
+        return placed
+
+    def close(self) -> None:
+        """End the subscriptions."""
+        for subscription in self._subscriptions:
+            subscription.close()

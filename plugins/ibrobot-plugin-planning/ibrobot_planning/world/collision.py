@@ -218,6 +218,31 @@ class Collisions:
         return self._coarse.touches(native) and (self._exact is self._coarse or self._exact.touches(native))
 
 
+class Clearance:
+    """Distances in one world. Not for use by several threads.
+
+    Args:
+        arm: the arm.
+        world: its objects; those that a link carries belong to the arm.
+    """
+
+    def __init__(self, arm: Arm, world: World) -> None:
+        self._checks = Collisions(arm, world, arm.joint_names)
+        standing = {name for name, thing in world.objects.items() if thing.link is None}
+        self._pairs = [number for number, names in enumerate(self._checks.pairs) if standing.intersection(names)]
+
+    def __call__(self, q: Vector) -> float:
+        """Distance from the nearest object [m] at `q`, shape (J,): negative in contact, infinite without objects."""
+        checks = self._checks
+        native = checks.native(q[None])[0]
+        pinocchio.updateGeometryPlacements(checks.arm.model, checks.data, checks.geometry, checks.results, native)
+        distance = pinocchio.computeDistance
+        return min(
+            (float(distance(checks.geometry, checks.results, number).min_distance) for number in self._pairs),
+            default=math.inf,
+        )
+
+
 class _Engine:
     """Native checks of shapes, with margins that can be widened.
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector
-from ibrobot_core.app import NoRequest, Service
+from ibrobot_core.app import Bus, NoRequest, Service
 
 FLOOR = "floor"
 """Name of the object that the option `floor` of a planner adds."""
@@ -282,6 +282,11 @@ class World:
 
 
 SNAPSHOT = Service("/world/snapshot", NoRequest, World, "The objects around the robot.")
+
+
+def world_of(bus: Bus) -> World:
+    """The objects around the robot; none in a run without the section `world`."""
+    return bus.call(SNAPSHOT) if bus.serves(SNAPSHOT) else World()
 
 
 def read_mesh(path: Path, scale: float = 1.0, *, convex: bool = False) -> Mesh:

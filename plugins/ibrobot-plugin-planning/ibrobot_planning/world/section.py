@@ -43,7 +43,7 @@ from ibrobot_planning.world.options import Added, Allowed, Attached, Detached, M
 
 if TYPE_CHECKING:
     from ibrobot_planning.world.arm import Arm
-    from ibrobot_planning.world.clearance import Clearance
+    from ibrobot_planning.world.collision import Clearance
 
 SECTION = "world"
 MOST_OBJECTS = 200
@@ -308,7 +308,7 @@ class WorldKeeper(Component):
 
     def _distance(self, request: Configuration) -> float:
         """Distance of the arm from the nearest object [m], where joints not given are where they are measured."""
-        from ibrobot_planning.world.clearance import Clearance
+        from ibrobot_planning.world.collision import Clearance
 
         q = self._session.measured().position.copy()
         robot, positions = self._session.config.robot, request.positions

@@ -22,16 +22,21 @@ from ibrobot_core.api import (
     trajectory_goal,
 )
 from ibrobot_core.app import Session
-from ibrobot_planning.planners.blend import Limits, braking, cut, joined, motion_of, trajectory_of
-from ibrobot_planning.planners.timing import Motion
+from ibrobot_planning.planners.blend import Limits, braking, cut, joined
+from ibrobot_planning.planners.timing import Motion, motion_of, trajectory_of
 
 _LATENCY_S = 0.04
 """How far ahead a trajectory takes over from the running one: it must arrive there in time."""
 _LEAD_S = 0.15
-"""How long a replaced motion goes on before it brakes, so that fast planning costs no speed."""
+"""How long a replaced motion goes on before it brakes, so that quick replans do not slow the arm."""
 
 type ExecutorGoal = JointTrajectory | float
 """A trajectory, or a position [rad]."""
+
+
+def commanded(session: Session) -> Vector:
+    """Commanded positions [rad], shape (J,): unlike the measured ones, they do not sag."""
+    return session.state.command if session.state is not None else session.measured().position
 
 
 @attrs.define(eq=False)
@@ -138,7 +143,7 @@ class Execution:
             braked = self._braked()
             if braked is None:
                 return None
-            rest = self.commanded().copy()
+            rest = commanded(self._session).copy()
             try:
                 for name, (begin_ns, way) in braked.items():
                     takes_over = {"goal": self._tracks[name].goal_id, "time_ns": begin_ns}
@@ -202,7 +207,7 @@ class Execution:
 
     def touched(self) -> str:
         """What the arm touches, or is too near to, where it stands; empty if nothing."""
-        session, position = self._session, self.commanded()
+        session, position = self._session, commanded(self._session)
         robot = session.config.robot
         others = dict(zip(robot.joint_names, position.tolist(), strict=True))
         for name in session.config.control_modes[session.mode].executors:
@@ -213,11 +218,6 @@ class Execution:
                 if touched := self._planner.blocked(JointTrajectory(Header(), executor.joints, points), others):
                     return touched
         return ""
-
-    def commanded(self) -> Vector:
-        """Commanded positions [rad], shape (J,): unlike the measured ones, they do not sag."""
-        state = self._session.state
-        return state.command if state is not None else self._session.measured().position
 
     def _send(self, name: str, goal_id: str, goal: ExecutorGoal, takes_over: Mapping[str, Any] | None = None) -> None:
         message: dict[str, Any] = {"position": goal} if isinstance(goal, float) else trajectory_goal(goal)
