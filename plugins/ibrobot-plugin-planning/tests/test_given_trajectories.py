@@ -240,6 +240,15 @@ def test_what_is_accepted_is_whole_and_within_the_limits(gaps, values, speeds, f
         assert spline.at(int(t) + later)[0][0] == pytest.approx(p, abs=1e-6)
 
 
+@pytest.mark.parametrize("there", [0.05, 1.0], ids=["acceleration", "velocity"])
+def test_jump_and_return_between_two_setpoints_is_refused(there: float):
+    """Points a tenth of a control period apart: of all phases of the setpoints, some see the jump."""
+    times = range(0, 5_000_000, 1_000_000)
+    points = tuple(JointTrajectoryPoint(t, np.array([there if t == 3_000_000 else 0.0])) for t in times)
+    with pytest.raises(PlanningError, match="pan near 0"):
+        completed(JointTrajectory(Header(), ("pan",), points), np.zeros(1), ONE, PERIOD_NS)
+
+
 @pytest.mark.parametrize("fields", [1, 3], ids=["positions", "accelerations"])
 def test_jump_of_a_planner_of_another_plugin_is_refused(
     start: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fields: int

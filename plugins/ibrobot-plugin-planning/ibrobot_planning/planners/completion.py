@@ -11,6 +11,8 @@ points leave out is computed here, so that the motion that is checked is the mot
 
 from __future__ import annotations
 
+import math
+
 import attrs
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +32,8 @@ _MORE = 1.01
 """Allowed excess of the limits of velocity and acceleration, for rounding."""
 _BEYOND_RAD = 1e-5
 """Allowed excess of positions, for rounding."""
+_MOST_PARTS = 20
+"""Samples within half a control period, at most."""
 _JUMP = 1e-3
 """Jumps of the acceleration, as a share of its limit, that need no further points."""
 _QUINTIC_SPEED, _QUINTIC_RATE = 1.875, 5.7736
@@ -86,7 +90,8 @@ def completed(trajectory: JointTrajectory, start: Vector, robot: Robot, period_n
     if made is None or not _is_whole(made, start):
         made = _smooth(points, robot.max_acceleration[order], period_ns)
         trajectory = trajectory_of(made, names, trajectory.header.stamp_ns)
-    _check_limits(made, robot, order, names, seconds(period_ns))
+    shortest_s = float(np.diff(points.times_ns).min()) / ns(1.0)
+    _check_limits(made, robot, order, names, seconds(period_ns), shortest_s)
     return trajectory
 
 
@@ -248,20 +253,33 @@ def _at(
     )
 
 
-def _check_limits(made: Motion, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...], period_s: float) -> None:
+def _check_limits(
+    made: Motion, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...], period_s: float, shortest_s: float
+) -> None:
     """Check positions, speeds and changes of speed as the safety layer sees them: by setpoints a control period apart.
+
+    Args:
+        made: the motion.
+        robot: the robot.
+        order: indices of the joints.
+        names: their names.
+        period_s: control period.
+        shortest_s: least time between two given points.
 
     Raises:
         PlanningError: for the joint that exceeds a limit most.
     """
-    step = period_s / 2  # setpoints may fall anywhere between the points
+    # Setpoints may fall anywhere between the points: samples lie as near to one another as the nearest given points.
+    parts = min(max(math.ceil(period_s / (2 * shortest_s)), 1), _MOST_PARTS)
+    step = period_s / 2 / parts
     inner = made.sampled(step)[0]
-    rest = np.repeat(inner[-1:], 3, axis=0)
-    positions = np.concatenate([inner[:1], inner[:1], inner, rest])
+    rest = np.repeat(inner[-1:], 3 * parts, axis=0)
+    positions = np.concatenate([np.repeat(inner[:1], 2 * parts, axis=0), inner, rest])
     # A motion may begin outside the positions, and lead inwards.
     lower, upper = np.minimum(robot.lower[order], inner[0]), np.maximum(robot.upper[order], inner[0])
-    speeds = np.abs(np.diff(positions, axis=0)) / step
-    changes = np.abs(positions[4:] - 2 * positions[2:-2] + positions[:-4]) / period_s**2
+    speeds = np.abs(positions[parts:] - positions[:-parts]) / (parts * step)
+    middle = positions[2 * parts : -2 * parts]
+    changes = np.abs(positions[4 * parts :] - 2 * middle + positions[: -4 * parts]) / period_s**2
     for what, unit, values, limits in (
         ("position", "rad", np.maximum(positions - upper, lower - positions), np.full(len(order), _BEYOND_RAD)),
         ("velocity", "rad/s", speeds, _MORE * robot.max_velocity[order]),
@@ -274,7 +292,7 @@ def _check_limits(made: Motion, robot: Robot, order: NDArray[np.intp], names: tu
             said = f"a {what} of {peak:.4g} {unit}; its limit is {limit:.4g} {unit}"
             if what == "position":
                 said = f"a position {peak:.4g} rad outside its limits"
-            at = min(max(float(worst) - 1, 0) * step, made.duration)
+            at = min(max(float(worst) - parts, 0) * step, made.duration)
             raise _invalid(f"the trajectory gives {names[int(joint)]} near {at:.3f} s {said}")
 
 
