@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import queue
 import re
 import select
+import signal
 import termios
 import threading
 import tty
@@ -15,6 +17,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from ibrobot_core.errors import TeleopError
+from ibrobot_core.keys import RELEASE, REPEAT
 
 _ESCAPE_S = 0.05
 """Time after which a lone escape is the key, not the start of a sequence [s]."""
@@ -35,6 +38,27 @@ _NUMBERS = {
 KEY_NAMES = tuple(dict.fromkeys((*_NAMED.values(), "esc", *_LETTERS.values(), *_NUMBERS.values())))
 """The keys with a name; every other key is the character that it types."""
 
+_ASK, _REPORT_ALL, _REPORT_NO_MORE = b"\x1b[?u", b"\x1b[>27u", b"\x1b[<u"
+"""Of kitty's keyboard protocol: ask whether the terminal has it; have it report presses, repeats and releases of all
+keys with the text that they type; and as before."""
+_ANSWER = re.compile(r"\?\d{1,5}")
+_REPORT = re.compile(r"(\d{1,7})(?::[\d:]*)?(?:;(\d{0,5})(?::([123]))?)?(?:;(\d{1,7})[\d:]*)?")
+"""Of the same: the code of a key, its modifiers, the kind of the event, and the first character typed."""
+_PLAIN = {27: "esc", 13: "enter", 9: "tab", 127: "backspace", 57414: "enter"} | dict(
+    enumerate(("left", "right", "up", "down", "page_up", "page_down", "home", "end", "insert", "delete"), 57417)
+)
+"""Code -> key; the last ones are those of the keypad."""
+_FUNCTIONAL = range(57344, 63744)
+"""Codes of keys that type nothing, e.g. modifiers."""
+_CTRL, _OTHERS = 4, 0b111010
+"""Bits of modifiers: Control; Alt, Super, Hyper and Meta, with which no key means anything here."""
+_KINDS = {"2": REPEAT, "3": RELEASE}
+_HAS_REPORTS = "\x05"
+"""Instead of a key: the terminal has said that it can report releases."""
+_SIGNALS = {termios.VINTR: signal.SIGINT, termios.VQUIT: signal.SIGQUIT, termios.VSUSP: signal.SIGTSTP}
+"""Which signal a control character sends; a terminal that reports all keys leaves that to the program."""
+_log = logging.getLogger("ibrobot.keys")
+
 _SEQUENCE = re.compile(rb"\x1b(?:\[\[([A-E])|\[([0-?]*)[ -/]*([@-Z\\-~])|O([A-Za-z]))")
 """An escape sequence: f1 to f5 of the Linux console, a control sequence, or a key in application mode."""
 _BEGINNING = re.compile(rb"\x1b(?:\[(?:\[|[0-?]*[ -/]*)|O)?")
@@ -51,22 +75,26 @@ def check_key(key: str) -> None:
         raise ValueError(f"{key!r} is not a key: give the character that it types, or a name: {', '.join(KEY_NAMES)}")
 
 
-def decode(typed: bytes, *, final: bool) -> tuple[list[str], bytes]:
+def decode(typed: bytes, *, final: bool, down: dict[int, str] | None = None) -> tuple[list[str], bytes]:
     """Decode the bytes sent by a terminal into keys.
 
     Keys are printable characters, and `space`, `enter`, `tab`, `backspace`, `esc`, `up`, `down`, `left`,
     `right`, `home`, `end`, `insert`, `delete`, `page_up`, `page_down`, `f1` to `f12`; modifiers of the named ones are
     ignored. Unknown sequences, control characters and invalid UTF-8 are ignored. An escape that starts no sequence is
-    `esc`.
+    `esc`. A terminal that reports all keys (kitty's protocol) also sends `repeat:KEY` and `release:KEY`, and a control
+    character for a key pressed with Control.
 
     Args:
         typed: the bytes, starting at a key.
         final: whether no more bytes follow for now, so that a lone escape is the key.
+        down: the keys that a terminal has reported as pressed, by code, kept from call to call: a release does not say
+            what the key typed.
 
     Returns:
         The keys, and the bytes of an incomplete last key, to be continued by the next bytes; empty if `final`.
     """
     keys: list[str] = []
+    down = {} if down is None else down
     while typed:
         if typed[0] != 0x1B:
             length = _character_length(typed[0])
@@ -82,7 +110,7 @@ def decode(typed: bytes, *, final: bool) -> tuple[list[str], bytes]:
                 keys.append(_NAMED.get(character, character))
         elif sequence := _SEQUENCE.match(typed):
             typed = typed[sequence.end() :]
-            keys += _sequence_key(*(group.decode() if group else "" for group in sequence.groups()))
+            keys += _sequence_key(down, *(group.decode() if group else "" for group in sequence.groups()))
         elif _BEGINNING.fullmatch(typed):
             if not final:
                 break
@@ -99,19 +127,41 @@ def _character_length(first: int) -> int:
     return 2 if 0xC2 <= first < 0xE0 else 3 if 0xE0 <= first < 0xF0 else 4 if 0xF0 <= first < 0xF5 else 1
 
 
-def _sequence_key(console: str, parameters: str, last: str, application: str) -> list[str]:
+def _sequence_key(down: dict[int, str], console: str, parameters: str, last: str, application: str) -> list[str]:
     """The key of a sequence, from the groups of `_SEQUENCE`, or none."""
     if console:
         return [f"f{ord(console) - ord('A') + 1}"]
+    report = _REPORT.fullmatch(parameters)
+    if last == "u":
+        return [_HAS_REPORTS] if _ANSWER.fullmatch(parameters) else _reported_key(report, down) if report else []
     key = _NUMBERS.get(parameters.partition(";")[0]) if last == "~" else _LETTERS.get(last or application)
-    return [key] if key else []
+    return [_KINDS.get(report[3] or "", "") + key if report else key] if key else []
+
+
+def _reported_key(report: re.Match[str], down: dict[int, str]) -> list[str]:
+    """The key of a report of kitty's protocol, or none."""
+    code, modifiers, kind = int(report[1]), int(report[2] or 1) - 1, _KINDS.get(report[3] or "", "")
+    if kind == RELEASE:
+        released = down.pop(code, None)
+        return [RELEASE + released] if released else []
+    key = _PLAIN.get(code)
+    if key is None and modifiers & _CTRL:
+        return [chr(code & 0x1F)] if 0x40 <= code < 0x80 and not kind else []
+    if key is None and not modifiers & _OTHERS:
+        character = chr(min(int(report[4] or code), 0x10FFFF))
+        key = _NAMED.get(character) or (character if character.isprintable() and code not in _FUNCTIONAL else None)
+    if key is None:
+        return []
+    down[code] = key
+    return [kind + key]
 
 
 class KeyReader:
     """Reads keys from a terminal while open, and sends each to every subscriber.
 
-    Meanwhile the terminal does not echo typed characters; Ctrl-C and similar keys still send signals. Use it as a
-    context manager, which always restores the terminal.
+    Meanwhile the terminal does not echo typed characters; Ctrl-C and similar keys still send signals. A terminal with
+    kitty's keyboard protocol reports repeats and releases, which `HeldKeys` understands. Use it as a context manager,
+    which always restores the terminal.
 
     Args:
         fd: the terminal; standard input by default.
@@ -129,6 +179,8 @@ class KeyReader:
         self._subscribers: weakref.WeakSet[queue.SimpleQueue[str]] = weakref.WeakSet()
         self._thread: threading.Thread | None = None
         self._saved: list[Any] = []
+        self._reports = False
+        """Whether the terminal was told to report all keys."""
         self._wake: tuple[int, int] = (-1, -1)
 
     def open(self) -> None:
@@ -144,6 +196,7 @@ class KeyReader:
         self._saved = termios.tcgetattr(self._fd)
         self._wake = os.pipe()
         tty.setcbreak(self._fd)
+        self._say(_ASK)
         self._thread = threading.Thread(target=self._read, name="keys", daemon=True)
         self._thread.start()
 
@@ -172,8 +225,21 @@ class KeyReader:
         finally:
             with suppress(termios.error):
                 tty.setcbreak(self._fd, termios.TCSANOW)
+            self._say(_ASK)
+
+    def _say(self, text: bytes) -> None:
+        """Write to the terminal, but never wait for one that is paused."""
+        with suppress(OSError):
+            terminal = os.open(os.ttyname(self._fd), os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+            try:
+                os.write(terminal, text)
+            finally:
+                os.close(terminal)
 
     def _restore(self) -> None:
+        if self._reports:
+            self._reports = False
+            self._say(_REPORT_NO_MORE)
         # At once: to wait until all output is written, as TCSAFLUSH does, takes forever on a terminal that is paused.
         with suppress(termios.error):  # the terminal is gone
             termios.tcsetattr(self._fd, termios.TCSANOW, self._saved)
@@ -194,7 +260,7 @@ class KeyReader:
         self.close()
 
     def _read(self) -> None:
-        typed = b""
+        typed, down = b"", dict[int, str]()
         while True:
             self.beat()
             ready, _, _ = select.select([self._fd, self._wake[0]], [], [], _ESCAPE_S)
@@ -209,8 +275,22 @@ class KeyReader:
                     self.gone()
                     return
                 typed += read
-            keys, typed = decode(typed, final=not ready)
+            keys, typed = decode(typed, final=not ready, down=down)
+            keys = [key for key in keys if not self._handle(key)]
             with self._lock:
                 for subscriber in self._subscribers:
                     for key in keys:
                         subscriber.put(key)
+
+    def _handle(self, key: str) -> bool:
+        """Act on what is no key: an answer of the terminal, and control characters."""
+        if key == _HAS_REPORTS:
+            if not self._reports:
+                self._reports = True
+                self._say(_REPORT_ALL)
+                _log.info("this terminal reports when keys are released")
+        elif key < " ":
+            for index, number in _SIGNALS.items():
+                if self._saved[6][index] == key.encode():
+                    os.kill(0, number)  # to the process group, as the terminal does
+        return key < " "

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import gc
 import os
+import queue
+import select
+import signal
 import termios
 import threading
 import weakref
@@ -14,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ibrobot_core.errors import TeleopError
+from ibrobot_core.keys import HeldKeys
 from ibrobot_core.terminal import KeyReader, decode
 
 TIMEOUT_S = 30
@@ -39,6 +43,27 @@ def test_a_key_is_known_by_what_terminals_send(typed, key):
 @pytest.mark.parametrize("typed", PASSED_OVER)
 def test_bytes_without_a_key_are_ignored(typed):
     assert decode(typed + b"a", final=True) == (["a"], b"")
+
+
+REPORTS = [
+    (b"\x1b[97;;97u", ["a"]), (b"\x1b[97;1:2;97u", ["repeat:a"]), (b"\x1b[97;1:3u", ["release:a"]),
+    (b"\x1b[61;2;43u", ["+"]), (b"\x1b[61;1:3u", ["release:+"]),  # shift was released first
+    (b"\x1b[32;1:1;32u\x1b[32;1:2;32u\x1b[32;1:3u", ["space", "repeat:space", "release:space"]),
+    (b"\x1b[27u", ["esc"]), (b"\x1b[27;5u", ["esc"]), (b"\x1b[27;1:2u", ["repeat:esc"]), (b"\x1b[13;1:1u", ["enter"]),
+    (b"\x1b[1;1:1A", ["up"]), (b"\x1b[1;1:2A", ["repeat:up"]), (b"\x1b[1;1:3A", ["release:up"]),
+    (b"\x1b[57419u", ["up"]),
+    (b"\x1b[21;1:3~", ["release:f10"]), (b"\x1b[13~", ["f3"]), (b"\x1b[P", ["f1"]),
+    (b"\x1b[57441;2u", []), (b"\x1b[119;3u", []), (b"\x1b[98;1:3u", []),  # shift; with alt; a press before the start
+    (b"\x1b[99;5u", ["\x03"]), (b"\x1b[99;5:2u", []), (b"\x1b[?0u", ["\x05"]),
+    (b"\x1b[55296;;55296u\x1b[9999999;;9999999u\x1b[;;u\x1b[97;9999999u\x1b[" + b"9" * 5000 + b"u", []),
+]  # fmt: skip
+"""What terminals with kitty's protocol send, one after the other -> the keys."""
+
+
+def test_reports_of_keys_say_which_are_pressed_repeated_and_released():
+    down: dict[int, str] = {}
+    for typed, keys in REPORTS:
+        assert decode(typed, final=True, down=down) == (keys, b""), typed
 
 
 @given(st.lists(st.sampled_from(list(SENT.items()))))
@@ -67,7 +92,10 @@ def test_it_does_not_matter_how_the_bytes_arrive(typed, sizes):
 def test_every_key_has_a_name_and_none_is_made_up(typed):
     keys, _ = decode(typed, final=True)
     for key in keys:
-        assert key in {*SENT.values(), "esc"} or (len(key) == 1 and key.isprintable() and key.encode() in typed)
+        name = key.removeprefix("repeat:").removeprefix("release:") or key
+        assert name in {*SENT.values(), "esc"} or (
+            len(name) == 1 and (name in typed.decode(errors="ignore") or b"u" in typed)
+        )
 
 
 @given(st.lists(pieces).map(b"".join))
@@ -156,6 +184,59 @@ def test_keys_come_unechoed_without_enter_and_the_terminal_is_restored(terminal)
     assert termios.tcgetattr(program) == before
     assert threading.active_count() == threads
     keys.close()
+
+
+def said(person: int, wanted: bytes) -> None:
+    """Wait until the program has written this to the terminal."""
+    text = b""
+    while not text.endswith(wanted):
+        assert select.select([person], [], [], TIMEOUT_S)[0], text
+        text += os.read(person, 100)
+
+
+def test_a_terminal_that_can_reports_repeats_and_releases_until_the_end(terminal, caplog):
+    caplog.set_level("INFO", "ibrobot.keys")
+    person, program = terminal
+    with KeyReader(program) as keys:
+        said(person, b"\x1b[?u")
+        subscriber = keys.subscribe()
+        os.write(person, b"\x1b[?0u")
+        said(person, b"\x1b[>27u")
+        held = HeldKeys(0.2)
+        os.write(person, b"\x1b[32;1:1;32u\x1b[32;1:2;32u")
+        held.take([subscriber.get(timeout=TIMEOUT_S) for _ in range(2)], 0)
+        assert held.held("space")
+        os.write(person, b"\x1b[32;1:3u")
+        held.take([subscriber.get(timeout=TIMEOUT_S)], 1)
+        assert held.events == [("release", "space")]
+        with keys.suspended():
+            said(person, b"\x1b[<u")
+        said(person, b"\x1b[?u")
+        os.write(person, b"\x1b[?0u")
+        said(person, b"\x1b[>27u")
+    said(person, b"\x1b[<u")
+    assert "this terminal reports when keys are released" in caplog.text
+
+
+def test_a_terminal_that_reports_all_keys_still_sends_signals(terminal, monkeypatch):
+    person, program = terminal
+    sent: queue.SimpleQueue[tuple[int, int]] = queue.SimpleQueue()
+    monkeypatch.setattr(os, "kill", lambda *arguments: sent.put(arguments))
+    with KeyReader(program) as keys:
+        subscriber = keys.subscribe()
+        os.write(person, b"\x1b[99;5u\x1b[122;5:1u\x1b[92;5u\x1b[120;5ua")
+        assert [sent.get(timeout=TIMEOUT_S) for _ in range(3)] == [
+            (0, signal.SIGINT), (0, signal.SIGTSTP), (0, signal.SIGQUIT),
+        ]  # fmt: skip
+        assert subscriber.get(timeout=TIMEOUT_S) == "a"
+
+
+def test_a_paused_terminal_holds_nothing_up(terminal):
+    _, program = terminal
+    termios.tcflow(program, termios.TCOOFF)
+    with KeyReader(program) as keys, keys.suspended():
+        pass
+    termios.tcflow(program, termios.TCOON)
 
 
 def test_it_can_be_opened_again(terminal):

@@ -21,6 +21,7 @@ from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.errors import IbrobotError, TeleopError
+from ibrobot_core.keys import RELEASE, REPEAT
 from ibrobot_core.launch.models import check_models
 from ibrobot_core.launch.pulses import PULSE_S, Pulse
 from ibrobot_core.launch.runtime import Runtime
@@ -218,6 +219,8 @@ def _listen(session: Session, take: Callable[[tuple[str, int]], None]) -> None:
             pulse.beat()
             with suppress(queue.Empty):
                 key = keys.get(timeout=PULSE_S)
+                if key.startswith((REPEAT, RELEASE)):
+                    continue
                 if key != "esc":
                     take((key, session.stops))
                     continue

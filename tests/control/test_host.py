@@ -311,10 +311,14 @@ class TestProcess:
         tick = reports.state(lambda state: True).tick
         os.kill(host.pid, signal.SIGSTOP)
         goal = {"executor": "trajectory", "goal_id": "1", "goal": {}}
-        for command in ({"do": "goal", **goal}, {"do": "reset", "stops": 0}, {"do": "estop"}):
-            host._child.channel.send({"id": 0, **command})
+        waiting = [host._replies.setdefault(number, queue.SimpleQueue()) for number in (101, 102)]
+        for command in ({"id": 101, "do": "goal", **goal}, {"id": 102, "do": "reset", "stops": 0}, {"do": "estop"}):
+            host._child.channel.send(command)
         os.kill(host.pid, signal.SIGCONT)
 
+        refused = [each.get(timeout=PATIENCE_S)["error"] for each in waiting]
+        assert refused[0].startswith("goal: refused before a reset: emergency stop")
+        assert refused[1] == "reset: refused, an emergency stop came after it was requested"
         reports.state(lambda state: state.stops == 1)
         host.call("counters")
         reports.state(lambda state: state.tick > tick + 20)

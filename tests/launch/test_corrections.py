@@ -153,6 +153,30 @@ def test_a_key_takes_the_robot(begin) -> None:
     assert episode.run.session.command_source.help().startswith("x  give the robot back")
 
 
+def test_repeats_of_a_held_key_are_no_presses(begin) -> None:
+    """A held key repeats after 0.4 s, every 40 ms; the terminal reports no releases."""
+    typed: list[queue.SimpleQueue[str]] = []
+
+    def keys() -> queue.SimpleQueue[str]:
+        typed.append(queue.SimpleQueue())
+        return typed[-1]
+
+    def hold(ticks: int) -> list[str]:
+        labels = []
+        for tick in range(ticks):
+            if tick == 0 or (tick >= 20 and tick % 2 == 0):
+                for each in typed:
+                    each.put("x")
+            labels += episode.ticks(1)
+        return labels + episode.ticks(30)
+
+    episode = begin("episodes={takeover_key: x}", keys=keys)
+    assert episode.ticks(5)[-1] == "policy"
+    assert set(hold(60)[2:]) == {"handover"}, "taken at once, and not given back"
+    assert list(dict.fromkeys(hold(60))) == ["handover", "policy"], "given back, and not taken again"
+    assert set(hold(1)[2:]) == {"handover"}
+
+
 def test_without_key_and_button_the_log_says_what_takes_the_robot(begin, caplog: pytest.LogCaptureFixture) -> None:
     begin()
     assert "and a button of lever (lever), only the service /intervene takes the robot" in caplog.text

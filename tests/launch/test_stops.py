@@ -271,18 +271,37 @@ class TestDevices:
         assert runtime.session.stops >= 1
         assert is_stopped(runtime)
 
-    def test_one_can_stop_the_robot_on_its_way_to_the_stop_pose(self, runs: Runs):
-        runtime = runs.start("control_modes.teleop.teleop=lever", "control.stop=pose up", mode="teleop")
+    @pytest.mark.parametrize("mode", ["teleop", "policy"])
+    def test_one_can_stop_the_robot_on_its_way_to_the_stop_pose(self, runs: Runs, mode: str):
+        runtime = runs.start(
+            "control_modes.teleop.teleop=lever", "control_modes.policy.inference={model: net, intervene: lever}",
+            "control.stop=pose up", mode=mode,
+        )  # fmt: skip
         lever = runs.parts.MADE["lever"]
         source: Any = runtime.session.command_source
+        control: Any = runtime.session.control
+        steps(runtime, 3)
         read = lever.read
         lever.read = lambda measured: pressed(read(measured))
-        runtime.session.finish()
-        control: Any = runtime.session.control
-        control.step()
-        source.step(runtime.session.clock.now_ns())
+        # The robot moves to its pose after what cannot send a stop has ended, and before the rest.
+        runtime.session.on_state.append(lambda state: source.step(runtime.session.clock.now_ns()))
+        runtime.stop()
 
-        assert runtime.session.stops == 1
+        assert control.stops >= 1
+
+    @pytest.mark.parametrize("mode", ["teleop", "policy"])
+    def test_one_that_blocks_is_noticed(self, runs: Runs, mode: str):
+        runtime = runs.start(
+            "control_modes.teleop.teleop=lever", "control_modes.policy.inference={model: net, intervene: lever}",
+            mode=mode,
+        )  # fmt: skip
+        (pulse,) = runtime.session.pulses
+        assert pulse.name == "teleop lever (lever)"
+        steps(runtime)
+        assert not pulse.is_late(0.1)
+        assert any(pulse.is_late(0.1) for _ in range(70))
+        runtime.switch_mode("idle")
+        assert not runtime.session.pulses
 
 
 def pressed(command: Any) -> Any:

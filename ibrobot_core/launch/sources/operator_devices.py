@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import JointReading, Teleop, TeleopCommand, begin_operation, operate
+from ibrobot_core.launch.pulses import Pulse
 from ibrobot_core.launch.session import Session
 from ibrobot_core.robot import Robot
+
+_BLOCKED_S = 6.0
+"""Time without a sign of life of the thread that reads devices after which the run ends [s]; the answer of control may
+take 5 s."""
 
 
 @attrs.define(eq=False)
@@ -34,12 +39,17 @@ class OperatorDevices:
     Args:
         session: the run.
         devices: joint group -> name of the device that moves it; empty group: a device that may move all joints.
+
+    Attributes:
+        pulse: the signs of life of the thread that reads them, from `connect` to `disconnect`. It must beat at every
+            unit of work, and pause for what may take long.
     """
 
     def __init__(self, session: Session, devices: Mapping[str, str]) -> None:
         self._session = session
         self._devices = devices
         self._connected: list[_Connected] = []
+        self.pulse = Pulse(f"teleop {self}", _BLOCKED_S)
 
     def __str__(self) -> str:
         types = self._session.config.teleoperation
@@ -61,9 +71,12 @@ class OperatorDevices:
             self._connected.append(
                 _Connected(name, device, robot.indices(part.joint_names), frozenset(part.joint_names))
             )
+        self.pulse.beat()
+        self._session.pulses.add(self.pulse)
 
     def disconnect(self) -> None:
         """Release the devices. Safe to call twice."""
+        self._session.pulses.discard(self.pulse)
         connected, self._connected = self._connected, []
         for (group, name), each in zip(self._devices.items(), connected, strict=False):
             if self._session.devices.give_back((group, name)):

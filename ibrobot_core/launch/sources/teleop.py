@@ -10,7 +10,6 @@ import numpy as np
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.control.link import ControlState
 from ibrobot_core.errors import TeleopError
-from ibrobot_core.launch.pulses import Pulse
 from ibrobot_core.launch.session import Session
 from ibrobot_core.launch.sources.operator_devices import OperatorDevices
 from ibrobot_core.launch.sources.source_worker import SourceWorker
@@ -45,10 +44,6 @@ class Braking:
         return {**positions, **dict(zip(dropped, stop.tolist(), strict=True))}
 
 
-_BLOCKED_S = 6.0
-"""Time without a reading of the devices after which the run ends [s]; the answer of control may take 5 s."""
-
-
 class TeleopSource(SourceWorker):
     """The teleoperation devices of a mode, which command the robot by plans as all command sources do.
 
@@ -69,13 +64,10 @@ class TeleopSource(SourceWorker):
         self.on_end.callback(self._devices.disconnect)
         self._devices.connect()
         self._states = self.session.watch_states()  # also while the joints do not answer: a device may stop the robot
-        self._pulse = Pulse(f"teleop {self._devices}", _BLOCKED_S)
-        self.session.pulses.add(self._pulse)
-        self.on_end.callback(self.session.pulses.discard, self._pulse)
 
     @override
     def recover(self) -> None:
-        with self._pulse.paused(), self.lock:
+        with self._devices.pulse.paused(), self.lock:
             self._devices.recover()
 
     @override
@@ -85,7 +77,7 @@ class TeleopSource(SourceWorker):
 
     @override
     def work(self, timeout_s: float) -> None:
-        self._pulse.beat()
+        self._devices.pulse.beat()
         if self._states.get(timeout_s) is None:
             return
         with self.lock:

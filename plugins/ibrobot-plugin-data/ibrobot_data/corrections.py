@@ -8,6 +8,7 @@ from typing import override
 import attrs
 
 from ibrobot_core.api import (
+    HeldKeys,
     NotSupported,
     String,
     TeleopCommand,
@@ -42,6 +43,8 @@ class Intervene:
 INTERVENE = Service(
     "/intervene", Intervene, str, "Take the robot from its policy; answers with who commands then.", alone="take"
 )
+_RELEASE_S = 0.2
+"""Longest time between two repeats of a held key [s]."""
 _ANSWER_S = 60.0
 """How long the arm holds while the policy does not answer, before its setpoints count as stale [s]."""
 
@@ -63,7 +66,7 @@ class Corrections(SourceWorker):
     """
 
     autonomous = True
-    urgent = True
+    sends_stops = urgent = True
 
     def __init__(self, session: Session, mode: ControlMode, policy: PolicySource) -> None:
         assert mode.inference is not None
@@ -76,6 +79,7 @@ class Corrections(SourceWorker):
         moved = {joint for name in mode.executors for joint in config.executors[name].joints}
         self._arm = Handover(session, tuple(joint for joint in config.robot.joint_names if joint in moved))
         self._keys: queue.SimpleQueue[str] | None = None
+        self._held = HeldKeys(_RELEASE_S)
         self._commander = POLICY
         self._taken = False
         """Whether the operator has the robot, or is about to have it."""
@@ -110,7 +114,7 @@ class Corrections(SourceWorker):
 
     @override
     def recover(self) -> None:
-        with self.lock:
+        with self._devices.pulse.paused(), self.lock:
             self._devices.recover()
             self._policy.recover()
 
@@ -120,7 +124,8 @@ class Corrections(SourceWorker):
         self._devices.activate(self.session.measured())
         self._taken = self._waiting = self._engaged = False
         self._set(POLICY)
-        self._typed()
+        self._held.take(self._typed(), self.session.clock.now_ns())
+        self._held.forget()
         self._policy.begin(seed)
         self.session.bus.serve(INTERVENE, lambda request: self.intervene(request.take))
 
@@ -147,12 +152,13 @@ class Corrections(SourceWorker):
 
     @override
     def work(self, timeout_s: float) -> None:
+        self._devices.pulse.beat()
         if self._states.get(timeout_s) is None:
             return
         with self.lock:
-            typed = self._typed()
+            self._held.take(self._typed(), self.session.clock.now_ns())
             if self.active:
-                self._tick(typed.count(self._options.takeover_key))
+                self._tick(int(self._is_key_pressed()))
 
     @override
     def help(self) -> str:
@@ -166,6 +172,19 @@ class Corrections(SourceWorker):
     @override
     def facts(self) -> dict[str, object]:
         return {"takeovers": self._takeovers, "operator_s": round(seconds(self._commanded_ns), 3)}
+
+    def _is_key_pressed(self) -> bool:
+        """Whether the key for takeovers was pressed: what may be a press takes the robot at once.
+
+        It is given back by what is certainly a press, since repeats of a held key must not do so.
+        """
+        key, held = self._options.takeover_key, self._held
+        if self._taken:
+            return key in held.presses
+        pressed = key in held.touched and ("repeat", key) not in held.events
+        if pressed:
+            held.forget()
+        return pressed
 
     def _has_button(self) -> bool:
         """Whether one of the devices has a button for takeovers."""

@@ -331,8 +331,11 @@ class LeaderTeleop(Teleop):
         key = self._options.deadman_key
         match self._options.deadman:
             case "toggle":
-                # Whatever comes while it follows pauses, so that a held key cannot start it again.
-                self._toggled = key not in self._held.touched if self._toggled else key in self._held.presses
+                if not self._toggled:
+                    self._toggled = key in self._held.presses
+                elif key in self._held.touched:  # whatever comes while it follows pauses, and starts nothing later
+                    self._toggled = False
+                    self._held.forget()
                 return self._toggled
             case "hold":
                 return self._held.held(key)

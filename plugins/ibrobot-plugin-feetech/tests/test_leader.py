@@ -433,6 +433,14 @@ class TestDeadman:
         assert np.flatnonzero(follows["hold"]).tolist() == list(range(40, 220))
         assert "known by its repeats" in LeaderTeleop.help(rig.leader)
 
+    def test_toggle_without_reports_of_releases_starts_and_pauses_by_one_press_each(self, emulator, calibration_file):
+        rig = TeleopRig(emulator, calibration_file, deadman="toggle")
+        rig.leader.connect()
+        begin_operation(rig.leader, rig.measured())
+        follows = [rig.read(*["space"] * (i in (10, 200, 500))).positions is not None for i in range(600)]
+        rig.leader.disconnect()
+        assert np.flatnonzero(follows).tolist() == [*range(25, 200), *range(515, 600)]
+
     @options(deadman="toggle")
     def test_key_repeats_are_no_presses(self, rig: TeleopRig):
         rig.read("space")
