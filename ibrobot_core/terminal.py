@@ -180,7 +180,7 @@ class KeyReader:
         self._thread: threading.Thread | None = None
         self._saved: list[Any] = []
         self._reports = False
-        """Whether the terminal was told to report all keys."""
+        """Whether the terminal reports all keys."""
         self._wake: tuple[int, int] = (-1, -1)
 
     def open(self) -> None:
