@@ -66,7 +66,8 @@ class Corrections(SourceWorker):
     """
 
     autonomous = True
-    sends_stops = urgent = True
+    sends_stops = True
+    urgent = True
 
     def __init__(self, session: Session, mode: ControlMode, policy: PolicySource) -> None:
         assert mode.inference is not None
