@@ -128,10 +128,7 @@ class MoveIt2(CollisionObjects):
         Raises:
             PlanningError: for a goal that makes no sense.
         """
-        if pose is not None or position is not None or quat_xyzw is not None:
-            self.set_pose_goal(
-                pose, position, quat_xyzw, frame_id, target_link, tolerance_position, tolerance_orientation
-            )
+        self.set_pose_goal(pose, position, quat_xyzw, frame_id, target_link, tolerance_position, tolerance_orientation)
         if cartesian:
             self._follow(self._straight(cartesian_fraction_threshold, {}))
         else:
@@ -166,10 +163,7 @@ class MoveIt2(CollisionObjects):
         Raises:
             PlanningError: for a goal that makes no sense.
         """
-        if pose is not None or position is not None or quat_xyzw is not None:
-            self.set_pose_goal(
-                pose, position, quat_xyzw, frame_id, target_link, tolerance_position, tolerance_orientation
-            )
+        self.set_pose_goal(pose, position, quat_xyzw, frame_id, target_link, tolerance_position, tolerance_orientation)
         if joint_positions is not None:
             self.set_joint_goal(joint_positions, joint_names, tolerance_joint_position)
         start = positions_of(start_joint_state, self.joint_names)

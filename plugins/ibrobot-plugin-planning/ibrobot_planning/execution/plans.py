@@ -87,7 +87,7 @@ class GoalPlans:
         return goals[0].goal(*place) if len(goals) == 1 else AnyGoal(tuple(each.goal(*place) for each in goals))
 
     def check(self, target: Target) -> None:
-        """Check that the mode can reach for a goal of this kind.
+        """Check that the mode takes goals of this kind.
 
         Raises:
             PlanningError: if its planner does not take such goals, or no executor of the mode can reach it.
@@ -187,7 +187,7 @@ class GoalPlans:
         return goals, planned
 
     def _checked(self, trajectory: JointTrajectory, start: Vector, others: Mapping[str, float]) -> JointTrajectory:
-        """A trajectory in full, within the limits and free in the present world.
+        """Complete a trajectory, and check its limits and its collisions in the present world.
 
         Raises:
             PlanningError: if it is not.

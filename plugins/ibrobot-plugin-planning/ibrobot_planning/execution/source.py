@@ -450,7 +450,7 @@ class PlannerSource(SourceWorker):
             self._finish(move, "SUCCEEDED", PlanCode.SUCCESS, "")
 
     def _stopped(self, move: _Move) -> str:
-        """Where the arm came to rest whose way was blocked."""
+        """Where a blocked arm came to rest."""
         try:
             touched = self._execution.touched()
         except PlanningError as error:

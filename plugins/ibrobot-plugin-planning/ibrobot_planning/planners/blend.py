@@ -1,8 +1,8 @@
-"""Changes between motions without a stop: one motion slows down along its path while the next one already begins.
+"""Blends from one motion into the next: the first slows down along its path while the next one already begins.
 
 A motion that another one replaces brakes along its own path, which is known to be free. The next motion is planned from
-where the arm comes to rest. Its way is then added to the braking motion, as early as limits and obstacles permit. At
-worst it begins when the arm stands.
+where the arm comes to rest. It is then added to the braking motion, as early as limits and obstacles permit. At worst
+it begins when the arm stands.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def braking(old: Motion, begin_s: float, brake_s: float, acceleration: Vector) -
 
 
 def joined(old: Motion, new: Motion, begin_s: float, limits: Limits) -> Iterator[Motion]:
-    """Ways from one motion to another, the shortest first; each begins where `old` is at `begin_s` [s].
+    """Blends from one motion into another, the shortest first; each begins where `old` is at `begin_s` [s].
 
     Args:
         old: comes to rest where `new` begins.
@@ -123,7 +123,7 @@ def joined(old: Motion, new: Motion, begin_s: float, limits: Limits) -> Iterator
 
 
 def _sum(rest: Vector, following: Vector, start: int) -> Vector:
-    """Samples of a motion, with the way of a second motion added from sample `start` on, shape (3, N, J)."""
+    """Samples of a motion, with the displacement of a second motion added from sample `start` on, shape (3, N, J)."""
     end = start + following.shape[1]
     rows = np.zeros((3, max(rest.shape[1], end), rest.shape[2]))
     rows[:, : rest.shape[1]] = rest

@@ -1,7 +1,7 @@
-"""Trajectories in full: from where the robot stands, with velocities and accelerations, and within the limits.
+"""Completion of trajectories: from where the robot stands, with velocities and accelerations, within the limits.
 
-Executors follow the points of every trajectory by quintics of positions, velocities and accelerations. What the
-points leave out is computed here, so that the motion that is checked is the motion that the robot makes:
+Executors follow the points of every trajectory by quintics of positions, velocities and accelerations. Missing
+fields are computed here, so that the robot makes exactly the motion that was checked:
 
 - Positions alone: the cubic spline with continuous accelerations, at rest at both ends.
 - Positions and velocities: the cubic between two points. Where the acceleration jumps from one cubic to the next, two
@@ -37,7 +37,7 @@ _MOST_PARTS = 20
 _JUMP = 1e-3
 """Jumps of the acceleration, as a share of its limit, that need no further points."""
 _QUINTIC_SPEED, _QUINTIC_RATE = 1.875, 5.7736
-"""Peaks of a quintic from rest to rest, over the way in unit time."""
+"""Peak velocity and acceleration of a quintic from rest to rest, for a unit of distance in unit time."""
 
 
 @attrs.frozen(eq=False)
@@ -148,7 +148,7 @@ def _field(rows: list[Vector], name: str, number: int) -> Vector | None:
 def _from_robot(
     points: _Points, start: Vector, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...], period_ns: int
 ) -> _Points:
-    """The points, begun where the robot stands.
+    """The points, with a motion to the first one from where the robot stands.
 
     Raises:
         PlanningError: if they begin elsewhere.

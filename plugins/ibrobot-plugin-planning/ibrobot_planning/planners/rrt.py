@@ -61,9 +61,9 @@ _WIDEST_WINDOW_S, _LINEAR_WINDOW_S = 0.1, 0.03
 _ROUNDING = 1e-6
 """Allowed excess of positions beyond a limit [rad]."""
 _WORSE_M = 1e-4
-"""Allowed decrease of a distance on the way out of a contact [m]."""
+"""Allowed decrease of a distance while the arm leaves a contact [m]."""
 _EXITS = 60
-"""Number of directions tried at each distance on the way out of a contact."""
+"""Number of directions tried at each distance to leave a contact."""
 
 
 class RrtConnectPlanner(Planner):
@@ -120,7 +120,7 @@ class RrtConnectPlanner(Planner):
         if made is None:
             return "nothing is known of a trajectory without velocities and accelerations"
         positions = made.sampled(_CHECK_S)[0][round(seconds(from_ns) / _CHECK_S) :: _WATCH_STRIDE]
-        # What touches already may get away.
+        # Contacts that exist already may open.
         leaving = _outwards(checks, positions) or 0 if len(positions) else 0
         hit = leaving + checks.first_hit_on_path(positions[leaving:])
         if hit < len(positions):
@@ -302,10 +302,10 @@ class _Plan:
         return sorted(found, key=lambda each: float(np.abs(each.joints - whole).max()))[:1]
 
     def _way_out(self) -> list[Vector]:
-        """From the start to where joints are within limits and nothing touches; the start alone where it is so there.
+        """Waypoints from the start to a configuration within limits and without contacts; the start alone if it is one.
 
         Raises:
-            PlanningError: where the start touches too deeply, or no way leads out.
+            PlanningError: if the start overlaps too deeply, or no short motion leads out.
         """
         inside = np.clip(self.start, *self._limits)
         way = [self.start] if np.array_equal(inside, self.start) else [self.start, inside]
@@ -323,12 +323,12 @@ class _Plan:
                 if self.checks.free(end) and self._leaves(self.start, end):
                     return [self.start, end]
         raise PlanningError(
-            f"the start is in collision, and no short way leads out: {_sentence(touching)}",
+            f"the start is in collision, and no short motion leads out: {_sentence(touching)}",
             PlanCode.START_STATE_IN_COLLISION,
         )
 
     def _leaves(self, start: Vector, end: Vector) -> bool:
-        """Whether what touches at the start only gets away on the line to a free end, and nothing else touches."""
+        """Whether contacts at the start only open on the line to a free end, and no other contact occurs."""
         line = Space(self.checks, *self._limits, _FINEST_M).line(start, end)
         return _outwards(self.checks, np.concatenate([start[None], line])) is not None
 
@@ -461,7 +461,7 @@ class _Plan:
 
 
 def _outwards(checks: Collisions, configurations: Vector) -> int | None:
-    """How many configurations from the start on touch, getting away; None where something comes closer."""
+    """Number of configurations in contact from the start on, while distances grow; None if one shrinks."""
     before = {(each.first, each.second): each.distance for each in checks.contacts(configurations[0])}
     for number, q in enumerate(configurations):
         if checks.free(q):

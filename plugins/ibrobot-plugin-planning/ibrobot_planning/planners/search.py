@@ -25,7 +25,7 @@ _SOME_JOINTS = 0.3
 """Share of extensions that move only some of the joints, which mostly fit through narrow passages better."""
 _ITERATIONS, _MORE = 300, 1.6
 """Iterations of the first run, and how many times as many each further one has. Some random trees run into dead ends
-for a minute where others take a tenth of a second, so that starting again is the faster way."""
+for a minute where others take a tenth of a second, so that starting again is faster."""
 _FIRST_NODES = 256
 _DRAWN = 50
 """Samples drawn at a time."""
@@ -35,7 +35,7 @@ _ATTEMPTS = 200
 _SHORTER = 1e-3
 """Share by which a shortcut must be faster to be taken."""
 _STRAIGHT = 0.5
-"""Share of straight shortcuts; in the others, one joint alone goes the straight way."""
+"""Share of straight shortcuts; the others straighten the motion of one joint."""
 
 type Random = np.random.Generator
 type Extended = Callable[..., int | None]
@@ -120,7 +120,7 @@ class Pace:
 
 
 def _travel(way: float, before: float, after: float, top: float, rate: float) -> float:
-    """Time of a way [s] between two speeds, below a top speed."""
+    """Time to travel a distance between two speeds, below a top speed [s]."""
     peak = min(top, math.sqrt(rate * way + (before * before + after * after) / 2))
     if peak <= 0:
         return 0.0
@@ -243,9 +243,9 @@ def _samples(space: Space, rng: Random, number: int) -> Iterator[tuple[Vector, b
 
 
 def _extended(space: Space, longest: float, tree: _Tree, parent: int, target: Vector, *, once: bool) -> int | None:
-    """Grow a tree from a node towards `target`, by extensions of equal length up to the first that is blocked.
+    """Grow a tree from a node towards `target`, by extensions of equal length until one is blocked.
 
-    A blocked extension is mostly found at its middle or its end, so that it costs little.
+    Most blocked extensions are found at their middle or end, which costs little.
 
     Returns:
         The last new node, or None where there was none.
@@ -314,12 +314,12 @@ def shortened(space: Space, path: Sequence[Vector], rng: Random, pace: Pace) -> 
 
 
 def _ends(path: Sequence[Vector]) -> list[float]:
-    """The way along a path to the end of each segment [rad]."""
+    """Distance along a path to the end of each segment [rad]."""
     return list(accumulate(float(np.linalg.norm(b - a)) for a, b in pairwise(path)))
 
 
 def _at(path: Sequence[Vector], ends: Sequence[float], way: float) -> tuple[int, Vector]:
-    """The index of the segment and the point at a way along a path."""
+    """The index of the segment and the point at a distance along a path."""
     segment = min(bisect_left(ends, way), len(ends) - 1)
     begin = ends[segment - 1] if segment else 0.0
     share = (way - begin) / max(ends[segment] - begin, 1e-12)

@@ -165,7 +165,7 @@ class Performance:
     # Steps.
 
     def _alternatives(self, step: AlternativesStep) -> Steps:
-        """Perform the first list of steps that succeeds; those whose first motions cannot be planned are passed over.
+        """Perform the first list of steps that succeeds; lists whose first motions cannot be planned are skipped.
 
         A failure while the gripper holds what a list has grasped, or of the robot, ends them all.
         """
@@ -189,7 +189,7 @@ class Performance:
         raise StepFailed(f"no alternative succeeded: {reasons}", _code(failures[0]))
 
     def _check_ahead(self, steps: Sequence[Step]) -> None:
-        """Plan the motions of some steps, one from the end of the other, up to the first step that moves the rest.
+        """Plan the motions of steps, each from the end of the one before, up to the first that moves anything else.
 
         Raises:
             StepFailed: if one cannot be planned.

@@ -108,7 +108,7 @@ class Arm:
         return self.frames[link]
 
     def hand(self, joint: str) -> tuple[str, ...]:
-        """Links that a joint and the joints behind it carry; the link next to the joint first.
+        """Links that move with a joint, the nearest to the joint first.
 
         For the last joint that moves the tool, these are the links of the gripper.
         """

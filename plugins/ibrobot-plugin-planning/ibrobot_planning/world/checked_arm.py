@@ -21,7 +21,7 @@ from ibrobot_planning.world.collision import Collisions, unchecked_pairs
 from ibrobot_planning.world.objects import World
 
 _SAMPLES = 200
-"""Number of configurations that determine which hulls are of use."""
+"""Number of configurations that determine which hulls make checks faster."""
 _VAIN_SHARE = 0.05
 """A link whose hull touches another link in more of the free configurations keeps its shapes."""
 
@@ -83,7 +83,7 @@ def urdf_names(arm: Arm, urdf: Urdf) -> dict[str, str]:
 
 
 def with_hulls(arm: Arm, unchecked: Collection[Pair]) -> Arm:
-    """The arm with one hull in place of the shapes of each link, where that is of use.
+    """The arm with one hull in place of the shapes of each link, where that makes checks faster.
 
     Args:
         arm: the arm.

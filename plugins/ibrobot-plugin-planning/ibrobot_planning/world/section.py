@@ -62,7 +62,7 @@ DETACH = Service("/world/detach", Detached, list, "Leave an object where it is."
 TOUCH = Service("/world/touch", Touched, list, "Let the hand touch objects, until the next call." + _ANSWER)
 ALLOW = Service("/world/allow", Allowed, list, "State what an object may touch." + _ANSWER)
 _FARTHEST_M = 1000.0
-"""Positions beyond this are no surroundings of an arm."""
+"""Positions beyond this are errors."""
 _STILL = 1e-4
 """Smaller changes of an object's position [m] and axes are no motion."""
 
@@ -162,7 +162,7 @@ class WorldKeeper(Component):
         self._poses.clear()
 
     def _check(self, world: World) -> None:
-        """Refuse a world with which no planner can plan.
+        """Refuse a world in which no planner can plan.
 
         Raises:
             PlanningError: as `World.check`, or without a model of the robot for an object that a link carries.
