@@ -32,7 +32,11 @@ from ibrobot_core.config.load import (
     read_document as read_document,
     contract_alone as contract_alone,
 )
-from ibrobot_core.config.overrides import apply_overrides as apply_overrides, single_options as single_options
+from ibrobot_core.config.overrides import (
+    Override as Override,
+    apply_overrides as apply_overrides,
+    single_options as single_options,
+)
 from ibrobot_core.config.missing import unavailable_modes as unavailable_modes
 from ibrobot_core.config.yaml_nodes import Document as Document, parse_yaml as parse_yaml
 from ibrobot_core.config.show import dump_yaml as dump_yaml

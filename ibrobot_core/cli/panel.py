@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, override
 
 import numpy as np
@@ -26,6 +26,8 @@ KEYS = {"Esc": "emergency stop", "F10": "reset", "Ctrl-C": "end"}
 LOOP = ""
 """Name of the control loop, beside the names of sensors."""
 _LOG_LINES = 6
+_LINES_PER_LOG_LINE = 6
+"""Height of the terminal for each line of messages [lines]."""
 _RECENT_NS = 3 * NS_PER_S
 """Time over which rates are measured [ns]."""
 _SAMPLE_NS = NS_PER_S // 4
@@ -123,7 +125,7 @@ def plain_line(session: Session, rates: RecentRates) -> str:
 def panel(
     session: Session, log: RecentLog, rates: RecentRates, help_text: str, more: Sequence[tuple[str, str]] = ()
 ) -> RenderableType:
-    """The panel, with `more` rows of heading and text; a small terminal cuts off its end."""
+    """The panel, with `more` rows of heading and text, and help on keys; a small terminal cuts off its end."""
     where = "in simulation" if session.config.simulated else "on hardware"
     modes = styled(f"{session.config.robot.name} {where}  ", "bold") + styled("  ").join(
         styled(f"{key} ")
@@ -132,15 +134,22 @@ def panel(
         )
         for key, name in session.mode_keys.items()
     )
+    # A device moves nothing while the robot holds.
+    source = "" if session.faults or session.held else session.command_source.help()
     return Group(  # `Live` cuts off what does not fit
         styled(" ").join(styled(key, "bold reverse") + styled(f" {does}", "bold") for key, does in KEYS.items()),
         *_faults(session),
+        *_rows(more),
         _Newest(tuple(log.lines)),  # other threads log while it is drawn
         modes,
-        *([styled(help_text, "cyan")] if help_text else []),
-        *(styled(f"{heading:<10}", "bold") + styled(row) for heading, row in (*more, *_facts(session, rates))),
+        *(styled(each, "cyan") for each in (source, help_text) if each),
+        *_rows(_facts(session, rates)),
         _Joints(session),
     )
+
+
+def _rows(rows: Iterable[tuple[str, str]]) -> list[Text]:
+    return [styled(f"{heading:<10}", "bold") + styled(row) for heading, row in rows]
 
 
 def _faults(session: Session) -> list[Text]:
@@ -177,16 +186,17 @@ def _facts(session: Session, rates: RecentRates) -> Iterator[tuple[str, str]]:
 
 
 class _Newest:
-    """The newest messages in full; as many as fit into `_LOG_LINES` lines, and at least one."""
+    """The newest messages in full: as many as fit into a part of the screen and `_LOG_LINES`, and at least one."""
 
     def __init__(self, messages: Sequence[RenderableType]) -> None:
         self._messages = messages
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        most = min(_LOG_LINES, console.height // _LINES_PER_LOG_LINE)
         shown: list[list[Segment]] = []
         for message in reversed(self._messages):
             lines = console.render_lines(message, options.update(height=None), pad=False)
-            if shown and len(shown) + len(lines) > _LOG_LINES:
+            if shown and len(shown) + len(lines) > most:
                 break
             shown = lines + shown
         for line in shown:

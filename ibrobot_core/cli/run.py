@@ -19,7 +19,6 @@ import click
 from ibrobot_core.aside import discard, output_aside
 from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.control.core import EMERGENCY_STOP
 from ibrobot_core.errors import IbrobotError, TeleopError
 from ibrobot_core.keys import RELEASE, REPEAT
 from ibrobot_core.launch.models import check_models
@@ -85,7 +84,7 @@ def run_robot(
             _watch_keys(runtime.session, keys)
             stack.enter_context(keys)
         try:
-            status = _run(runtime, hooks, live=not headless, as_json=as_json)
+            status = _run(runtime, hooks, signals, live=not headless, as_json=as_json)
         finally:
             for line in runtime.session.outcome.holding:
                 echo(line, err=True)
@@ -94,10 +93,13 @@ def run_robot(
     sys.exit(status)
 
 
-def _run(runtime: Runtime, hooks: RunHooks, *, live: bool, as_json: bool) -> int:
+def _run(runtime: Runtime, hooks: RunHooks, signals: _Signals, *, live: bool, as_json: bool) -> int:
     """Start, run and stop; return the exit status of a run without failures.
 
     Status goes to standard output, or to standard error with `as_json`.
+
+    Raises:
+        click.Abort: if a signal came before the run began.
     """
     session = runtime.session
     where = "simulation" if session.config.simulated else "hardware"
@@ -108,11 +110,13 @@ def _run(runtime: Runtime, hooks: RunHooks, *, live: bool, as_json: bool) -> int
         session.log.info("%s from %s: %s, mode %s", config.robot.name, config.source, where, session.mode)
         runtime.start(display.starting)
         stack.callback(runtime.stop)
+        if signals.came:
+            raise click.Abort
         while not (runtime.step() if session.request.lockstep else runtime.wait(1.0 / _PANEL_HZ)):
             hooks.step()
             display.show()
     outcome = session.outcome
-    if any(fault != EMERGENCY_STOP for fault in outcome.faults):
+    if outcome.faults:
         return _FAULTED
     return NOT_ALL_SUCCEEDED if outcome.successes < outcome.episodes or outcome.goals_failed else 0
 
@@ -288,10 +292,9 @@ class _Panel:
         self._next_s = time.monotonic() + 1.0 / _PANEL_HZ
         while not self._pressed.empty():
             self._handle_key(*self._pressed.get())
-        session = self._runtime.session
-        help_text = "\n".join(text for text in (session.command_source.help(), self._hooks.help()) if text)
+        session, hooks = self._runtime.session, self._hooks
         self._rates.sample(session)
-        self._display.update(panel(session, self._log, self._rates, help_text, self._hooks.rows()), refresh=True)
+        self._display.update(panel(session, self._log, self._rates, hooks.help(), hooks.rows()), refresh=True)
 
     def _handle_key(self, key: str, stops: int) -> None:
         session = self._runtime.session

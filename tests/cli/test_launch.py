@@ -7,6 +7,7 @@ import logging
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.util import find_spec
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING
 import pytest
 from ibrobot_testing.fakes import FakePolicy
 
+from ibrobot_core.cli.run import _Signals
 from ibrobot_core.errors import PolicyError
 
 if TYPE_CHECKING:
@@ -43,6 +45,7 @@ control_modes:
   stick: {executors: [position], teleop: stick}
   bug: {executors: [position], teleop: bug}
   person: {executors: [position], teleop: person}
+  cautious: {executors: [position], teleop: cautious}
   plan: {executors: [trajectory], planner: {type: cubic}}
   idle: {executors: [position]}
 default_control_mode: policy
@@ -50,6 +53,7 @@ teleoperation:
   stick: {type: stick}
   bug: {type: bug}
   person: {type: person}
+  cautious: {type: cautious}
 contract:
   rate_hz: 25
   max_duration_s: 1
@@ -139,6 +143,7 @@ def test_the_summary_as_json_is_the_last_line(launch: Callable[..., Ran]):
         (("--mode", "stick", "--duration", "2"), 1),
         (("--mode", "bug"), 1),
         (("--mode", "person"), 0),
+        (("--mode", "cautious", "--duration", "2"), 1),
         (("--mode", "plan", "--goal", "up", "--duration", "0.2"), 0),
         (("--mode", "idle", "--goal", "up"), 2),
         (("--mode", "climb"), 2),
@@ -171,6 +176,31 @@ def test_the_first_ctrl_c_ends_the_run_in_order(launch: Callable[..., Ran]):
     assert ran.code == 0, ran.err
     assert "stopping; Ctrl-C again stops at once" in ran.err
     assert 45 <= json.loads(ran.out)["loop"]["ticks"] < 150  # a thread acts on the signal, while simulated time goes on
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_before_the_run_begins_leaves_no_summary(
+    launch: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+):
+    interrupted = threading.Event()
+
+    def load(self: object) -> None:
+        signal.raise_signal(number)
+        assert interrupted.wait(10)
+
+    monkeypatch.setattr(FakePolicy, "load", load)
+    monkeypatch.setattr(_Signals, "_stop", _then(_Signals._stop, interrupted.set))
+    ran = launch(*LOCKSTEP, "--json")
+    assert (ran.code, ran.out) == (130, "")
+    assert ran.err.endswith("error: stopped\n")
+
+
+def _then(first: Callable[..., None], second: Callable[[], None]) -> Callable[..., None]:
+    def both(*arguments: object) -> None:
+        first(*arguments)
+        second()
+
+    return both
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
@@ -285,6 +315,19 @@ def test_deep_check_wants_weights_only_where_they_are_loaded(
     assert ran.err == ("" if code == 0 else "error: mini.yaml: models.net: model.safetensors is missing\n")
 
 
+def test_missing_checkpoint_has_the_same_exit_code_as_in_a_dry_run(
+    launch: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
+):
+    def check_weights(self: object) -> None:
+        raise PolicyError("model.safetensors is missing")
+
+    monkeypatch.setattr(FakePolicy, "check_weights", check_weights)
+    ran = launch(*LOCKSTEP, "--episodes", "1")
+    assert (ran.code, ran.out) == (2, "")
+    assert ran.err.endswith("error: model:net: model.safetensors is missing\n")
+    assert launch(*LOCKSTEP, "--dry-run").code == 2
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -367,7 +410,8 @@ def test_ctrl_c_at_any_moment_of_the_start_is_one_line(site: Site, tmp_path: Pat
         code, out, err = run(at)
         codes.append(code)
         if code == 130:
-            assert (out, err) == ("", "error: stopped\n"), f"step {at} of {steps}"
+            logged = [line for line in err.splitlines() if not line.startswith("I ")]
+            assert (out, logged) == ("", ["error: stopped"]), f"step {at} of {steps}"
         else:  # it ran already, and stopped in order
             assert code == 0, err
             assert "Traceback" not in err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shlex
 import shutil
 import signal
 import subprocess
@@ -297,3 +298,28 @@ def test_signal_while_a_command_starts_is_one_line(line: str, at: str, number: s
     assert (ran.returncode, ran.stdout) == (130, ""), ran.stderr
     assert printed == "error: stopped" or printed.startswith("interrupted; finished episodes are kept"), printed
     assert len(printed.splitlines()) == 1
+
+
+TYPED = {
+    "record so101_blind --sim --dry-run --root BAD": "--root BAD: recording.root: ",
+    "record so101_blind --sim --dry-run --dataset ../x": "--dataset ../x: recording.dataset: '../x' is not below ",
+    "launch so101_blind --sim --dry-run --viewer foo": "--viewer foo: viewer.type: unknown viewer type 'foo'",
+    "launch so101_blind --sim --dry-run --mode telop": "--mode telop: default_control_mode: unknown control mode ",
+    "convert EPISODE --out new --codec foo": "--codec foo: codec: 'foo' is not one of: ",
+    "serve so101_blind --set 'transport={type: zenoh}' --listen bad": "--listen bad: transport.listen: ",
+    "serve so101_blind --set 'transport={type: zenoh}' --listen tcp/[::1]:1 --transport foo=3": "--transport foo=3: ",
+}
+"""Command line -> its error."""
+
+
+@pytest.mark.parametrize("line", TYPED)
+def test_errors_name_an_option_as_it_was_typed(line: str, folder: Path, terminal: Terminal) -> None:
+    make("binary", folder / BAD)
+    code, _, err = terminal.run(*shlex.split(line))
+    assert code == 2
+    assert err.startswith(f"error: {TYPED[line]}"), err
+
+
+def test_name_of_a_dataset_is_text_whatever_it_looks_like(folder: Path, terminal: Terminal) -> None:
+    code, _, err = terminal.run("record", "so101_blind", "--sim", "--dry-run", "--dataset", "2024")
+    assert (code, err) == (0, "")

@@ -35,6 +35,8 @@ class Terminal:
     height: int
     log: RecentLog = attrs.field(factory=RecentLog)
     rates: RecentRates = attrs.field(factory=RecentRates)
+    help: str = ""
+    more: tuple[tuple[str, str], ...] = ()
 
     def lines(self, *messages: str, draws: int = 3) -> list[str]:
         """What is on the screen after some draws over one another."""
@@ -46,9 +48,7 @@ class Terminal:
             for _ in range(draws):
                 self.run.step()
                 self.rates.sample(self.run.session)
-                source = self.run.session.command_source
-                help_text = source.help() if source is not None else ""
-                live.update(panel(self.run.session, self.log, self.rates, help_text), refresh=True)
+                live.update(panel(self.run.session, self.log, self.rates, self.help, self.more), refresh=True)
             drawn = sent.getvalue()  # before the display ends, which adds a line
         screen = pyte.Screen(self.width, self.height)
         pyte.Stream(screen).feed(drawn.replace("\n", "\r\n"))
@@ -81,7 +81,7 @@ def test_a_message_may_come_while_the_panel_is_drawn(terminal: Terminal):
 
     terminal.lines("first")
     terminal.log.lines.append(Interrupted())
-    assert "drawn" in terminal.words()
+    assert "drawn" in terminal.lines(draws=1)
 
 
 def test_keys_come_first_and_nothing_scrolls_away(terminal: Terminal):
@@ -104,6 +104,35 @@ def test_a_fault_is_shown_in_full_above_the_messages_and_the_mode_until_its_rese
     assert "holding after the reset: press F1 to go on with policy" in shown
     terminal.run.switch_mode("policy")
     assert "holding" not in terminal.words()
+
+
+RECORDING = (
+    ("record", "prompt (Enter alone takes “pick the cube”, Tab goes back): pick the red cu_"),
+    ("saved", "0 of 3 into episodes/default"),
+    ("lost", "0 messages"),
+    ("disk", "71338 MiB left at 1.5 MiB/s, 0.0 MiB wait for it"),
+    ("topics", "/joint_states 100 Hz  /arm_position_controller/commands 100 Hz"),
+)
+
+
+def test_the_prompt_and_the_lines_of_a_recording_are_seen_in_every_terminal(terminal: Terminal):
+    terminal.help = "Tab start, and end as success   F11 end as failure   F12 discard"
+    terminal.more = RECORDING
+    shown = terminal.words(*(f"message {i}" for i in range(9)))
+    for heading, text in RECORDING[:4]:
+        assert " ".join(f"{heading} {text}".split()) in shown
+
+
+def test_help_on_a_device_is_not_shown_while_the_robot_holds(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    terminal = Terminal(runs.start(mode="teleop"), 120, 40, help="Tab start")
+    monkeypatch.setattr(terminal.run.session.command_source, "help", lambda: "following the leader arm")
+    assert "following the leader arm Tab start" in terminal.words()
+    terminal.run.session.control.call("fault", fault=FAULT)
+    for _ in range(20):
+        terminal.run.step()
+    shown = terminal.words()
+    assert "following the leader arm" not in shown
+    assert "Tab start" in shown
 
 
 def test_an_emergency_stop_is_shown_with_its_key_until_its_reset(terminal: Terminal):

@@ -12,6 +12,7 @@ from ibrobot_core.config.schema import ControlMode, InferenceConfig
 from ibrobot_core.contract.joint_units import JointUnits
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher
+from ibrobot_core.errors import wrong_input
 from ibrobot_core.inference.client import EngineClient, InferenceClient, LockstepClient
 from ibrobot_core.interfaces import Engine, ModelContext, Policy
 from ibrobot_core.launch.models import check_model
@@ -78,11 +79,13 @@ class LoadedModel(Component):
     @override
     def start(self) -> None:
         model, session = self._model, self._session
-        policy = session.make("policy", model, model.name)
+        with wrong_input():  # no joint has torque yet
+            self._policy = policy = session.make("policy", model, model.name)
+            if self._inference.weights_here:
+                policy.check_weights()
         self.units = check_model(session.config, model, policy.spec, session.log)
         topics = {part.topic for key in policy.spec.observations for part in self.contract.parts(key)}
         session.refuse_absent(f"model {model.name!r}", topics.__contains__)
-        self._policy = policy
         transport = self._link.transport if self._link is not None else None
         context = ModelContext(session.config, policy, transport, self._inference.request_timeout, session.finished)
         self._engine = session.make("engine", self._inference, model.name, model=context)

@@ -141,8 +141,7 @@ def _to_dataset(
     from ibrobot_data.run import convert as run
     from ibrobot_data.run import find_episodes
 
-    given = [(flag, asked.pop(name)) for name, flag in _flags().items()]
-    overrides = [f"{flag.option}={flag.value or value}" for flag, value in given if value]
+    overrides = [_override(flag, value) for name, flag in _flags().items() if (value := asked.pop(name))]
     type_ = type_ or installed_plugins().default("dataset")
     request = ConversionRequest(
         out, _options("dataset", type_, (*overrides, *sets)), type_,
@@ -201,6 +200,14 @@ def _numbers(text: str | None, total: int) -> tuple[int, ...]:
         there = f"0 to {total - 1}" if total else "none"
         raise click.BadParameter(f"{text}: the dataset's episodes are {there}", param_hint="--episodes")
     return tuple(sorted(found))
+
+
+def _override(flag: Flag, value: Any) -> str:
+    from ibrobot_core.app import Override
+
+    if flag.value is not None:
+        return Override.of(flag.name, f"{flag.option}={flag.value}")
+    return Override.of(f"{flag.name} {value}", f"{flag.option}={value}")
 
 
 def cores() -> int:

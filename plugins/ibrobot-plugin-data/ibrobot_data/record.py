@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import click
 
 from ibrobot_core.app import (
     LaunchRequest,
+    Override,
     RobotConfig,
     Runtime,
     find_config,
@@ -85,7 +87,11 @@ def _recorded(config: str | None, dataset: str | None, root: Path | None, option
     made = []
     if robot.recording is None:
         made = [f"recording={{type: {registry.default('recorder')}, root: episodes, topics: contract}}"]
-    named = [f"recording.{key}={value}" for key, value in (("dataset", dataset), ("root", root)) if value]
+    named = [
+        Override.of(f"--{key} {value}", f"recording.{key}={json.dumps(str(value))}")
+        for key, value in (("dataset", dataset), ("root", root))
+        if value is not None
+    ]
     return load_config(
         path, overrides=(*made, *changes, *named), mode=options["mode"], sim=options["sim"], registry=registry
     )

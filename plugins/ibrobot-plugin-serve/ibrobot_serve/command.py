@@ -19,6 +19,7 @@ from ibrobot_core.api import Context, Policy, RealClock, Robot, Transport, Trans
 from ibrobot_core.app import (
     ConfigError,
     LogFormatter,
+    Override,
     Problem,
     Registry,
     apply_overrides,
@@ -154,8 +155,10 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
         raise click.UsageError(f"{what} is a folder: name the plugin of its model, e.g. --type lerobot")
     path = find_config(what, registry)
     transport = _transport_type(path, options["overrides"])
-    listening = _listening(registry, transport, options["listen"]) if transport and options["listen"] else []
-    changes = (*options["overrides"], *(f"transport.{each}" for each in (*listening, *options["transport_options"])))
+    endpoints = options["listen"] if transport else ()
+    listening = _listening(registry, transport, endpoints, "transport.") if endpoints else []
+    given = [Override.of(f"--transport {each}", f"transport.{each}") for each in options["transport_options"]]
+    changes = (*options["overrides"], *listening, *given)
     config = load_config(path, overrides=changes, sim=options["sim"], registry=registry, communicates=True)
     model: str = options["model"] or (next(iter(config.models)) if len(config.models) == 1 else "")
     if model not in config.models:
@@ -219,12 +222,14 @@ def _transport_type(path: Path, overrides: Sequence[str]) -> str:
     return "" if found == "local" else found
 
 
-def _listening(registry: Registry, transport: str, endpoints: Sequence[str]) -> list[str]:
-    """Overrides of a transport's options for a server that listens."""
+def _listening(registry: Registry, transport: str, endpoints: Sequence[str], section: str = "") -> list[str]:
+    """Overrides of a transport's options, below `section`, for a server that listens."""
     descriptor = registry.find("transport", transport)
     if not isinstance(descriptor, TransportDescriptor) or descriptor.listen is None:
         raise click.UsageError(f"--listen: a server cannot listen with transport {transport!r}")
-    return [f"{option}={json.dumps(value)}" for option, value in descriptor.listen(endpoints).items()]
+    typed = " ".join(f"--listen {each}" for each in endpoints)
+    options = descriptor.listen(endpoints)
+    return [Override.of(typed, f"{section}{option}={json.dumps(value)}") for option, value in options.items()]
 
 
 def _context(robot: Robot) -> Context:

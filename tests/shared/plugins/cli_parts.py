@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from typing import Never
 
+import attrs
 from ibrobot_testing.fakes import (
     FakeHardware,
     FakePlanner,
@@ -86,6 +87,16 @@ class Person(FakeTeleop):
         return super().read(measured)
 
 
+class Cautious(FakeTeleop):
+    """Stops the robot after a second."""
+
+    reads = 0
+
+    def read(self, measured):
+        self.reads += 1
+        return attrs.evolve(super().read(measured), estop=self.reads == 50)
+
+
 def no_library():
     raise MissingDependency("no OpenGL", apt=["libegl1"])
 
@@ -130,6 +141,7 @@ def ibrobot_teleop():
     yield TeleopDescriptor("stick", lambda options, ctx: Stick(ctx), "a stick")
     yield TeleopDescriptor("bug", lambda options, ctx: Bug(ctx), "a bug")
     yield TeleopDescriptor("person", lambda options, ctx: Person(ctx), "a person")
+    yield TeleopDescriptor("cautious", lambda options, ctx: Cautious(ctx), "a person")
 
 
 @hookimpl
