@@ -7,9 +7,11 @@ import io
 import os
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
-from typing import override
+from typing import Any, override
 
 import click
 
@@ -32,6 +34,15 @@ COMMANDS = {
     "doctor": ("ibrobot_core.cli.doctor:doctor", "Check this machine, and print a remedy for each fault."),
 }
 """Name -> place of the click command, and its line in the help."""
+
+
+@contextmanager
+def _broken_pipes_told() -> Iterator[None]:
+    """Report a reader of the output that is gone; click would exit without a word."""
+    try:
+        yield
+    except BrokenPipeError as error:
+        raise IbrobotError(f"standard output: {error.strerror}") from error
 
 
 class LazyGroup(click.Group):
@@ -61,11 +72,14 @@ class LazyGroup(click.Group):
         return command
 
     @override
+    def make_context(self, *arguments: Any, **more: Any) -> click.Context:
+        with _broken_pipes_told():  # of --help and --version
+            return super().make_context(*arguments, **more)
+
+    @override
     def invoke(self, ctx: click.Context) -> object:
-        try:
+        with _broken_pipes_told():
             return super().invoke(ctx)
-        except BrokenPipeError as error:  # click would exit without a word
-            raise IbrobotError(f"standard output: {error.strerror}") from error
 
     @override
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -132,11 +132,12 @@ def test_full_output_is_an_error_of_one_line() -> None:
     assert (ran.returncode, ran.stderr) == (1, "error: standard output: No space left on device\n")
 
 
-def test_reader_that_left_is_an_error_of_one_line() -> None:
+@pytest.mark.parametrize("command", ["plugins", "--help"])
+def test_reader_that_left_is_an_error_of_one_line(command: str) -> None:
     reader, writer = os.pipe()
     os.close(reader)
     with open(writer, "w", encoding="utf-8") as output:
-        ran = piped("plugins", stdout=output, stderr=subprocess.PIPE)
+        ran = piped(command, stdout=output, stderr=subprocess.PIPE)
     assert (ran.returncode, ran.stderr) == (1, "error: standard output: Broken pipe\n")
 
 
