@@ -2,13 +2,15 @@
 
     python benchmarks/owners.py [--times 20] [--kills 10] [--seed 0] [--only NAME]
 
-Every pair of record, repair, trim, mark, delete, restore, convert, append and merge runs at once, `--times` times, with
-random delays. Then each of them is killed (SIGKILL) at `--kills` times of its run, beside another one. Then follow
-`ibrobot episodes repair` and, of conversions and merges, the same command, as a user would run them. Prints a line per
-pair, and exits with 1 if anything was lost or doubled, or if a refusal names no owner, or more than one.
+Every pair of record, repair, trim, mark, delete, restore, convert, append, merge and train runs at once, `--times`
+times, with random delays. Then each of them is killed (SIGKILL) at `--kills` times of its run, beside another one. Then
+follow `ibrobot episodes repair` and, of conversions, merges and trainings, the same command, as a user would run them.
+Prints a line per pair, and exits with 1 if anything was lost or doubled, or if a refusal names no owner, or more than
+one.
 
 All of them run the code of the commands in forked processes, which have imported it already. Episodes are converted in
-the process of the command instead of one of their own, which takes a second longer to start.
+the process of the command instead of one of their own, which takes a second longer to start. The program that `ibrobot
+train` starts is a stand-in, which reads the dataset and writes checkpoints as LeRobot does, but loads no torch.
 """
 
 from __future__ import annotations
@@ -43,13 +45,18 @@ import pyarrow.parquet as pq
 from ibrobot_data import run as convert_module
 from ibrobot_data.episode import convert_episode
 from ibrobot_data.episode_start import take_next_folder
+from ibrobot_lerobot import train as training_module
 from ibrobot_lerobot.layout import open_dataset
 from ibrobot_lerobot.options import LeRobotOptions
+from ibrobot_lerobot.training_checkpoints import newest_checkpoint
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_testing.contexts import host_context
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests/shared"))
+from trainer import install as install_trainer
 
 from ibrobot_core.cli.main import main as ibrobot
 from ibrobot_core.clock import RealClock, SteppedClock
@@ -63,8 +70,10 @@ START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
 WHOLE, PART, RECORDED = 100, 61, 50
 """Joint states of the original, of the part that takes its place at first, and of the episode that is recorded."""
+STEPS = 10
+"""Of a training; each is saved."""
 DELAY_S = 0.15
-PATIENCE_S = 60.0
+PATIENCE_S = 300.0
 STATE, COMMAND = JointState.ros_type, Float64MultiArray.ros_type
 PAN = Feature("float32", (1,))
 CONTRACT = Contract(
@@ -143,6 +152,7 @@ COMMANDS: dict[str, Callable[[Path], None]] = {
     "convert": command("convert", "pick", "--out", "new", "--jobs", "1"),
     "append": command("convert", "pick", "--out", "set", "--append", "--jobs", "1"),
     "merge": merge,
+    "train": command("train", "set", "--out", "training", "--steps", str(STEPS), "--pause=0.02"),
 }
 
 
@@ -283,6 +293,7 @@ def faults(place: Path, ended: list[Ended]) -> Iterator[str]:
         yield "of what was appended and merged, one is missing"
     for each in ended:
         yield from refusal_faults(each)
+        yield from training_faults(place / "training", each)
 
 
 def lengths(dataset: Path) -> list[int]:
@@ -302,6 +313,14 @@ def dataset_faults(dataset: Path, merged: bool) -> Iterator[str]:
         yield f"{dataset.name}: has an episode twice"
     if not merged and len(kept) != len(lengths(dataset)):
         yield f"{dataset.name}: describes {len(kept)} of {len(lengths(dataset))} episodes"
+
+
+def training_faults(out: Path, ended: Ended) -> Iterator[str]:
+    newest = newest_checkpoint(out)
+    if (ended.name, ended.code) != ("train", 0):
+        return
+    if newest is None or newest.step != STEPS:
+        yield f"of the training, {newest} is there"
 
 
 def refusal_faults(ended: Ended) -> Iterator[str]:
@@ -333,7 +352,7 @@ def trial(
     if kill_s is not None and ended[0].code < 0:
         with suppress(RuntimeError):  # of the episodes, some may be gone
             here("episodes", "repair", place / "pick")
-        if names[0] in ("convert", "append", "merge"):  # the others are done or not
+        if names[0] in ("convert", "append", "merge", "train"):  # the others are done or not
             ended.append(Started(names[0], place, 0.0).end())
             if "already has a dataset" in ended[-1].said:
                 return ended, [f"{names[0]}: does not go on: {ended[-1].said[-300:]}"]
@@ -363,6 +382,8 @@ def run(times: int, kills: int, seed: int, only: str | None = None) -> bool:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         template = folder / "template"
+        program = str(install_trainer(folder))
+        training_module._program = lambda: program
         aside(prepare, template)
         pairs = [pair for pair in itertools.combinations_with_replacement(COMMANDS, 2) if only is None or only in pair]
         for pair in pairs:

@@ -24,8 +24,8 @@ class Ownership:
     """The right to change a folder, or with `shared` to read it while nobody changes it; until `close`.
 
     The lock (`flock`) is on a hidden file beside the folder, so that it covers the folder's name while the folder is
-    created, replaced or removed. The file names the owner. The last owner removes it; after a kill it stays, without
-    effect.
+    created, replaced or removed. The file has a line for each owner, which names it. The last owner removes the file;
+    after a kill it stays, without effect.
 
     Args:
         path: the folder, which need not exist; or one of an episode's files, for their folder.
@@ -45,6 +45,8 @@ class Ownership:
         self.path = path
         self._file = file or lock_file(path)
         self._descriptor: int | None = None
+        self._line = 0, 0
+        """Begin and end of the own line in the file [bytes]."""
         deadline_s = time.monotonic() + wait_s
         while not self._acquire(shared):
             if time.monotonic() >= deadline_s:
@@ -52,8 +54,11 @@ class Ownership:
             time.sleep(_POLL_S)
         if self._descriptor is not None:
             with suppress(OSError):  # only others' errors need it
-                os.ftruncate(self._descriptor, 0)
-                os.pwrite(self._descriptor, f"{doing} by process {os.getpid()}".encode(), 0)
+                if not shared:
+                    os.ftruncate(self._descriptor, 0)
+                size = os.write(self._descriptor, f"{doing} by process {os.getpid()}\n".encode())
+                end = os.lseek(self._descriptor, 0, os.SEEK_CUR)
+                self._line = end - size, end
 
     def __enter__(self) -> Self:
         return self
@@ -68,6 +73,10 @@ class Ownership:
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is None:
             return
+        begin, end = self._line
+        with suppress(OSError):  # it cannot be written
+            fcntl.fcntl(descriptor, fcntl.F_SETFL, 0)  # does not append any more
+            os.pwrite(descriptor, b"\n" * (end - begin), begin)
         with suppress(OSError):  # others share it, or it cannot be removed
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if _is_at(descriptor, self._file):
@@ -96,10 +105,11 @@ class Ownership:
             os.close(descriptor)  # its last owner removed it after it was opened here
 
     def _owner(self) -> str:
+        lines: list[str] = []
         with suppress(OSError):
-            if owner := self._file.read_text(encoding="utf-8", errors="replace"):
-                return owner
-        return "is being changed by another process"
+            lines = [line for line in self._file.read_text(encoding="utf-8", errors="replace").splitlines() if line]
+        here = [line for line in lines if _runs(line.rpartition(" ")[2])]  # others may have been killed
+        return (here or lines or ["is being changed by another process"])[-1]
 
 
 def lock_file(path: Path) -> Path:
@@ -112,10 +122,21 @@ def lock_file(path: Path) -> Path:
     return folder.with_name(f".{short}.lock")
 
 
+def _runs(process: str) -> bool:
+    """Whether a process with this number runs on this machine."""
+    try:
+        os.kill(int(process), 0)
+    except PermissionError:
+        return True
+    except (OSError, ValueError, OverflowError):
+        return False
+    return True
+
+
 def _open(file: Path, shared: bool) -> int | None:
     """Open a lock file; None if there is none and nobody can create one here."""
     try:
-        return os.open(file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        return os.open(file, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     except OSError as error:
         if not shared or error.errno not in _READ_ONLY:
             raise

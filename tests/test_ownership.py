@@ -38,12 +38,12 @@ def test_another_owner_is_named_until_it_has_ended(tmp_path: Path):
 
 def test_readers_share_it_and_nobody_changes_it_meanwhile(tmp_path: Path):
     path = tmp_path / "episode"
-    first, second = (Ownership(path, "is being converted", shared=True) for _ in range(2))
-    first.close()
+    first, second = (Ownership(path, f"is being {what}", shared=True) for what in ("converted", "copied"))
+    second.close()
     with pytest.raises(InUse, match="is being converted"):
         Ownership(path, "is being deleted", wait_s=0.0)
-    second.close()
-    second.close()
+    first.close()
+    first.close()
     with Ownership(path, "is being deleted"), pytest.raises(InUse, match="is being deleted"):
         Ownership(path, "is being converted", shared=True, wait_s=0.0)
     assert list(tmp_path.iterdir()) == []
@@ -61,6 +61,20 @@ def test_after_a_kill_nobody_owns_it(tmp_path: Path):
     assert lock_file(path).exists()
     Ownership(path, "is being trimmed").close()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_who_shares_it_is_named_and_not_who_was_killed(tmp_path: Path):
+    path = tmp_path / "episode"
+    with Ownership(path, "is being copied", shared=True):
+        command = [sys.executable, "-c", HOLD.replace('recorded"', 'converted", shared=True'), str(path)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
+            assert child.stdout is not None
+            assert child.stdout.readline() == "owned\n"
+            with pytest.raises(InUse, match=f"is being converted by process {child.pid};"):
+                Ownership(path, "is being trimmed", wait_s=0.0)
+            child.kill()
+        with pytest.raises(InUse, match=f"is being copied by process {os.getpid()};"):
+            Ownership(path, "is being trimmed", wait_s=0.0)
 
 
 def test_there_is_never_more_than_one_owner(tmp_path: Path):

@@ -256,6 +256,33 @@ def test_copies_are_found_before_they_are_encoded(tmp_path: Path, monkeypatch: p
     assert passed_over == {"1": "", "1_copy": "is a copy of 1", "2": "", "2_copy": "is a copy of 2", "3": ""}
 
 
+@pytest.mark.parametrize("only", [(), ("--outcome", "success")], ids=["all", "successes"])
+def test_of_copies_whose_outcomes_differ_none_is_converted(bags: Path, tmp_path: Path, only: tuple[str, ...]) -> None:
+    shutil.copytree(bags / "episodes/episode_000001", bags / "episodes/episode_000003")
+    assert episodes("mark", bags / "episodes/episode_000001", "failure").returncode == 0
+    done = convert(bags, "--out", tmp_path / "set", *only)
+    assert done.returncode == 1
+    sources = "blocks/episode_000001, blocks/episode_000003"
+    assert f"left out {sources}: copies of one episode have different outcomes: " in done.stderr
+    assert "blocks/episode_000001 is failure, blocks/episode_000003 is success; `ibrobot episodes mark`" in done.stderr
+    assert [each["source"] for each in own(tmp_path / "set")["episodes"]] == ["blocks/episode_000002"]
+
+
+def test_an_outcome_that_is_marked_during_the_conversion_counts(
+    bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = run_module._run_in_processes
+
+    def marked(*arguments: Any) -> Any:
+        assert episodes("mark", bags / "episodes/episode_000001", "failure").returncode == 0
+        return real(*arguments)
+
+    monkeypatch.setattr(run_module, "_run_in_processes", marked)
+    found = report(bags, "--out", tmp_path / "set", "--outcome", "success")
+    assert (found["code"], found["episodes"]) == (0, 1)
+    assert [each["passed_over"] for each in found["reports"]] == ["its outcome is failure", ""]
+
+
 def test_a_copy_takes_the_place_of_an_original_that_is_damaged(tmp_path: Path) -> None:
     record(tmp_path / "bags/1", 1, 0.5, uuid=UUID.format(1))
     for name in ("2", "3"):

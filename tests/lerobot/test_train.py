@@ -80,10 +80,11 @@ def ended(output: list[str]) -> list[dict[str, object]]:
 @pytest.mark.parametrize(
     ("when", "number"),
     [
+        (lambda out: True, signal.SIGKILL),
         (lambda out: (out / "checkpoints/000003/pretrained_model").exists(), signal.SIGKILL),
         (lambda out: newest_checkpoint(out) is not None, signal.SIGINT),
     ],
-    ids=["in the first save", "after a checkpoint"],
+    ids=["while torch loads", "in the first save", "after a checkpoint"],
 )
 def test_killed_training_continues_to_the_same_number_of_steps(
     small_dataset: Path, tmp_path: Path, when: Callable[[Path], bool], number: signal.Signals
@@ -100,8 +101,11 @@ def test_killed_training_continues_to_the_same_number_of_steps(
             assert process.poll() is None
             time.sleep(0.05)
         process.send_signal(number)
-        process.communicate()
+        _, errors = process.communicate()
     kept = newest_checkpoint(out) if out.exists() else None
+    if number == signal.SIGINT:
+        assert kept is not None
+        assert f"interrupted; kept: {kept.folder} (step {kept.step}); the same command continues" in errors
     again = subprocess.run(command, capture_output=True, text=True, check=False)
     assert again.returncode == 0, again.stderr
     events = ended(again.stdout.splitlines())

@@ -176,6 +176,8 @@ def _convert(
         reader = installed_plugins().open_episode(job.episode)
         stack.callback(reader.close)
         summary = reader.summary()
+        if unwanted := unwanted_outcome(summary, job.request):  # it was marked meanwhile
+            return attrs.evolve(report, outcome=summary.outcome, passed_over=unwanted)
         report = attrs.evolve(_described(report, summary, job.request), identity=identity(reader, summary))
         unit = _write(job, key, reader, summary, report, making, progress)
         if unit is None:
@@ -195,6 +197,11 @@ def _convert(
 
 _NOTHING = {"interventions": "no operator commands in it", "policy": "no policy commands in it"}
 """Rows to keep -> why an episode without any is passed over."""
+
+
+def unwanted_outcome(summary: EpisodeSummary, request: ConversionRequest) -> str:
+    """Why an episode is passed over for its outcome; empty if it is wanted."""
+    return "" if summary.outcome in request.outcomes else f"its outcome is {summary.outcome}"
 
 
 def stop_if_full(error: BaseException, source: str) -> None:

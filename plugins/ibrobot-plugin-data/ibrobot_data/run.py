@@ -35,6 +35,7 @@ from ibrobot_data.episode import (
     read_unit,
     unexpected,
     unit_key,
+    unwanted_outcome,
 )
 from ibrobot_data.identity import KnownEpisodes, identity
 from ibrobot_data.provenance import conversion, provenance
@@ -220,8 +221,8 @@ class _Plan:
         """Source -> number of frames, estimated from its length."""
         self._copies: dict[str, str] = {}
         """Source -> the source of which it is a copy; not converted unless that one fails."""
-        self._alike: dict[Any, list[str]] = {}
-        """What copies have in common, as far as summaries tell -> sources."""
+        self._alike: dict[Any, list[Job]] = {}
+        """What copies have in common, as far as summaries tell -> episodes that the dataset does not have."""
         self.resumed = 0
         self.sources: list[str] = []
         known = KnownEpisodes(old.metadata["episodes"] if old is not None else ())
@@ -250,13 +251,14 @@ class _Plan:
         report = attrs.evolve(report, outcome=summary.outcome, start_ns=summary.start_ns)
         if there:
             self._reports[source] = attrs.evolve(report, passed_over=there)
-        elif summary.outcome not in self._request.outcomes:
-            self._reports[source] = attrs.evolve(report, passed_over=f"its outcome is {summary.outcome}")
+            return
+        counts = tuple((topic, each.count) for topic, each in sorted(summary.topics.items()))
+        self._alike.setdefault((summary.start_ns, summary.end_ns, counts), []).append(job)
+        if unwanted := unwanted_outcome(summary, self._request):
+            self._reports[source] = attrs.evolve(report, passed_over=unwanted)
         else:
             self._jobs[source] = job
             self._reports[source] = report
-            counts = tuple((topic, each.count) for topic, each in sorted(summary.topics.items()))
-            self._alike.setdefault((summary.start_ns, summary.end_ns, counts), []).append(source)
             text = summary.metadata.get("contract", "")
             rate = re.search(r'"rate_hz": ([0-9.]+)', text)
             rate_hz = self._request.contract.rate_hz if self._request.contract else float(rate[1]) if rate else 30.0
@@ -269,13 +271,25 @@ class _Plan:
 
     def _find_copies(self) -> None:
         """Find copies before they are converted; only episodes that look alike are compared by their content."""
-        for sources in self._alike.values():
-            originals: dict[str, str] = {}
-            for source in sources if len(sources) > 1 else ():
+        for alike in self._alike.values():
+            equal: dict[str, list[Job]] = {}
+            for job in alike if len(alike) > 1 else ():
                 with suppress(IbrobotError, OSError):  # its conversion will report it
-                    original = originals.setdefault(_identity(self._jobs[source].episode), source)
-                    if original != source:
-                        self._copies[source] = original
+                    equal.setdefault(_identity(job.episode), []).append(job)
+            for jobs in equal.values():
+                self._note_copies([job.source for job in jobs])
+
+    def _note_copies(self, sources: Sequence[str]) -> None:
+        """Keep the first of equal episodes; none of them if their outcomes contradict each other."""
+        outcomes = {source: self._reports[source].outcome for source in sources}
+        if len(set(outcomes.values())) > 1:
+            each = ", ".join(f"{source} is {outcome}" for source, outcome in outcomes.items())
+            for source in sources:
+                self._jobs.pop(source, None)
+                error = f"copies of one episode have different outcomes: {each}; `ibrobot episodes mark` sets them"
+                self._reports[source] = attrs.evolve(self._reports[source], passed_over="", error=error)
+        elif sources[0] in self._jobs:
+            self._copies |= dict.fromkeys(sources[1:], sources[0])
 
     def units(self) -> list[Unit]:
         """The staged units, in the order of the episodes."""

@@ -52,7 +52,7 @@ class JointLogReader(EpisodeReader):
     def __init__(self, address: EpisodeAddress) -> None:
         self._path = address.path
         self._file = self._path / LOG if self._path.is_dir() else self._path
-        self._facts = _facts(self._path / METADATA) if self._path.is_dir() else {}
+        self._facts = _facts(self._file.with_name(METADATA)) if self._file.name == LOG else {}
         self._log = read_log(self._file)
         stated, count = self._facts.get("samples"), len(self._log.times)
         if stated is not None and self._facts.get("outcome") != "unfinished" and stated != count:

@@ -83,6 +83,27 @@ def merge(root: Path, parts: Sequence[Path], metadata: Mapping[str, Any]) -> Non
 
 
 @contextmanager
+def reading(root: Path, doing: str) -> Iterator[None]:
+    """A context in which nobody merges into the dataset; a complete merge that was interrupted is finished first.
+
+    Args:
+        root: the dataset.
+        doing: what is done with it, for others' errors, e.g. `is being trained on`.
+
+    Raises:
+        InUse: if another process merges into the dataset, and takes long.
+        DatasetError: if an interrupted merge cannot be finished, or the dataset cannot be locked.
+    """
+    complete(root)
+    try:
+        owned = Ownership(root, doing, file=root / _LOCK, shared=True, wait_s=_WAIT_S)
+    except OSError as error:
+        raise DatasetError(f"{root}: cannot be locked: {error.strerror}") from error
+    with owned:
+        yield
+
+
+@contextmanager
 def _owning(root: Path) -> Iterator[None]:
     """A context in which no other process merges into the dataset."""
     try:

@@ -11,14 +11,14 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
 from ibrobot_core.api import DatasetError, MissingDependency
-from ibrobot_core.app import echo, wrong_input
+from ibrobot_core.app import Ownership, echo, wrong_input
 from ibrobot_lerobot.pretrained import check_policy
 from ibrobot_lerobot.training_checkpoints import TrainingCheckpoint, begun_in_vain, check_same, newest_checkpoint
 
@@ -72,27 +72,30 @@ def train(
     The same command continues a training that was interrupted, from its newest checkpoint.
     Further OPTIONS are passed to lerobot-train, e.g. --seed=1.
     """
+    from ibrobot_lerobot.merge import reading
+
     if not (dataset / "meta" / "info.json").is_file():
         raise DatasetError(f"{dataset}: is not a LeRobot dataset: it has no meta/info.json")
     program = _program()
     chosen = [*arguments(dataset, out, policy, steps, batch_size, save_every, device), *options]
-    newest = _begun(out, chosen)
-    if newest is None:
-        if policy != SMALL:
-            check_policy(policy, options, download=download)
-        command = [program, *chosen]
-    else:
-        kept = [each for each in chosen if each.partition("=")[0] in _WHEN_CONTINUING]
-        command = [program, f"--config_path={newest.settings}", "--resume=true", *kept]
-    begun = 0 if newest is None else newest.step
-    if begun < steps:
-        if not events:
-            echo(f"$ {shlex.join(command)}", err=True)
-        code = _run(command, _environment(policy, download=download), begun, steps, events=events)
-        newest = newest_checkpoint(out)
-        if code or newest is None:
-            echo(_kept(newest, save_every or saving_step(steps), interrupted=code == _INTERRUPTED), err=True)
-            sys.exit(code or 1)
+    with reading(dataset, "is being trained on"), _owning(out):
+        newest = _begun(out, chosen)
+        if newest is None:
+            if policy != SMALL:
+                check_policy(policy, options, download=download)
+            command = [program, *chosen]
+        else:
+            kept = [each for each in chosen if each.partition("=")[0] in _WHEN_CONTINUING]
+            command = [program, f"--config_path={newest.settings}", "--resume=true", *kept]
+        begun = 0 if newest is None else newest.step
+        if begun < steps:
+            if not events:
+                echo(f"$ {shlex.join(command)}", err=True)
+            code = _run(command, _environment(policy, download=download), begun, steps, events=events)
+            newest = newest_checkpoint(out)
+            if code or newest is None:
+                echo(_kept(newest, save_every or saving_step(steps), interrupted=code == _INTERRUPTED), err=True)
+                sys.exit(code or 1)
     assert newest is not None
     trained = out / "checkpoints" / "last" / newest.policy.name
     echo(json.dumps({"event": "report", "checkpoint": str(trained)}) if events else f"trained: {trained}")
@@ -105,6 +108,23 @@ def _environment(policy: str, *, download: bool) -> dict[str, str]:
     if policy == SMALL:  # one thread is the fastest for so small a network
         environment |= {"OMP_NUM_THREADS": "1"}
     return environment
+
+
+@contextlib.contextmanager
+def _owning(out: Path) -> Iterator[None]:
+    """A context in which no other training writes into `out`.
+
+    Raises:
+        InUse: if one does.
+        DatasetError: if `out` cannot be locked.
+    """
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        owned = Ownership(out, "is being trained")
+    except OSError as error:
+        raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
+    with owned:
+        yield
 
 
 def _begun(out: Path, chosen: Sequence[str]) -> TrainingCheckpoint | None:

@@ -14,72 +14,25 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from ibrobot_lerobot import merge as merging
 from ibrobot_lerobot import train as training
 from ibrobot_lerobot.commands import datasets
 from ibrobot_lerobot.train import arguments, progress, train
 from ibrobot_lerobot.training_checkpoints import newest_checkpoint
+from trainer import install
 
 from ibrobot_core.api import DatasetError, Feature, MissingDependency
+from ibrobot_core.app import InUse
 
-from .conftest import CAMERA, FPS, write
+from .conftest import CAMERA, FPS, rows, write
 
 FEATURES = {"observation.state": Feature("float32", (2,), ("a.pos", "b.pos")), "observation.images.top": CAMERA}
-LINE = "INFO 19:45:10 ot_train.py:300 step:{step} smpl:2K ep:9 epch:0.10 loss:{loss} grdn:1.2 lr:5.0e-04 updt_s:0.1"
-PROGRAM = f"""#!{sys.executable}
-import json, sys, time
-from pathlib import Path
-given = dict(each.removeprefix("--").partition("=")[::2] for each in sys.argv[1:])
-steps, every, save = (int(given[name]) for name in ("steps", "log_freq", "save_freq"))
-out = Path(given["output_dir"])
-begun = 0
-if "resume" in given:
-    settings = json.loads(Path(given["config_path"]).read_text())
-    state = Path(given["config_path"]).parents[1] / "training_state" / "training_step.json"
-    begun = json.loads(state.read_text())["step"]
-else:
-    out.mkdir(parents=True)
-    settings = {{}}
-    for key, value in given.items():
-        *folders, last = key.split(".")
-        inner = settings
-        for folder in folders:
-            inner = inner.setdefault(folder, {{}})
-        try:
-            inner[last] = json.loads(value)
-        except ValueError:
-            inner[last] = value
-print("WARNING no wandb")
-print("BEGUN", begun)
-print("INFO Creating dataset")
-print("INFO Start offline training on a fixed dataset")
-for step in range(begun + 1, steps + 1):
-    if step % every == 0:
-        print({LINE!r}.format(step=step, loss=1 / step), flush=True)
-    if step % save == 0 or step == steps:
-        folder = out / "checkpoints" / f"{{step:06}}"
-        (folder / "pretrained_model").mkdir(parents=True)
-        (folder / "pretrained_model" / "train_config.json").write_text(json.dumps(settings))
-        (folder / "training_state").mkdir()
-        (folder / "training_state" / "training_step.json").write_text(json.dumps({{"step": step}}))
-        nothing = b"\\2\\0\\0\\0\\0\\0\\0\\0{{}}"  # a safetensors file without tensors
-        (folder / "training_state" / "optimizer_state.safetensors").write_bytes(nothing)
-        (folder / "pretrained_model" / "model.safetensors").write_bytes(nothing)
-        (folder / "training_state" / "scheduler_state.json").write_text("{{}}")
-        (out / "checkpoints" / "last").unlink(missing_ok=True)
-        (out / "checkpoints" / "last").symlink_to(folder.name)
-    if step == int(given.get("stop_at", 0)) and not begun:
-        Path(given["stopped"]).write_text("")
-        time.sleep(60)
-raise SystemExit(7 * ("fail" in given))
-"""
 
 
 @pytest.fixture
 def dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A dataset; `ibrobot train` runs the program above in place of LeRobot's."""
-    program = tmp_path / "lerobot-train"
-    program.write_text(PROGRAM)
-    program.chmod(0o755)
+    """A dataset; `ibrobot train` runs `trainer` in place of LeRobot's program."""
+    program = install(tmp_path)
     monkeypatch.setattr(training, "_program", lambda: str(program))
     return write(tmp_path / "set", FEATURES, (3,), codec="h264")
 
@@ -127,9 +80,9 @@ def test_training_saves_a_tenth_of_its_steps_apart(dataset: Path, tmp_path: Path
 
 
 def interrupted(
-    dataset: Path, out: Path, stop_at: int, number: signal.Signals
+    dataset: Path, out: Path, stop_at: int, number: signal.Signals, meanwhile: Callable[[int], None] = lambda pid: None
 ) -> tuple[int, str, Callable[[], list[str]]]:
-    """Begin a training of 100 steps, and end it at a step.
+    """Begin a training of 100 steps, and end it at a step, after a call of `meanwhile` with its process.
 
     Returns:
         Exit code and standard error, and a function that runs the same command again.
@@ -143,6 +96,7 @@ def interrupted(
         while not stopped.exists():
             assert process.poll() is None
             time.sleep(0.01)
+        meanwhile(process.pid)
         process.send_signal(number)
         _, errors = process.communicate()
     return process.returncode, errors, lambda: run(train, dataset, *words, "--events")
@@ -150,6 +104,7 @@ def interrupted(
 
 SCRIPT = """
 import sys
+from ibrobot_lerobot import merge as merging
 from ibrobot_lerobot import train as training
 training._program = lambda: sys.argv[1]
 training.train(sys.argv[2:])
@@ -183,7 +138,47 @@ def test_interrupted_training_says_what_is_kept_and_continues_by_the_same_comman
 
 def test_killed_train_takes_the_trainer_along(dataset: Path, tmp_path: Path):
     code, _, _ = interrupted(dataset, tmp_path / "out", 20, signal.SIGKILL)
-    assert code == -signal.SIGKILL  # its pipes were closed, so that the trainer that held them is dead, too
+    assert code == -signal.SIGKILL
+    newest = newest_checkpoint(tmp_path / "out")  # its pipes were closed, so that the trainer that held them ended, too
+    assert newest is not None
+    assert newest.step == 20, "it did not go on to the end"
+
+
+@pytest.mark.parametrize("stop_at", [5, 57], ids=["before a checkpoint", "after one"])
+def test_a_training_has_its_folder_and_its_dataset_to_itself(
+    dataset: Path, tmp_path: Path, stop_at: int, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(merging, "_WAIT_S", 0.0)
+    out, part = tmp_path / "out", write(tmp_path / "part", FEATURES, (4,), codec="h264")
+    before = list(rows(dataset))
+
+    def meanwhile(pid: int) -> None:
+        kept = sorted(out.rglob("*"))
+        for words in (["--steps", 100], ["--steps", 10]):
+            with pytest.raises(InUse, match=f"out: is being trained by process {pid}; try again"):
+                run(train, dataset, "--out", out, *words)
+        assert sorted(out.rglob("*")) == kept
+        with pytest.raises(InUse, match=f"set: is being trained on by process {pid}; try again"):
+            merging.merge(dataset, [part], {})
+        assert list(rows(dataset)) == before
+        run(train, dataset, "--out", tmp_path / "beside", "--steps", 10)  # another one may read the dataset, too
+
+    interrupted(dataset, out, stop_at, signal.SIGKILL, meanwhile)
+    merging.merge(dataset, [part], {})
+    run(train, dataset, "--out", out, "--steps", 100)
+
+
+def test_a_merge_that_was_interrupted_is_finished_before_a_training(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    part = write(tmp_path / "part", FEATURES, (4,), codec="h264")
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "replace", lambda self, target: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+        with pytest.raises(DatasetError, match="the merge cannot be completed"):
+            merging.merge(dataset, [part], {})
+    run(train, dataset, "--out", tmp_path / "out", "--steps", 10)
+    assert json.loads((dataset / "meta/info.json").read_bytes())["total_episodes"] == 2
+    assert not list(dataset.glob(".*"))
 
 
 def test_training_with_other_settings_is_refused_and_kept(dataset: Path, tmp_path: Path):
