@@ -116,11 +116,11 @@ def test_a_wrong_first_message_keeps_no_right_one_out(runs: Runs, network: None,
     runtime.stop()
 
 
-def test_the_contract_states_types(runs: Runs, network: None):
-    runtime = runs.start("transport={type: network, share: {subscribe: [/joint_states]}}", lockstep=False)
+def test_the_contract_states_types_before_anything_is_published(runs: Runs):
+    bus = runs.make().session.bus
+    assert bus.topics() == {}
     with pytest.raises(TransportError, match="topic /joint_states carries sensor_msgs/msg/JointState, not"):
-        runtime.session.bus.publish("/joint_states", String("no state"))
-    runtime.stop()
+        bus.publish("/joint_states", String("no state"))
 
 
 def test_a_topic_of_unknown_type_is_named(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):
@@ -136,6 +136,16 @@ def test_nothing_comes_in_in_lockstep(runs: Runs, network: None):
 
 def ask(service: str, request: Any = None, raw: bytes | None = None) -> Answer:
     return decode_answer(made().request("services", raw or encode_call(Call(service, request)), 5.0))
+
+
+def test_only_short_calls_of_urgent_services_overtake_others(runs: Runs, network: None):
+    runtime = runs.start("transport={type: network, share: {services: [/estop]}}", lockstep=False)
+    is_urgent = made().is_urgent
+    assert is_urgent(encode_call(Call("/estop")))
+    for other in (Call("/reset"), Call("/nobody"), Call("/estop", "a" * 1000)):
+        assert not is_urgent(encode_call(other))
+    assert not is_urgent(b"{")
+    runtime.stop()
 
 
 def test_services_answer_other_machines(runs: Runs, network: None):

@@ -48,11 +48,14 @@ class TopicTransport(Transport):
             TransportError: if closed.
         """
 
+    @abstractmethod
     def serve_with_urgent(
-        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool]
+        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool], largest: int
     ) -> Callable[[], None]:
-        """Like `serve`; urgent requests have a queue and threads of their own, which no other request delays."""
-        return self.serve(name, handler)
+        """Like `serve`; urgent requests have a queue and threads of their own, which no other request delays.
+
+        Requests of more than `largest` bytes are refused at once, so that a flood of them fills no memory.
+        """
 
     @property
     def namespace(self) -> str:
@@ -198,7 +201,8 @@ class SharedServices(Component):
     @override
     def start(self) -> None:
         transport = _topics(self._link)
-        self._end = transport.serve_with_urgent(endpoint(transport.namespace), self._answer, self._is_urgent)
+        name = endpoint(transport.namespace)
+        self._end = transport.serve_with_urgent(name, self._answer, self._is_urgent, _MOST_BYTES)
 
     @override
     def stop(self) -> None:
@@ -218,8 +222,6 @@ class SharedServices(Component):
 
     def _answer(self, payload: Payload, sender: str | None) -> bytes:
         try:
-            if len(payload) > _MOST_BYTES:
-                raise NotSupported(f"a call of {len(payload)} bytes is too large, at most {_MOST_BYTES} are read")
             call = decode_call(payload)
             if call.service == SERVICES:
                 return encode_answer(Answer(self._shared()))

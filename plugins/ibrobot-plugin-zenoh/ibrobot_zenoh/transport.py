@@ -104,16 +104,16 @@ class ZenohTransport(TopicTransport):
 
     @override
     def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
-        return self._serve(name, handler, workers, None)
+        return self._serve(name, handler, workers, lambda payload: False, self._largest)
 
     @override
     def serve_with_urgent(
-        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool]
+        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool], largest: int
     ) -> Callable[[], None]:
-        return self._serve(name, handler, HANDLER_THREADS, is_urgent)
+        return self._serve(name, handler, HANDLER_THREADS, is_urgent, largest)
 
     def _serve(
-        self, name: str, handler: Handler, workers: int, is_urgent: Callable[[Payload], bool] | None
+        self, name: str, handler: Handler, workers: int, is_urgent: Callable[[Payload], bool], largest: int
     ) -> Callable[[], None]:
         key, token = _key(f"{SERVICES}/*", name), _key(SERVED, name).join(uuid.uuid4().hex)
 
@@ -135,7 +135,12 @@ class ZenohTransport(TopicTransport):
 
         def take(query: zenoh.Query) -> None:
             payload = query.payload
-            first = is_urgent is not None and is_urgent(payload.to_bytes() if payload is not None else b"")
+            size = len(payload) if payload is not None else 0
+            if size > largest:
+                with query:
+                    query.reply_err(f"a request of {size} bytes, at most {largest} are read", encoding=_FAILED)
+                return
+            first = is_urgent(payload.to_bytes() if payload is not None else b"")
             turned_away = (urgent if first else server).put(query)
             if turned_away is not None:
                 with turned_away:

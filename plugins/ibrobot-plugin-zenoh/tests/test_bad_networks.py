@@ -190,7 +190,7 @@ def test_urgent_requests_wait_for_no_others(monkeypatch: pytest.MonkeyPatch):
             release.wait()
         return b"done"
 
-    server.serve_with_urgent("services", answer, lambda payload: payload == b"stop")
+    server.serve_with_urgent("services", answer, lambda payload: payload == b"stop", 1000)
     settle(robot, server)
     outcomes: queue.SimpleQueue[str] = queue.SimpleQueue()
 
@@ -208,6 +208,8 @@ def test_urgent_requests_wait_for_no_others(monkeypatch: pytest.MonkeyPatch):
     try:
         for _ in range(20):
             assert robot.request("services", b"stop", WAIT_S) == b"done"
+        with pytest.raises(TransportError, match="services failed: a request of 1001 bytes, at most 1000 are read"):
+            robot.request("services", bytes(1001), WAIT_S)
     finally:
         release.set()
     told = [outcomes.get(timeout=WAIT_S) for _ in asking]

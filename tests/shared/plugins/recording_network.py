@@ -37,6 +37,10 @@ class Network(FakeTransport, TopicTransport):
         self.callbacks[topic] = callback
         return lambda: self.callbacks.pop(topic)
 
+    def serve_with_urgent(self, name, handler, is_urgent, largest):
+        self.is_urgent = is_urgent
+        return self.serve(name, handler)
+
     def shared_topics(self, timeout_s):
         return []
 
