@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import enum
-import inspect
-import itertools
 import logging
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any, get_origin
+from typing import Any
 
 import attrs
 import numpy as np
@@ -17,11 +13,14 @@ import numpy as np
 from ibrobot_core.clock import Clock
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.active import ActiveExecutors
+from ibrobot_core.control.commands import Act, permitted
 from ibrobot_core.control.following import FollowingError
 from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.control.health import Health
 from ibrobot_core.control.link import ControlState, PlanRecord
-from ibrobot_core.control.plausible import Plausibility
+from ibrobot_core.control.phase import TRANSITIONS, Cause, Phase
+from ibrobot_core.control.pose_motion import TIMEOUT_S, PoseMotion
+from ibrobot_core.control.readings import Readings
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.control.timing import Pace
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
@@ -31,39 +30,14 @@ from ibrobot_core.units import NS_PER_S, ns
 
 EMERGENCY_STOP = "emergency stop"
 """The fault raised by `/estop`."""
-_FIRST_READINGS = 10
-"""Least number of attempts to get a new reading, since single replies may be lost."""
 _FIRST_READING_S = 2.0
 """How long a start tries: the computer may be busy with starting the rest."""
-_POSE_SPEED = 0.25
-"""Speed of motions to a start or stop pose, as a fraction of the velocity limits."""
-_POSE_TIMEOUT_S = 10.0
 _RECENT_NS = NS_PER_S
 """Time after its last command for which a robot at rest counts as commanded [ns]."""
 _POSE_TOLERANCE = 0.2
 """Largest distance of a joint from the commanded startup pose, e.g. due to its weight [rad]."""
 _SUSPENDED_NS = ns(0.1)
 """Shortest suspend that is a fault [ns]."""
-
-
-class Phase(enum.Enum):
-    """What the control loop does; the value says when a command is refused."""
-
-    ARRIVING = "while the robot moves to its startup pose"
-    RUNNING = "while executors command the robot"
-    FAULTED = "before a reset"
-    STOPPING = "while the robot is stopping"
-
-
-_ALWAYS = frozenset({"estop", "fault", "cancel", "counters", "halt"})
-"""Commands that stop the robot or change nothing."""
-PERMITTED: Mapping[Phase, frozenset[str]] = {
-    Phase.ARRIVING: _ALWAYS,
-    Phase.RUNNING: _ALWAYS | {"switch_mode", "goal", "reset", "reset_episode"},
-    Phase.FAULTED: _ALWAYS | {"reset", "reset_episode"},
-    Phase.STOPPING: _ALWAYS,
-}
-"""The commands of the host that each phase accepts."""
 
 
 class ControlCore:
@@ -76,6 +50,7 @@ class ControlCore:
         clock: the source of stamps.
 
     Attributes:
+        phase: what the loop does; `TRANSITIONS` has what leads to another one.
         take_stops: executes emergency stops that have arrived; called during commands that may take long.
         stops: number of emergency stops so far, also of those pressed while one was latched.
     """
@@ -90,31 +65,24 @@ class ControlCore:
         self._clock = clock
         self.period_ns = ns(1.0 / config.control.rate_hz)
         self._safety = SafetyLayer(config.robot, self.period_ns)
-        self._state_timeout_ns = ns(config.control.state_timeout)
-        self._counts = {"read_errors": 0, "write_errors": 0, "signal_errors": 0, "stale_states": 0, "old_plans": 0}
-        self._counts |= {"following_errors": 0, "implausible_states": 0}
+        self._pose = PoseMotion(self._safety, clock)
+        self._readings = Readings(hardware, config.robot, clock, self.period_ns, ns(config.control.state_timeout))
+        self._counts = {"write_errors": 0, "signal_errors": 0, "old_plans": 0, "following_errors": 0}
         self._relaxed = False
-        self._stopping = False
         self._following = FollowingError(config.control.following_error, config.robot, self.period_ns)
         self._yielded: Vector | None = None
         """Held positions of joints that did not follow, until a reset [rad]; NaN for the others, shape (J,)."""
-        self._target: Vector | None = None
-        self._plausibility = Plausibility(config.robot, self.period_ns)
-        self._implausible = ""
-        """Why the last reading is not believed; empty if it is."""
         # A value is too low if the process is interrupted between its two clocks, never too high.
         self._asleep_ns = max(clock.asleep_ns() for _ in range(3))
         self._health = Health(config.control.load_shedding, self._log)
         self._pace = Pace(self.period_ns)
-        self._shedding = self._has_shed = False
         self._commanded_ns: int | None = None
         """Time of the last plan or goal of this generation [ns]; None before the first."""
         self._unwell = ""
         """The fault, if a joint's condition caused it; otherwise empty."""
-        self._arriving = False
         self._tick = 0
         self._due_ns = clock.now_ns()
-        self._commands: dict[str, Callable[..., Mapping[str, Any] | None]] = {
+        self._commands: dict[str, Act] = {
             "switch_mode": self._switch_mode,
             "reset_episode": self._reset_episode,
             "estop": self.emergency_stop,
@@ -127,6 +95,7 @@ class ControlCore:
         }
         self.take_stops: Callable[[], None] = lambda: None
         self.stops = 0
+        self.phase = Phase.RUNNING
         self.mode = ""
         self.generation = 0
         self.fault = ""
@@ -149,15 +118,15 @@ class ControlCore:
             self._hardware.require_relax()
         self._hardware.connect()
         try:
-            self._measured = self._first_reading(_FIRST_READING_S)
-            self._safety.activate(self._measured.position)
+            self._readings.newest = self._readings.first(_FIRST_READING_S)
+            self._safety.activate(self._readings.newest.position)
         except HardwareError:
             self._hardware.undo_connect()
             raise
         self.mode = mode
         behaviour, _, pose = self._config.control.startup.partition(" ")
         if behaviour == "pose":
-            self._arriving = True
+            self.phase = Phase.ARRIVING
             self._move_to(pose)
         else:
             self._switch_mode(mode)
@@ -169,22 +138,25 @@ class ControlCore:
             HardwareError: after a fault or an emergency stop during the motion, or if it takes too long; the robot is
                 at rest then.
         """
-        if not self._arriving:
-            return True
-        if self.fault or self._target is None:
+        if self.phase is Phase.FAILED:
             if not (self._safety.at_rest or self._relaxed):
                 return False  # still braking
             raise HardwareError(f"control.startup: {self._config.control.startup}: {self.fault}")
-        away = np.abs(self._measured.position - self._target)
+        if self.phase is not Phase.ARRIVING:
+            return True
+        assert self._pose.target is not None
+        measured = self._readings.newest
+        away = np.abs(measured.position - self._pose.target)
         # The mode starts from the measured positions; those of an old reading would pull the robot back.
-        if self._at_target and not self._measured.stale and away.max() <= _POSE_TOLERANCE:
-            self._target, self._arriving = None, False
+        if self._pose.reached and not measured.stale and away.max() <= _POSE_TOLERANCE:
+            self._pose.end()
+            self._advance(Cause.ARRIVED)
             self._switch_mode(self.mode)
             return True
-        if self._late_to_pose and self._safety.at_rest:
+        if self._pose.late and self._safety.at_rest:
             joint = self._robot.joint_names[int(away.argmax())]
             raise HardwareError(
-                f"control.startup: {self._config.control.startup}: not reached within {_POSE_TIMEOUT_S:g} s: "
+                f"control.startup: {self._config.control.startup}: not reached within {TIMEOUT_S:g} s: "
                 f"{joint} is {away.max():.2f} rad away; check that nothing is in its way"
             )
         return False
@@ -200,18 +172,19 @@ class ControlCore:
         self._due_ns = self._clock.now_ns() if due_ns is None else due_ns
         self._check_suspend()
         begun_ns = self._clock.now_ns()
-        self._read()
+        if (fault := self._readings.read()) is not None:
+            self._raise_fault(fault)
         if slow := self._pace.tick(periods, self._clock.now_ns() - begun_ns):
             self._log.warning("%s", slow)
         signals = self._read_signals()
         success = self._hardware.success()
         self._check_following()
         self._check_health()
-        command = self._safety.apply(self._desired(), self._measured.position)
+        measured = self._readings.newest
+        command = self._safety.apply(self._desired(), measured.position)
         self._write(command)
         self._hardware.advance(periods * self.period_ns)
         self._tick += 1
-        measured = self._measured
         self.state = ControlState(
             tick=self._tick, stamp_ns=measured.stamp_ns, late_ns=late_ns, generation=self.generation,
             estop=self._safety.estopped, stale=measured.stale, success=success, position=measured.position,
@@ -237,20 +210,11 @@ class ControlCore:
             fault: what happened.
         """
         longest_s = self._config.control.peer_timeout
-        if silent_s <= longest_s / 3 or self.fault or self._stopping or not self._is_commanded:
+        if silent_s <= longest_s / 3 or self.fault or self.phase is Phase.STOPPING or not self._is_commanded:
             return
         braking_s = float(np.max(np.abs(self._safety.velocity) / self._robot.max_acceleration))
         if silent_s + braking_s >= longest_s:
             self._raise_fault(f"{fault} for {silent_s * 1e3:.0f} ms")
-
-    @property
-    def phase(self) -> Phase:
-        """What the loop does now."""
-        if self._stopping:
-            return Phase.STOPPING
-        if self._arriving:
-            return Phase.ARRIVING
-        return Phase.FAULTED if self.fault else Phase.RUNNING
 
     def handle(self, command: Mapping[str, Any]) -> dict[str, Any]:
         """Execute a command of the host and return the reply; the reply to a refused command has the key `error`.
@@ -260,21 +224,11 @@ class ControlCore:
         reply = {"reply": command.get("id")}
         arguments = {key: value for key, value in command.items() if key not in ("do", "id")}
         try:
-            result = self._permitted(command.get("do"), arguments)(**arguments) or {}
+            act = permitted(self._commands, command.get("do"), arguments, self.phase, self.fault)
+            result = act(**arguments) or {}
         except IbrobotError as error:
             return {**reply, "stops": self.stops, "error": str(error)}
         return {**reply, "stops": self.stops, "generation": self.generation, **result}
-
-    def _permitted(self, do: object, arguments: Mapping[str, Any]) -> Callable[..., Mapping[str, Any] | None]:
-        act = self._commands.get(do) if isinstance(do, str) else None
-        if act is None:
-            raise HardwareError(f"control has no command {do!r:.40}")
-        phase = self.phase
-        if do not in PERMITTED[phase]:
-            cause = f": {self.fault}" if phase is Phase.FAULTED else ""
-            raise HardwareError(f"{do}: refused {phase.value}{cause}")
-        _check_arguments(act, arguments)
-        return act
 
     def counters(self) -> dict[str, Any]:
         """Counts of all interventions and refusals by the safety layer, the executors, the hardware and the loop."""
@@ -283,7 +237,7 @@ class ControlCore:
             "joints": dict(self._safety.interventions),
             "executors": self._executors.counters(),
             "hardware": self._hardware.counters(),
-            "loop": {**self._counts, "slow_seconds": self._pace.slow_seconds},
+            "loop": {**self._readings.counts, **self._counts, "slow_seconds": self._pace.slow_seconds},
             "conditions": [attrs.asdict(each) for each in self._health.conditions],
         }
 
@@ -294,12 +248,11 @@ class ControlCore:
             unmoved: whether nothing has moved the robot, since the start failed elsewhere; torque that the start
                 switched on is then switched off again.
         """
-        if self._stopping:
+        if self.phase is Phase.STOPPING:
             return
-        self._stopping = True
+        self._advance(Cause.STOP)
         self._leave()
-        self._target = None
-        self._shedding = self._arriving = False
+        self._pose.end()
         if unmoved and self._config.control.startup == "hold":
             self._hardware.undo_connect()
             self._relaxed = True
@@ -329,9 +282,9 @@ class ControlCore:
         """Whether the stop behaviour has finished."""
         if self._relaxed:
             return True
-        if self._target is None or self._late_to_pose:
+        if self._pose.target is None or self._pose.late:
             return self._safety.at_rest
-        return self._at_target
+        return self._pose.reached
 
     def abandon(self) -> None:
         """Switch torque off if the stop behaviour is `relax`; for a loop that cannot tick because of a bug."""
@@ -342,22 +295,8 @@ class ControlCore:
         """Release the hardware."""
         self._hardware.disconnect()
 
-    def _first_reading(self, patience_s: float = 0.0) -> JointReading:
-        """A reading that agrees with the one before it: the command begins there."""
-        deadline_s = time.monotonic() + patience_s
-        last: JointReading | None = None
-        for number in itertools.count(1):
-            measured = self._hardware.read()
-            if not measured.stale:
-                if last is not None and not self._plausibility.jump(last.position, measured.position, 0):
-                    self._answered_ns = measured.stamp_ns
-                    return measured
-                last = measured
-            else:
-                time.sleep(0.001)  # hardware that reads in a thread of its own is stale at once
-            if number > _FIRST_READINGS and time.monotonic() >= deadline_s:
-                raise HardwareError("the joints do not answer yet, or each time with other positions")
-        raise AssertionError
+    def _advance(self, cause: Cause) -> None:
+        self.phase = TRANSITIONS[self.phase].get(cause, self.phase)
 
     @property
     def _is_commanded(self) -> bool:
@@ -370,50 +309,12 @@ class ControlCore:
         return by_policy or self._clock.now_ns() - self._commanded_ns < _RECENT_NS
 
     def _move_to(self, pose: str) -> None:
-        self._target = self._robot.pose(pose.strip())
-        self._pose_deadline = self._clock.now_ns() + ns(_POSE_TIMEOUT_S)
-
-    @property
-    def _at_target(self) -> bool:
-        target = self._target
-        return target is not None and self._safety.at_rest and np.allclose(self._safety.current, target, atol=1e-4)
-
-    @property
-    def _late_to_pose(self) -> bool:
-        return self._clock.now_ns() >= self._pose_deadline
+        self._pose.begin(self._robot.pose(pose.strip()))
 
     @property
     def _at_tick(self) -> JointReading:
         """The reading at the time of the cycle: executors see equal periods even if cycles are late."""
-        return attrs.evolve(self._measured, stamp_ns=self._due_ns)
-
-    def _read(self) -> None:
-        try:
-            measured = self._hardware.read()
-        except HardwareError as error:
-            # The driver has already retried what it can.
-            self._counts["read_errors"] += 1
-            measured = attrs.evolve(self._measured, stale=True)
-            self._raise_fault(str(error))
-        else:
-            measured = self._believed(measured)
-            if measured.stale:
-                self._counts["stale_states"] += 1
-                self._stale()
-            else:
-                self._answered_ns = measured.stamp_ns
-        self._measured = measured
-
-    def _believed(self, measured: JointReading) -> JointReading:
-        """The reading, or the one before it, as after a lost reply, if no joint can have moved like that."""
-        self._implausible = ""
-        if not measured.stale:
-            since_ns = measured.stamp_ns - self._answered_ns
-            self._implausible = self._plausibility.jump(self._measured.position, measured.position, since_ns)
-        if not self._implausible:
-            return measured
-        self._counts["implausible_states"] += 1
-        return attrs.evolve(self._measured, stamp_ns=measured.stamp_ns, stale=True)
+        return attrs.evolve(self._readings.newest, stamp_ns=self._due_ns)
 
     def _check_suspend(self) -> None:
         """Raise a fault if the computer was asleep: whatever was planned before belongs to another time."""
@@ -430,18 +331,12 @@ class ControlCore:
             self._counts["signal_errors"] += 1
             return np.full(self.signal_size, np.nan)
 
-    def _stale(self) -> None:
-        """Handle a tick without a new state; raise a fault once states have been missing for `state_timeout`."""
-        age_ns = self._clock.now_ns() - self._answered_ns
-        if age_ns >= self._state_timeout_ns:
-            what = self._implausible or "the joints do not answer"
-            self._raise_fault(f"{what}: no state for {age_ns / 1e6:.0f} ms")
-
     def _check_following(self) -> None:
         """Raise a fault if a joint does not follow, and stop pressing against the obstacle."""
-        if self.fault or self._relaxed or self._measured.stale:
+        reading = self._readings.newest
+        if self.fault or self._relaxed or reading.stale:
             return
-        commanded, measured = self._safety.current, self._measured.position
+        commanded, measured = self._safety.current, reading.position
         fault = self._following.check(commanded, self._safety.velocity, measured)
         if fault:
             self._counts["following_errors"] += 1
@@ -454,24 +349,19 @@ class ControlCore:
         if conditions or self._health.conditions:
             now_ns = self._clock.now_ns()
             self._health.update(conditions, now_ns)
-            if not (self._has_shed or self._stopping or self._relaxed) and (why := self._health.overdue(now_ns)):
+            sheds = Cause.OVERDUE in TRANSITIONS[self.phase] and not self._relaxed
+            if sheds and (why := self._health.overdue(now_ns)):
                 self._shed(why)
             if (fault := self._health.fault) and not self.fault:
                 self._unwell = fault
                 self._raise_fault(fault)
-        if self._shedding:
-            arrived = self._at_target
-            if arrived or not self._may_shed_in_motion:
-                self._target = None
-            if arrived or (self._target is None and self._safety.at_rest):
-                self._shedding = False
+        if self.phase is Phase.SHEDDING:
+            reached = self._pose.reached
+            if reached or self._pose.late or self._readings.silent:
+                self._pose.end()
+            if reached or (self._pose.target is None and self._safety.at_rest):
+                self._advance(Cause.RELAXED)
                 self._relax("load shedding")
-
-    @property
-    def _may_shed_in_motion(self) -> bool:
-        """Whether the motion to the pose may continue: the joints answer, and it is not late."""
-        silent = self._clock.now_ns() - self._answered_ns >= self._state_timeout_ns
-        return self._target is not None and not (self._late_to_pose or silent)
 
     def _shed(self, why: str) -> None:
         """Move to the load-shedding pose, unless a fault other than the joints' health prevents motion, then relax."""
@@ -479,14 +369,9 @@ class ControlCore:
         moves = options.pose and self.fault in ("", self._unwell) and not self._safety.estopped
         then = f"goes to pose {options.pose} and relaxes" if moves else "relaxes"
         self._announce(f"{why}; this has lasted for {options.after:g} s", then)
-        self._shedding = self._has_shed = True
+        self._advance(Cause.OVERDUE)
         if moves:
             self._move_to(options.pose)
-
-    def _yield(self) -> Vector | None:
-        if self._yielded is None:
-            return None
-        return np.where(np.isnan(self._yielded), self._safety.current, self._yielded)
 
     def _write(self, command: Vector) -> None:
         if self._relaxed:
@@ -499,10 +384,11 @@ class ControlCore:
 
     def _desired(self) -> Vector | None:
         """The desired positions of this tick [rad], shape (J,); None to brake and hold."""
-        if self._target is not None:
-            return None if self._late_to_pose else self._safety.towards(self._target, _POSE_SPEED)
+        if self._pose.target is not None:
+            return self._pose.desired()
         if not self._executors:
-            return self._yield()
+            held = self._yielded
+            return None if held is None else np.where(np.isnan(held), self._safety.current, held)
         setpoints = self._executors.update(self._at_tick)
         relax = self._executors.want_relax
         if relax and not self._relaxed:
@@ -531,9 +417,9 @@ class ControlCore:
     def _restore_torque(self) -> bool:
         """Switch torque on at the measured positions. Raise a fault and return False if they are unknown."""
         try:
-            if self._measured.stale:
+            if self._readings.newest.stale:
                 raise HardwareError("the joints do not answer")
-            self._safety.activate(self._measured.position)
+            self._safety.activate(self._readings.newest.position)
         except HardwareError as error:
             self._raise_fault(f"torque stays off: {error}")
             return False
@@ -544,9 +430,6 @@ class ControlCore:
         self._relaxed = False
         self._hardware.resume()
         self._health.restart()
-        if self._shedding:
-            self._target = None
-        self._shedding = self._has_shed = False
 
     def _raise_fault(self, fault: str) -> None:
         if self.fault:
@@ -567,8 +450,9 @@ class ControlCore:
         )
         if not self.fault:
             self.fault = fault
+            self._advance(Cause.FAULT)
             self._leave()
-            self._target = None
+            self._pose.end()
 
     def _leave(self) -> None:
         """Deactivate all executors; without one, every joint brakes and holds."""
@@ -599,16 +483,16 @@ class ControlCore:
         self._leave()
         self._hardware.reset_episode(EpisodeSetup(seed))
         self._hardware.reset_faults()
-        self._begin_again(self._first_reading())
+        self._begin_again(self._readings.first())
         return {"begun": True}
 
     def emergency_stop(self) -> None:
         """Brake and hold, whatever the robot does; a load that was to be shed is given its time again."""
         self.stops += 1
         self._safety.estop()
-        self._shedding = self._has_shed = False
-        self._target = None
+        self._pose.end()
         self._health.restart()
+        self._advance(Cause.EMERGENCY_STOP)
         self._raise_fault(EMERGENCY_STOP)
 
     def _halt(self, *, unmoved: bool) -> dict[str, Any]:
@@ -641,7 +525,7 @@ class ControlCore:
             self._hardware.reset_faults()
             self.take_stops()
             self._refuse_after(stops)
-            self._begin_again(self._first_reading())
+            self._begin_again(self._readings.first())
         return {"cleared": cleared}
 
     def _refuse_after(self, stops: int, what: str = "reset") -> None:
@@ -655,11 +539,13 @@ class ControlCore:
             HardwareError: if it is not a valid position; nothing has changed then.
         """
         self._safety.reset(measured.position)
-        self._measured = measured
+        self._readings.newest = measured
         self._leave()
+        self._pose.end()
         self._after_relax()
         self._yielded = None
         self.fault = self._unwell = ""
+        self._advance(Cause.RESET)
         self._enter()
 
     def _goal(self, executor: str, goal_id: str, goal: Mapping[str, Any], stops: int | None = None) -> None:
@@ -670,20 +556,3 @@ class ControlCore:
 
     def _cancel(self) -> None:
         self._executors.cancel(self._at_tick)
-
-
-def _check_arguments(act: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
-    """Check the names and types of the arguments of a command.
-
-    Raises:
-        HardwareError: if they are others.
-    """
-    signature = inspect.signature(act, eval_str=True)
-    try:
-        signature.bind(**arguments)
-    except TypeError as error:
-        raise HardwareError(f"malformed command: {error}") from None
-    for name, value in arguments.items():
-        kind = signature.parameters[name].annotation
-        if not isinstance(value, get_origin(kind) if get_origin(kind) is Mapping else kind):
-            raise HardwareError(f"malformed command: {name} cannot be a {type(value).__name__}")

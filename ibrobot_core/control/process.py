@@ -21,8 +21,9 @@ from ibrobot_core.clock import RealClock
 from ibrobot_core.component import error_text, exit_code
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
-from ibrobot_core.control.core import ControlCore, Phase
+from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.link import LinkLayout, SharedMemory
+from ibrobot_core.control.phase import Phase
 from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
 from ibrobot_core.outside import echo

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ibrobot_core.control.core import PERMITTED, Phase
+from ibrobot_core.control.phase import PERMITTED, TRANSITIONS, Cause, Phase
 from ibrobot_core.errors import HardwareError
+from ibrobot_core.interfaces import Condition, Severity
 from ibrobot_core.units import NS_PER_S
 
 RELAXES = {"control": {"stop": "relax"}}
@@ -222,17 +223,30 @@ class TestFaults:
         rig.tick(10)
 
 
+HOT = Condition("lift", "temperature", 58.0, "deg C", Severity.WARNING, "lift is at 58 deg C", sheds_load=True)
+
+
 def into(make_rig, phase: Phase):
     """A robot in a phase."""
-    rig = make_rig({"control": {"startup": "pose rest", "stop": "pose rest"}}, sim=True)
+    shedding = {"after": 0.2, "pose": "rest"}
+    rig = make_rig({"control": {"startup": "pose rest", "stop": "pose rest", "load_shedding": shedding}}, sim=True)
     rig.core.start("stream")
     rig.hardware.written.append(rig.hardware.read().position)
     rig.tick(5)
-    if phase is not Phase.ARRIVING:
+    if phase is Phase.FAILED:
+        rig.call("fault", fault="a cable is loose")
+    elif phase is not Phase.ARRIVING:
         while not rig.core.arrived():
             rig.tick()
     if phase is Phase.FAULTED:
         rig.call("fault", fault="a cable is loose")
+    if phase in {Phase.SHEDDING, Phase.SHED}:
+        rig.plan([0.4, 0.4, 0.9])
+        rig.tick(50)
+        rig.hardware.conditions = (HOT,)
+        while rig.core.phase is not phase:
+            rig.tick()
+        rig.hardware.conditions = ()
     if phase is Phase.STOPPING:
         rig.core.begin_stop()
     assert rig.core.phase is phase
@@ -250,8 +264,12 @@ COMMANDS: dict[str, dict[str, Any]] = {
     "estop": {},
     "halt": {"unmoved": False},
 }
-AFTER = {"estop": Phase.FAULTED, "fault": Phase.FAULTED, "halt": Phase.STOPPING}
-AFTER_A_FAULT = {"reset": Phase.RUNNING, "reset_episode": Phase.RUNNING, "halt": Phase.STOPPING}
+CAUSES = {
+    "estop": Cause.EMERGENCY_STOP, "fault": Cause.FAULT, "reset": Cause.RESET, "reset_episode": Cause.RESET,
+    "halt": Cause.STOP,
+}  # fmt: skip
+BRAKING = {(Phase.SHEDDING, "reset")}
+"""Refused since the robot moves."""
 
 
 class TestPhases:
@@ -260,12 +278,11 @@ class TestPhases:
     def test_each_permits_its_commands_and_goes_where_they_lead(self, make_rig, phase, do):
         rig = into(make_rig, phase)
         answer = rig.call(do, **COMMANDS[do])
-        if do in PERMITTED[phase]:
+        if do in PERMITTED[phase] and (phase, do) not in BRAKING:
             assert "refused" not in answer.get("error", "")
-            leads = {Phase.RUNNING: AFTER, Phase.FAULTED: AFTER_A_FAULT}.get(phase, {})
-            after = leads.get(do, phase) if do != "halt" else Phase.STOPPING
+            after = TRANSITIONS[phase].get(CAUSES.get(do), phase)
         else:
-            assert answer["error"].startswith(f"{do}: refused {phase.value}")
+            assert answer["error"].startswith((f"{do}: refused {phase.value}", "the robot is still braking"))
             after = phase
         assert rig.core.phase is after
 

@@ -78,7 +78,7 @@ def test_a_joint_that_is_blocked_is_named(rig):
     ):
         arrive(rig)
     refused = rig.call("goal", executor="arm_position", goal_id="1", goal={})["error"]
-    assert refused == "goal: refused while the robot moves to its startup pose"
+    assert refused == "goal: refused after the start has failed"
 
 
 def test_a_joint_that_hangs_too_far_from_the_pose_is_named(rig):
