@@ -1,16 +1,18 @@
-"""The built-in plugin: executor `position`, engine `monolithic`, and transport `local`, which means none."""
+"""The plugin of core: its commands, executor `position`, engine `monolithic`, and transport `local`, that is none."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import EngineDescriptor, ExecutorDescriptor, TransportDescriptor
+from ibrobot_core.descriptors import Command, EngineDescriptor, ExecutorDescriptor, TransportDescriptor
 from ibrobot_core.errors import NotSupported
 from ibrobot_core.executor_options import PositionOptions
 from ibrobot_core.hookspecs import hookimpl
 
 if TYPE_CHECKING:
+    import click
+
     from ibrobot_core.interfaces import Context, Engine, Executor, Transport
 
 
@@ -50,3 +52,36 @@ def ibrobot_engines() -> Iterable[EngineDescriptor]:
 def ibrobot_transports() -> Iterable[TransportDescriptor]:
     """The transport of a run without other machines."""
     yield TransportDescriptor(type="local", make=_local, summary="none: everything stays in this process")
+
+
+def _launch() -> click.Command:
+    from ibrobot_core.cli.launch import launch
+
+    return launch
+
+
+def _config() -> click.Command:
+    from ibrobot_core.cli.config import config
+
+    return config
+
+
+def _plugins() -> click.Command:
+    from ibrobot_core.cli.plugins import plugins
+
+    return plugins
+
+
+def _doctor() -> click.Command:
+    from ibrobot_core.cli.doctor import doctor
+
+    return doctor
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """Commands that need no other plugin."""
+    yield Command("launch", "Run a robot, real or simulated.", _launch)
+    yield Command("config", "Check and show robot YAMLs.", _config)
+    yield Command("plugins", "List what the installed plugins offer.", _plugins)
+    yield Command("doctor", "Check this machine, and print a remedy for each fault.", _doctor)

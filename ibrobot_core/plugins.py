@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from ibrobot_core.messages import CompressedImage, Image
 
 ENTRY_POINT_GROUP = "ibrobot"
+CORE = "ibrobot-core"
+"""The package whose plugin is loaded before all others."""
 
 KINDS: Mapping[str, str] = {
     "hardware": "ibrobot_hardware",
@@ -99,6 +101,8 @@ class Registry:
     guides: list[descriptors.GuideDescriptor] = attrs.field(factory=list)
     decoders: list[descriptors.DecoderDescriptor] = attrs.field(factory=list)
     commands: dict[str, descriptors.Command] = attrs.field(factory=dict)
+    command_packages: dict[str, str] = attrs.field(factory=dict)
+    """Command -> the package that offers it."""
     managers: dict[str, pluggy.PluginManager] = attrs.field(factory=dict)
 
     def types(self, kind: str) -> list[str]:
@@ -306,21 +310,32 @@ def _add(registry: Registry, plugin: str, package: str, version: str, load: Call
     registry.configs += offers["ibrobot_configs"]
     registry.panels += offers["ibrobot_panels"]
     registry.guides += offers["ibrobot_guides"]
-    registry.commands.update({command.name: command for command in offers["ibrobot_commands"]})
+    for command in offers["ibrobot_commands"]:
+        if command.name in registry.commands:
+            reason = f"command {command.name!r} is offered by {registry.command_packages[command.name]} already"
+            registry.failures.append(Failure(plugin, package, "ibrobot_commands", reason))
+            continue
+        registry.commands[command.name] = command
+        registry.command_packages[command.name] = package
     registry.managers[plugin] = manager
 
 
 def discover(found: Iterable[EntryPoint] | None = None) -> Registry:
-    """Load the built-in plugin and all installed plugins. A plugin's failure raises nothing; see `Registry.failures`.
+    """Load core's own plugin, then others. A plugin's failure raises nothing; see `Registry.failures`.
 
     Args:
-        found: entry points to load; None for the installed ones of group `ibrobot`.
-    """
-    from ibrobot_core import __version__, builtin
+        found: entry points of the others; None for all that are installed.
 
+    Raises:
+        PluginError: if the installation of core lacks its entry point, as one from before it had one.
+    """
+    installed = entry_points(group=ENTRY_POINT_GROUP)
+    own = [entry for entry in installed if entry.dist is not None and entry.dist.name == CORE]
+    if not own:
+        raise PluginError(f"the installed {CORE} has no plugin of its own: install it again, in a checkout by `uv sync`")
+    others = [entry for entry in (installed if found is None else found) if entry not in own]
     registry = Registry()
-    _add(registry, "core", "ibrobot-core", __version__, lambda: builtin)
-    for entry in sorted(entry_points(group=ENTRY_POINT_GROUP) if found is None else found, key=lambda e: e.name):
+    for entry in (*own, *sorted(others, key=lambda entry: entry.name)):
         package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("?", "?")
         _add(registry, entry.name, package, version, entry.load)
     return registry

@@ -72,6 +72,33 @@ def test_every_failure_is_reported_with_its_cause(registry: Registry) -> None:
     ]
 
 
+def test_two_commands_of_one_name_are_a_failure_of_the_later_plugin(site: Site) -> None:
+    site.add("fake-first", "two_commands.py")
+    site.add("fake-second", "two_commands.py")
+    registry = discover(site.entry_points())
+
+    assert registry.commands["juggle"].summary == "juggles, as fake_first does"
+    assert registry.command_packages["juggle"] == "fake-first"
+    assert registry.command_packages["doctor"] == "ibrobot-core"
+    assert [str(failure) for failure in registry.failures] == [
+        "plugin 'fake_first' (fake-first) failed in ibrobot_commands: "
+        "command 'doctor' is offered by ibrobot-core already",
+        "plugin 'fake_second' (fake-second) failed in ibrobot_commands: "
+        "command 'doctor' is offered by ibrobot-core already",
+        "plugin 'fake_second' (fake-second) failed in ibrobot_commands: "
+        "command 'juggle' is offered by fake-first already",
+    ]
+    shown = _ibrobot("plugins")
+    assert f"broken: {registry.failures[2]}\n" in shown.stdout
+    assert _ibrobot("juggle", "--help").returncode == 0
+
+
+def test_core_without_its_entry_point_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ibrobot_core.plugins.entry_points", lambda group: [])
+    with pytest.raises(PluginError, match="the installed ibrobot-core has no plugin of its own: install it again"):
+        discover([])
+
+
 def test_a_missing_type_names_the_nearest_and_what_is_broken(registry: Registry) -> None:
     with pytest.raises(PluginError, match=r"unknown hardware type 'god_arm', did you mean 'good_arm'\?; plugin 'fake_"):
         registry.find("hardware", "god_arm")

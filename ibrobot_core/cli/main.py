@@ -10,7 +10,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
-from importlib import import_module
 from typing import Any, override
 
 import click
@@ -27,14 +26,6 @@ _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
 _OUTPUT_REFUSED = (errno.ENOSPC, errno.EPIPE, errno.EIO)
 """Errors of a full device, a reader that is gone, and a terminal that is gone."""
 
-COMMANDS = {
-    "launch": ("ibrobot_core.cli.launch:launch", "Run a robot, real or simulated."),
-    "config": ("ibrobot_core.cli.config:config", "Check and show robot YAMLs."),
-    "plugins": ("ibrobot_core.cli.plugins:plugins", "List what the installed plugins offer."),
-    "doctor": ("ibrobot_core.cli.doctor:doctor", "Check this machine, and print a remedy for each fault."),
-}
-"""Name -> place of the click command, and its line in the help."""
-
 
 @contextmanager
 def _broken_pipes_told() -> Iterator[None]:
@@ -46,29 +37,29 @@ def _broken_pipes_told() -> Iterator[None]:
 
 
 class LazyGroup(click.Group):
-    """A group that imports commands when they are called; commands of plugins are listed after those of core."""
+    """A group that imports commands when they are called; it lists commands of plugins after those of core."""
 
     @override
     def list_commands(self, ctx: click.Context) -> list[str]:
-        from ibrobot_core.plugins import installed_plugins
+        from ibrobot_core.plugins import CORE, installed_plugins
 
-        return [*COMMANDS, *sorted(set(installed_plugins().commands) - set(COMMANDS))]
+        packages = installed_plugins().command_packages
+        own = [name for name, package in packages.items() if package == CORE]
+        return [*own, *sorted(set(packages) - set(own))]
 
     @override
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name in COMMANDS:
-            module, _, attribute = COMMANDS[cmd_name][0].partition(":")
-            command: click.Command = getattr(import_module(module), attribute)
-            return command
-        from ibrobot_core.plugins import installed_plugins, official_plugins
+        from ibrobot_core.plugins import CORE, installed_plugins, official_plugins
 
-        contributed = installed_plugins().commands.get(cmd_name)
-        if contributed is None:
+        registry = installed_plugins()
+        found = registry.commands.get(cmd_name)
+        if found is None:
             if any(cmd_name in offers.get("command", ()) for offers in official_plugins().values()):
-                raise installed_plugins().not_found("command", cmd_name)
+                raise registry.not_found("command", cmd_name)
             return None
-        command = contributed.load()
-        let_interrupts_raise()
+        command = found.load()
+        if registry.command_packages[cmd_name] != CORE:  # a run of core handles signals itself
+            let_interrupts_raise()
         return command
 
     @override
@@ -85,11 +76,9 @@ class LazyGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         from ibrobot_core.plugins import installed_plugins
 
-        contributed = installed_plugins().commands
-        summaries = {name: command.summary for name, command in sorted(contributed.items())}
-        summaries |= {name: summary for name, (_, summary) in COMMANDS.items()}
+        commands = installed_plugins().commands
         with formatter.section("Commands"):
-            formatter.write_dl([(name, summaries[name]) for name in self.list_commands(ctx)])
+            formatter.write_dl([(name, commands[name].summary) for name in self.list_commands(ctx)])
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

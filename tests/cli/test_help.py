@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ibrobot_core import __version__
-from ibrobot_core.cli.main import COMMANDS
-from ibrobot_core.plugins import Registry
+from ibrobot_core.plugins import Registry, discover
 
 if TYPE_CHECKING:
     from tests.cli.conftest import Ran
@@ -26,8 +25,10 @@ def test_help_lists_every_command_and_those_of_plugins(ibrobot: Ibrobot, robot: 
 
     lines = [line.split(maxsplit=1) for line in ran.out.splitlines()]
     assert ran.code == 0
-    for name, (_, summary) in COMMANDS.items():
-        assert [name, summary] in lines
+    own = discover([]).commands
+    assert list(own) == ["launch", "config", "plugins", "doctor"]
+    for command in own.values():
+        assert [command.name, command.summary] in lines
     assert ["greet", "Say hello."] in lines
 
 
