@@ -332,7 +332,9 @@ def discover(found: Iterable[EntryPoint] | None = None) -> Registry:
     installed = entry_points(group=ENTRY_POINT_GROUP)
     own = [entry for entry in installed if entry.dist is not None and entry.dist.name == CORE]
     if not own:
-        raise PluginError(f"the installed {CORE} has no plugin of its own: install it again, in a checkout by `uv sync`")
+        raise PluginError(
+            f"the installed {CORE} has no plugin of its own: install it again, in a checkout by `uv sync`"
+        )
     others = [entry for entry in (installed if found is None else found) if entry not in own]
     registry = Registry()
     for entry in (*own, *sorted(others, key=lambda entry: entry.name)):
