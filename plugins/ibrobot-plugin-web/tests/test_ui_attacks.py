@@ -104,10 +104,14 @@ def test_requests_that_are_sent_by_half_are_ended_and_what_is_no_http_says_nothi
     async def test(server: UiServer) -> None:
         async def send(data: bytes) -> None:
             reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
-            writer.write(data)
-            with contextlib.suppress(ConnectionError):
-                await asyncio.wait_for(reader.read(), ENDED_S)
-            writer.close()
+            try:
+                writer.write(data)
+                with contextlib.suppress(ConnectionError):
+                    await asyncio.wait_for(reader.read(), ENDED_S)
+            except TimeoutError:
+                raise AssertionError(f"the connection stays open after {data[:60]!r}") from None
+            finally:
+                writer.transport.abort()
 
         await asyncio.gather(*(send(data) for data in garbage * 5))
         cookies = server.client.cookie_jar.filter_cookies(server.client._base_url)  # type: ignore[arg-type]
