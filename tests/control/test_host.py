@@ -18,6 +18,7 @@ import attrs
 import numpy as np
 import pytest
 import yaml
+from logged_run import wait_for
 
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.config import from_document
@@ -284,8 +285,8 @@ class TestProcess:
         np.testing.assert_array_equal(commands[-1], commands[-2])
         assert np.abs(commands[-1] - [0.4, 0.8]).max() > 0.01
 
-    def test_a_stop_during_a_slow_reset_wins(self, make, reports):
-        host = make(slow=1.0)
+    def test_a_stop_during_a_slow_reset_wins(self, make, reports, tmp_path):
+        host = make(resetting=str(file := tmp_path / "resetting"))
         host.start()
         host.call("fault", fault="a cable is loose")
         answers: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -297,8 +298,9 @@ class TestProcess:
 
         resetting = threading.Thread(target=reset)
         resetting.start()
-        time.sleep(0.3)  # the hardware is being set up
-        assert host.call("estop")["stops"] == 1
+        wait_for(file.exists, "the hardware clears its faults")
+        host._child.channel.send({"id": 0, "do": "estop"})
+        file.unlink()
         resetting.join()
 
         assert answers.get(timeout=PATIENCE_S) == "reset: refused, an emergency stop came after it was requested"

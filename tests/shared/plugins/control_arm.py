@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from pathlib import Path
 
 import attrs
 from ibrobot_testing.fakes import FakeHardware, FakeTrajectoryExecutor
@@ -34,7 +35,10 @@ class Arm(FakeHardware):
         return super().read()
 
     def reset_faults(self):
-        time.sleep(self.options.slow)
+        if self.options.resetting:
+            Path(self.options.resetting).touch()
+            while Path(self.options.resetting).exists():
+                time.sleep(0.001)
 
     def holding(self):
         return Holding("/dev/ttyARM", "arm torque off") if self.options.holds and not self.relaxed else None
@@ -52,7 +56,7 @@ class Options:
     trouble: str = option("", help="when it fails")
     closed: str = option("", help="file made when it is released")
     fork: bool = option(False, help="whether a process forked by it outlives it")
-    slow: float = option(0.0, unit="s", help="how long it takes to clear faults")
+    resetting: str = option("", help="file made when it begins to clear faults, which takes until the file is removed")
     holds: bool = option(False, help="whether it has torque")
 
 
