@@ -42,9 +42,9 @@ window.ibrobot = page; // for tests and for the console
 
 let toolMotion = [0, 0, 0];
 const view = new View3D($("view"), {
-  onTool({ held, linear }) {
+  onTool({ press, held, linear }) {
     toolMotion = linear;
-    if (held && !page.deadman.held) page.deadman.hold(() => ({ linear: toolMotion }));
+    if (press) page.deadman.hold(() => ({ linear: toolMotion }), press);
     if (!held) page.deadman.release();
   },
   onGoal: (point) => panels[0].setGoal?.(`xyz=${point.map((value) => value.toFixed(3)).join(",")}`),

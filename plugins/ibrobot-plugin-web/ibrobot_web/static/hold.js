@@ -10,20 +10,25 @@ export class Deadman {
     this.drive = drive;
     this.request = null;
     this.timer = null;
+    this.released = 0;
     this.listeners = new Set();
-    const release = () => this.release();
+    const release = () => {
+      this.released = performance.now();
+      this.release();
+    };
     for (const event of ["blur", "pagehide", "freeze"]) window.addEventListener(event, release);
     for (const event of ["pointerup", "pointercancel"]) window.addEventListener(event, release, true);
-    document.addEventListener("visibilitychange", () => { if (document.hidden) this.release(); });
+    document.addEventListener("visibilitychange", () => { if (document.hidden) release(); });
     window.addEventListener("contextmenu", release);
-    drive.addEventListener("operator", () => { if (!drive.facts.operating) this.release(); });
+    drive.addEventListener("operator", () => { if (!drive.facts.operating) release(); });
   }
 
   get held() { return this.request !== null; }
 
-  // `request` is a function that returns the present motion: {joints, targets, linear, turn, pose}.
-  hold(request) {
-    if (!this.drive.facts.operating || document.hidden) return;
+  // `request` is a function that returns the present motion: {joints, targets, linear, turn, pose}. A press that began
+  // `since` and was released before the call, as by leaving the page, counts no more.
+  hold(request, since = performance.now()) {
+    if (since < this.released || !this.drive.facts.operating || document.hidden) return;
     this.press = this.drive.clock.now();
     if (this.press === null) return;
     this.request = request;

@@ -83,7 +83,8 @@ export class View3D {
     this.canvas.addEventListener("pointerdown", (event) => {
       this.canvas.setPointerCapture(event.pointerId);
       pointers.set(event.pointerId, at(event));
-      this.tell({ do: "down", at: at(event), pan: event.button === 2 || event.shiftKey, fingers: pointers.size });
+      const pan = event.button === 2 || event.shiftKey;
+      this.tell({ do: "down", at: at(event), pan, fingers: pointers.size, press: performance.now() });
     });
     this.canvas.addEventListener("pointermove", (event) => {
       if (!pointers.has(event.pointerId)) return;

@@ -200,7 +200,7 @@ function under(at, point) {
   return add(view.from, ray, depth);
 }
 
-function down({ at, pan: pans, fingers }) {
+function down({ at, pan: pans, fingers, press }) {
   grip.at = at;
   if (fingers > 1 || pans) {
     release();
@@ -213,7 +213,7 @@ function down({ at, pan: pans, fingers }) {
   if (!shown || Math.hypot(shown[0] - at[0], shown[1] - at[1]) > HANDLE_PX) return;
   grip.mode = goals ? "goal" : "tool";
   grip.through = grip.target = here;
-  if (!goals) steer();
+  if (!goals) steer(press);
 }
 
 function move({ at }) {
@@ -229,12 +229,12 @@ function move({ at }) {
   }
 }
 
-// The tool moves towards the point under the pointer, slower when it is close.
-function steer() {
+// The tool moves towards the point under the pointer, slower when it is close. `press` is the time of a press that begins.
+function steer(press = null) {
   const way = subtract(grip.target, tipOf(measured));
   const far = length(way);
   const linear = far > 1e-4 ? way.map((value) => value / far * Math.min(1, far / REACH_M)) : [0, 0, 0];
-  postMessage({ tool: { held: true, linear } });
+  postMessage({ tool: { press, held: true, linear } });
 }
 
 function release() {
