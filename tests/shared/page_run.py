@@ -22,6 +22,7 @@ from ibrobot_web.messages import clock_ms
 
 IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
 _START_S = 60.0
+_ANSWER_S = 30.0
 _SMALL = ("fps=5", "width=160", "height=120")
 SO101 = (
     "so101",
@@ -82,6 +83,8 @@ class PageClient:
         """Channel, stamp [ns] and time of arrival [ns] of all pictures."""
         self.status: Mapping[str, Any] = {}
         self.answers: dict[int, Mapping[str, Any]] = {}
+        self.confirmed: dict[int, Mapping[str, Any]] = {}
+        """Answers to emergency stops."""
         self.press_ms = 0
         """When the deadman's present press began."""
 
@@ -93,7 +96,12 @@ class PageClient:
         self.drive = await self._browser.ws_connect(f"{base}/drive")
         self.line = await self._browser.ws_connect(f"{base}/stop")
         self.stream = await self._browser.ws_connect(f"{base}/stream", max_msg_size=0)
-        self._tasks = [asyncio.create_task(self._receive()), asyncio.create_task(self._listen())]
+        # A client answers the server's pings only while it receives.
+        self._tasks = [
+            asyncio.create_task(self._receive()),
+            asyncio.create_task(self._listen(self.drive, self.answers)),
+            asyncio.create_task(self._listen(self.line, self.confirmed)),
+        ]
 
     def get(self, path: str) -> Any:
         """Request a file or a fact of the page."""
@@ -119,11 +127,12 @@ class PageClient:
                 self.status = json.loads(data[1:])
             await self.stream.send_bytes(data[:1])
 
-    async def _listen(self) -> None:
-        async for message in self.drive:
+    @staticmethod
+    async def _listen(socket: aiohttp.ClientWebSocketResponse, answers: dict[int, Mapping[str, Any]]) -> None:
+        async for message in socket:
             answer = json.loads(message.data)
             if "id" in answer and answer["id"] is not None:
-                self.answers[answer["id"]] = answer
+                answers[answer["id"]] = answer
 
     async def call(self, do: str, **facts: Any) -> Any:
         """Send a command and return its result.
@@ -135,15 +144,19 @@ class PageClient:
         number = self._number
         stops = self.states[-1]["stops"] if self.states else None
         await self.drive.send_json({"id": number, "do": do, "stops": stops, **facts})
-        async with asyncio.timeout(20):
-            while number not in self.answers:
+        return await self._answer_in(self.answers, number)
+
+    @staticmethod
+    async def _answer_in(answers: dict[int, Mapping[str, Any]], number: int) -> Any:
+        async with asyncio.timeout(_ANSWER_S):
+            while number not in answers:
                 await asyncio.sleep(0.005)
-        answer = self.answers.pop(number)
+        answer = answers.pop(number)
         if "error" in answer:
             raise RuntimeError(answer["error"])
-        return answer["ok"]
+        return answer.get("ok")
 
-    async def until(self, met: Any, timeout_s: float = 20.0) -> None:
+    async def until(self, met: Any, timeout_s: float = _ANSWER_S) -> None:
         """Wait until a condition is met."""
         async with asyncio.timeout(timeout_s):
             while not met():
@@ -158,10 +171,7 @@ class PageClient:
         self._number += 1
         begun_s = time.monotonic()
         await self.line.send_str(str(self._number))
-        while (answer := await self.line.receive_json(timeout=20)).get("id") != self._number:
-            pass
-        if "error" in answer:
-            raise RuntimeError(answer["error"])
+        await self._answer_in(self.confirmed, self._number)
         return time.monotonic() - begun_s
 
     def press(self) -> None:
