@@ -74,10 +74,7 @@ def between(a: Vector, b: Vector) -> Vector:
     """
     normal = cross(a, b)
     sine, cosine = math.hypot(*normal.tolist()), float(a @ b)
-    if sine < _PARALLEL:
-        if cosine > 0:
-            return normal
-        # Half a turn, about any axis perpendicular to both.
+    if sine < _PARALLEL:  # no turn, or half a turn about any axis perpendicular to both
         normal = cross(a, _IDENTITY[int(np.abs(a).argmin())])
     return normal * (math.atan2(sine, cosine) / math.hypot(*normal.tolist()))
 

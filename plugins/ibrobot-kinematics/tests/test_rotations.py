@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from ibrobot_kinematics.poses import matrix, pose, pose_at
 from ibrobot_kinematics.rotations import between, cross, exp, from_quaternion, from_rpy, log, quaternion, rpy, skew
@@ -46,6 +46,7 @@ def test_log_of_many_is_that_of_each(pairs: list[tuple[Vector, float]]):
 
 
 @given(axes, angles)
+@example(np.array([-1.0, 0.0, 0.0]), 3.0)
 def test_quaternion_is_of_unit_length_and_undone(axis: Vector, angle: float):
     rotation = exp(angle * axis)
     q = quaternion(rotation)
