@@ -67,6 +67,8 @@ from ibrobot_core.keys import HeldKeys as HeldKeys, KeyEvent as KeyEvent
 from ibrobot_core.calibration import (
     Calibration as Calibration,
     JointCalibration as JointCalibration,
+    calibration_path as calibration_path,
+    companion_path as companion_path,
     load_calibration as load_calibration,
 )
 
@@ -183,33 +185,6 @@ from ibrobot_core.messages import (
     DiagnosticStatus as DiagnosticStatus,
     KeyValue as KeyValue,
     RobotStatus as RobotStatus,
-)
-
-# Servo ticks
-from ibrobot_core.interfaces import EngineStats as EngineStats
-from ibrobot_core.options import OptionName as OptionName
-from ibrobot_core.messages import Variant as Variant, VariantsList as VariantsList
-from ibrobot_core.config.models import DescriptionModel as DescriptionModel
-from ibrobot_core.units import (
-    LEROBOT_MODES as LEROBOT_MODES,
-    TICKS_PER_TURN as TICKS_PER_TURN,
-    degrees as degrees,
-    lerobot_to_radians as lerobot_to_radians,
-    lerobot_to_ticks as lerobot_to_ticks,
-    radians as radians,
-    radians_to_lerobot as radians_to_lerobot,
-    radians_to_ticks as radians_to_ticks,
-    ticks_to_lerobot as ticks_to_lerobot,
-    ticks_to_radians as ticks_to_radians,
-)
-from ibrobot_core.calibration import (
-    MAX_HOMING_OFFSET as MAX_HOMING_OFFSET,
-    MIDDLE_TICK as MIDDLE_TICK,
-    ZERO_AT as ZERO_AT,
-    ZERO_AT_POSE as ZERO_AT_POSE,
-    ZERO_AT_RANGE as ZERO_AT_RANGE,
-    calibration_path as calibration_path,
-    companion_path as companion_path,
 )
 
 __all__: list[str]

@@ -1,4 +1,4 @@
-"""Calibrations: zero and range of each joint in servo ticks, in the file formats of LeRobot and IB-Robot."""
+"""Calibrations: zero and range of each joint, in the file formats of LeRobot and IB-Robot, which count servo ticks."""
 
 from __future__ import annotations
 
@@ -10,34 +10,26 @@ import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import attrs
 
 from ibrobot_core.errors import CalibrationError
-from ibrobot_core.units import TICKS_PER_TURN
 
 VERSION = 2
 """Version of the companion file. Version 1 had no `zero_at`; 0 rad was at the pose."""
-ZERO_AT_POSE = "pose"
-"""0 rad is the pose that was set by hand at calibration."""
-ZERO_AT_RANGE = "range"
-"""0 rad is the middle of each joint's calibrated range."""
-ZERO_AT: Mapping[str, str] = {
-    ZERO_AT_POSE: "the pose that was set by hand at calibration (tick 2048)",
-    ZERO_AT_RANGE: "the middle of each joint's calibrated range, as in LeRobot",
-}
-"""The choices for the position of 0 rad, with their meaning."""
-MAX_HOMING_OFFSET = 2047
-"""Greatest homing offset that a servo can store (sign and 11 bits)."""
-MIDDLE_TICK = TICKS_PER_TURN // 2
-"""Middle of a servo's turn [ticks]."""
-_LAST = TICKS_PER_TURN - 1
+ZERO_AT = ("pose", "range")
+"""Positions of 0 rad: the pose that was set by hand at calibration, or the middle of each joint's calibrated range."""
 
 
 @attrs.frozen
 class JointCalibration:
     """The calibration of one joint, with LeRobot's field names (`MotorCalibration`)."""
+
+    TICKS_PER_TURN: ClassVar[int] = 4096
+    """Encoder positions per turn of a servo (12 bit)."""
+    MAX_HOMING_OFFSET: ClassVar[int] = 2047
+    """Greatest homing offset that a servo can store (sign and 11 bits)."""
 
     id: int
     """Id of the servo."""
@@ -49,7 +41,7 @@ class JointCalibration:
     """Least reported position [ticks], 0 to 4094."""
     range_max: int
     """Greatest reported position [ticks], above `range_min`, at most 4095."""
-    zero_at: str = ZERO_AT_POSE
+    zero_at: str = "pose"
     """Position of 0 rad: one of `ZERO_AT`. Not present in LeRobot's files."""
     closed_at: float | None = None
     """Lower limit [rad] if the hardware anchors the joint at its closed end; set only in recordings."""
@@ -66,16 +58,18 @@ class JointCalibration:
             raise ValueError(f"id: must be 0 to 253, not {self.id}")
         if self.drive_mode not in (0, 1):
             raise ValueError(f"drive_mode: must be 0 or 1, not {self.drive_mode}")
-        if abs(self.homing_offset) > MAX_HOMING_OFFSET:
+        most = self.MAX_HOMING_OFFSET
+        if abs(self.homing_offset) > most:
             raise ValueError(
-                f"homing_offset: must be -{MAX_HOMING_OFFSET} to {MAX_HOMING_OFFSET}, not {self.homing_offset}; "
+                f"homing_offset: must be -{most} to {most}, not {self.homing_offset}; "
                 "the servo's horn sits so that the joint's middle is at the encoder's end (0/4095): "
                 "mount it half a turn on, and re-run the calibration"
             )
+        last = self.TICKS_PER_TURN - 1
         for name in ("range_min", "range_max"):
-            if not 0 <= getattr(self, name) <= _LAST:
+            if not 0 <= getattr(self, name) <= last:
                 raise ValueError(
-                    f"{name}: must be 0 to {_LAST}, not {getattr(self, name)}; a range beyond that crosses the "
+                    f"{name}: must be 0 to {last}, not {getattr(self, name)}; a range beyond that crosses the "
                     "encoder's end (0/4095): re-run the calibration with the joint's middle in the middle"
                 )
         if self.range_min >= self.range_max:
@@ -103,9 +97,15 @@ class JointCalibration:
                 closed end is at `range_min`, or at `range_max` if inverted.
         """
         if lower is None:
-            return float(MIDDLE_TICK) if self.zero_at == ZERO_AT_POSE else self.range_middle
-        ticks = lower * TICKS_PER_TURN / (2 * math.pi)
+            return self.TICKS_PER_TURN / 2 if self.zero_at == "pose" else self.range_middle
+        ticks = lower * self.TICKS_PER_TURN / (2 * math.pi)
         return self.range_max + ticks if self.inverted else self.range_min - ticks
+
+    def ends(self, lower: float | None = None) -> tuple[float, float]:
+        """The angles at the ends of the calibrated range [rad], the lesser one first; see `zero` for `lower`."""
+        zero = self.zero(lower)
+        first, last = ((end - zero) * 2 * math.pi / self.TICKS_PER_TURN for end in (self.range_min, self.range_max))
+        return (-last, -first) if self.inverted else (first, last)
 
 
 _NUMBERS = tuple(field.name for field in attrs.fields(JointCalibration) if field.name not in ("zero_at", "closed_at"))
@@ -141,7 +141,7 @@ class Calibration:
     @property
     def zero_at(self) -> str:
         """Position of 0 rad, the same for all joints: one of `ZERO_AT`."""
-        return next((joint.zero_at for joint in self.joints.values()), ZERO_AT_POSE)
+        return next((joint.zero_at for joint in self.joints.values()), "pose")
 
     def with_zero_at(self, zero_at: str) -> Calibration:
         """A copy with another position of 0 rad."""
@@ -218,7 +218,7 @@ def load_calibration(
         calibration = Calibration(found, path=path)
     except ValueError as error:
         raise CalibrationError(f"{path}: {error}") from None
-    calibration = calibration.with_zero_at(ZERO_AT_POSE if numbered else ZERO_AT_RANGE)
+    calibration = calibration.with_zero_at("pose" if numbered else "range")
     loaded = _with_meta(calibration, path, tool, any_numbers=zero_at is not None)
     return loaded if zero_at is None else loaded.with_zero_at(zero_at)
 
@@ -287,7 +287,7 @@ def _with_meta(calibration: Calibration, path: Path, tool: str | None, *, any_nu
     if not isinstance(meta, dict) or meta.get("version") not in (1, VERSION):
         found = meta.get("version") if isinstance(meta, dict) else meta
         raise CalibrationError(f"{companion}: version: must be 1 or {VERSION}, not {found!r}")
-    zero_at = ZERO_AT_POSE if meta["version"] == 1 else str(meta.get("zero_at"))
+    zero_at = "pose" if meta["version"] == 1 else str(meta.get("zero_at"))
     if zero_at not in ZERO_AT:
         raise CalibrationError(f"{companion}: zero_at: must be one of {', '.join(ZERO_AT)}, not {zero_at!r}")
     if meta.get("sha256") != calibration.fingerprint() and not any_numbers:

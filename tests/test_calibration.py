@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_testing.calibration import write_calibration
+from lerobot_units import angle, normalised
 
 from ibrobot_core.calibration import (
     ZERO_AT,
@@ -21,7 +22,6 @@ from ibrobot_core.calibration import (
     load_calibration,
 )
 from ibrobot_core.errors import CalibrationError
-from ibrobot_core.units import ticks_to_lerobot, ticks_to_radians
 
 GOOD: dict[str, Any] = {"id": 1, "drive_mode": 0, "homing_offset": -12, "range_min": 700, "range_max": 3400}
 
@@ -120,11 +120,9 @@ def test_angles_of_lerobots_file_are_lerobots_degrees(
     loaded = load_calibration(path)
     assert loaded.zero_at == "range"
     for joint in loaded.joints.values():
-        ends = {"range_min": joint.range_min, "range_max": joint.range_max}
         # LeRobot divides a turn by 4095, not 4096, and does not turn inverted joints round.
-        degrees = ticks_to_lerobot(float(ticks), "degrees", **ends) * 4095 / 4096
-        angle = ticks_to_radians(float(ticks), zero=joint.zero(), inverted=joint.inverted)
-        assert math.degrees(angle) == pytest.approx(-degrees if joint.inverted else degrees, abs=1e-9)
+        degrees = normalised(ticks, "degrees", joint) * 4095 / 4096
+        assert math.degrees(angle(ticks, joint)) == pytest.approx(-degrees if joint.inverted else degrees, abs=1e-9)
 
 
 def test_ib_robots_file_has_zero_at_the_pose(tmp_path: Path) -> None:
@@ -157,6 +155,5 @@ def test_all_joints_have_zero_at_the_same_place() -> None:
 def test_a_gripper_is_anchored_at_its_closed_end(drive_mode: int) -> None:
     joint = JointCalibration(**{**GOOD, "drive_mode": drive_mode})
     closed = joint.range_max if drive_mode else joint.range_min
-    zero = joint.zero(math.radians(-10))
-    assert ticks_to_radians(float(closed), zero=zero, inverted=joint.inverted) == pytest.approx(math.radians(-10))
+    assert angle(closed, joint, math.radians(-10)) == pytest.approx(math.radians(-10))
     assert joint.zero() == 2048

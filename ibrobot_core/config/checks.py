@@ -29,7 +29,6 @@ from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Joint, Robot
 from ibrobot_core.run_hooks import RUN_KEYS
 from ibrobot_core.terminal import check_key
-from ibrobot_core.units import radians
 
 _SLACK = 0.01
 """Tolerance for limits wider than a model's [rad], since both may be rounded."""
@@ -132,7 +131,7 @@ class Checks:
                 continue
             remedy = f"narrow it, or set beyond_model: true where {joint.name} can go there"
             if abs(value) > 2 * math.pi:
-                remedy = f"were degrees meant? {value:g} degrees are {radians(value):.5g} rad"
+                remedy = f"were degrees meant? {value:g} degrees are {math.radians(value):.5g} rad"
             model = f"{widest.lower:g} to {widest.upper:g} rad ({widest.place})"
             self.document.add((*key, end), f"{value:g} rad is beyond the model's limits, {model}; {remedy}")
 

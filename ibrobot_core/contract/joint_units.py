@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ibrobot_core.calibration import JointCalibration, load_calibration
 from ibrobot_core.config.schema import RobotConfig
@@ -15,13 +16,55 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import CalibrationError
 from ibrobot_core.interfaces import Frame
 from ibrobot_core.messages import JointState
-from ibrobot_core.units import lerobot_to_radians, radians_to_lerobot
 
 ACTION = "action"
 """Key of the action vector."""
+LEROBOT_MODES = ("range_m100_100", "range_0_100", "degrees")
+"""LeRobot's units of joint positions, named as in its `MotorNormMode`."""
 _CLOSED_MODE = "range_0_100"
 _POSITION = "position."
-_NUMBERS = ("range_min", "range_max", "inverted")
+_DEGREES_PER_RADIAN = 360 / (JointCalibration.TICKS_PER_TURN - 1) * JointCalibration.TICKS_PER_TURN / (2 * math.pi)
+"""LeRobot counts a tick less for a turn."""
+
+
+def radians_to_lerobot(
+    radians: ArrayLike, mode: str, lower: ArrayLike, upper: ArrayLike, inverted: ArrayLike
+) -> NDArray[Any]:
+    """Radians -> LeRobot's units, as its `MotorsBus` (0.6) normalises the ticks of a servo.
+
+    - `range_m100_100`: the calibrated range -> -100 to 100, clipped.
+    - `range_0_100` (the gripper): -> 0 to 100, clipped.
+    - `degrees`: from the middle of the range, not clipped; they increase with the ticks, also if inverted.
+
+    Args:
+        radians: positions [rad], any shape.
+        mode: one of `LEROBOT_MODES`.
+        lower: the lesser end of the calibrated range [rad]; a number, or one per joint.
+        upper: the greater end; likewise.
+        inverted: whether radians decrease as ticks increase; likewise.
+    """
+    low, high = np.asarray(lower), np.asarray(upper)
+    converted: NDArray[Any]
+    if mode == "degrees":
+        converted = (radians - (low + high) / 2) * _DEGREES_PER_RADIAN * np.where(inverted, -1.0, 1.0)
+        return converted
+    fraction = (np.clip(radians, low, high) - low) / (high - low)
+    converted = fraction * 100 if mode == _CLOSED_MODE else fraction * 200 - 100
+    return converted
+
+
+def lerobot_to_radians(
+    values: ArrayLike, mode: str, lower: ArrayLike, upper: ArrayLike, inverted: ArrayLike
+) -> NDArray[Any]:
+    """LeRobot's units -> radians; the inverse of `radians_to_lerobot`."""
+    low, high = np.asarray(lower), np.asarray(upper)
+    converted: NDArray[Any]
+    if mode == "degrees":
+        converted = values * np.where(inverted, -1.0, 1.0) / _DEGREES_PER_RADIAN + (low + high) / 2
+        return converted
+    fraction = np.clip(values, 0, 100) / 100 if mode == _CLOSED_MODE else (np.clip(values, -100, 100) + 100) / 200
+    converted = fraction * (high - low) + low
+    return converted
 
 
 @attrs.frozen
@@ -50,6 +93,7 @@ class JointUnits:
 
     Raises:
         CalibrationError: if the calibration of a joint is needed and missing.
+        ValueError: for an unknown unit.
     """
 
     def __init__(
@@ -62,6 +106,8 @@ class JointUnits:
         self._elements: dict[str, list[_Elements]] = {}
         if norm_mode == "radians":
             return
+        if norm_mode not in LEROBOT_MODES:
+            raise ValueError(f"unknown unit {norm_mode!r}; LeRobot has: {', '.join(LEROBOT_MODES)}")
         closed = _closed_ends(calibration, document)
         for key, joints in _position_joints(contract).items():
             modes: dict[str, dict[int, str]] = {}
@@ -138,9 +184,9 @@ def _elements(
             has = f"it has: {', '.join(calibration)}" if calibration else f"there is none; {remedy}"
             raise CalibrationError(f"{mode} needs the calibration of joint {joint!r}; {has}")
     each = {joint: JointCalibration(**calibration[joint]) for joint in named.values()}
-    columns = {name: np.array([getattr(joint, name) for joint in each.values()]) for name in _NUMBERS}
-    zero = np.array([joint.zero(closed.get(name)) for name, joint in each.items()])
-    return _Elements(np.array(list(named), np.intp), mode, {**columns, "zero": zero})
+    lower, upper = np.transpose([joint.ends(closed.get(name)) for name, joint in each.items()])
+    inverted = np.array([joint.inverted for joint in each.values()])
+    return _Elements(np.array(list(named), np.intp), mode, {"lower": lower, "upper": upper, "inverted": inverted})
 
 
 def _closed_ends(calibration: Mapping[str, Mapping[str, Any]], document: Mapping[str, Any]) -> dict[str, float]:

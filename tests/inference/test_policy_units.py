@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_testing.contexts import host_context
+from lerobot_units import angle, normalised
 from numpy.typing import NDArray
 
 from ibrobot_core.calibration import ZERO_AT, Calibration, JointCalibration
 from ibrobot_core.config.schema import Align
-from ibrobot_core.contract.joint_units import JointUnits
+from ibrobot_core.contract.joint_units import JointUnits, radians_to_lerobot
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import CalibrationError
 from ibrobot_core.interfaces import Feature, Frame, Policy, PolicySpec, Tensors
-from ibrobot_core.units import radians_to_lerobot, ticks_to_lerobot, ticks_to_radians
 
 JOINTS = host_context().robot.joint_names
 CALIBRATION = {
@@ -76,14 +76,8 @@ def test_it_sees_its_unit_and_gives_radians(norm_mode: str) -> None:
     policy, converted = Echo(), units(norm_mode)
     shown = frame()
     seen = policy.preprocess(converted.frame(shown))["rows"]
-    arm = CALIBRATION["shoulder_lift"]
-    lift = radians_to_lerobot(
-        float(shown.values["observation.state"][1]),
-        norm_mode,
-        range_min=arm["range_min"],
-        range_max=arm["range_max"],
-        inverted=True,
-    )
+    arm = JointCalibration(**CALIBRATION["shoulder_lift"])
+    lift = radians_to_lerobot(shown.values["observation.state"][1], norm_mode, *arm.ends(), arm.inverted)
     assert abs(seen[-1, 1] - lift) < 1e-4
     assert abs(lift) > 2  # neither radians nor normalised twice
     assert shown.prefix is not None
@@ -115,12 +109,11 @@ def test_what_a_dataset_gets_is_lerobots_value_of_the_tick_wherever_0_rad_is(
         {joint: JointCalibration(i, drive_mode, 0, low, high, zero_at) for i, joint in enumerate(JOINTS, 1)}
     )
     pan = arm.joints[JOINTS[0]]
-    measured = ticks_to_radians(np.full(len(JOINTS), float(ticks)), zero=pan.zero(), inverted=pan.inverted)
+    measured = np.full(len(JOINTS), angle(ticks, pan))
     for mode in ("degrees", "range_m100_100"):
         # The state in float64, as the recorded calibration says: the same for either place of 0 rad.
         (value, *_) = units(mode, arm.snapshot())({"action": measured})["action"]
-        wanted = ticks_to_lerobot(float(ticks), mode, range_min=low, range_max=high, inverted=bool(drive_mode))
-        assert value == pytest.approx(wanted, abs=1e-9)
+        assert value == pytest.approx(normalised(ticks, mode, pan), abs=1e-9)
 
 
 def test_no_unit_without_a_calibration() -> None:

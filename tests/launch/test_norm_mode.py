@@ -10,9 +10,9 @@ import pytest
 from ibrobot_testing.calibration import write_calibration
 
 from ibrobot_core.calibration import Calibration, JointCalibration
+from ibrobot_core.contract.joint_units import radians_to_lerobot
 from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.interfaces import Frame
-from ibrobot_core.units import radians_to_lerobot
 
 if TYPE_CHECKING:
     from tests.launch.conftest import Runs
@@ -30,7 +30,8 @@ def calibration(tmp_path: Path) -> str:
 
 def degrees(positions: Any) -> list[float]:
     """Radians -> LeRobot's degrees by the calibration."""
-    return [radians_to_lerobot(float(each), "degrees", range_min=RANGE[0], range_max=RANGE[1]) for each in positions]
+    ends = JointCalibration(1, 0, 0, *RANGE).ends()
+    return [float(radians_to_lerobot(each, "degrees", *ends, False)) for each in positions]
 
 
 def test_the_model_lives_in_degrees_and_the_arm_in_radians(

@@ -15,10 +15,10 @@ from lerobot.motors import Motor, MotorCalibration, MotorNormMode
 from lerobot.motors.feetech import FeetechMotorsBus
 from lerobot.robots.so_follower import SO101Follower, SO101FollowerConfig
 from lerobot.teleoperators.so_leader import SO101Leader, SO101LeaderConfig
+from lerobot_units import normalised
 
 from ibrobot_core.calibration import Calibration, JointCalibration, load_calibration
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.units import ticks_to_lerobot
 
 pytestmark = [pytest.mark.lerobot, pytest.mark.usefixtures("patient_buses")]
 
@@ -132,11 +132,8 @@ class TestBus:
         bus.write_calibration(CALIBRATION)
         turn(emulator, 2, 1800.0)
         calibration = CALIBRATION["shoulder_lift"]
-        assert bus.read("Present_Position", "shoulder_lift") == ticks_to_lerobot(
-            1800 - calibration.homing_offset,
-            "range_m100_100",
-            range_min=calibration.range_min,
-            range_max=calibration.range_max,
+        assert bus.read("Present_Position", "shoulder_lift") == normalised(
+            1800 - calibration.homing_offset, "range_m100_100", calibration
         )
 
     def test_configure_motors(self, bus: FeetechMotorsBus, emulator: Emulator) -> None:

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from ibrobot_feetech.calibration import save_calibration
 from lerobot.motors import Motor, MotorCalibration, MotorNormMode
 from lerobot.motors.feetech import FeetechMotorsBus
+from lerobot_units import angle, normalised
 
 from ibrobot_core.calibration import Calibration, JointCalibration, load_calibration
-from ibrobot_core.units import LEROBOT_MODES, lerobot_to_ticks, ticks_to_lerobot, ticks_to_radians
+from ibrobot_core.contract.joint_units import LEROBOT_MODES, lerobot_to_radians, radians_to_lerobot
 
 pytestmark = pytest.mark.lerobot
 
@@ -40,24 +41,18 @@ def test_lerobots_modes_are_ours() -> None:
 
 
 @given(st.sampled_from(LEROBOT_MODES), joints, st.integers(0, 4095))
-def test_ticks_normalise_as_in_lerobot(mode: str, joint: JointCalibration, ticks: int) -> None:
-    ours = ticks_to_lerobot(ticks, mode, range_min=joint.range_min, range_max=joint.range_max, inverted=joint.inverted)
-    assert ours == bus_of(mode, joint)._normalize({joint.id: ticks})[joint.id]
+def test_angles_normalise_as_the_ticks_of_lerobot(mode: str, joint: JointCalibration, ticks: int) -> None:
+    theirs = bus_of(mode, joint)._normalize({joint.id: ticks})[joint.id]
+    assert normalised(ticks, mode, joint) == theirs, "the formulas that core's tests use"
+    ours = radians_to_lerobot(angle(ticks, joint), mode, *joint.ends(), joint.inverted)
+    assert ours == pytest.approx(theirs, abs=1e-7)
 
 
 @given(st.sampled_from(LEROBOT_MODES), joints, st.floats(-200, 200))
-def test_values_become_lerobots_ticks(mode: str, joint: JointCalibration, value: float) -> None:
-    ours = lerobot_to_ticks(value, mode, range_min=joint.range_min, range_max=joint.range_max, inverted=joint.inverted)
-    assert int(ours) == bus_of(mode, joint)._unnormalize({joint.id: value})[joint.id]
-
-
-@given(st.sampled_from(LEROBOT_MODES), joints, st.lists(st.integers(0, 4095), min_size=1))
-def test_arrays_normalise_as_each_of_their_elements(mode: str, joint: JointCalibration, ticks: list[int]) -> None:
-    bus = bus_of(mode, joint)
-    ours = ticks_to_lerobot(
-        np.array(ticks), mode, range_min=joint.range_min, range_max=joint.range_max, inverted=joint.inverted
-    )
-    np.testing.assert_array_equal(ours, [bus._normalize({joint.id: tick})[joint.id] for tick in ticks])
+def test_values_become_angles_of_lerobots_ticks(mode: str, joint: JointCalibration, value: float) -> None:
+    theirs = bus_of(mode, joint)._unnormalize({joint.id: value})[joint.id]  # it truncates ticks
+    ours = lerobot_to_radians(value, mode, *joint.ends(), joint.inverted)
+    assert ours == pytest.approx(angle(theirs, joint), abs=2 * np.pi / 4096 + 1e-9)
 
 
 @given(joints)
@@ -86,5 +81,4 @@ def test_angles_of_lerobots_file_are_its_degrees(
     loaded = load_calibration(path).joints["pan"]
     # LeRobot divides a turn by 4095, not 4096, and does not turn inverted joints round.
     degrees = bus_of("degrees", joint)._normalize({joint.id: ticks})[joint.id] * 4095 / 4096
-    angle = ticks_to_radians(float(ticks), zero=loaded.zero(), inverted=loaded.inverted)
-    assert np.degrees(angle) == pytest.approx(-degrees if joint.inverted else degrees, abs=1e-9)
+    assert np.degrees(angle(ticks, loaded)) == pytest.approx(-degrees if joint.inverted else degrees, abs=1e-9)

@@ -9,19 +9,13 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import (
-    ZERO_AT,
-    Calibration,
-    HardwareError,
-    JointCalibration,
-    Vector,
-    radians_to_ticks,
-    ticks_to_radians,
-)
+from ibrobot_core.api import Calibration, HardwareError, JointCalibration, Vector
 from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.calibration import ZERO_AT
 from ibrobot_feetech.errors import FeetechError, NoReply, TorqueStaysOn
 from ibrobot_feetech.registers import MODEL_STS3215
 from ibrobot_feetech.supply import check_supply
+from ibrobot_feetech.ticks import radians_to_ticks, ticks_to_radians
 
 _LAST_TICK = 4095
 _ANGLE_BEYOND_A_TURN = 0x10

@@ -11,6 +11,12 @@ from typing import Any
 
 from ibrobot_core.api import Calibration, CalibrationError, calibration_path, companion_path
 
+ZERO_AT: Mapping[str, str] = {
+    "pose": "the pose that was set by hand at calibration (tick 2048)",
+    "range": "the middle of each joint's calibrated range, as in LeRobot",
+}
+"""The choices for the position of 0 rad, with their meaning."""
+
 
 def save_calibration(
     calibration: Calibration, name: str | Path, *, overwrite: bool = False, by_id: bool = False

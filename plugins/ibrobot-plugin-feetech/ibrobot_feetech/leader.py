@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
-    TICKS_PER_TURN,
     Context,
     HardwareError,
     HeldKeys,
@@ -19,17 +18,16 @@ from ibrobot_core.api import (
     TeleopCommand,
     TeleopError,
     Vector,
-    lerobot_to_ticks,
     load_calibration,
     ns,
     seconds,
-    ticks_to_lerobot,
 )
 from ibrobot_feetech.arm import Arm, calibration_differences, find_servos, hold, relax
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.errors import FeetechError
 from ibrobot_feetech.options import TOOL, LeaderOptions
 from ibrobot_feetech.sync import SyncReader
+from ibrobot_feetech.ticks import TICKS_PER_RADIAN, TICKS_PER_TURN
 from ibrobot_feetech.usb import check_adapter
 
 _LONGEST_STEP_S = 0.1
@@ -42,7 +40,6 @@ _ARRIVED = 30
 """Largest distance of a joint from the robot's pose at which its motor lets go [ticks]: 2.6 degrees."""
 _PATIENCE_S = 2.0
 """How much longer than the way takes the motors try to reach the robot's pose [s]."""
-_TICKS_PER_RADIAN = TICKS_PER_TURN / (2 * np.pi)
 _TAKEN_UP = 40
 """A joint that turned by more was moved by hand [ticks]: 3.5 degrees."""
 
@@ -138,11 +135,11 @@ class LeaderTeleop(Teleop):
                 for servo in self._arm.servos:
                     hold(self._bus, servo)
                 self._goal, self._driven_ns = self._ticks.astype(np.float64), now_ns
-                slowest_s = np.abs(pose - self._goal).max() / (self._ramp.min() * _TICKS_PER_RADIAN)
+                slowest_s = np.abs(pose - self._goal).max() / (self._ramp.min() * TICKS_PER_RADIAN)
                 self._give_up_ns = now_ns + ns(_PATIENCE_S + float(slowest_s))
             elapsed_s = min(seconds(now_ns - self._driven_ns), _LONGEST_STEP_S)
             self._driven_ns = now_ns
-            step = self._ramp * _TICKS_PER_RADIAN * elapsed_s
+            step = self._ramp * TICKS_PER_RADIAN * elapsed_s
             self._goal = self._goal + np.clip(pose - self._goal, -step, step)
             goals = np.rint(self._goal).astype(int).tolist()
             self._bus.sync_write("goal_position", dict(zip(self._arm.servos, goals, strict=True)))
@@ -269,23 +266,17 @@ class LeaderTeleop(Teleop):
         ticks = self._ticks.astype(np.float64)
         low, high = self._range
         angles = np.where(self._mirrored, -1.0, 1.0) * self._arm.radians(ticks)
-        opened = ticks_to_lerobot(
-            ticks, "range_0_100", range_min=low, range_max=high, inverted=self._turned != self._mirrored
-        )
-        positions = np.where(self._scaled, self._lower + opened / 100 * (self._upper - self._lower), angles)
+        opened = np.clip((ticks - low) / (high - low), 0.0, 1.0)
+        opened = np.where(self._turned != self._mirrored, 1.0 - opened, opened)
+        positions = np.where(self._scaled, self._lower + opened * (self._upper - self._lower), angles)
         return np.clip(positions, self._lower, self._upper)
 
     def _leader_pose(self, positions: Vector) -> Vector:
         """Positions of the robot's joints [rad] mapped to the leader's [ticks], within their calibrated ranges."""
         low, high = self._range
         angles = self._arm.positions(np.where(self._mirrored, -1.0, 1.0) * positions).astype(np.float64)
-        opened = lerobot_to_ticks(
-            (positions - self._lower) / (self._upper - self._lower) * 100,
-            "range_0_100",
-            range_min=low,
-            range_max=high,
-            inverted=self._turned != self._mirrored,
-        )
+        opened = (positions - self._lower) / (self._upper - self._lower)
+        opened = low + np.where(self._turned != self._mirrored, 1.0 - opened, opened) * (high - low)
         pose: Vector = np.clip(np.where(self._scaled, opened, angles), low, high)
         return pose
 

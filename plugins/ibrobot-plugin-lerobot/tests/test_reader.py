@@ -27,7 +27,6 @@ from ibrobot_core.api import (
     JointState,
     ObservationPart,
     RecorderError,
-    lerobot_to_radians,
     pixels,
 )
 from ibrobot_core.app import Align, ImageSpec, installed_plugins
@@ -131,7 +130,7 @@ def test_joints_come_in_radians(tmp_path: Path):
     more = provenance(norm_mode="degrees", calibration=json.dumps({"arm": joints}))
     items = read(foreign(tmp_path / "set", videos=False), 0, **more)
     degrees = values(FEATURES, 0)["action"].astype(float)
-    expected = lerobot_to_radians(degrees, "degrees", range_min=1000, range_max=3100, zero=2048.0)
+    expected = (degrees * 4095 / 360 + (1000 + 3100) / 2 - 2048) * 2 * np.pi / 4096
     np.testing.assert_allclose(items[2].message.data, expected, atol=1e-9)
 
 

@@ -9,19 +9,11 @@ from pathlib import Path
 
 import click
 
-from ibrobot_core.api import (
-    ZERO_AT,
-    ZERO_AT_POSE,
-    Calibration,
-    HardwareError,
-    IbrobotError,
-    JointCalibration,
-    calibration_path,
-)
+from ibrobot_core.api import Calibration, HardwareError, IbrobotError, JointCalibration, calibration_path
 from ibrobot_core.app import Declined, Guide
 from ibrobot_feetech.arm import relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
-from ibrobot_feetech.calibration import save_calibration
+from ibrobot_feetech.calibration import ZERO_AT, save_calibration
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import by_servo, joints_of
 from ibrobot_feetech.commands.measure import Answers, Measurement
@@ -45,7 +37,7 @@ FULL_TURN = ("wrist_roll",)
 @click.option(
     "--zero-at",
     type=click.Choice(list(ZERO_AT)),
-    default=ZERO_AT_POSE,
+    default="pose",
     show_default=True,
     help="0 rad: the middle pose, set by hand, or the middle of each range, as in LeRobot.",
 )
@@ -75,7 +67,7 @@ def calibrate(
 
 def calibrate_arm(
     guide: Guide, port: str | None, name: str, *, leader: bool = False, robot: str | None = None,
-    arm: str | None = None, full_turn: Sequence[str] = FULL_TURN, zero_at: str = ZERO_AT_POSE, prefix: str = "",
+    arm: str | None = None, full_turn: Sequence[str] = FULL_TURN, zero_at: str = "pose", prefix: str = "",
     yes: bool = False, answers: Answers | None = None,
 ) -> None:  # fmt: skip
     """Calibrate an arm with an operator; the arguments are those of the command.

@@ -13,17 +13,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ibrobot_core.api import (
-    MIDDLE_TICK,
-    TICKS_PER_TURN,
-    Calibration,
-    JointCalibration,
-    calibration_path,
-    load_calibration,
-)
+from ibrobot_core.api import Calibration, JointCalibration, calibration_path, load_calibration
 from ibrobot_core.app import echo, on_signals
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.commands.joints import SO101
+from ibrobot_feetech.ticks import MIDDLE_TICK, TICKS_PER_RADIAN, TICKS_PER_TURN
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -173,10 +167,10 @@ def _ranges(joints: Sequence[str], robot: Robot | None) -> dict[str, JointCalibr
     found = {}
     for number, joint in enumerate(joints, 1):
         lower, upper = limits.get(joint) or next(ends for name, ends in SO101.items() if joint.endswith(name))
-        per_radian = TICKS_PER_TURN / (2 * math.pi)
         if joint.endswith(_GRIPPER):  # anchored at its closed end, but centred on the turn as well
             half = (upper - lower) / 2
             lower, upper = -half, half
-        low, high = math.floor(MIDDLE_TICK + lower * per_radian), math.ceil(MIDDLE_TICK + upper * per_radian)
+        low = math.floor(MIDDLE_TICK + lower * TICKS_PER_RADIAN)
+        high = math.ceil(MIDDLE_TICK + upper * TICKS_PER_RADIAN)
         found[joint] = JointCalibration(number, 0, 0, max(0, low), min(TICKS_PER_TURN - 1, high))
     return found

@@ -5,9 +5,9 @@ from __future__ import annotations
 import attrs
 import click
 
-from ibrobot_core.api import ZERO_AT, HardwareError, calibration_path, load_calibration
+from ibrobot_core.api import HardwareError, calibration_path, load_calibration
 from ibrobot_core.app import Declined, echo
-from ibrobot_feetech.calibration import save_calibration
+from ibrobot_feetech.calibration import ZERO_AT, save_calibration
 from ibrobot_feetech.commands.calibrate import backup
 from ibrobot_feetech.commands.dialogue import agree
 from ibrobot_feetech.commands.joints import joints_of

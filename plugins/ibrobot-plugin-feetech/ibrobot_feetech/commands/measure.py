@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 
 import attrs
 
-from ibrobot_core.api import TICKS_PER_TURN, CalibrationError, JointCalibration
+from ibrobot_core.api import CalibrationError, JointCalibration
 from ibrobot_core.app import Declined, Guide
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.joints import Joint
 from ibrobot_feetech.commands.ranges import Range, doubtful, homing_offset, impossible
+from ibrobot_feetech.ticks import TICKS_PER_TURN
 
 _COLUMNS = (">id", "joint", ">min", ">now", ">max", ">span", "")
 _TURNED = 40

@@ -12,7 +12,6 @@ from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
-from ibrobot_core.api import degrees, ticks_to_radians
 from ibrobot_core.app import Screen, echo, styled
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import table
@@ -20,6 +19,7 @@ from ibrobot_feetech.commands.joints import Joint, by_servo, joints_of
 from ibrobot_feetech.commands.ports import opened, port_argument
 from ibrobot_feetech.protocol import faults
 from ibrobot_feetech.sync import SyncReader
+from ibrobot_feetech.ticks import MIDDLE_TICK, TICKS_PER_TURN
 
 _UNITS = {
     "velocity_deg_s": ("present_velocity", 360 / 4096),
@@ -75,7 +75,7 @@ def reading(reader: SyncReader, joints: Sequence[Joint]) -> list[dict[str, Any]]
         if servo["answers"]:
             values = dict(zip(reader.registers, replies.values[row].tolist(), strict=True))
             servo["position_ticks"] = values["present_position"]
-            servo["position_deg"] = round(degrees(ticks_to_radians(float(values["present_position"]))), 2)
+            servo["position_deg"] = round((values["present_position"] - MIDDLE_TICK) * 360 / TICKS_PER_TURN, 2)
             servo |= {name: round(values[register] * unit, 3) for name, (register, unit) in _UNITS.items()}
             servo["errors"] = list(faults(int(replies.errors[row]) | values["status"]))
         found.append(servo)

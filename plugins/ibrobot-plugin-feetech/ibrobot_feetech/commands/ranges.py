@@ -6,12 +6,11 @@ position that it would report with any other offset can be computed.
 
 from __future__ import annotations
 
-import math
-
 import attrs
 
-from ibrobot_core.api import MAX_HOMING_OFFSET, MIDDLE_TICK, TICKS_PER_TURN, ZERO_AT_POSE, CalibrationError, degrees
+from ibrobot_core.api import CalibrationError, JointCalibration
 from ibrobot_feetech.commands.joints import Joint
+from ibrobot_feetech.ticks import MIDDLE_TICK, TICKS_PER_RADIAN, TICKS_PER_TURN
 
 _LEAST_SPAN = 150
 """A joint that moved by less counts as not moved [ticks]: 13 degrees."""
@@ -28,10 +27,11 @@ def homing_offset(joint: str, encoder: int) -> int:
         CalibrationError: if the offset does not fit into the servo's register.
     """
     offset = encoder - MIDDLE_TICK
-    if abs(offset) > MAX_HOMING_OFFSET:
+    most = JointCalibration.MAX_HOMING_OFFSET
+    if abs(offset) > most:
         raise CalibrationError(
             f"{joint}: in the middle pose its encoder is at {encoder}, which needs an offset of {offset}, but a servo "
-            f"accepts -{MAX_HOMING_OFFSET} to {MAX_HOMING_OFFSET}: move the joint a little; if that does not help, "
+            f"accepts -{most} to {most}: move the joint a little; if that does not help, "
             "turn the servo's horn by half a turn and mount it again"
         )
     return offset
@@ -79,17 +79,16 @@ def impossible(joint: str, measured: Range) -> str | None:
     return None
 
 
-def doubtful(joint: Joint, measured: Range, zero_at: str = ZERO_AT_POSE) -> str | None:
+def doubtful(joint: Joint, measured: Range, zero_at: str = "pose") -> str | None:
     """The reason why a range does not match the joint's limits; None if it does."""
-    ticks = TICKS_PER_TURN / (2 * math.pi)
-    expected = (joint.upper - joint.lower) * ticks
+    expected = (joint.upper - joint.lower) * TICKS_PER_RADIAN
     if abs(measured.span - expected) > _TOLERANCE * expected:
         return (
             f"{joint.name}: it moved by {_deg(measured.span):.0f} deg, its limits are {_deg(expected):.0f} deg apart; "
             "check that it was moved to both ends, and that it is the right joint"
         )
-    middle = abs((joint.lower + joint.upper) / 2) * ticks
-    if zero_at != ZERO_AT_POSE:
+    middle = abs((joint.lower + joint.upper) / 2) * TICKS_PER_RADIAN
+    if zero_at != "pose":
         if joint.anchored or middle <= _OFF_CENTRE:
             return None
         return (
@@ -104,4 +103,4 @@ def doubtful(joint: Joint, measured: Range, zero_at: str = ZERO_AT_POSE) -> str 
 
 
 def _deg(ticks: float) -> float:
-    return degrees(ticks * 2 * math.pi / TICKS_PER_TURN)
+    return ticks * 360 / TICKS_PER_TURN

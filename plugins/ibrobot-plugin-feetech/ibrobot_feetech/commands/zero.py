@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from ibrobot_core.api import MIDDLE_TICK, TICKS_PER_TURN, ZERO_AT, ZERO_AT_RANGE, Calibration
+from ibrobot_core.api import Calibration
+from ibrobot_feetech.calibration import ZERO_AT
+from ibrobot_feetech.ticks import MIDDLE_TICK, TICKS_PER_TURN
 
 
 def zero_text(calibration: Calibration) -> str:
@@ -12,8 +14,6 @@ def zero_text(calibration: Calibration) -> str:
     }
     joint = max(off, key=off.__getitem__)
     other = (
-        "the pose that was set by hand"
-        if calibration.zero_at == ZERO_AT_RANGE
-        else "LeRobot's 0, the middle of the range,"
+        "the pose that was set by hand" if calibration.zero_at == "range" else "LeRobot's 0, the middle of the range,"
     )
     return f"0 rad is {ZERO_AT[calibration.zero_at]}; {other} is up to {off[joint]:.1f} deg from it ({joint})"

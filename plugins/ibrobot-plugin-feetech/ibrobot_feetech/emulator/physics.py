@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ibrobot_core.api import Context, EpisodeSetup, IbrobotError, RealClock, SimulatedHardware, ns, radians_to_ticks
+from ibrobot_core.api import Context, EpisodeSetup, IbrobotError, RealClock, SimulatedHardware, ns
 from ibrobot_core.app import Registry, RobotConfig
 from ibrobot_feetech.arm import Arm
 from ibrobot_feetech.emulator.pty import Emulator
 from ibrobot_feetech.emulator.signals import SignalServer
+from ibrobot_feetech.ticks import radians_to_ticks
 
 
 class PhysicsArm:
