@@ -41,7 +41,7 @@ The names on this page are the public API, together with the [hooks](hooks.md), 
   least one more minor release. After that a minor release (a major one, from 1.0 on) removes it.
 - Messages, log lines and the order of listings are for people. They may change at any time.
 
-The official plugins use nothing else of core. `lint-imports` checks it.
+The official plugins use nothing else of core. `nox -s layers` checks it.
 """
 
 

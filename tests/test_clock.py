@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ibrobot_core.clock import RealClock, SteppedClock
-from ibrobot_core.units import degrees, ns, radians, seconds
+from ibrobot_core.units import ns, seconds
 
 
 def test_real_time_is_the_date_and_never_runs_backwards() -> None:
@@ -62,9 +62,3 @@ def test_stepped_sleep_moves_forwards_only() -> None:
 @given(st.integers(0, 2**52))
 def test_nanoseconds_survive_the_way_through_seconds(stamp: int) -> None:
     assert ns(seconds(stamp)) == pytest.approx(stamp, abs=1)
-
-
-@given(st.floats(-1e6, 1e6))
-def test_degrees_and_radians_are_inverse(angle: float) -> None:
-    assert radians(degrees(angle)) == pytest.approx(angle)
-    assert degrees(3.141592653589793) == 180.0

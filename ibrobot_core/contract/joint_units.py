@@ -8,7 +8,7 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ibrobot_core.calibration import JointCalibration, load_calibration
 from ibrobot_core.config.schema import RobotConfig
@@ -27,8 +27,12 @@ _DEGREES_PER_RADIAN = 360 / (JointCalibration.TICKS_PER_TURN - 1) * JointCalibra
 """LeRobot counts a tick less for a turn."""
 
 
+type _Numbers = float | NDArray[Any]
+"""A number, or one per joint."""
+
+
 def radians_to_lerobot(
-    radians: ArrayLike, mode: str, lower: ArrayLike, upper: ArrayLike, inverted: ArrayLike
+    radians: _Numbers, mode: str, lower: _Numbers, upper: _Numbers, inverted: bool | NDArray[np.bool_]
 ) -> NDArray[Any]:
     """Radians -> LeRobot's units, as its `MotorsBus` (0.6) normalises the ticks of a servo.
 
@@ -43,27 +47,26 @@ def radians_to_lerobot(
         upper: the greater end; likewise.
         inverted: whether radians decrease as ticks increase; likewise.
     """
-    low, high = np.asarray(lower), np.asarray(upper)
     converted: NDArray[Any]
     if mode == "degrees":
-        converted = (radians - (low + high) / 2) * _DEGREES_PER_RADIAN * np.where(inverted, -1.0, 1.0)
+        converted = (radians - (lower + upper) / 2) * _DEGREES_PER_RADIAN * np.where(inverted, -1.0, 1.0)
         return converted
-    fraction = (np.clip(radians, low, high) - low) / (high - low)
-    converted = fraction * 100 if mode == _CLOSED_MODE else fraction * 200 - 100
+    least = 0.0 if mode == _CLOSED_MODE else -100.0
+    converted = (np.clip(radians, lower, upper) - lower) / (upper - lower) * (100.0 - least) + least
     return converted
 
 
 def lerobot_to_radians(
-    values: ArrayLike, mode: str, lower: ArrayLike, upper: ArrayLike, inverted: ArrayLike
+    values: _Numbers, mode: str, lower: _Numbers, upper: _Numbers, inverted: bool | NDArray[np.bool_]
 ) -> NDArray[Any]:
     """LeRobot's units -> radians; the inverse of `radians_to_lerobot`."""
-    low, high = np.asarray(lower), np.asarray(upper)
     converted: NDArray[Any]
     if mode == "degrees":
-        converted = values * np.where(inverted, -1.0, 1.0) / _DEGREES_PER_RADIAN + (low + high) / 2
+        converted = values * np.where(inverted, -1.0, 1.0) / _DEGREES_PER_RADIAN + (lower + upper) / 2
         return converted
-    fraction = np.clip(values, 0, 100) / 100 if mode == _CLOSED_MODE else (np.clip(values, -100, 100) + 100) / 200
-    converted = fraction * (high - low) + low
+    least = 0.0 if mode == _CLOSED_MODE else -100.0
+    fraction = (np.clip(values, least, 100.0) - least) / (100.0 - least)
+    converted = fraction * (upper - lower) + lower
     return converted
 
 

@@ -22,7 +22,7 @@ from ibrobot_core.errors import CalibrationError
 from ibrobot_core.interfaces import Feature, Frame, Policy, PolicySpec, Tensors
 
 JOINTS = host_context().robot.joint_names
-CALIBRATION = {
+CALIBRATION: dict[str, dict[str, Any]] = {
     joint: {"id": i + 1, "drive_mode": i % 2, "homing_offset": 0, "range_min": 700 + 10 * i, "range_max": 3300 - 20 * i}
     for i, joint in enumerate(JOINTS)
 }

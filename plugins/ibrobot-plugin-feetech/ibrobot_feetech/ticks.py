@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from ibrobot_core.api import JointCalibration
 
@@ -17,7 +17,9 @@ MIDDLE_TICK = TICKS_PER_TURN // 2
 TICKS_PER_RADIAN = TICKS_PER_TURN / (2 * math.pi)
 
 
-def ticks_to_radians(ticks: ArrayLike, *, zero: ArrayLike = MIDDLE_TICK, inverted: ArrayLike = False) -> Any:
+def ticks_to_radians(
+    ticks: float | NDArray[Any], *, zero: float | NDArray[Any] = MIDDLE_TICK, inverted: bool | NDArray[np.bool_] = False
+) -> NDArray[np.float64]:
     """Servo ticks -> radians.
 
     Args:
@@ -25,9 +27,16 @@ def ticks_to_radians(ticks: ArrayLike, *, zero: ArrayLike = MIDDLE_TICK, inverte
         zero: the tick at which the joint is at 0 rad; a number, or one per joint.
         inverted: whether radians decrease as ticks increase (LeRobot's `drive_mode` 1); likewise.
     """
-    return (np.asarray(ticks) - zero) * np.where(inverted, -1.0, 1.0) / TICKS_PER_RADIAN
+    radians: NDArray[np.float64] = (ticks - zero) * np.where(inverted, -1.0, 1.0) / TICKS_PER_RADIAN
+    return radians
 
 
-def radians_to_ticks(radians: ArrayLike, *, zero: ArrayLike = MIDDLE_TICK, inverted: ArrayLike = False) -> Any:
+def radians_to_ticks(
+    radians: float | NDArray[Any],
+    *,
+    zero: float | NDArray[Any] = MIDDLE_TICK,
+    inverted: bool | NDArray[np.bool_] = False,
+) -> NDArray[np.float64]:
     """Radians -> servo ticks, not rounded; the inverse of `ticks_to_radians`."""
-    return np.asarray(radians) * np.where(inverted, -1.0, 1.0) * TICKS_PER_RADIAN + zero
+    ticks: NDArray[np.float64] = radians * np.where(inverted, -1.0, 1.0) * TICKS_PER_RADIAN + zero
+    return ticks
