@@ -112,6 +112,7 @@ from ibrobot_core.units import NORM_MODES as NORM_MODES
 from ibrobot_core.cli.run import run_robot as run_robot
 from ibrobot_core.cli.options import (
     run_options as run_options,
+    check_end as check_end,
     run_overrides as run_overrides,
     EpisodePath as EpisodePath,
 )

@@ -46,6 +46,8 @@ def _hidden(value: object) -> str:
     return repr(value if value is None else HIDDEN)
 
 
+_LARGEST, _LONGEST_S = 1e15, 1e9
+"""The largest number of an option; timers take no longer times [s]."""
 _BOUNDS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = {
     "ge": (operator.ge, "small, must be at least"),
     "gt": (operator.gt, "small, must be above"),
@@ -101,8 +103,8 @@ def option(
             fits, words = _BOUNDS[name]
             if bound is not None and not fits(value, bound):  # so that NaN fits none
                 raise ValueError(f"{value} is too {words} {bound}{f' {unit}' if unit else ''}")
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ValueError(f"{value} is not a finite number")
+        if isinstance(value, float) and not abs(value) <= (_LONGEST_S if unit == "s" else _LARGEST):
+            raise ValueError(f"{value} is {'too large' if math.isfinite(value) else 'not a finite number'}")
 
     validators = [check] if validator is None else [check, validator]
     default = default if factory is None else attrs.Factory(factory)

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from ibrobot_core.cli.options import run_options, run_overrides
+from ibrobot_core.cli.options import check_end, run_options, run_overrides
 from ibrobot_core.cli.run import run_robot
 from ibrobot_core.config import find_config, load_config
 from ibrobot_core.launch.session import LaunchRequest
@@ -29,6 +29,7 @@ def launch(config: str | None, **options: Any) -> None:
         find_config(config, registry),
         overrides=run_overrides(options), mode=options["mode"], sim=options["sim"], registry=registry,
     )  # fmt: skip
+    check_end(robot, options)
     request = LaunchRequest(
         options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"]
     )

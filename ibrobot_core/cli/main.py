@@ -7,10 +7,8 @@ import io
 import os
 import re
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from difflib import get_close_matches
-from typing import Any, override
+from typing import override
 
 import click
 
@@ -25,15 +23,6 @@ _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
 
 _OUTPUT_REFUSED = (errno.ENOSPC, errno.EPIPE, errno.EIO)
 """Errors of a full device, a reader that is gone, and a terminal that is gone."""
-
-
-@contextmanager
-def _broken_pipes_told() -> Iterator[None]:
-    """Report a reader of the output that is gone; click would exit without a word."""
-    try:
-        yield
-    except BrokenPipeError as error:
-        raise IbrobotError(f"standard output: {error.strerror}") from error
 
 
 class LazyGroup(click.Group):
@@ -63,16 +52,6 @@ class LazyGroup(click.Group):
         return command
 
     @override
-    def make_context(self, *arguments: Any, **more: Any) -> click.Context:
-        with _broken_pipes_told():  # of --help and --version
-            return super().make_context(*arguments, **more)
-
-    @override
-    def invoke(self, ctx: click.Context) -> object:
-        with _broken_pipes_told():
-            return super().invoke(ctx)
-
-    @override
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         from ibrobot_core.plugins import installed_plugins
 
@@ -96,11 +75,15 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # an ASCII terminal shows \u2026 instead of raising an error
             stream.reconfigure(errors="backslashreplace")
+    code = 0
     try:
-        try:
-            code = cli(prog_name="ibrobot", standalone_mode=False)
+        try:  # not `cli()`, which would exit without a word if the reader of the output is gone
+            with cli.make_context("ibrobot", sys.argv[1:]) as context:
+                cli.invoke(context)
         finally:
             sys.stdout.flush()
+    except click.exceptions.Exit as end:
+        code = end.exit_code
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the end of the process: nothing else can tell it
         lines, code = _error_lines(error)
         for line in lines:
@@ -125,13 +108,6 @@ def _has_working_folder() -> bool:
     except FileNotFoundError:
         return False
     return True
-
-
-def _discard_output() -> None:
-    """Let the interpreter end without another attempt to write what standard output did not take."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.close(nowhere)
 
 
 def _suggestion(message: str, ctx: click.Context | None) -> str:
@@ -165,7 +141,9 @@ def _system_error(error: OSError) -> tuple[list[str], int] | None:
     if error.strerror and str(error.filename) in sys.argv:
         return [f"{error.filename}: {error.strerror}"], _WRONG
     if error.filename is None and error.errno in _OUTPUT_REFUSED:
-        _discard_output()
+        from ibrobot_core.aside import discard
+
+        discard([1])  # so that the interpreter does not try to write it once more
         return [f"standard output: {error.strerror}"], _FAILED
     if isinstance(error, FileNotFoundError) and not _has_working_folder():
         return ["the working folder no longer exists: change to another one"], _WRONG

@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, override
+from typing import TYPE_CHECKING, Any, override
 
 import click
 from click import argument, option
 
 from ibrobot_core.descriptors import ViewerDescriptor
 from ibrobot_core.plugins import installed_plugins
+
+if TYPE_CHECKING:
+    from ibrobot_core.config import RobotConfig
 
 
 def _viewer_flags() -> dict[str, str]:
@@ -119,3 +122,13 @@ def run_overrides(options: Mapping[str, Any]) -> tuple[str, ...]:
 
     typed = _viewer_flags().get(viewer, f"--viewer {viewer}")
     return (Override.of(typed, f"viewer.type={viewer}"), *options["overrides"])
+
+
+def check_end(config: RobotConfig, options: Mapping[str, Any]) -> None:
+    """Refuse a run in simulated time that would go on for ever without a goal."""
+    mode = config.control_modes[config.default_control_mode]
+    ends = options["goals"] or options["episodes"] is not None or options["duration"] is not None
+    if options["lockstep"] and mode.planner is not None and not ends:
+        raise click.UsageError(
+            f"--lockstep: nothing sends mode {mode.name} a goal: add --goal, --duration or --episodes"
+        )

@@ -335,6 +335,11 @@ def test_missing_checkpoint_has_the_same_exit_code_as_in_a_dry_run(
         (("--lockstep",), "--lockstep is for simulation: add --sim"),
         (("--sim", "--episodes", "0"), "'--episodes'"),
         (("--sim", "--duration", "-1"), "'--duration'"),
+        ((*LOCKSTEP, "--mode", "plan"), "--lockstep: nothing sends mode plan a goal: add --goal, --duration or --epis"),
+        (
+            ("--sim", "--set", "executors.position.stale_timeout=1e300"),
+            "stale_timeout: 1e+300 is too large",
+        ),
     ],
 )
 def test_options_that_make_no_sense_are_refused(launch: Callable[..., Ran], arguments: tuple[str, ...], message: str):

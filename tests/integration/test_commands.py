@@ -312,6 +312,13 @@ TYPED = {
 """Command line -> its error."""
 
 
+def test_recording_that_would_never_end_is_refused(folder: Path, terminal: Terminal) -> None:
+    planned = ("--sim", "--mode", "moveit_planning", "--auto", "--lockstep")
+    code, _, err = terminal.run("record", "so101_blind", *planned)
+    message = "--lockstep: nothing sends mode moveit_planning a goal: add --goal, --duration or --episodes"
+    assert (code, err) == (2, f"error: {message}; see ibrobot record --help\n")
+
+
 @pytest.mark.parametrize("line", TYPED)
 def test_errors_name_an_option_as_it_was_typed(line: str, folder: Path, terminal: Terminal) -> None:
     make("binary", folder / BAD)

@@ -14,6 +14,7 @@ from ibrobot_core.app import (
     Override,
     RobotConfig,
     Runtime,
+    check_end,
     find_config,
     installed_plugins,
     load_config,
@@ -56,6 +57,7 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
     if continuous and (auto or options["episodes"] is not None or reset_time):
         raise click.UsageError("--continuous records one episode: leave --auto, --episodes and --reset-time out")
     robot = _recorded(config, dataset, root, options)
+    check_end(robot, options)
     live = sys.stdin.isatty() and sys.stdout.isatty() and not options["headless"]
 
     def operator(runtime: Runtime) -> Operator:

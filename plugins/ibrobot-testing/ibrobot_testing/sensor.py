@@ -69,6 +69,19 @@ class SensorSuite(Suite[Sensor]):
                 assert previous < stamp_ns <= ctx.clock.now_ns()
                 previous = stamp_ns
 
+    def test_stamps_are_times_of_capture(self) -> None:
+        """A message that is read late has the stamp of its capture."""
+        with self.opened() as (sensor, ctx):
+            self._next(sensor, ctx)
+            self.trigger(sensor, ctx)
+            self.silence(sensor)
+            silent_ns = ctx.clock.now_ns()
+            ctx.clock.sleep_until(silent_ns + ctx.period_ns // 2)
+            message: Any = sensor.read(0.01)
+            if message is None:
+                pytest.skip("the device keeps no message that was not read")
+            assert message.header.stamp_ns <= silent_ns
+
     def test_silence_gives_none(self) -> None:
         """A device that has stopped capturing returns None, never its last message with a new stamp."""
         with self.opened() as (sensor, ctx):

@@ -42,7 +42,7 @@ from ibrobot_core.app import ControlMode, Session, SourceWorker, Subscription
 
 
 class FakeSensor(Sensor):
-    """A camera that captures an image whenever the clock has advanced."""
+    """A camera that captures an image at every control period of the clock."""
 
     message_type: type[Message] = Image
 
@@ -61,7 +61,8 @@ class FakeSensor(Sensor):
     def read(self, timeout_s: float) -> Image | None:
         if not self._open:
             raise SensorError(f"{self._ctx.name} is not open")
-        stamp_ns = self._ctx.clock.now_ns()
+        now_ns = self._ctx.clock.now_ns()
+        stamp_ns = now_ns - now_ns % self._ctx.period_ns
         if stamp_ns == self._last_ns:
             return None
         self._last_ns = stamp_ns
