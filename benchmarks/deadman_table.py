@@ -3,7 +3,7 @@
     python benchmarks/deadman_table.py [--device NAME ...] [--event NAME ...]
 
 Each cell is a run of the simulated arm in lockstep, with the device emulated at its reports: HID reports, replies of
-servos, a serial port, keys of a terminal, poses of a headset, twists. A person presses the deadman and moves the arm;
+servos, a serial port, bytes of a terminal, messages of pages, twists. A person presses the deadman and moves the arm;
 the event happens, and the person keeps the deadman pressed for 3 s. A cell shows the time from the last report until
 the command rests [ms], and how far the command moved afterwards [mrad]. At the end a new press must move the arm. Exits
 with 1 if a motion lasts longer than 0.3 s, or the arm moves again without a new press.
@@ -12,6 +12,7 @@ with 1 if a motion lasts longer than 0.3 s, or the arm moves again without a new
 from __future__ import annotations
 
 import argparse
+import json
 import queue
 import sys
 import tempfile
@@ -24,7 +25,9 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_feetech.calibration import save_calibration
-from ibrobot_webxr.messages import HandPose, Hands
+from ibrobot_web import commands as page_commands
+from ibrobot_web.messages import Sent, from_page, from_server, to_run
+from ibrobot_webxr.messages import Hands, decode
 from ibrobot_webxr.options import WebxrOptions
 from ibrobot_webxr.shared import close_page, open_page
 from takeovers import CONFIG, JOINTS, of_tests
@@ -36,6 +39,7 @@ from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.terminal import decode as keys_of
 
 LIMIT_S = 0.3
 _STILL = 2e-5
@@ -56,16 +60,17 @@ class Person(ABC):
 
     def __init__(self) -> None:
         self.typed: list[queue.SimpleQueue[str]] = []
+        self._down: dict[int, str] = {}
 
     def subscribe(self) -> queue.SimpleQueue[str]:
         """A new queue of the keys of the terminal."""
         self.typed.append(queue.SimpleQueue())
         return self.typed[-1]
 
-    def type(self, *keys: str) -> None:
-        """Type keys."""
-        for each in self.typed:
-            for key in keys:
+    def type(self, typed: bytes) -> None:
+        """Have the terminal send bytes."""
+        for key in keys_of(typed, final=True, down=self._down)[0]:
+            for each in self.typed:
                 each.put(key)
 
     def meet(self, runtime: Runtime) -> None:
@@ -192,7 +197,7 @@ class Keyboard(Person):
     """Keys of a terminal that reports no releases: a held key repeats after 0.4 s, every 30 ms."""
 
     device = "{type: keyboard, cartesian: false}"
-    key = "w"
+    key = b"w"
     absent: tuple[str, ...] = ("key repeat",)
 
     def __init__(self) -> None:
@@ -215,23 +220,23 @@ class Keyboard(Person):
 
 
 class KittyKeyboard(Keyboard):
-    """Keys of a terminal that reports repeats and releases."""
+    """Keys of a terminal with kitty's protocol, which reports repeats and releases."""
 
     @override
     def hold(self, *, arrives: bool = True) -> None:
         if arrives and (self._ticks == 0 or (self._ticks >= 40 and self._ticks % 3 == 1)):
-            self.type(self.key if self._ticks == 0 else f"repeat:{self.key}")
+            self.type(b"\x1b[119;1:%d;119u" % (1 if self._ticks == 0 else 2))
         self._ticks += 1
 
     @override
     def release(self) -> None:
-        self.type(f"release:{self.key}")
+        self.type(b"\x1b[119;1:3u")
 
 
 class _Leader(Keyboard):
     """An emulated leader arm; space is its deadman."""
 
-    key = "space"
+    key = b" "
     faults = True
     absent: tuple[str, ...] = ("network cut",)
     deadman = ""
@@ -299,9 +304,13 @@ class LeaderHold(_Leader):
 
 
 class LeaderToggle(_Leader):
-    """`deadman: toggle`: one press starts, the next one pauses; the person holds the key for a second press's sake."""
+    """`deadman: toggle`: one press starts, the next one pauses."""
 
     deadman = "toggle"
+
+    @override
+    def meet(self, runtime: Runtime) -> None:
+        self._source = runtime.session.command_source
 
     @override
     def hold(self, *, arrives: bool = True) -> None:
@@ -311,11 +320,16 @@ class LeaderToggle(_Leader):
         self._turn()
         self._silence(not arrives)
 
+    @override
+    def release(self) -> None:
+        if self._source.help().startswith("following"):
+            self.type(self.key)
+
 
 class Imu(Keyboard):
     """A sensor at a serial port, and a held key."""
 
-    key = "space"
+    key = b" "
     faults = True
     absent: tuple[str, ...] = ("unplug", "replug", "key repeat", "network cut")
 
@@ -359,8 +373,14 @@ class Headset(Person):
         if abs(self._at + self._way) > 0.1:
             self._way = -self._way
         self._at += self._way
-        pose = HandPose((0.0, 0.0, 0.0, 1.0), (0.0, 1.0 + self._at, 0.0), clutch)
-        self._exchange.put(Hands(self._sent, 0.01 * self._sent, 0.0, {"right": pose}), 0.0)
+        hand = {"orientation": [0, 0, 0, 1], "clutch": clutch, "gripper": None, "open": 0, **self._pose()}
+        message = {"type": "hands", "n": self._sent, "t": 0.01 * self._sent, "heading": 0, "hands": {"right": hand}}
+        hands = decode(json.dumps(message))
+        assert isinstance(hands, Hands)
+        self._exchange.put(hands, 0.0)
+
+    def _pose(self) -> dict[str, object]:
+        return {"position": [0, 1.0 + self._at, 0], "move": [0, 0, 0]}
 
     @override
     def hold(self, *, arrives: bool = True) -> None:
@@ -377,6 +397,73 @@ class Headset(Person):
     def close(self) -> None:
         if self._sent:
             close_page(WebxrOptions(port=0), self._ctx)
+
+
+class Phone(Headset):
+    """A phone without positions of its own, whose sticks move the tool."""
+
+    @override
+    def _pose(self) -> dict[str, object]:
+        return {"position": None, "move": [0, 0.5 if self._way > 0 else -0.5, 0]}
+
+
+class Page(Person):
+    """A page in a browser, whose messages pass through the checks of its server and of the run."""
+
+    device = "{type: web}"
+    absent: tuple[str, ...] = ("key repeat",)
+    """Browsers say which key events are repeats, and the page passes over these; its own tests have that."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._ticks, self._press_ms = 0, 0
+        self._patches = pytest.MonkeyPatch()
+        self._commands: page_commands.Commands | None = None
+
+    @override
+    def meet(self, runtime: Runtime) -> None:
+        session = runtime.session
+        self._now_ns = session.clock.now_ns
+        self._patches.setattr(page_commands, "clock_ns", session.clock.now_ns)
+        failed: list[Exception] = []
+        self._commands = page_commands.Commands(session, session.finish, lambda reply: None, failed.append)
+
+    def _send(self, do: str, **facts: object) -> None:
+        sent = to_run(from_page(json.dumps({"do": do, **facts})))  # type: ignore[arg-type]
+        command = from_server(json.loads(json.dumps(sent)))
+        assert isinstance(command, Sent)
+        assert self._commands is not None
+        self._commands.take(command)
+
+    @override
+    def press(self) -> None:
+        self._press_ms = self._now_ns() // 1_000_000
+
+    @override
+    def hold(self, *, arrives: bool = True) -> None:
+        self._ticks += 1
+        if arrives and self._ticks % 4 == 0:
+            speed = 0.5 if self._ticks // 60 % 2 else -0.5
+            at = self._now_ns() // 1_000_000
+            self._send("jog", at=at, press=self._press_ms, joints={"shoulder_pan": speed})
+
+    @override
+    def release(self) -> None:
+        self._send("release", at=self._now_ns() // 1_000_000)
+
+    @override
+    def rest(self) -> None:
+        pass
+
+    @override
+    def unplug(self) -> None:
+        self._send("release")  # its server does, when the connection is gone
+
+    @override
+    def close(self) -> None:
+        self._patches.undo()
+        if self._commands is not None:
+            self._commands.close(1.0)
 
 
 class Twists(Person):
@@ -415,7 +502,9 @@ PERSONS: dict[str, Callable[[Path], Person]] = {
     "leader, hold": LeaderHold,
     "leader, toggle": LeaderToggle,
     "IMU": lambda folder: Imu(),
+    "page": lambda folder: Page(),
     "headset": lambda folder: Headset(),
+    "phone": lambda folder: Phone(),
     "twists": lambda folder: Twists(),
 }
 
@@ -449,8 +538,10 @@ class Trial:
         self.ticks(60, self.person.rest)
 
     def moves(self) -> bool:
-        """Whether a new press of the deadman moves the arm."""
+        """Whether a release ends all motion, and a new press of the deadman moves the arm."""
         self.release()
+        if np.ptp(self.commands[-10:], axis=0).max() > 1e-3:
+            return False
         for _ in range(self.person.presses - 1):
             self.person.press()
             self.hold(5)
@@ -565,7 +656,7 @@ class Cell:
     after_rad: float
     """The way of the command after that, by the same press [rad]."""
     new_press: bool
-    """Whether a new press of the deadman moved the arm."""
+    """Whether a release of the deadman left the arm still, and a new press moved it."""
 
     @property
     def good(self) -> bool:

@@ -1,5 +1,7 @@
 """Random interleavings of requests, each delivered later than it was made: what a person stopped stays stopped.
 
+Some arrive while the run starts and moves to its startup pose, and while it ends and moves to its stop pose.
+
 IBROBOT_INTERLEAVINGS sets their number; each is one seed, which a failure names.
 """
 
@@ -19,7 +21,7 @@ from ibrobot_testing.fakes import FakeTeleop
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.deadman import HOLD_S
 from ibrobot_core.descriptors import TeleopDescriptor
-from ibrobot_core.errors import IbrobotError
+from ibrobot_core.errors import ComponentFailed, IbrobotError
 from ibrobot_core.interfaces import JointReading, TeleopCommand
 from ibrobot_core.plugins import Registry
 from ibrobot_core.units import NS_PER_S, ns
@@ -116,7 +118,7 @@ class Story:
 
     def reset(self, stops: int) -> None:
         at_rest = self.run.session.control._core._safety.at_rest  # type: ignore[attr-defined]
-        self.run.reset(stops)
+        self.run.session.bus.call("/reset", {"stops": stops})
         assert stops == self.run.session.stops, "it knew of every stop"
         self.begins, self.settles = at_rest, 0 if at_rest else SETTLES_TICKS
         self.latched, Lever.allowed_ns = False, -NS_PER_S
@@ -125,7 +127,7 @@ class Story:
 
     def switch(self, mode: str, stops: int) -> None:
         known = self.run.session.mode, self.run.session.held
-        self.run.switch_mode(mode, stops)
+        self.run.session.bus.call("/set_mode", {"mode": mode, "stops": stops})
         assert not self.latched
         if known != (self.run.session.mode, self.run.session.held):
             self.consent, self.settles, Lever.allowed_ns = mode == "policy", SETTLES_TICKS, -NS_PER_S
@@ -154,6 +156,55 @@ class Story:
         episodes = self.run.session.episodes
         episodes.end("unknown") if episodes.running else episodes.begin()
 
+    def start(self) -> bool:
+        """Start, with requests meanwhile; return whether the run goes on: after a stop on the way to a pose it does not."""
+        self.meanwhile(self.run.start)
+        return not self.run.session.finished.is_set()
+
+    def end(self) -> None:
+        """End the run, with requests meanwhile."""
+        assert self.before is not None
+        self.meanwhile(self.run.stop)
+
+    def meanwhile(self, act: Callable[[], object]) -> None:
+        """Let the robot start or end, which moves it to a pose, with requests at each of its states."""
+        hooks = self.run.session.on_state
+        hooks.append(self.state_on_the_way)
+        try:
+            act()
+        except ComponentFailed as error:
+            assert self.latched, error  # noqa: PT017 - a start fails after a stop
+            self.run.session.finish()
+        finally:
+            if self.state_on_the_way in hooks:
+                hooks.remove(self.state_on_the_way)
+
+    def state_on_the_way(self, state: ControlState) -> None:
+        self.tick += 1
+        self.check_limits(state)
+        if self.latched:
+            self.seen["braking on the way"] += int(np.abs(self.step).max() > STILL_RAD)
+        else:
+            self.seen["moves on the way"] += int(np.abs(self.step).max() > STILL_RAD)
+        if self.draw.random() < 0.1:
+            self.act()
+        self.deliver_due()
+
+    def check_limits(self, state: ControlState) -> None:
+        """Check a command by those before: it begins where the joints are, is smooth, and brakes after a stop."""
+        robot = self.run.session.config.robot
+        period = 1 / self.run.session.config.control.rate_hz
+        assert state.estop == self.latched
+        if self.before is None:
+            self.before, self.step = state, state.command - state.position
+            assert np.abs(self.step).max() <= BEGINS_RAD + (robot.max_acceleration * period**2).max()
+            return
+        step = state.command - self.before.command
+        assert np.abs(step - self.step).max() <= (robot.max_acceleration * period**2).max() * 1.001
+        assert np.abs(step).max() <= (robot.max_velocity * period).max() * 1.001
+        assert not self.latched or (np.abs(step) <= np.abs(self.step) + STILL_RAD).all(), "it speeds up while stopped"
+        self.before, self.step = state, step
+
     def act(self) -> None:
         """Make one request."""
         session = self.run.session
@@ -165,8 +216,9 @@ class Story:
             "goal": lambda: self.goal(stops),
             "plan": lambda: self.plan(generation),
             "intervene": self.intervene,
-            "episode": self.episode,
         }
+        if self.run.session.bus.serves("/reset"):  # neither at the start nor at the end
+            requests["episode"] = self.episode
         name = self.draw.choice([*requests, "stop", "reset", "reset", "deadman", "deadman"])
         if name == "deadman":
             Lever.held = not Lever.held
@@ -186,14 +238,18 @@ class Story:
     def ticks(self, count: int) -> None:
         for _ in range(count):
             self.tick += 1
-            due = [each for each in self.waiting if each[0] <= self.tick]
-            self.draw.shuffle(due)
-            for each in due:
-                self.waiting.remove(each)
-                each[1]()
+            self.deliver_due()
             generation = self.run.session.generation
             assert not self.run.step(), self.run.session.failure_text
             self.watch(scene=self.run.session.generation != generation)
+
+    def deliver_due(self) -> None:
+        """Deliver what is due, in any order."""
+        due = [each for each in self.waiting if each[0] <= self.tick]
+        self.draw.shuffle(due)
+        for each in due:
+            self.waiting.remove(each)
+            each[1]()
 
     def watch(self, *, scene: bool) -> None:
         """Check the newest command."""
@@ -238,19 +294,25 @@ def test_after_a_stop_nothing_moves_before_a_reset_that_saw_it(runs: Runs, lever
     seen: Counter[str] = Counter()
     for seed in range(part, INTERLEAVINGS, PARTS):
         draw = random.Random(seed)
-        run = runs.start(
+        run = runs.make(
             "control_modes.policy.inference={model: net, intervene: lever}", "control_modes.teleop.teleop=lever",
+            f"control.startup={draw.choice(('hold', 'pose up'))}", f"control.stop={draw.choice(('hold', 'pose up'))}",
             mode=draw.choice(MODES),
         )  # fmt: skip
         runs.made.clear()
         story = Story(run, draw, seen=seen, consent=run.session.mode == "policy")
         try:
-            story.play()
+            if story.start():
+                story.play()
+                story.end()
         except AssertionError as error:
             raise AssertionError(f"seed {seed}: {error}\n" + "\n".join(story.told)) from error
         finally:
             run.stop()
     if os.environ.get("IBROBOT_INTERLEAVINGS"):
         print(dict(seen))
-    wanted = {"stop", "reset", "reset, refused", "mode", "goal, refused", "begun", "braking", "moves"}
+    wanted = {
+        "stop", "reset", "reset, refused", "mode", "mode, refused", "goal, refused", "plan", "episode", "intervene",
+        "begun", "braking", "moves", "braking on the way", "moves on the way",
+    }  # fmt: skip
     assert wanted <= set(seen), f"not every kind of request came about: {wanted - set(seen)}"

@@ -87,10 +87,9 @@ class WebxrTeleop(Teleop):
     @override
     def activate(self, measured: JointReading) -> None:
         if self._page is not None and self._inbox is not None:
-            self._inbox.drain()  # discards what was pressed before, except for the emergency stop
-            _, stop = self._page.exchange.take_events()
-            if stop:
-                self._page.exchange.stop()
+            # Discards what was pressed before. The server sends an emergency stop to control by itself.
+            self._inbox.drain()
+            self._page.exchange.take_events()
         self._restart()
 
     @override

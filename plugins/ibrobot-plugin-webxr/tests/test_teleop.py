@@ -429,16 +429,6 @@ def test_buttons_and_the_stop_of_the_page_reach_the_run_once(start: Start):
     assert rig.last.positions is None, "a clutch held during the stop counts as released"
 
 
-def test_a_stop_pressed_while_the_mode_begins_is_not_lost(start: Start):
-    rig = start()
-    rig.page.exchange.press("start")
-    rig.page.exchange.stop()
-    rig.teleop.activate(rig.measured())
-    assert rig.tick().estop
-    assert rig.last.events == ()
-    assert not rig.tick().estop
-
-
 def test_a_robot_without_a_model_is_refused(mjcf: Path):
     teleop = WebxrTeleop(ANY_PORT, host_context("hand"))
     with pytest.raises(TeleopError, match=r"hand: a hand moves the tool, which needs robot\.description\.mjcf"):
