@@ -157,7 +157,7 @@ class Story:
         episodes.end("unknown") if episodes.running else episodes.begin()
 
     def start(self) -> bool:
-        """Start, with requests meanwhile; return whether the run goes on: after a stop on the way to a pose it does not."""
+        """Start, with requests meanwhile; return whether the run goes on."""
         self.meanwhile(self.run.start)
         return not self.run.session.finished.is_set()
 
