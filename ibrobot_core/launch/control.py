@@ -94,6 +94,8 @@ class ControlComponent(Component):
             bus.publish(JOINT_STATES, JointState(header, self._joints, state.position, state.velocity, effort))
         for topic, columns in self._actions[session.mode]:
             bus.publish(topic, Float64MultiArray(state.command[columns]))
+        if state.stale:
+            return
         begin = 0
         for topic, size in session.control.signals:
             bus.publish(topic, Float64MultiArray(state.signals[begin : begin + size].copy()))

@@ -12,15 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+import independent
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from command_line import run_here
 from ibrobot_data.ticks import Ticks
 from ibrobot_mcap.reader import Rosbag2Reader
-from mcap.reader import make_reader
 from recordings import CONTRACT, record
-from rosbags.typesys import Stores, get_typestore
 
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ContractError, RecorderError
@@ -29,15 +27,12 @@ pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion
 
 STATES, COMMANDS, TOP = "/joint_states", "/commands", "/top"
 LONG_S = 2.0
+LIMIT_NS = 250_000_000
 TICKS = 60
 BENCH = attrs.evolve(CONTRACT, observation_parts=CONTRACT.observation_parts[:2])
-LIMITS_NS = {STATES: 250_000_000, COMMANDS: 250_000_000, TOP: 200_000_000}
-KEYS = {STATES: "observation.state", COMMANDS: "action", TOP: "observation.images.top"}
-STORE = get_typestore(Stores.ROS2_JAZZY)
-
 SILENT: dict[str, dict[str, tuple[float, float]]] = {
     f"{topic} {what}": {topic: span}
-    for topic in KEYS
+    for topic in (STATES, COMMANDS, TOP)
     for what, span in {"silent": (0.5, 1.3), "late": (0.0, 0.7), "ends early": (1.2, 9.0)}.items()
 }
 CLOCKS: dict[str, Callable[[float], float]] = {
@@ -49,79 +44,11 @@ CLOCKS: dict[str, Callable[[float], float]] = {
 STAMPED = {f"{topic} {what}": {topic: clock} for topic in (STATES, TOP) for what, clock in CLOCKS.items()}
 
 
-@attrs.frozen
-class Sample:
-    stamp_ns: int
-    received_ns: int
-
-
-def samples(folder: Path) -> dict[str, list[Sample]]:
-    """What mcap and rosbags read: topic -> stamp and receipt of each message [ns]."""
-    found: dict[str, list[Sample]] = {topic: [] for topic in KEYS}
-    with (folder / f"{folder.name}_0.mcap").open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages(topics=list(KEYS)):
-            assert schema is not None
-            stamp_ns = message.log_time
-            if channel.topic != COMMANDS:
-                stamp = STORE.deserialize_cdr(message.data, schema.name).header.stamp  # type: ignore[attr-defined]
-                stamp_ns = stamp.sec * 10**9 + stamp.nanosec
-            found[channel.topic].append(Sample(stamp_ns, message.log_time))
-    return found
-
-
-def ages(of_topic: list[Sample], t_ns: int) -> int | None:
-    """Age at a tick [ns] of the sample that counts; None without one."""
-    newest: int | None = None
-    since_jump: list[int] = []
-    for each in of_topic:
-        if each.received_ns <= t_ns:
-            if newest is not None and abs(each.stamp_ns - newest) > 10**9:
-                newest, since_jump = None, []
-            newest = each.stamp_ns if newest is None else max(newest, each.stamp_ns)
-            since_jump.append(each.stamp_ns)
-    due = [stamp_ns for stamp_ns in since_jump if stamp_ns <= t_ns]
-    return t_ns - max(due) if due else None
-
-
-def expected(read: dict[str, list[Sample]]) -> list[frozenset[str]]:
-    """What is missing at each tick, by brute force."""
-    times = [each.received_ns for of_topic in read.values() for each in of_topic]
-    missing = []
-    for t_ns in range(min(times), max(times) + 1, BENCH.step_ns):
-        old = {topic: ages(of_topic, t_ns) for topic, of_topic in read.items()}
-        missing.append(frozenset(KEYS[topic] for topic, age in old.items() if age is None or age > LIMITS_NS[topic]))
-    return missing
-
-
-def gaps(missing: list[frozenset[str]]) -> dict[str, int]:
-    """Key -> how often it goes missing; before the first complete tick only what is longer than natural counts."""
-    begin = missing.index(frozenset())
-    late = missing[: begin + 1] if begin * BENCH.step_ns > BENCH.max_age * 1e9 else []
-    beginning = frozenset().union(*missing[round(BENCH.max_age * BENCH.rate_hz) + 1 : begin]) if late else frozenset()
-    found = dict.fromkeys(beginning, 1)
-    for before, now in zip(missing[begin:], missing[begin + 1 :], strict=False):
-        for key in now - before:
-            found[key] = found.get(key, 0) + 1
-    return found
-
-
 def check(folder: Path, out: Path, topic: str) -> None:
-    """Compare `convert`, its dataset and `verify` with the independent reading."""
-    missing = expected(samples(folder))
-    whole = missing.count(frozenset())
-    assert 0 < whole < len(missing) - 3, "the fault costs ticks"
-    done = run_here("convert", folder, "--out", out, "--no-videos", "--json")
-    assert done.returncode == 0, done.stderr
-    (report,) = json.loads(done.stdout)["reports"]
-    table = pq.read_table(out / "data/chunk-000/file-000.parquet")
-    assert table.num_rows == report["frames"] == whole
-    assert report["gaps"] == gaps(missing)
-    assert report["skipped"] in (len(missing) - whole, len(missing) - whole - missing.index(frozenset()))
-    metadata = json.loads((out / "meta/ibrobot.json").read_text())
-    assert metadata["episodes"][0]["skipped"] == report["skipped"]
-    verified = run_here("episodes", "verify", folder)
-    assert verified.returncode == 1
-    assert f"{topic}: " in verified.stdout
+    """A fault of `topic` costs ticks, and all agree on which."""
+    lost, verified = independent.check(folder, out, BENCH)
+    assert lost, "the fault costs ticks"
+    assert f"{topic}: " in verified
 
 
 @pytest.mark.parametrize("fault", SILENT)
@@ -163,14 +90,14 @@ def test_the_next_command_is_missing_where_it_comes_late(span: tuple[float, floa
         "action_parts": (attrs.evolve(action, align="next"),),
     }
     contract = attrs.evolve(CONTRACT, **parts)
-    read = samples(tmp_path / "bag")
+    read = independent.samples(tmp_path / "bag", contract)
     begin_ns = min(each.received_ns for of_topic in read.values() for each in of_topic)
     end_ns = max(each.received_ns for topic in (STATES, COMMANDS) for each in read[topic])
     wanted = []
     for t_ns in range(begin_ns, end_ns + 1, contract.step_ns):
         following = [each.received_ns - t_ns for each in read[COMMANDS] if each.received_ns > t_ns]
-        old = ages(read[STATES], t_ns)
-        if following and min(following) <= LIMITS_NS[COMMANDS] and old is not None and old <= LIMITS_NS[STATES]:
+        old = independent.age(read[STATES], t_ns)
+        if following and min(following) <= LIMIT_NS and old is not None and old <= LIMIT_NS:
             wanted.append(t_ns)
     made, ticks = rows(tmp_path / "bag", contract)
     assert len(made) == len(wanted)

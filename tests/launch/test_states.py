@@ -37,11 +37,12 @@ def test_a_state_that_was_not_read_is_no_message(runs: Runs, mute) -> None:
     run = runs.start("control.state_timeout=10", mode="idle")
     states = run.session.bus.subscribe("/joint_states", 1000)
     commands = run.session.bus.subscribe("/arm/commands", 1000)
+    signals = run.session.bus.subscribe("/fake/command", 1000)
     run.step()
     mute(True)
     for _ in range(20):
         run.step()
-    assert len(states.drain()) == 1
+    assert (len(states.drain()), len(signals.drain())) == (1, 1), "nor is a signal"
     assert len(commands.drain()) == 21, "what the robot is told is published all the same"
     mute(False)
     run.step()
