@@ -1,9 +1,11 @@
-"""Generated requests to every service of a simulated SO-101 in motion, over Zenoh, from several clients at once.
+"""Generated requests and messages for all services and topics of an SO-101 in motion, from several clients at once.
 
     python benchmarks/service_requests.py [--requests 5000] [--clients 2] [--seed 0]
 
-Meanwhile one more client keeps the arm moving, and stops and resets it. It fails if the run ends, if an answer shows
-the environment or an error of Python, or if a refused request takes more than a second or 200 MB.
+They go over Zenoh to a simulation. What it offers comes from its bus, in each mode. Meanwhile one more client keeps the
+arm moving, resets it, and enters its modes. It fails if the run ends, if a declared service was never reached, if an
+answer or the log shows the environment or an error of Python, or if a refused request takes more than a second or
+200 MB. Requests that are accepted and take longer are listed: planning has its own time limit.
 """
 
 from __future__ import annotations
@@ -25,27 +27,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import ibrobot_data.corrections
-import ibrobot_data.episode_service
-import ibrobot_data.partial_recording
-import ibrobot_planning.execution.services
-import ibrobot_planning.execution.source
-import ibrobot_planning.tasks.runner
-import ibrobot_planning.world.clouds
-import ibrobot_planning.world.objects
-import ibrobot_planning.world.section
-import ibrobot_web.teleop
 from ibrobot_planning.client import Node
-from ibrobot_servo.teleop import twist_service
+from ibrobot_zenoh.sharing import TopicTransport
 
-import ibrobot_core.launch.runtime
-import ibrobot_core.launch.sources.policy
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Service
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "tests" / "shared"))
-from plain_requests import SECRET, Requests  # noqa: E402
+from plain_requests import CONFIG, EVERYTHING, SECRET, Offered, Requests, declared, offered  # noqa: E402
 
 VALUE = "hunter2-0451"
 SHOWN = re.compile(rf"{VALUE}|Traceback|the service failed|\b[A-Z]\w*(Error|Exception): |a bug|{os.environ['HOME']}/")
@@ -53,18 +42,6 @@ SHOWN = re.compile(rf"{VALUE}|Traceback|the service failed|\b[A-Z]\w*(Error|Exce
 WAITS = ("/moveit_gateway/move_to_pose", "/moveit_gateway/move_to_configuration")
 """They answer when the motion has ended."""
 MIB = 1 << 20
-
-
-def declared() -> dict[str, Service[Any, Any]]:
-    """The services of core and the plugins."""
-    modules = [
-        ibrobot_core.launch.runtime, ibrobot_core.launch.sources.policy, ibrobot_data.corrections,
-        ibrobot_data.episode_service, ibrobot_data.partial_recording, ibrobot_planning.world.clouds,
-        ibrobot_planning.execution.services, ibrobot_planning.execution.source, ibrobot_planning.tasks.runner,
-        ibrobot_planning.world.objects, ibrobot_planning.world.section, ibrobot_web.teleop,
-    ]  # fmt: skip
-    found = [value for module in modules for value in vars(module).values() if isinstance(value, Service)]
-    return {each.name: each for each in (*found, twist_service("/servo_node/delta_twist_cmds"))}
 
 
 def resident(pid: int) -> int:
@@ -86,6 +63,9 @@ class Findings:
 
     def __init__(self) -> None:
         self.outcomes = Counter[str]()
+        self.reached = Counter[str]()
+        """Service -> requests that found it served."""
+        self.messages = 0
         self.slowest: dict[str, tuple[float, str]] = {}
         self.refused: tuple[float, str] = (0.0, "")
         self.wrong: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -93,6 +73,7 @@ class Findings:
     def add(self, service: str, took_s: float, answer: str, *, accepted: bool, request: str) -> None:
         """Note an answer."""
         self.outcomes["accepted" if accepted else "refused"] += 1
+        self.reached[service] += accepted or "nobody serves" not in answer
         self.slowest[service] = max(self.slowest.get(service, (0.0, "")), (took_s, request[:200]))
         if not accepted and service not in WAITS:
             self.refused = max(self.refused, (took_s, f"{service} {request[:300]} -> {answer[:200]}"))
@@ -110,26 +91,45 @@ def ask(node: Node, service: str, request: Any, findings: Findings) -> None:
     findings.add(service, time.monotonic() - begun, answer, accepted=accepted, request=repr(request))
 
 
-def client(address: str, number: int, count: int, seed: int, findings: Findings) -> None:
-    """Ask `count` generated requests."""
-    requests, known = Requests(seed), declared()
-    with Node(f"client{number}", f"connect=[{address}]") as node:
-        names = sorted(set(node.call("/rosapi/services")) | set(known))
+def connected(name: str, address: str) -> Node:
+    """A client, as soon as the run answers."""
+    while True:
+        try:
+            return Node(name, f"connect=[{address}]")
+        except IbrobotError:
+            time.sleep(0.5)
+
+
+def client(address: str, number: int, count: int, seed: int, known: Offered, findings: Findings) -> None:
+    """Ask `count` generated requests, mostly of the service that was reached least, and send as many messages."""
+    requests, topics = Requests(seed), sorted(known.topics)
+    with connected(f"client{number}", address) as node:
+        transport = node._transport
+        assert isinstance(transport, TopicTransport)
+        served: list[str] = []
         for i in range(count):
-            name = names[(i * 7 + number) % len(names)] if i < len(names) else requests._random.choice(names)
-            if name in known:
-                ask(node, name, requests.request(known[name]), findings)
+            if i % 500 == 499:
+                print(f"client {number}: {i + 1} requests", flush=True)
+            if i % 10 == 0:
+                served = [name for name in node.call("/rosapi/services") if name in known.services]
+            least = min(served, key=lambda name: findings.reached[name])
+            name = least if i % 2 else requests._random.choice(served)
+            ask(node, name, requests.request(known.services[name]), findings)
+            topic = topics[i % len(topics)]
+            with suppress(IbrobotError):  # the client's own end knows the topic by another type
+                transport.publish_message(topic, requests.message(known.topics[topic]))
+                findings.messages += 1
 
 
-def mover(address: str, ended: threading.Event, moved: list[int]) -> None:
-    """Keep the arm moving, in spite of the others."""
-    with Node("mover", f"connect=[{address}]") as node:
+def mover(address: str, modes: list[str], ended: threading.Event, moved: list[int]) -> None:
+    """Keep the arm moving, in spite of the others, and enter all modes."""
+    with connected("mover", address) as node:
         for i in range(1_000_000):
             if ended.is_set():
                 return
             for service, request in (
                 ("/reset", None),
-                ("/set_mode", "moveit_planning"),
+                ("/set_mode", modes[i // 4 % len(modes)] if i % 4 == 3 else "moveit_planning"),
                 ("/planning/go_to", ("home", "shoulder_pan=0.6", "shoulder_pan=-0.6")[i % 3]),
             ):
                 try:
@@ -149,17 +149,16 @@ def main() -> int:
     parser.add_argument("--port", type=int, default=17447)
     options = parser.parse_args()
     address = f"tcp/127.0.0.1:{options.port}"
-    transport = (
-        f"transport={{type: zenoh, mode: router, listen: [{address}], share: {{services: [{', '.join(declared())}]}}}}"
-    )
+    known = offered()
+    types = ", ".join(f"{topic}: {min(each)}" for topic, each in known.topics.items())
+    share = f"{{services: [{', '.join(known.services)}], subscribe: {{{types}}}}}"
+    transport = f"transport={{type: zenoh, mode: router, listen: [{address}], share: {share}}}"
     findings, ended, moved = Findings(), threading.Event(), [0]
     with tempfile.TemporaryDirectory() as folder:
         log, result = Path(folder) / "log", Path(folder) / "result"
-        command = [
-            str(Path(sys.executable).with_name("ibrobot")), "launch",
-            str(ROOT / "configs" / "so101_blind.yaml"), "--sim",
-            "--mode", "moveit_planning", "--json", "--set", transport, "--set", "world={scene: true}",
-        ]  # fmt: skip
+        ibrobot = str(Path(sys.executable).with_name("ibrobot"))
+        command = [ibrobot, "launch", str(CONFIG), "--sim", "--mode", "moveit_planning", "--json", "--set", transport]
+        command += [part for override in EVERYTHING for part in ("--set", override)]
         with log.open("w") as told, result.open("w") as summary:
             run = subprocess.Popen(
                 command,
@@ -170,11 +169,15 @@ def main() -> int:
                 cwd=folder,
             )
         try:
-            threads = [threading.Thread(target=mover, args=(address, ended, moved), daemon=True)]
+            threads = [
+                threading.Thread(
+                    target=mover, args=(address, sorted(set(known.modes.values())), ended, moved), daemon=True
+                )
+            ]
             threads += [
                 threading.Thread(
                     target=client,
-                    args=(address, i, options.requests // options.clients, options.seed + i, findings),
+                    args=(address, i, options.requests // options.clients, options.seed + i, known, findings),
                     daemon=True,
                 )
                 for i in range(options.clients)
@@ -206,6 +209,11 @@ def main() -> int:
 def report(findings: Findings, summary: dict[str, Any], log: str, moved: int, grown: int, *, alive: bool) -> int:
     """Print what was found; 1 if something is wrong."""
     print(f"{dict(findings.outcomes)}, {moved} motions of the mover, run alive: {alive}")
+    missed = sorted({*declared(), *findings.reached} - {name for name, count in findings.reached.items() if count})
+    least = min(findings.reached.items(), key=lambda item: item[1], default=("", 0))
+    print(
+        f"{len(+findings.reached)} services reached, {least[0]} least: {least[1]} times; {findings.messages} messages"
+    )
     print(
         f"memory grew by at most {grown / MIB:.0f} MiB; "
         f"slowest refusal {findings.refused[0]:.2f} s: {findings.refused[1]}"
@@ -217,6 +225,7 @@ def report(findings: Findings, summary: dict[str, Any], log: str, moved: int, gr
     lines = log.splitlines()
     wrong += [line for line in lines if VALUE in line]
     wrong += [line for i, each in enumerate(lines) if "Traceback" in each for line in lines[i : i + 40]]
+    wrong += [f"never reached: {', '.join(missed)}"] if missed else []
     wrong += [] if alive else ["the run ended:", *log.splitlines()[-20:]]
     wrong += [f"a refusal took {findings.refused[0]:.2f} s"] if findings.refused[0] > 1.0 else []
     wrong += [f"memory grew by {grown / MIB:.0f} MiB"] if grown > 200 * MIB else []

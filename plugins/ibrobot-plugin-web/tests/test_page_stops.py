@@ -261,16 +261,21 @@ def test_a_press_that_outlives_an_event_moves_nothing(
     run(address, test)
 
 
+@pytest.mark.parametrize("held_s", [0.1, 3.0])
 @pytest.mark.parametrize("rate", [300, 700, 2000])
-def test_on_a_narrow_link_motion_ends_soon_after_the_release_and_stop_is_not_late(address: str, rate: int) -> None:
+def test_on_a_narrow_link_motion_ends_soon_after_the_release_and_stop_is_not_late(
+    address: str, rate: int, held_s: float
+) -> None:
     async def test(found: Scene) -> None:
         await found.hold()
         found.link.up_per_s = rate
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(held_s)
         released_ns = time.time_ns()
         await found.page.mouse.up()
         await asyncio.sleep(2.0)
-        print(f"{rate} bytes/s: moved for {moved_for_s(found.watcher, released_ns):.3f} s after the release")
+        print(
+            f"{rate} bytes/s, held {held_s} s: moved {moved_for_s(found.watcher, released_ns):.3f} s after the release"
+        )
         assert moved_for_s(found.watcher, released_ns) < HOLD_S + PATIENCE_S
         await found.page.mouse.down()
         await asyncio.sleep(0.5)

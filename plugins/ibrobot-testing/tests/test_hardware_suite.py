@@ -263,6 +263,25 @@ class RepeatsALostReply(FakeHardware):
         return JointReading(r.stamp_ns, self.last.copy(), r.velocity, r.effort)
 
 
+class RepeatsATick(FakeHardware):
+    """Of fast joints, all readings of every seventh tick have the positions of the tick before, and a new stamp."""
+
+    stamp_ns = ticks = 0
+    now = before = np.zeros(0)
+
+    def reset(self, episode):
+        super().reset(episode)
+        self.stamp_ns, self.ticks = -1, 0
+
+    def read(self):
+        r = super().read()
+        if r.stamp_ns != self.stamp_ns:
+            self.stamp_ns, self.ticks, self.before = r.stamp_ns, self.ticks + 1, self.now
+        repeats = self.ticks % 7 == 6 and np.abs(r.velocity).max() >= 0.5
+        self.now = self.before if repeats else r.position
+        return JointReading(r.stamp_ns, self.now.copy(), r.velocity, r.effort)
+
+
 class AlwaysStale(FakeHardware):
     """Each reading is that of the tick before, as from a queue that nobody empties."""
 
@@ -289,6 +308,7 @@ class BlocksInWrite(FakeHardware):
 WRONG = {
     TorqueByWayOfZero: "torque_returns_without_a_jump",
     RepeatsALostReply: "readings_are_new",
+    RepeatsATick: "readings_are_new",
     AlwaysStale: "readings_are_new",
     BlocksInWrite: "reading_fits_into_a_control_period",
     OtherJoints: "owns_the_joints_it_was_given",
@@ -351,6 +371,7 @@ def test_catches_a_read_that_blocks(tmp_path):
 ALONE = {
     TorqueByWayOfZero: "torque_returns_without_a_jump",
     RepeatsALostReply: "readings_are_new",
+    RepeatsATick: "readings_are_new",
     BlocksInWrite: "reading_fits_into_a_control_period",
 }
 
