@@ -218,7 +218,9 @@ def wheels(session: nox.Session) -> None:
         requirement, *commands = installation(page)
         environment = folder / requirement
         session.run("uv", "venv", "--quiet", "--clear", str(environment))
-        wheels = ("--find-links", str(folder / "dist"), "-c", "constraints.txt")
+        # Wheels of an earlier run have the same names.
+        fresh = (f"--refresh-package={name}" for name in LOCAL)
+        wheels = ("--find-links", str(folder / "dist"), "-c", "constraints.txt", *fresh)
         session.run("uv", "pip", "install", "--quiet", "--python", str(environment), *wheels, requirement)
         with session.chdir(folder):  # away from this repository
             for command in commands:

@@ -14,7 +14,6 @@ import os
 import sys
 import threading
 from collections import defaultdict
-from contextlib import suppress
 from pathlib import Path
 from typing import override
 
@@ -23,8 +22,11 @@ _CLASSES = {os.SCHED_OTHER: "OTHER", os.SCHED_BATCH: "BATCH", os.SCHED_FIFO: "FI
 
 
 def scheduling_class(thread: int) -> str:
-    """The scheduling class of the thread with this native id."""
-    policy = os.sched_getscheduler(thread)
+    """The scheduling class of the thread with this native id; empty if it has ended."""
+    try:
+        policy = os.sched_getscheduler(thread)
+    except ProcessLookupError:
+        return ""
     text = _CLASSES.get(policy & ~os.SCHED_RESET_ON_FORK, str(policy))
     return f"{text} RESET" if policy & os.SCHED_RESET_ON_FORK else text
 
@@ -50,19 +52,16 @@ class Sampler(threading.Thread):
         self.join()
 
     def _sample(self) -> None:
+        # Names after classes: a thread that starts meanwhile has its name before it changes its class.
+        classes = {thread: found for thread in _threads(os.getpid()) if (found := scheduling_class(thread))}
         names = {thread.native_id: thread.name for thread in threading.enumerate()}
-        for thread in _threads(os.getpid()):
+        for thread, found in classes.items():
             if thread != self.native_id:
-                self._note(names.get(thread, "native"), thread)
+                self.seen[names.get(thread, "native")].add(found)
         for task in _threads(os.getpid()):
             for child in _read(f"/proc/self/task/{task}/children").split():
                 program = _read(f"/proc/{child}/comm").strip()
-                for thread in _threads(int(child)):
-                    self._note(f"child process {program}", thread)
-
-    def _note(self, name: str, thread: int) -> None:
-        with suppress(ProcessLookupError):  # it has just ended
-            self.seen[name].add(scheduling_class(thread))
+                self.seen[f"child process {program}"].update(map(scheduling_class, _threads(int(child))))
 
 
 def _threads(process: int) -> list[int]:
@@ -89,7 +88,7 @@ def main() -> None:
         ibrobot()
     finally:
         sampler.end()
-        print(json.dumps({name: sorted(classes) for name, classes in sorted(sampler.seen.items())}, indent=1))
+        print(json.dumps({name: sorted(classes - {""}) for name, classes in sorted(sampler.seen.items())}, indent=1))
 
 
 if __name__ == "__main__":

@@ -37,8 +37,8 @@ def offers() -> dict[str, dict[str, list[str]]]:
                 kinds.setdefault("default", []).append(kind)
         if registry.readers:
             kinds["reader"] = sorted(reader.type for reader in registry.readers)
-        if registry.commands:
-            kinds["command"] = sorted(registry.commands)
+        if commands := sorted(name for name, owner in registry.command_packages.items() if owner == package):
+            kinds["command"] = commands
         found[package] = kinds
     return dict(sorted(found.items()))
 

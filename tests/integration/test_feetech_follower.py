@@ -208,7 +208,7 @@ def test_ctrl_c_on_the_way_to_the_startup_pose_stops_there(bench: Bench) -> None
     run = bench.launch("--set", "control.startup=pose far", max_velocity=0.3)  # it is on its way for long
     run.send_signal(signal.SIGINT)
     _, err = bench.end()
-    assert run.returncode == 0, err
+    assert run.returncode == 130, err
     with bench.emulator.lock:
         goal = bench.emulator.servos[1].get("goal_position")
     assert goal < 2048 + 1.3 * RADIAN

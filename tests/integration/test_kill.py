@@ -109,8 +109,8 @@ class TestInterrupt:
         run.host.send_signal(signal.SIGINT)
         status, error = run.end()
 
-        assert status == 0
-        assert errors_in(error) == []
+        assert status == 130
+        assert errors_in(error) == ["error: stopped"]
 
     def test_the_first_stops_in_order(self, launch):
         run = launch("control.stop=pose rest")
@@ -143,7 +143,7 @@ class TestInterrupt:
         run.host.send_signal(signal.SIGTERM)
         status, error = run.end()
 
-        assert status == 0
+        assert status == 1  # an emergency stop
         assert "emergency stop: the robot holds where it is, and the run ends" in error
         commands = run.commands()[1]
         np.testing.assert_array_equal(commands[-1], commands[-2])

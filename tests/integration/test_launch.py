@@ -99,7 +99,7 @@ def test_a_component_that_cannot_start_is_exit_code_1(launch: Callable[..., Ran]
 
 
 def test_dry_run_prints_the_plan_and_starts_nothing(launch: Callable[..., Ran], rendering: None):
-    ran = launch("--lockstep", "--dry-run", "--mode", "moveit_planning", robot="so101")
+    ran = launch("--lockstep", "--dry-run", "--mode", "moveit_planning", "--goal", "home", robot="so101")
     assert (ran.code, ran.err) == (0, "")
     components = json.loads(ran.out)["components"]
     names = [component["name"] for component in components]

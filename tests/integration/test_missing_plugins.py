@@ -27,7 +27,8 @@ def only(monkeypatch: pytest.MonkeyPatch) -> Iterator[Only]:
     """Has some plugins installed, and no others."""
 
     def choose(*names: str) -> None:
-        found = [entry for entry in entry_points(group="ibrobot") if entry.name in names]
+        installed = [entry for entry in entry_points(group="ibrobot") if entry.dist is not None]
+        found = [each for each in installed if each.name in names or (each.dist and each.dist.name == plugins.CORE)]
         monkeypatch.setattr(plugins, "entry_points", lambda group: found)
         installed_plugins.cache_clear()
 

@@ -145,7 +145,7 @@ def test_a_person_jogs_by_keyboard_stops_and_leaves(terminal: Terminal, tmp_path
     while "}\r\n" not in terminal.shown[terminal.shown.rfind("{") :]:  # what it said last may come after its end
         assert time.monotonic() < deadline, terminal.shown[-3000:]
         terminal.read(0.05)
-    assert terminal.process.returncode == 0, terminal.shown[-3000:]
+    assert terminal.process.returncode == 1, terminal.shown[-3000:]  # an emergency stop
     assert termios.tcgetattr(terminal.slave) == terminal.before, "the terminal is as it was"
     last = terminal.shown.strip().splitlines()[-1]
     summary = json.loads(last[last.index("{") :])  # the terminal's cursor is shown again before it

@@ -90,7 +90,7 @@ def test_the_next_command_is_missing_where_it_comes_late(span: tuple[float, floa
         "action_parts": (attrs.evolve(action, align="next"),),
     }
     contract = attrs.evolve(CONTRACT, **parts)
-    read = independent.samples(tmp_path / "bag", contract)
+    read = independent.samples(tmp_path / "bag", BENCH)
     begin_ns = min(each.received_ns for of_topic in read.values() for each in of_topic)
     end_ns = max(each.received_ns for topic in (STATES, COMMANDS) for each in read[topic])
     wanted = []

@@ -48,7 +48,7 @@ def permitted() -> None:
 def test_only_threads_with_short_work_have_real_time_priority(
     arguments: tuple[str, ...], urgent: set[str], tmp_path: Path
 ) -> None:
-    command = [sys.executable, PROGRAM, *arguments, "--sim", "--headless"]
+    command = [sys.executable, str(PROGRAM), *arguments, "--sim", "--headless"]
     ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     threads = json.loads(ran.stdout[ran.stdout.index("\n{") :])
     assert {name for name, classes in threads.items() if URGENT in classes} == urgent, ran.stderr

@@ -53,8 +53,8 @@ class EpisodeDataset:
         Raises:
             RecorderError: if the dataset has another contract, or the file cannot be written.
         """
-        self.check(contract)
         if "fingerprint" in self._read():
+            self.check(contract)
             return
         facts = {"name": self._folder.name, "robot": robot, "robot_type": robot_type}
         with self._owned():

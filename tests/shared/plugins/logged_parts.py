@@ -13,14 +13,14 @@ import attrs
 from ibrobot_testing.fakes import FakePolicy, FakeRealHardware, FakeSensor, FakeTeleop
 
 from ibrobot_core import hookimpl
-from ibrobot_core.control import core, host
+from ibrobot_core.control import host, pose_motion
 from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, SensorDescriptor, TeleopDescriptor
 from ibrobot_core.errors import PolicyError, SensorError
 from ibrobot_core.interfaces import TeleopCommand, Torque
 from ibrobot_core.options import option
 
 # A way is gone by ticks: on a busy machine, which misses some, it takes longer.
-core._POSE_TIMEOUT_S = host._STOP_TIMEOUT_S = 60.0
+pose_motion.TIMEOUT_S = host._STOP_TIMEOUT_S = 60.0
 
 
 def block_main(number, frame):
