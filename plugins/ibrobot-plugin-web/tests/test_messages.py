@@ -149,6 +149,12 @@ def test_the_run_takes_only_messages_of_the_server(message: dict[str, Any]) -> N
     assert isinstance(found, Sent | StopRun | Pages | messages.Alive)
 
 
+@pytest.mark.parametrize("message", [StopRun(4), Pages(1, None), messages.Alive(), Sent(1, 2, Release())])
+def test_a_message_of_the_server_with_a_further_key_is_refused(message: Any) -> None:
+    with pytest.raises((ValueError, IbrobotError)):
+        from_server({**to_run(message), "event": "log"})
+
+
 @pytest.mark.parametrize("name", ["operate", "resign", "time", "estop", "log"])
 def test_commands_for_the_server_alone_do_not_reach_the_run(name: str) -> None:
     with pytest.raises((ValueError, IbrobotError)):
