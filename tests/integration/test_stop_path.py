@@ -61,10 +61,6 @@ def hold(run: Run) -> None:
     wait_for(holds, "the arm holds")
 
 
-def error_text(run: Run) -> str:
-    return (run.folder / "errors.txt").read_text()
-
-
 def end(run: Run) -> tuple[int, str]:
     run.host.send_signal(signal.SIGTERM)
     return run.end()
@@ -79,7 +75,7 @@ class TestHost:
         assert motion_s(run, stopped_ns) < LIMIT_S
         before = run.commands()[1][-1]
         run.host.send_signal(signal.SIGCONT)
-        wait_for(lambda: "fault" in error_text(run), "the run reports it")
+        wait_for(lambda: "fault" in run.errors(), "the run reports it")
         hold(run)
 
         np.testing.assert_array_equal(run.commands()[1][-1], before)
@@ -103,8 +99,8 @@ class TestControl:
     def test_stopped_by_sigstop_it_is_named_and_holds_when_it_goes_on(self, launch):
         run = launch()
         os.kill(run.control, signal.SIGSTOP)
-        wait_for(lambda: "is stopped, and STOP does not reach the robot" in error_text(run), "the host names it")
-        assert f"switch off the power of its motors, or `kill -CONT {run.control}` continues" in error_text(run)
+        wait_for(lambda: "is stopped, and STOP does not reach the robot" in run.errors(), "the host names it")
+        assert f"switch off the power of its motors, or `kill -CONT {run.control}` continues" in run.errors()
         os.kill(run.control, signal.SIGCONT)
         hold(run)
 
@@ -115,7 +111,7 @@ class TestControl:
     def test_stopped_by_sigstop_it_ends_with_the_run(self, launch):
         run = launch()
         os.kill(run.control, signal.SIGSTOP)
-        wait_for(lambda: "is stopped, and STOP" in error_text(run), "the host names it")
+        wait_for(lambda: "is stopped, and STOP" in run.errors(), "the host names it")
         _, error = end(run)
 
         assert not is_alive(run.control)
@@ -128,7 +124,7 @@ class TestControl:
         os.kill(run.control, signal.SIGKILL)
 
         assert run.host.wait(PATIENCE_S) == 1
-        assert errors_in(error_text(run)) == ["error: control: the control process died (killed by SIGKILL)"]
+        assert errors_in(run.errors()) == ["error: control: the control process died (killed by SIGKILL)"]
         assert is_alive(helper)
 
 
@@ -169,7 +165,7 @@ class TestThreads:
         status = run.host.wait(PATIENCE_S)
 
         assert status == 1
-        [line] = errors_in(error_text(run))
+        [line] = errors_in(run.errors())
         assert line.startswith("error: thread 'swing helper': ")
         wait_for(lambda: not is_alive(run.control), "the control process exits")
 
@@ -179,7 +175,7 @@ class TestThreads:
 
         times, _ = run.commands()
         assert status == 1
-        assert errors_in(error_text(run))[0] == (
+        assert errors_in(run.errors())[0] == (
             "error: teleop swing (swing): does not react for 6 s: STOP would be late there"
         )
         assert (times[-1] - run.moves()[-1]) * 1e-9 > 4.0
@@ -188,20 +184,20 @@ class TestThreads:
         run = launch("teleoperation.swing.trouble=exit")
 
         assert run.host.wait(PATIENCE_S) == 1
-        assert errors_in(error_text(run)) == [
+        assert errors_in(run.errors()) == [
             "error: mode:teleop: its thread was ended by SystemExit('a device ended it')"
         ]
 
     def test_the_main_thread_that_blocks_does_not_keep_ctrl_c_from_stopping_the_arm(self, launch):
         run = launch("teleoperation.swing.trouble=main")
-        wait_for(lambda: "the main thread is blocked" in error_text(run), "the main thread is blocked")
+        wait_for(lambda: "the main thread is blocked" in run.errors(), "the main thread is blocked")
         came_ns = time.monotonic_ns()
         run.host.send_signal(signal.SIGINT)
         hold(run)
 
         assert motion_s(run, came_ns) < 1.0 + LIMIT_S
         wait_for(
-            lambda: "fault: the run ends, but its main thread is busy; the robot holds" in error_text(run), "it says so"
+            lambda: "fault: the run ends, but its main thread is busy; the robot holds" in run.errors(), "it says so"
         )
         run.host.send_signal(signal.SIGINT)
         assert run.host.wait(PATIENCE_S) == 130

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 
 
 ROBOT = """
@@ -52,10 +52,10 @@ control: {rate_hz: 100, stop: hold}
 """
 
 
-def wait_for(condition: Callable[[], bool], what: str) -> None:
+def wait_for(condition: Callable[[], bool], what: str, why: Callable[[], str] = str) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
-        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE_S:.0f} s"
+        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE_S:.0f} s; {why()}"
         time.sleep(0.005)
 
 
@@ -98,6 +98,10 @@ class Run:
         _, positions = self.commands()
         return len(positions) > 20 and bool(np.abs(np.diff(positions[-3:], axis=0)).min() > 0.02)
 
+    def errors(self) -> str:
+        """Standard error so far."""
+        return (self.folder / "errors.txt").read_text()
+
     def find_control(self) -> None:
         """Learn the process ids of the host's children."""
         wait_for(lambda: len(self.log) > 10, "the arm has setpoints")
@@ -118,7 +122,7 @@ class Run:
         """Wait for the host to exit; its status and standard error."""
         status = self.host.wait(PATIENCE_S)
         wait_for(lambda: not is_alive(self.control), "the control process exits")
-        return status, (self.folder / "errors.txt").read_text()
+        return status, self.errors()
 
 
 @contextmanager
@@ -140,7 +144,8 @@ def logged_runs(site: Site, folder: Path) -> Iterator[Callable[..., Run]]:
         run = Run(folder, host)
         runs.append(run)
         if awaited:
-            wait_for(run.is_swinging, "the arm swings")
+            wait_for(lambda: run.is_swinging() or host.poll() is not None, "the arm swings", run.errors)
+            assert host.poll() is None, f"the run ended: {run.errors()}"
             run.find_control()
         return run
 
