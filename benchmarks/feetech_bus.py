@@ -30,6 +30,7 @@ from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.protocol import Packet
 from ibrobot_feetech.registers import STS3215
 from ibrobot_feetech.sync import SyncReader, SyncWriter
+from progress import in_rounds
 
 SERVOS = range(1, 7)
 GOALS = [2048] * len(SERVOS)
@@ -168,7 +169,7 @@ def measure(throttled: bool, rounds: int, calls: int) -> dict[str, Any]:
     cpu: dict[tuple[str, str], list[float]] = {}
     with ExitStack() as stack:
         clients = {name: make(_servos(throttled, stack), stack) for name, make in available().items()}
-        for number in range(rounds + 1):
+        for number in in_rounds(rounds + 1):
             for name, (read, write) in clients.items():
                 for what in ("read", "read+write"):
                     spans, begun = [], time.process_time()

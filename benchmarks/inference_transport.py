@@ -43,6 +43,7 @@ from ibrobot_serve.wire import WireKind, WireMessage, encode
 from ibrobot_testing import host_context
 from ibrobot_testing.ports import free_port
 from made_up import plugin
+from progress import in_rounds
 
 from ibrobot_core.config import load_config
 from ibrobot_core.inference.client import DispatchInfer, EngineClient
@@ -322,7 +323,7 @@ def run(given: argparse.Namespace, folder: Path) -> int:
     made = ("certs", certificates, "--server", "localhost", "--robot", "robot")
     subprocess.run([*ibrobot, *made], check=True, stdout=subprocess.DEVNULL)
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for number in range(ROUNDS):
+    for number in in_rounds(ROUNDS):
         for payload, way, row in measured(given, number, folder, certificates):
             found.setdefault((payload, way), []).append(row)
     rows = [summary(payload, way, rounds) for (payload, way), rounds in found.items()]

@@ -150,6 +150,7 @@ async def attack(address: str, count: int, seed: int) -> list[float]:
             if number % EVERY == 0:
                 # The one who drives is the attacker, then the operator: both may send anything.
                 times.append(await check(operator))
+                print(f"{number} of {count} messages", file=sys.stderr, flush=True)
                 if number % (2 * EVERY) == 0:
                     await attacker.call("operate", take_over=True)
         await attacks.close()

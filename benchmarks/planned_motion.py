@@ -41,6 +41,7 @@ from ibrobot_planning.execution.results import MoveResult
 from ibrobot_planning.world.objects import Box, World, WorldObject
 from planning import Referee
 from planning_scenes import ARM_JOINTS, Maker
+from progress import in_rounds
 
 from ibrobot_core.api import Pose, Vector, Vector3
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
@@ -328,7 +329,7 @@ def loop(seconds: float, *, planning: bool) -> dict[str, Any]:
 
 def lateness(pairs: int, seconds: float) -> bool:
     found: dict[str, list[dict[str, Any]]] = {"none": [], "planning": []}
-    for number in range(pairs):
+    for number in in_rounds(pairs, "pair"):
         # Each comes first in every second pair.
         for which in ("none", "planning") if number % 2 else ("planning", "none"):
             command = [sys.executable, __file__, "--only", which, "--seconds", str(seconds)]

@@ -29,6 +29,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+from progress import in_rounds
 
 from ibrobot_core.interfaces import Frame, Tensors
 
@@ -95,7 +96,7 @@ def measure(policy: LeRobotPolicy, count: int, rounds: int, clock: Callable[[], 
     together = [policy.postprocess(outputs) for outputs in policy.infer_batch(batch)]
     alone = [policy.postprocess(policy.infer(tensors)) for tensors in batch]
     single_ms, one_run_ms = [], []
-    for _ in range(rounds):
+    for _ in in_rounds(rounds):
         single_ms.append(timed(lambda: [policy.infer(tensors) for tensors in batch], clock))
         one_run_ms.append(timed(lambda: policy.infer_batch(batch), clock))
     single, one_run = np.median(single_ms), np.median(one_run_ms)

@@ -271,12 +271,10 @@ def main() -> int:
     parser.add_argument("--watermark", type=int, nargs="+", default=[5, 10, 15, 20, 25, 28, 30], help="[actions]")
     given = parser.parse_args()
     logging.disable(logging.CRITICAL)
-    runs = {
-        watermark: Fleet(given.robots, watermark, given.seconds, given.hiccup).phases()
-        for watermark in ("auto", *given.watermark)
-    }
-    for watermark, phases in runs.items():
-        print(json.dumps({"watermark": watermark, **phases}))
+    runs = {}
+    for watermark in ("auto", *given.watermark):
+        runs[watermark] = Fleet(given.robots, watermark, given.seconds, given.hiccup).phases()
+        print(json.dumps({"watermark": watermark, **runs[watermark]}), flush=True)
     auto = runs.pop("auto")
     problems = []
     for phase in ("before", "after"):

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import attrs
 import click
 
 from ibrobot_core.cli.options import run_options
-from ibrobot_core.errors import ConfigError, PluginError
+from ibrobot_core.errors import CalibrationError, ConfigError, PluginError, Problem
 from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed_plugins
+
+if TYPE_CHECKING:
+    from ibrobot_core.config import RobotConfig
 
 config_options = run_options("config", "sim", "overrides", "mode")
 
@@ -28,7 +31,9 @@ def config() -> None:
 @config.command()
 @config_options
 @click.option("--json", "as_json", is_flag=True, help="Print a list of {file, line, path, message}.")
-@click.option("--deep", is_flag=True, help="Also compare the models of all modes with the contract; loads no weights.")
+@click.option(
+    "--deep", is_flag=True, help="Also compare the models of all modes, without their weights, and want calibrations."
+)
 def check(
     config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None, as_json: bool, deep: bool
 ) -> None:
@@ -43,6 +48,9 @@ def check(
         found = load_config(path, overrides=overrides, mode=mode, sim=sim)
         modes = [name for name in found.control_modes if name not in found.unavailable]
         models = check_models(found, installed_plugins(), modes) if deep else []
+        uncalibrated = _uncalibrated(found)
+        if uncalibrated and deep:
+            raise ConfigError([Problem(found.source, 0, "hardware", uncalibrated)])
     except ConfigError as error:
         if not as_json:
             raise
@@ -61,8 +69,21 @@ def check(
         echo(f"note: {line}")
     if absent := describe_absent(absent_sensors(found, installed_plugins())):
         echo(f"note: runs start without {absent}")
+    if uncalibrated:
+        echo(f"note: {uncalibrated}")
     for line in models:
         echo(line)
+
+
+def _uncalibrated(config: RobotConfig) -> str:
+    """What is wrong with a calibration of the hardware; this machine may not be the robot's."""
+    from ibrobot_core.contract.joint_units import calibrations
+
+    try:
+        calibrations(config)
+    except CalibrationError as error:
+        return str(error)
+    return ""
 
 
 @config.command()

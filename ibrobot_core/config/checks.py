@@ -24,7 +24,7 @@ from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
 from ibrobot_core.descriptors import ExecutorDescriptor, TeleopDescriptor, TransportDescriptor
-from ibrobot_core.options import OptionFault
+from ibrobot_core.options import OptionFault, did_you_mean
 from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Joint, Robot
 from ibrobot_core.run_hooks import RUN_KEYS
@@ -112,6 +112,10 @@ class Checks:
                     self.document.add(key, str(error))
         for i, joint in enumerate(robot.joints):
             name = joint.name.removeprefix(robot.description.arm_of(joint.name))
+            for each in () if self.sections.simulated else known:  # the simulation has its own error
+                if each.joints and name not in each.joints:
+                    remark = did_you_mean(name, each.joints, "it has")
+                    self.document.add(("robot", "description", "mjcf"), f"the model has no joint {name!r}{remark}")
             limits = [each.limits[name] for each in known if name in each.limits]
             if limits and not joint.beyond_model:
                 self._within(("robot", "joints", i), joint, limits)

@@ -38,6 +38,8 @@ class DescriptionModel:
     """Candidates for the tip: sites of an MJCF, links of a URDF."""
     frame: str
     """The word for such a frame: site or link."""
+    joints: tuple[str, ...] = ()
+    """All joints of an MJCF; none for a URDF, which may describe a part of the robot."""
     links: tuple[str, ...] = ()
     """Bodies of an MJCF, links of a URDF."""
 
@@ -135,7 +137,7 @@ def read_urdf(path: Path) -> DescriptionModel:
                     lower, upper = (limit.numbers(name, "0", 1)[0] for name in ("lower", "upper"))
                     found[joint.attributes.get("name", "")] = Limits(lower, upper, f"{path.name}:{limit.line}")
     links = _names(root.children, "link")
-    return DescriptionModel(found, links, "link", links)
+    return DescriptionModel(found, links, "link", links=links)
 
 
 def read_mjcf(path: Path) -> DescriptionModel:
@@ -165,7 +167,9 @@ def read_mjcf(path: Path) -> DescriptionModel:
             lower, upper = attrs.evolve(joint, attributes=given).numbers("range", "0 0", 2)
             turn = math.pi / 180 if kind == "hinge" and compiler.get("angle", "degree") == "degree" else 1.0
             found[name] = Limits(lower * turn, upper * turn, f"{joint.file.name}:{joint.line}")
-    return DescriptionModel(found, _names(root.below(), "site"), "site", _names(root.below(), "body"))
+    joints = _names((joint for joint, _ in _mjcf_joints(root)), "joint")
+    sites, bodies = _names(root.below(), "site"), _names(root.below(), "body")
+    return DescriptionModel(found, sites, "site", joints, bodies)
 
 
 READERS: Mapping[str, Callable[[Path], DescriptionModel]] = {"mjcf": read_mjcf, "urdf": read_urdf}

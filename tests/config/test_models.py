@@ -40,6 +40,12 @@ MJCF = """<mujoco>
 </mujoco>
 """
 
+WHOLE = MJCF.replace(
+    '<joint name="plain"/>',
+    '<joint name="plain"/><joint name="lift" limited="false"/><joint name="grip" limited="false"/>',
+)
+"""With all joints of the robot."""
+
 
 def limits_of(model: DescriptionModel) -> dict[str, tuple[float, float]]:
     return {name: (limits.lower, limits.upper) for name, limits in model.limits.items()}
@@ -151,10 +157,19 @@ def test_a_limit_a_little_beyond_the_model_needs_a_word(load_text: Load, modelle
 def test_of_two_models_the_wider_one_counts(load_text: Load, modelled: str, tmp_path: Path) -> None:
     text = modelled.replace("name: pan, lower: -1.0", "name: pan, lower: -1.2")
     text = text.replace("    urdf:", "    mjcf: arm.xml\n    urdf:")
-    write(tmp_path, MJCF)
+    write(tmp_path, WHOLE)
     assert load_text(text).robot.joints[0].lower == -1.2
     ((_, _, message),) = problems(load_text, text.replace("lower: -1.2", "lower: -1.7"))
     assert "-1.5708 to 1.5708 rad (arm.xml:9)" in message
+
+
+def test_mjcf_without_a_joint_of_the_robot_is_refused_on_hardware(
+    load_text: Load, modelled: str, tmp_path: Path
+) -> None:
+    write(tmp_path, WHOLE.replace('name="pan"', 'name="pann"'))
+    text = modelled.replace("    urdf:", "    mjcf: arm.xml\n    urdf:")
+    ((_, path, message),) = problems(load_text, text)
+    assert (path, message) == ("robot.description.mjcf", "the model has no joint 'pan', did you mean 'pann'?")
 
 
 def test_a_model_that_cannot_be_read_is_a_fault_of_its_key(load_text: Load, modelled: str, tmp_path: Path) -> None:
@@ -171,5 +186,5 @@ def test_a_tip_that_no_model_has_is_refused(load_text: Load, modelled: str, tmp_
     assert path == "robot.description.tip"
     assert message == "unknown link 'griper_tip', did you mean 'gripper_tip'?"
     assert load_text(text.replace("griper", "gripper")).robot.description.tip == "gripper_tip"
-    write(tmp_path, MJCF.replace("</body>\n  </worldbody>", '<site name="griper_tip"/></body>\n  </worldbody>'))
+    write(tmp_path, WHOLE.replace("</body>\n  </worldbody>", '<site name="griper_tip"/></body>\n  </worldbody>'))
     assert load_text(text.replace("    urdf:", "    mjcf: arm.xml\n    urdf:")).robot.description.tip == "griper_tip"

@@ -312,6 +312,15 @@ TYPED = {
 """Command line -> its error."""
 
 
+@pytest.mark.parametrize(("deep", "code", "begin"), [((), 0, "note: "), (("--deep",), 2, "error: ")])
+def test_config_check_names_a_missing_calibration(
+    folder: Path, terminal: Terminal, deep: tuple[str, ...], code: int, begin: str
+) -> None:
+    found, out, err = terminal.run("config", "check", "so101_blind", *deep)
+    [line] = [line for line in (out + err).splitlines() if "there is no such calibration" in line]
+    assert (found, line.startswith(begin)) == (code, True)
+
+
 def test_recording_that_would_never_end_is_refused(folder: Path, terminal: Terminal) -> None:
     planned = ("--sim", "--mode", "moveit_planning", "--auto", "--lockstep")
     code, _, err = terminal.run("record", "so101_blind", *planned)
