@@ -64,7 +64,6 @@ from ibrobot_core.launch.session import (
 from ibrobot_core.launch.runtime import Runtime as Runtime
 from ibrobot_core.component import (
     Component as Component,
-    Worker as Worker,
     CONTROL as CONTROL,
     error_line as error_line,
     error_text as error_text,
@@ -78,7 +77,6 @@ from ibrobot_core.inference.build import build_policy as build_policy
 from ibrobot_core.launch.absence import absent_sensors as absent_sensors, describe_absent as describe_absent
 
 # Sources
-from ibrobot_core.launch.session import CommandSource as CommandSource
 from ibrobot_core.launch.sources.source_worker import SourceWorker as SourceWorker
 from ibrobot_core.launch.sources.policy import PolicySource as PolicySource
 from ibrobot_core.launch.sources.operator_devices import OperatorDevices as OperatorDevices
@@ -91,16 +89,15 @@ from ibrobot_core.bus import Bus as Bus, Subscription as Subscription, Received 
 from ibrobot_core.services import (
     Service as Service,
     NoRequest as NoRequest,
-    Plain as Plain,
     RequestLimits as RequestLimits,
 )
-from ibrobot_core.launch.runtime import SET_MODE as SET_MODE, SetMode as SetMode, ESTOP as ESTOP, RESET as RESET
+from ibrobot_core.launch.runtime import SET_MODE as SET_MODE, SetMode as SetMode, ESTOP as ESTOP
 from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
 from ibrobot_core.interfaces.policy import copied_tensors as copied_tensors
 
 # Episodes and datasets
 from ibrobot_core.ownership import Ownership as Ownership
-from ibrobot_core.interfaces import find_episode as find_episode, short_name as short_name
+from ibrobot_core.interfaces import find_episode as find_episode
 from ibrobot_core.contract.metadata import robot_metadata as robot_metadata
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler
 from ibrobot_core.selection import Selection as Selection, Leaf as Leaf, value_at as value_at
@@ -136,7 +133,6 @@ from ibrobot_core.errors import (
     Problem as Problem,
     RequestError as RequestError,
     ComponentFailed as ComponentFailed,
-    PluginError as PluginError,
     InUse as InUse,
     DiskFull as DiskFull,
     Declined as Declined,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.descriptors import Command, EngineDescriptor, ExecutorDescriptor, TransportDescriptor
 from ibrobot_core.errors import NotSupported
-from ibrobot_core.executor_options import PositionOptions
+from ibrobot_core.executor_options import StreamOptions
 from ibrobot_core.hookspecs import hookimpl
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def _local(options: Any, ctx: Context) -> Transport:
 def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
     """The executor for policies and teleoperation."""
     yield ExecutorDescriptor(
-        type="position", options=PositionOptions, make=_position, streams=True,
+        type="position", options=StreamOptions, make=_position, streams=True,
         summary="follows a stream of setpoints; holds when they go stale",
     )  # fmt: skip
 

@@ -16,9 +16,3 @@ class StreamOptions:
     safety_behavior: str = option(
         "hold", choices=("hold", "relax"), help="behaviour for stale setpoints, here or in the contract's action"
     )
-
-
-@documented
-@attrs.frozen
-class PositionOptions(StreamOptions):
-    """Options of `type: position`."""

@@ -8,7 +8,7 @@ from typing import ClassVar, override
 import numpy as np
 
 from ibrobot_core.control.spline import Spline, smooth_velocities
-from ibrobot_core.executor_options import PositionOptions
+from ibrobot_core.executor_options import StreamOptions
 from ibrobot_core.interfaces import Context, Executor, JointReading, Plan
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns, seconds
@@ -26,7 +26,7 @@ class PositionExecutor(Executor):
 
     accepts_plans: ClassVar[bool] = True
 
-    def __init__(self, options: PositionOptions, ctx: Context) -> None:
+    def __init__(self, options: StreamOptions, ctx: Context) -> None:
         self.joints = ctx.joints
         columns = ctx.robot.indices(ctx.joints)
         self._lower, self._upper = ctx.robot.lower[columns], ctx.robot.upper[columns]

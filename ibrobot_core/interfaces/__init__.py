@@ -39,7 +39,6 @@ from ibrobot_core.interfaces.reader import (
     Recorded,
     TopicSummary,
     find_episode,
-    short_name,
 )
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.interfaces.sensor import Sensor

@@ -79,18 +79,6 @@ def find_episode(path: Path) -> Path:
     return folder if folder.exists() else path
 
 
-def short_name(episode: Path) -> str:
-    """The shortest name of an episode that every command takes: `find_episode` gives its path."""
-    numbered = re.fullmatch(r"episode_(\d{6,})", episode.name)
-    if numbered is not None and episode.parent.name == "episodes":
-        dataset = episode.parents[1]
-        for name in (dataset.name, str(dataset)):
-            short = f"{name}:{int(numbered[1])}"
-            if find_episode(Path(short)) == episode:
-                return short
-    return str(episode)
-
-
 @attrs.frozen
 class EpisodeAddress:
     """The address of an episode."""

@@ -7,10 +7,10 @@ from typing import override
 from ibrobot_testing import ExecutorSuite
 
 from ibrobot_core.control.position import PositionExecutor
-from ibrobot_core.executor_options import PositionOptions
+from ibrobot_core.executor_options import StreamOptions
 
 
 class TestPosition(ExecutorSuite):
     @override
     def make(self, ctx):
-        return PositionExecutor(PositionOptions(), ctx)
+        return PositionExecutor(StreamOptions(), ctx)

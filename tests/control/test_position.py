@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.control.position import PositionExecutor
 from ibrobot_core.errors import GoalRejected
-from ibrobot_core.executor_options import PositionOptions
+from ibrobot_core.executor_options import StreamOptions
 from ibrobot_core.interfaces import Context, JointReading, Plan
 from ibrobot_core.robot import Joint, Robot
 
@@ -28,7 +28,7 @@ def make(**options: Any) -> PositionExecutor:
     context = Context(
         name="arm", clock=SteppedClock(), log=logging.getLogger("test"), robot=ROBOT, joints=("roll", "pan")
     )
-    return PositionExecutor(PositionOptions(**options), context)
+    return PositionExecutor(StreamOptions(**options), context)
 
 
 def reading(stamp_ns: int, *position: float) -> JointReading:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -26,7 +27,6 @@ def list_episodes(path: Path, as_json: bool) -> None:
     PATH is a folder of datasets (by default `episodes`), a dataset, or an episode. All commands take the names that it
     prints, e.g. pick:1.
     """
-    from ibrobot_core.app import short_name
     from ibrobot_mcap.commands.found import (
         date_of,
         duration_s,
@@ -75,7 +75,7 @@ def list_episodes(path: Path, as_json: bool) -> None:
             table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "prompt")
         for row in rows:
             table.add_row(
-                short_name(Path(str(row["path"]))),
+                _short_name(Path(str(row["path"]))),
                 str(row["date"])[0 if wide else 5 :],
                 f"{row['duration_s']:.1f}",
                 str(row["messages"]),
@@ -89,3 +89,17 @@ def list_episodes(path: Path, as_json: bool) -> None:
         echo(f"unreadable: {problem}", err=True)
     if problems:
         raise SystemExit(1)
+
+
+def _short_name(episode: Path) -> str:
+    """The shortest name of an episode that every command takes: `find_episode` gives its path."""
+    from ibrobot_core.app import find_episode
+
+    numbered = re.fullmatch(r"episode_(\d{6,})", episode.name)
+    if numbered is not None and episode.parent.name == "episodes":
+        dataset = episode.parents[1]
+        for name in (dataset.name, str(dataset)):
+            short = f"{name}:{int(numbered[1])}"
+            if find_episode(Path(short)) == episode:
+                return short
+    return str(episode)
