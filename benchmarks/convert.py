@@ -101,10 +101,14 @@ def record(folder: Path, frames: int, episode: int) -> None:
     contract = Contract(float(FPS), tuple(parts), (action,))
     recorder = McapRecorder(McapOptions(), host_context(clock=recorder_clock))
     metadata = {
-        "robot_type": "so101_follower", "prompt": "push the block", "contract": json.dumps(contract.canonical()),
-        "fingerprint": contract.fingerprint(), "config": "{}", "calibration": "{}",
+        "robot_type": "so101_follower",
+        "prompt": "push the block",
+        "contract": json.dumps(contract.canonical()),
+        "fingerprint": contract.fingerprint(),
+        "config": "{}",
+        "calibration": "{}",
         "uuid": uuid_of(episode),
-    }  # fmt: skip
+    }
     folder.parent.mkdir(parents=True, exist_ok=True)
     recorder.begin(EpisodeStart(folder, start_ns, contract.topics, metadata))
     for i, images in enumerate(zip(*streams(episode, frames), strict=True)):

@@ -36,14 +36,18 @@ POSITION_FIRST = 1e4
 """Radians that a metre counts: the nearest point is nearest in position, then in orientation."""
 ARMS = {
     "UR5, six joints": (
-        "ur5_gripper.urdf", "tool0", ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint",
-        "wrist_2_joint", "wrist_3_joint"), None,
+        "ur5_gripper.urdf",
+        "tool0",
+        ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
+        None,
     ),
     "Gen3, seven joints": (
-        "kinova_robotiq.urdf", "end_effector_link", tuple(f"joint_{number}" for number in range(1, 8)),
+        "kinova_robotiq.urdf",
+        "end_effector_link",
+        tuple(f"joint_{number}" for number in range(1, 8)),
         np.array([np.pi, 2.24, np.pi, 2.57, np.pi, 2.09, np.pi]),
     ),
-}  # fmt: skip
+}
 """Name -> URDF, link of the tip, joints, and their limits on both sides [rad] where the URDF has none."""
 
 

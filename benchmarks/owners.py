@@ -80,7 +80,7 @@ CONTRACT = Contract(
     30.0,
     (ObservationPart("observation.state", "/joint_states", STATE, ("position.pan",), None, Align(), PAN),),
     (ActionPart("arm", "/commands", COMMAND, "hold", ("pan",)),),
-)  # fmt: skip
+)
 STATES_LEGITIMATELY = (
     "there is no such", "is not an episode", "contains no episode", "already has a dataset", "is no longer there",
     "its trash has no", "the dataset has another state", "the dataset has this episode", "not an episode of a known",
@@ -95,9 +95,13 @@ def write(folder: Path, count: int, number: int, pause_s: float = 0.0) -> None:
     clock = RealClock() if pause_s else SteppedClock(START_NS)
     recorder = McapRecorder(McapOptions(min_free=0, chunk_period_s=0.02), host_context(clock=clock))
     metadata = {
-        "uuid": str(UUID(int=number, version=4)), "contract": json.dumps(CONTRACT.canonical()), "prompt": "pick",
-        "fingerprint": CONTRACT.fingerprint(), "config": "{}", "calibration": "{}",
-    }  # fmt: skip
+        "uuid": str(UUID(int=number, version=4)),
+        "contract": json.dumps(CONTRACT.canonical()),
+        "prompt": "pick",
+        "fingerprint": CONTRACT.fingerprint(),
+        "config": "{}",
+        "calibration": "{}",
+    }
     folder.parent.mkdir(parents=True, exist_ok=True)
     recorder.begin(EpisodeStart(folder, START_NS, CONTRACT.topics, metadata))
     try:
@@ -410,8 +414,11 @@ def told(what: str, tried: list[Any]) -> bool:
     codes = Counter(each.code for ended, _ in tried for each in ended)
     refused = sum("by process" in each.said for ended, _ in tried for each in ended if each.code)
     wrong = [fault for _, found in tried for fault in found]
-    print(f"{what:20} {len(tried):3} times: kept {codes[0]:3}, refused by an owner {refused:3}, killed {codes[-9]:3}, "
-          f"wrong {len(wrong)}", flush=True)  # fmt: skip
+    print(
+        f"{what:20} {len(tried):3} times: kept {codes[0]:3}, refused by an owner {refused:3}, killed {codes[-9]:3}, "
+        f"wrong {len(wrong)}",
+        flush=True,
+    )
     for fault, count in Counter(wrong).items():
         print(f"    {count} times: {fault}", flush=True)
     return not wrong

@@ -169,10 +169,14 @@ def perform(seed: int, speed: float = 1.0) -> Outcome:
     beyond = exceeded(config, command) + [f"safety: {name}" for name in corrected]
     message = "no result" if result is None else result.message
     return Outcome(
-        seed, success and result is not None and result.success, tuple(dict.fromkeys(touched)), tuple(beyond), message,
+        seed,
+        success and result is not None and result.success,
+        tuple(dict.fromkeys(touched)),
+        tuple(beyond),
+        message,
         0.0 if result is None else result.duration_s,
         hashlib.sha256(command.tobytes() + position.tobytes()).hexdigest(),
-    )  # fmt: skip
+    )
 
 
 def values(subscription: Subscription) -> list[Vector]:

@@ -171,8 +171,12 @@ def _cage(rng: Random) -> Scene:
 
 
 _SCENES: dict[str, Callable[[Random], Scene]] = {
-    "table_pick": _table_pick, "under_table": _under_table, "box": _open_box, "bookshelf": _bookshelf, "cage": _cage,
-}  # fmt: skip
+    "table_pick": _table_pick,
+    "under_table": _under_table,
+    "box": _open_box,
+    "bookshelf": _bookshelf,
+    "cage": _cage,
+}
 KINDS = tuple(_SCENES)
 
 

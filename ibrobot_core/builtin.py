@@ -37,9 +37,12 @@ def _local(options: Any, ctx: Context) -> Transport:
 def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
     """The executor for policies and teleoperation."""
     yield ExecutorDescriptor(
-        type="position", options=StreamOptions, make=_position, streams=True,
+        type="position",
+        options=StreamOptions,
+        make=_position,
+        streams=True,
         summary="follows a stream of setpoints; holds when they go stale",
-    )  # fmt: skip
+    )
 
 
 @hookimpl

@@ -6,9 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 RUN_KEYS: Mapping[str, str] = {
-    "esc": "emergency stop", "tab": "start and end of an episode", **{f"f{i}": "mode switch" for i in range(1, 10)},
-    "f10": "reset", "f11": "end of an episode", "f12": "end of an episode",
-}  # fmt: skip
+    "esc": "emergency stop",
+    "tab": "start and end of an episode",
+    **{f"f{i}": "mode switch" for i in range(1, 10)},
+    "f10": "reset",
+    "f11": "end of an episode",
+    "f12": "end of an episode",
+}
 """Key -> its meaning in every run; devices and sections may only use it for the same."""
 
 

@@ -74,8 +74,11 @@ def test_it_says_what_its_stream_is(pipe):
     aside = AsideStream(stream)
 
     assert (aside.fileno(), aside.isatty(), aside.encoding, aside.errors) == (
-        stream.fileno(), False, "utf-8", "strict",
-    )  # fmt: skip
+        stream.fileno(),
+        False,
+        "utf-8",
+        "strict",
+    )
     assert aside.writable()
     aside.end(PATIENCE_S)
 

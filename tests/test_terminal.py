@@ -226,8 +226,10 @@ def test_a_terminal_that_reports_all_keys_still_sends_signals(terminal, monkeypa
         subscriber = keys.subscribe()
         os.write(person, b"\x1b[99;5u\x1b[122;5:1u\x1b[92;5u\x1b[120;5ua")
         assert [sent.get(timeout=TIMEOUT_S) for _ in range(3)] == [
-            (0, signal.SIGINT), (0, signal.SIGTSTP), (0, signal.SIGQUIT),
-        ]  # fmt: skip
+            (0, signal.SIGINT),
+            (0, signal.SIGTSTP),
+            (0, signal.SIGQUIT),
+        ]
         assert subscriber.get(timeout=TIMEOUT_S) == "a"
 
 

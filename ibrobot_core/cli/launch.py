@@ -27,8 +27,11 @@ def launch(config: str | None, **options: Any) -> None:
     registry = installed_plugins()
     robot = load_config(
         find_config(config, registry),
-        overrides=run_overrides(options), mode=options["mode"], sim=options["sim"], registry=registry,
-    )  # fmt: skip
+        overrides=run_overrides(options),
+        mode=options["mode"],
+        sim=options["sim"],
+        registry=registry,
+    )
     check_end(robot, options)
     request = LaunchRequest(
         options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"]

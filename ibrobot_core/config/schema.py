@@ -489,9 +489,12 @@ class ControlConfig:
     priority: int = option(60, ge=1, le=99, help="SCHED_FIFO priority, if the machine permits it")
     state_timeout: float = option(0.1, unit="s", gt=0, help="time without a state from the hardware before a fault")
     peer_timeout: float = option(
-        0.3, unit="s", gt=0.0, le=10.0,
+        0.3,
+        unit="s",
+        gt=0.0,
+        le=10.0,
         help="longest motion while the host process, or the control loop, is stopped or blocked, braking included",
-    )  # fmt: skip
+    )
     following_error: Following = option(factory=Following, help="detection of joints that do not follow setpoints")
     load_shedding: Shedding = option(factory=Shedding, help="relief of joints that stay hot or overloaded")
 

@@ -251,9 +251,13 @@ def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
 
 
 def _recorded_action(
-    topic: str, type: str, joints: Sequence[str], select: Sequence[str] = (), align: str = "hold",
+    topic: str,
+    type: str,
+    joints: Sequence[str],
+    select: Sequence[str] = (),
+    align: str = "hold",
     max_age: float | None = None,
-) -> ActionPart:  # fmt: skip
+) -> ActionPart:
     max_age = None if max_age is None else _recorded_age(max_age)
     return ActionPart(topic, topic, type, "hold", tuple(joints), tuple(select), align, max_age)
 

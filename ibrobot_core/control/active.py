@@ -108,7 +108,11 @@ class ActiveExecutors:
         while (status := owned.executor.pop_status()) is not None:
             self._report(
                 {
-                    "event": "goal", "executor": owned.name, "goal": status.goal_id, "state": str(status.state),
-                    "message": status.message, "result": dict(status.result),
+                    "event": "goal",
+                    "executor": owned.name,
+                    "goal": status.goal_id,
+                    "state": str(status.state),
+                    "message": status.message,
+                    "result": dict(status.result),
                 }
-            )  # fmt: skip
+            )

@@ -234,9 +234,13 @@ class ControlClient(ControlHost):
         self._config = config
         self._clock = clock
         self._order = {
-            "document": config.complete, "source": str(config.source), "sim": config.simulated, "seed": seed,
-            "mode": config.default_control_mode, "epoch_offset_ns": clock.epoch_offset_ns,
-        }  # fmt: skip
+            "document": config.complete,
+            "source": str(config.source),
+            "sim": config.simulated,
+            "seed": seed,
+            "mode": config.default_control_mode,
+            "epoch_offset_ns": clock.epoch_offset_ns,
+        }
         self._on_death = on_death
         self._given_up = given_up or threading.Event()
         self._aftermath = aftermath
@@ -443,10 +447,13 @@ class ControlClient(ControlHost):
                 self._silence = self._describe_silence(child.pid, silent_s, stopped=stopped)
                 self._on_event(
                     {
-                        "event": "fault", "fault": self._silence, "then": "keeps the last command of its motors",
-                        "stamp_ns": self._clock.now_ns(), "generation": self._generation,
+                        "event": "fault",
+                        "fault": self._silence,
+                        "then": "keeps the last command of its motors",
+                        "stamp_ns": self._clock.now_ns(),
+                        "generation": self._generation,
                     }
-                )  # fmt: skip
+                )
                 # Whatever it was doing, it does not go on with it unasked.
                 self.raise_fault("the control process was silent")
                 self._let_go(self._silence)

@@ -136,9 +136,13 @@ class Dispatcher:
         holds = all(part.safety_behavior == "hold" for part in contract.action_parts)
         blends = options.joins_by == "ensemble"
         self._smoother = TemporalSmoother(
-            step_ns, len(joints), coeff=options.smoothing.temporal_ensemble_coeff, enabled=blends,
-            lead_in=lead_in if holds else None, continues=options.joins_by == "rtc",
-        )  # fmt: skip
+            step_ns,
+            len(joints),
+            coeff=options.smoothing.temporal_ensemble_coeff,
+            enabled=blends,
+            lead_in=lead_in if holds else None,
+            continues=options.joins_by == "rtc",
+        )
         self._latency = LatencyEstimate()
         """Total latency."""
         self._unqueued = LatencyEstimate()

@@ -82,9 +82,12 @@ class InferenceClient(ABC):
 
 
 def run_policy(
-    policy: Policy, engine: Engine, request: DispatchInfer, deadline_ns: int,
+    policy: Policy,
+    engine: Engine,
+    request: DispatchInfer,
+    deadline_ns: int,
     turn: contextlib.AbstractContextManager[object] = _ALONE,
-) -> Chunk:  # fmt: skip
+) -> Chunk:
     """Preprocess, infer and postprocess. If the policy raises, the chunk carries the error and the arm holds.
 
     Args:

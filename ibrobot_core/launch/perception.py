@@ -22,9 +22,12 @@ class SensorWorker(SessionWorker):
 
     def __init__(self, session: Session, peripheral: PeripheralConfig, needs: tuple[str, ...]) -> None:
         super().__init__(
-            session, f"sensor:{peripheral.name}", f"{peripheral.kind} {peripheral.type}", needs,
+            session,
+            f"sensor:{peripheral.name}",
+            f"{peripheral.kind} {peripheral.type}",
+            needs,
             ready_timeout_s=_READY_TIMEOUT_S,
-        )  # fmt: skip
+        )
         self._peripheral = peripheral
         self._sensor: Sensor | None = None
         self._received = 0

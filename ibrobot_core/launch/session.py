@@ -454,7 +454,11 @@ class SessionWorker(Worker):
         self, session: Session, name: str, summary: str, needs: tuple[str, ...] = (), *, ready_timeout_s: float = 60.0
     ) -> None:
         super().__init__(
-            name, summary, needs,
-            on_failure=session.fail, lockstep=session.request.lockstep, ready_timeout_s=ready_timeout_s,
-        )  # fmt: skip
+            name,
+            summary,
+            needs,
+            on_failure=session.fail,
+            lockstep=session.request.lockstep,
+            ready_timeout_s=ready_timeout_s,
+        )
         self.session = session

@@ -237,8 +237,12 @@ def test_dry_run_as_json(launch: Callable[..., Ran]):
     assert (ran.code, ran.err) == (0, "")
     plan = json.loads(ran.out)
     assert [component["name"] for component in plan["components"]] == [
-        "model:net", "control", "mode:policy", "status", "episodes",
-    ]  # fmt: skip
+        "model:net",
+        "control",
+        "mode:policy",
+        "status",
+        "episodes",
+    ]
     assert plan["components"][2]["needs"] == ["control", "model:net"]
     assert (plan["without"], len(plan["models"])) == ("", 1)
 
@@ -247,8 +251,12 @@ def test_dry_run_prints_the_plan(launch: Callable[..., Ran]):
     ran = launch(*LOCKSTEP, "--dry-run")
     assert (ran.code, ran.err) == (0, "")
     assert [line.split()[1] for line in ran.out.splitlines()[:-2]] == [
-        "model:net", "control", "mode:policy", "status", "episodes",
-    ]  # fmt: skip
+        "model:net",
+        "control",
+        "mode:policy",
+        "status",
+        "episodes",
+    ]
     assert ran.out.splitlines()[-1] == (
         "model net fits the contract: observation.state -> 1 joints in chunks of 10; "
         "what it was trained on is not known"

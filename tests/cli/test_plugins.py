@@ -33,9 +33,13 @@ def test_as_json_with_what_is_broken(ibrobot: Ibrobot, robot: Path, site: Site) 
     listed = json.loads(ibrobot("plugins", "--json").out)
 
     assert {
-        "kind": "sensor", "type": "fake_arm", "package": "fake-arm", "version": "1.0",
-        "summary": "the camera in its hand", "missing": None,
-    } in listed["plugins"]  # fmt: skip
+        "kind": "sensor",
+        "type": "fake_arm",
+        "package": "fake-arm",
+        "version": "1.0",
+        "summary": "the camera in its hand",
+        "missing": None,
+    } in listed["plugins"]
     assert {
         "plugin": "fake_broken",
         "package": "fake-broken",

@@ -87,10 +87,14 @@ def check(options: WiredOptions, robot: Robot, joints: tuple[str, ...]) -> Itera
 @pytest.fixture
 def registry(registry: Registry) -> Registry:
     wired = TeleopDescriptor(
-        "wired", lambda options, ctx: pytest.fail("it is only checked"), "a device", WiredOptions, check_options=check,
+        "wired",
+        lambda options, ctx: pytest.fail("it is only checked"),
+        "a device",
+        WiredOptions,
+        check_options=check,
         devices=lambda options: {"port": options.port},
         keys=lambda options, robot: {options.deadman: "deadman", options.stop: "emergency stop"},
-    )  # fmt: skip
+    )
     registry.entries["teleop", "wired"] = Entry("teleop", wired, "fake", "ibrobot-plugin-fake", "1.0")
     return registry
 

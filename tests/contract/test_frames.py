@@ -361,9 +361,13 @@ def test_a_foreign_message_without_a_header_needs_to_go_by_receipt(make_config: 
 
     def contract(stamp: str) -> Contract:
         spec = ObservationSpec(
-            "observation.touch", topic="/touch", type=Touch.ros_type, foreign=True, select=("hardness",),
+            "observation.touch",
+            topic="/touch",
+            type=Touch.ros_type,
+            foreign=True,
+            select=("hardness",),
             align=Align("hold", stamp),
-        )  # fmt: skip
+        )
         return Contract.from_config(make_config((spec,)))
 
     received = [("/touch", Touch(0.5), 7)]

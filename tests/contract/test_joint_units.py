@@ -64,11 +64,15 @@ def foreign(tmp_path: Path) -> Callable[[str], RobotConfig]:
     registry = discover([])
     described = (
         HardwareDescriptor(
-            "foreign_arm", never_made, "an arm", ForeignOptions,
-            calibration=lambda options: options.offsets, anchored=lambda options: options.closes,
+            "foreign_arm",
+            never_made,
+            "an arm",
+            ForeignOptions,
+            calibration=lambda options: options.offsets,
+            anchored=lambda options: options.closes,
         ),
         HardwareDescriptor("stick", never_made, "a stick"),
-    )  # fmt: skip
+    )
     for kind, descriptor in zip(("hardware", "teleop"), described, strict=True):
         registry.entries[kind, descriptor.type] = Entry(kind, descriptor, "test", "test", "0")
     offsets = write_calibration(MADE, tmp_path / "offsets.json")

@@ -265,9 +265,12 @@ COMMANDS: dict[str, dict[str, Any]] = {
     "halt": {"unmoved": False},
 }
 CAUSES = {
-    "estop": Cause.EMERGENCY_STOP, "fault": Cause.FAULT, "reset": Cause.RESET, "reset_episode": Cause.RESET,
+    "estop": Cause.EMERGENCY_STOP,
+    "fault": Cause.FAULT,
+    "reset": Cause.RESET,
+    "reset_episode": Cause.RESET,
     "halt": Cause.STOP,
-}  # fmt: skip
+}
 BRAKING = {(Phase.SHEDDING, "reset")}
 """Refused since the robot moves."""
 

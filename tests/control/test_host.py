@@ -90,9 +90,13 @@ def make(site: Site, reports: Reports) -> Iterator[Callable[..., ControlHost]]:
     made: list[ControlHost] = []
 
     def make_host(
-        kind: str = "process", startup: str = "hold", given_up: threading.Event | None = None, stop: str = "hold",
-        mode: str = "stream", **options: Any,
-    ) -> ControlHost:  # fmt: skip
+        kind: str = "process",
+        startup: str = "hold",
+        given_up: threading.Event | None = None,
+        stop: str = "hold",
+        mode: str = "stream",
+        **options: Any,
+    ) -> ControlHost:
         document = yaml.safe_load(DOCUMENT)
         document["simulation"] |= options
         document["control"] = {"startup": startup, "stop": stop}

@@ -14,8 +14,12 @@ PERIOD_NS = 10_000_000
 
 def test_nothing_was_counted_yet() -> None:
     assert Punctuality().summary() == {
-        "ticks": 0, "rate_hz": 0.0, "lateness_p50_us": 0, "lateness_p99_us": 0, "missed": 0,
-    }  # fmt: skip
+        "ticks": 0,
+        "rate_hz": 0.0,
+        "lateness_p50_us": 0,
+        "lateness_p99_us": 0,
+        "missed": 0,
+    }
 
 
 @given(late_us=st.lists(st.integers(0, 19_999), min_size=2, max_size=300))

@@ -47,11 +47,15 @@ def test_core_names_no_plugin() -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        'DEFAULT = "recording={type: mcap}"', "# as scripted_pick does", "pip install ibrobot-plugin-zenoh",
-        "import ibrobot_feetech", 'teleoperation: {jog: {type: keyboard}}', "see `ibrobot episodes verify`",
+        'DEFAULT = "recording={type: mcap}"',
+        "# as scripted_pick does",
+        "pip install ibrobot-plugin-zenoh",
+        "import ibrobot_feetech",
+        "teleoperation: {jog: {type: keyboard}}",
+        "see `ibrobot episodes verify`",
         'config.plugin_sections["metrics"]',
     ],
-)  # fmt: skip
+)
 def test_a_plugin_named_in_core_is_found(line: str) -> None:
     assert named(f"first = 1\n{line}") == [f":2: {line}"]
 

@@ -48,9 +48,13 @@ def arm(endpoint: str) -> Iterator[Runtime]:
     """A simulated SO-101 with a table, which shares its services."""
     registry = installed_plugins()
     config = load_config(
-        find_config("so101_blind", registry), sim=True, mode="moveit_planning", registry=registry,
+        find_config("so101_blind", registry),
+        sim=True,
+        mode="moveit_planning",
+        registry=registry,
         overrides=(
-            "simulation.scene=empty", "simulation.start_pose=home",
+            "simulation.scene=empty",
+            "simulation.start_pose=home",
             "control_modes.moveit_planning.planner={type: rrt_connect}",
             "world={objects: {table: {shape: box, size: [0.8, 0.8, 0.02], position: [0.2, 0, -0.05]}}}",
             f"transport={{type: zenoh, mode: router, listen: [{endpoint}], shared_memory: false, namespace: arm1, "
@@ -59,7 +63,7 @@ def arm(endpoint: str) -> Iterator[Runtime]:
             "teleoperation.twist={type: twist}",
             "control_modes.servo={executors: [arm_position, gripper_position], teleop: twist}",
         ),
-    )  # fmt: skip
+    )
     runtime = Runtime(Session(config, registry, LaunchRequest()))
     try:
         runtime.start()

@@ -48,9 +48,13 @@ def run(ibrobot: tuple[str, ...]) -> Run:
             done = run_here(*arguments)
         else:
             done = subprocess.run(
-                [*ibrobot, *map(str, arguments)], capture_output=True, text=True, timeout=120, check=False,
+                [*ibrobot, *map(str, arguments)],
+                capture_output=True,
+                text=True,
+                timeout=120,
+                check=False,
                 preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest)),
-            )  # fmt: skip
+            )
         assert "Traceback" not in done.stderr, done.stderr
         return Ran(done.returncode, done.stdout, done.stderr)
 

@@ -38,8 +38,12 @@ def test_twists_from_another_process_move_the_tool(tmp_path: Path, ibrobot: tupl
     document["teleoperation"]["twist"] = {"type": "twist"}
     share = {"publish": ["/robot_status/ee_pose"], "subscribe": ["/servo_node/delta_twist_cmds"]}
     document["transport"] = {
-        "type": "zenoh", "mode": "router", "listen": [endpoint], "namespace": "arm1", "share": share,
-    }  # fmt: skip
+        "type": "zenoh",
+        "mode": "router",
+        "listen": [endpoint],
+        "namespace": "arm1",
+        "share": share,
+    }
     config = tmp_path / "robot.yaml"
     config.write_text(yaml.safe_dump(document))
     run = [*ibrobot, "launch", str(config), "--sim", "--headless", "--mode", "servo", "--json"]

@@ -237,8 +237,12 @@ def test_recording_says_which_policy_acts_with_which_weights(runs: Runs, monkeyp
     policy = json.loads(notes.begun[0].metadata["policy"])
     fingerprint = runs.parts.MADE["net"].fingerprint()
     assert policy == {
-        "model": "net", "type": "net", "fingerprint": fingerprint, "weights": "a1", "execution_mode": "monolithic"
-    }  # fmt: skip
+        "model": "net",
+        "type": "net",
+        "fingerprint": fingerprint,
+        "weights": "a1",
+        "execution_mode": "monolithic",
+    }
     runtime.session.episodes.end("unknown")
     runtime.switch_mode("teleop")
     ticks(runtime, 2)

@@ -109,9 +109,13 @@ def test_one_that_cannot_start_is_named_and_those_before_it_stop(
     assert str(failure.value).partition(" (a bug at ")[0] == expected
     assert failure.value.exit_code == 1
     assert happened == [
-        "start control", "start sensor:top", "start sensor:side",
-        "stop sensor:side", "stop sensor:top", "stop control",
-    ]  # fmt: skip
+        "start control",
+        "start sensor:top",
+        "start sensor:side",
+        "stop sensor:side",
+        "stop sensor:top",
+        "stop control",
+    ]
     assert runs.parts.CALLS == ["open top", "close side", "close top"]
 
 

@@ -194,12 +194,16 @@ class TestOneAtATime:
     def test_what_waits_when_a_stop_comes_is_refused(self, slow: Slow):
         run = slow.run
         raised = slow.concurrently(
-            lambda: run.switch_mode("policy"), run.reset, lambda: run.switch_mode("plan"),
+            lambda: run.switch_mode("policy"),
+            run.reset,
+            lambda: run.switch_mode("plan"),
             meanwhile=run.session.emergency_stop,
-        )  # fmt: skip
+        )
         assert sorted(raised) == [
-            f"mode plan: {AFTER}", f"reset: {AFTER}", "switch_mode: refused before a reset: emergency stop",
-        ]  # fmt: skip
+            f"mode plan: {AFTER}",
+            f"reset: {AFTER}",
+            "switch_mode: refused before a reset: emergency stop",
+        ]
         assert is_stopped(run)
         assert run.session.mode == "teleop"
 
@@ -274,9 +278,11 @@ class TestDevices:
     @pytest.mark.parametrize("mode", ["teleop", "policy"])
     def test_one_can_stop_the_robot_on_its_way_to_the_stop_pose(self, runs: Runs, mode: str):
         runtime = runs.start(
-            "control_modes.teleop.teleop=lever", "control_modes.policy.inference={model: net, intervene: lever}",
-            "control.stop=pose up", mode=mode,
-        )  # fmt: skip
+            "control_modes.teleop.teleop=lever",
+            "control_modes.policy.inference={model: net, intervene: lever}",
+            "control.stop=pose up",
+            mode=mode,
+        )
         lever = runs.parts.MADE["lever"]
         source: Any = runtime.session.command_source
         control: Any = runtime.session.control
@@ -292,9 +298,10 @@ class TestDevices:
     @pytest.mark.parametrize("mode", ["teleop", "policy"])
     def test_one_that_blocks_is_noticed(self, runs: Runs, mode: str):
         runtime = runs.start(
-            "control_modes.teleop.teleop=lever", "control_modes.policy.inference={model: net, intervene: lever}",
+            "control_modes.teleop.teleop=lever",
+            "control_modes.policy.inference={model: net, intervene: lever}",
             mode=mode,
-        )  # fmt: skip
+        )
         (pulse,) = runtime.session.pulses
         assert pulse.name == "teleop lever (lever)"
         steps(runtime)

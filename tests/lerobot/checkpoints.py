@@ -173,9 +173,13 @@ def language_model(path: Path) -> Path:
         "num_attention_heads": 4, "num_key_value_heads": 2, "vocab_size": len(_WORDS), "pad_token_id": 1,
     }  # fmt: skip
     vision = {
-        "hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 32,
+        "hidden_size": 16,
+        "intermediate_size": 16,
+        "num_hidden_layers": 1,
+        "num_attention_heads": 2,
+        "image_size": 32,
         "patch_size": 8,
-    }  # fmt: skip
+    }
     SmolVLMConfig(
         text_config=text, vision_config=vision, scale_factor=2, image_token_id=2, pad_token_id=1
     ).save_pretrained(path)

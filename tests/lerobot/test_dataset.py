@@ -71,9 +71,13 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("bags")
     for number, seconds in ((1, 1.5), (2, 0.8), (3, 2.1)):
         record(
-            root / f"episode_{number:06d}", number, seconds, "sort the blocks" if number == 2 else "pick the cube",
-            outcome=OUTCOMES[number], commanders=COMMANDERS[number],
-        )  # fmt: skip
+            root / f"episode_{number:06d}",
+            number,
+            seconds,
+            "sort the blocks" if number == 2 else "pick the cube",
+            outcome=OUTCOMES[number],
+            commanders=COMMANDERS[number],
+        )
     # The first conversion starts a process, and opens memory, that live as long as the interpreter.
     convert(
         ConversionRequest(tmp_path_factory.mktemp("first") / "set", LeRobotOptions(videos=False), "lerobot"),

@@ -53,11 +53,15 @@ class Status(SessionWorker):
         session = self.session
         dispatch = {name: getattr(session.acting.dispatch, name) for name in _OF_DISPATCH} if session.acting else {}
         return RobotStatus(
-            Header(now_ns), session.config.robot.name, session.mode,
+            Header(now_ns),
+            session.config.robot.name,
+            session.mode,
             active_executors=session.config.control_modes[session.mode].executors,
-            estop=session.state is not None and session.state.estop, faults=session.faults,
-            episode=session.outcome.episodes + 1, **dispatch,
-        )  # fmt: skip
+            estop=session.state is not None and session.state.estop,
+            faults=session.faults,
+            episode=session.outcome.episodes + 1,
+            **dispatch,
+        )
 
     def _diagnostics(self, now_ns: int) -> DiagnosticArray:
         session = self.session

@@ -72,9 +72,12 @@ class LoadedModel(Component):
         """Name and weights of the policy, for recordings."""
         model, engine = self._model, self.engine
         return {
-            "model": model.name, "type": model.type, "fingerprint": self.policy.fingerprint(),
-            "weights": engine.stats.weights, "execution_mode": engine.stats.mode,
-        }  # fmt: skip
+            "model": model.name,
+            "type": model.type,
+            "fingerprint": self.policy.fingerprint(),
+            "weights": engine.stats.weights,
+            "execution_mode": engine.stats.mode,
+        }
 
     @override
     def start(self) -> None:

@@ -140,9 +140,13 @@ def _solutions(
     for starts in _rounds(model, target, start, near_misses, every):
         first = search(model, target, starts, position_weight=weight, iterations=_SHORT)
         found = search(
-            model, target, first.best(len(starts) if every else _BEST, weight), position_weight=weight,
-            iterations=_LONG, stop_within=None if every else tolerances,
-        )  # fmt: skip
+            model,
+            target,
+            first.best(len(starts) if every else _BEST, weight),
+            position_weight=weight,
+            iterations=_LONG,
+            stop_within=None if every else tolerances,
+        )
         solved = found.joints[found.within(*tolerances)]
         if len(solved):
             nearest_first = solved[np.argsort(((solved - start) ** 2).sum(axis=1), kind="stable")]

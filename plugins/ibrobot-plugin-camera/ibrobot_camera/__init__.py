@@ -54,10 +54,14 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         check_options=_check, summary="V4L2 device, RTSP or HTTP stream, or video file",
     )  # fmt: skip
     yield SensorDescriptor(
-        type="realsense", options=RealSenseOptions, make=_realsense, check=_find_librealsense, devices=realsense_stream,
+        type="realsense",
+        options=RealSenseOptions,
+        make=_realsense,
+        check=_find_librealsense,
+        devices=realsense_stream,
         picture=picture_size,
         summary="Intel RealSense: colour, or aligned depth",
-    )  # fmt: skip
+    )
 
 
 def _decoder() -> Callable[[CompressedImage], Image | None]:

@@ -88,9 +88,13 @@ def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
     help="Keep only the rows that the operator or the policy commanded; each stretch becomes an episode.",
 )
 @click.option(
-    "--context", type=click.FloatRange(min=0), default=_CONTEXT, show_default=True, metavar="S",
+    "--context",
+    type=click.FloatRange(min=0),
+    default=_CONTEXT,
+    show_default=True,
+    metavar="S",
     help="Seconds to keep before and after an intervention, for --only interventions.",
-)  # fmt: skip
+)
 @click.option("--success", is_flag=True, help="Add next.success: true in the last row of a success.")
 @click.option(
     "--jobs",

@@ -22,9 +22,12 @@ def conversion(request: ConversionRequest) -> dict[str, Any]:
     options = attrs.asdict(request.options)
     labels = {"labels": True} if request.labels else {}
     settings = {
-        "writer": request.type, "options": options, "norm_mode": request.norm_mode, "success": request.success,
+        "writer": request.type,
+        "options": options,
+        "norm_mode": request.norm_mode,
+        "success": request.success,
         "missing": request.missing,
-    }  # fmt: skip
+    }
     return settings | labels
 
 
@@ -48,10 +51,14 @@ def provenance(
         ]
     contract = before.get("contract", units[0].contract)
     run = {
-        "episodes": len(episodes) - len(before.get("episodes", ())), "only": request.only, "context": request.context,
-        "outcomes": list(request.outcomes), "prompt": request.prompt,
-        "calibration": _file(calibrations, request.calibration or {}), "failed": list(failed),
-    }  # fmt: skip
+        "episodes": len(episodes) - len(before.get("episodes", ())),
+        "only": request.only,
+        "context": request.context,
+        "outcomes": list(request.outcomes),
+        "prompt": request.prompt,
+        "calibration": _file(calibrations, request.calibration or {}),
+        "failed": list(failed),
+    }
     return {
         "robot_type": before.get("robot_type", units[0].robot_type), "contract": contract,
         "fingerprint": Contract.from_canonical(contract).fingerprint(), "conversion": conversion(request),

@@ -73,9 +73,13 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
         prompt=prompt or "", by_operator=True,
     )  # fmt: skip
     run_robot(
-        robot, request, headless=options["headless"], dry_run=options["dry_run"], as_json=options["as_json"],
+        robot,
+        request,
+        headless=options["headless"],
+        dry_run=options["dry_run"],
+        as_json=options["as_json"],
         make_hooks=operator,
-    )  # fmt: skip
+    )
 
 
 def _recorded(config: str | None, dataset: str | None, root: Path | None, options: dict[str, Any]) -> RobotConfig:

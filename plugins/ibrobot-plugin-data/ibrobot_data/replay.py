@@ -43,9 +43,13 @@ _MODE = "replay"
 @click.argument("episode", type=EpisodePath())
 @run_options("config", "sim", "lockstep")
 @click.option(
-    "--speed", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, metavar="X",
+    "--speed",
+    type=click.FloatRange(min=0, min_open=True),
+    default=1.0,
+    show_default=True,
+    metavar="X",
     help="Speed; 0.5 plays at half the recorded speed.",
-)  # fmt: skip
+)
 @click.option("--force-contract", is_flag=True, help="Replay even if the observations of CONFIG differ.")
 @click.option("--any-robot", is_flag=True, help="Replay even if robot, robot type or calibration differ.")
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of joints in a dataset that does not state it.")

@@ -163,9 +163,13 @@ class ReplaySource(SourceWorker):
             times = np.array([elapsed_ns for elapsed_ns, _ in self._measured]) / NS_PER_S * replay.speed
             tracking = replay.playback.tracking(Track(times, np.stack([position for _, position in self._measured])))
         return {
-            "source": replay.source, "speed": replay.speed, "recorded_s": round(replay.playback.duration, 3),
-            "recorded_outcome": replay.playback.outcome, "success": self._success, "tracking": tracking,
-        }  # fmt: skip
+            "source": replay.source,
+            "speed": replay.speed,
+            "recorded_s": round(replay.playback.duration, 3),
+            "recorded_outcome": replay.playback.outcome,
+            "success": self._success,
+            "tracking": tracking,
+        }
 
     @override
     def help(self) -> str:

@@ -167,9 +167,13 @@ class _Job:
         return contract
 
     def _write(
-        self, reader: EpisodeReader, summary: EpisodeSummary, contract: Contract, prompt: str,
+        self,
+        reader: EpisodeReader,
+        summary: EpisodeSummary,
+        contract: Contract,
+        prompt: str,
         progress: Callable[[int], None],
-    ) -> int:  # fmt: skip
+    ) -> int:
         metadata = {
             "ibrobot_version": ibrobot_core.__version__,
             **summary.metadata,

@@ -346,8 +346,12 @@ class FeetechFollower(Hardware):
             if lower < low - 0.1 or upper > high + 0.1:
                 self._ctx.log.warning(
                     "%s: its calibrated range is %.2f to %.2f rad, its limits are %.2f to %.2f: it stops at the range",
-                    joint, low, high, lower, upper,
-                )  # fmt: skip
+                    joint,
+                    low,
+                    high,
+                    lower,
+                    upper,
+                )
 
 
 def _reach(elapsed_s: Vector) -> Vector:

@@ -37,13 +37,21 @@ def _events(options: Any) -> Collection[OperatorEvent]:
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """Jog with the hands on a device."""
     yield TeleopDescriptor(
-        type="gamepad", options=GamepadOptions, make=_jog, check_options=_check, events=_events,
+        type="gamepad",
+        options=GamepadOptions,
+        make=_jog,
+        check_options=_check,
+        events=_events,
         summary="joint and tool jog with an Xbox, PlayStation, Switch, 8BitDo or other pad",
-    )  # fmt: skip
+    )
     yield TeleopDescriptor(
-        type="spacemouse", options=SpaceMouseOptions, make=_jog, check_options=_check, events=_events,
+        type="spacemouse",
+        options=SpaceMouseOptions,
+        make=_jog,
+        check_options=_check,
+        events=_events,
         summary="joint and tool jog with a SpaceMouse",
-    )  # fmt: skip
+    )
 
 
 def _commands() -> click.Command:

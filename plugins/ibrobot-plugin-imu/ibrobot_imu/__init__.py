@@ -22,10 +22,14 @@ def _imu(options: ImuOptions, ctx: Context) -> Teleop:
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """The teleop `imu`."""
     yield TeleopDescriptor(
-        type="imu", options=ImuOptions, make=_imu, check_options=check_imu, devices=serial_port,
+        type="imu",
+        options=ImuOptions,
+        make=_imu,
+        check_options=check_imu,
+        devices=serial_port,
         keys=imu_keys,
         summary="moves the tool by the tilt of an orientation sensor (BNO08x, WitMotion)",
-    )  # fmt: skip
+    )
 
 
 @hookimpl

@@ -34,6 +34,10 @@ def _keys(options: Any, robot: Robot) -> Mapping[str, str]:
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """Jog from the terminal."""
     yield TeleopDescriptor(
-        type="keyboard", options=KeyboardOptions, make=_keyboard, check_options=_check, keys=_keys,
+        type="keyboard",
+        options=KeyboardOptions,
+        make=_keyboard,
+        check_options=_check,
+        keys=_keys,
         summary="joint and Cartesian jog from the terminal",
-    )  # fmt: skip
+    )

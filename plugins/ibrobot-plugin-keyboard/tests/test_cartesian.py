@@ -16,10 +16,14 @@ from ibrobot_testing import host_context
 from ibrobot_core.api import Description, Joint, JointReading, Robot, TeleopError, Vector, ns
 
 LINKS = {
-    "pan": ("0 0 1", "0 0 0.05"), "lift": ("0 1 0", "0 0 0.05"), "elbow": ("0 1 0", "0.15 0 0"),
-    "flex": ("0 1 0", "0.15 0 0"), "heading": ("0 0 1", "0.01 0 0"), "roll": ("1 0 0", "0.05 0 0"),
+    "pan": ("0 0 1", "0 0 0.05"),
+    "lift": ("0 1 0", "0 0 0.05"),
+    "elbow": ("0 1 0", "0.15 0 0"),
+    "flex": ("0 1 0", "0.15 0 0"),
+    "heading": ("0 0 1", "0.01 0 0"),
+    "roll": ("1 0 0", "0.05 0 0"),
     "gripper": ("0 0 1", "0.03 0.01 0"),
-}  # fmt: skip
+}
 """Joint -> axis, and where its body is; with `heading` the arm has six."""
 BENT = {"pan": 0.3, "lift": -0.6, "elbow": 1.1, "flex": 0.2, "heading": 0.1, "roll": 0.2, "gripper": 0.4}
 DT = 0.01

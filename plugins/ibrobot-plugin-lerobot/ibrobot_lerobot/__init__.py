@@ -42,13 +42,17 @@ def _policy(options: Any, ctx: Context) -> Policy:
 def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
     """The writer of LeRobot datasets."""
     yield DatasetDescriptor(
-        type="lerobot", options=LeRobotOptions, make=_write, default=True, summary="LeRobot v3.0: videos and tables",
+        type="lerobot",
+        options=LeRobotOptions,
+        make=_write,
+        default=True,
+        summary="LeRobot v3.0: videos and tables",
         flags=(
             Flag("--codec", "codec", "Video encoder, e.g. h264; auto uses a GPU's if available."),
             Flag("--crf", "crf", "Video quality; lower values give better quality and larger files."),
             Flag("--no-videos", "videos", "Store lossless images, as PNG in the tables.", "false"),
         ),
-    )  # fmt: skip
+    )
 
 
 @hookimpl

@@ -221,9 +221,13 @@ class _Merge:
             task_numbers = tasks[[part.tasks.index(task) for task in row["tasks"]]]
             stats |= counter_stats(n, self._info["fps"], self._frame, self._episode, np.resize(task_numbers, n))
             moved: dict[str, Any] = {
-                "episode_index": self._episode, "tasks": row["tasks"], "length": n, **_indices("data", place),
-                "dataset_from_index": self._frame, "dataset_to_index": self._frame + n,
-            }  # fmt: skip
+                "episode_index": self._episode,
+                "tasks": row["tasks"],
+                "length": n,
+                **_indices("data", place),
+                "dataset_from_index": self._frame,
+                "dataset_to_index": self._frame + n,
+            }
             for key, places in videos.items():
                 file, begin_s = places[_number(row, f"videos/{key}")]
                 moved |= _indices(f"videos/{key}", file)

@@ -42,9 +42,13 @@ class PolicyModel:
     """
 
     def __init__(
-        self, checkpoint: Checkpoint, options: LeRobotPolicyOptions, steps: Steps, pictures: Sequence[str],
+        self,
+        checkpoint: Checkpoint,
+        options: LeRobotPolicyOptions,
+        steps: Steps,
+        pictures: Sequence[str],
         log: logging.Logger,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._checkpoint = checkpoint
         self._device = torch.device(_device(options.device))
         self._steps = steps.of(lambda array: torch.from_numpy(np.array(array)).to(self._device))

@@ -35,9 +35,10 @@ _SMALL = (
 _NORMALISED = {"VISUAL": "MEAN_STD", "STATE": "MEAN_STD", "ENV": "MEAN_STD", "ACTION": "MEAN_STD"}
 """LeRobot's ACT does not normalise ENV, the poses of objects in metres, which it would hardly see then."""
 _PHASES = {
-    "Creating dataset": "opening the dataset", "Creating policy": "making the policy",
+    "Creating dataset": "opening the dataset",
+    "Creating policy": "making the policy",
     "Start offline training": "training",
-}  # fmt: skip
+}
 """Text in the output of `lerobot-train` -> what it does from then on, for events. Loading torch comes first."""
 _REPORTS = 200
 """Reports of progress in a training."""

@@ -89,9 +89,7 @@ def interrupted(
     """
     stopped = dataset.parent / f"stopped-{stop_at}"
     words = ["--out", out, "--steps", 100, f"--stop_at={stop_at}", f"--stopped={stopped}"]
-    command = (
-        sys.executable, "-c", SCRIPT, str(dataset.parent / "lerobot-train"), str(dataset), *map(str, words)
-    )  # fmt: skip
+    command = (sys.executable, "-c", SCRIPT, str(dataset.parent / "lerobot-train"), str(dataset), *map(str, words))
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         while not stopped.exists():
             assert process.poll() is None

@@ -37,9 +37,13 @@ class Rewritten:
 
 
 def rewrite(
-    source: Path, target: Path, *, begin_ns: int | None = None, end_ns: int | None = None,
+    source: Path,
+    target: Path,
+    *,
+    begin_ns: int | None = None,
+    end_ns: int | None = None,
     marks: Mapping[str, str] | None = None,
-) -> Rewritten:  # fmt: skip
+) -> Rewritten:
     """Copy the messages of an episode to a new one.
 
     Args:

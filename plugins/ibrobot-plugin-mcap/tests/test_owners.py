@@ -42,12 +42,14 @@ def content(folder):
 @pytest.mark.parametrize(
     "command",
     [
-        ("mark", "EPISODE", "failure"), ("trim", "EPISODE", "--in-place", "--to", "0.5"),
-        ("trim", "EPISODE", "--to", "0.5", "-o", "part"), ("delete", "EPISODE", "--yes"),
+        ("mark", "EPISODE", "failure"),
+        ("trim", "EPISODE", "--in-place", "--to", "0.5"),
+        ("trim", "EPISODE", "--to", "0.5", "-o", "part"),
+        ("delete", "EPISODE", "--yes"),
         ("delete", "EPISODE", "--to-trash"),
     ],
     ids=" ".join,
-)  # fmt: skip
+)
 def test_no_command_changes_an_episode_that_is_being_recorded(tmp_path, episode, command, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before = content(episode)

@@ -162,9 +162,13 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
     )  # fmt: skip
     # A plane has contacts everywhere; its size only affects rendering.
     world.add_geom(
-        name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, pos=[0.15, 0, 0], size=[0.6, 0.6, 0.05],
-        rgba=[0.72, 0.70, 0.66, 1], friction=[1, 0.005, 0.0001],
-    )  # fmt: skip
+        name=TABLE,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        pos=[0.15, 0, 0],
+        size=[0.6, 0.6, 0.05],
+        rgba=[0.72, 0.70, 0.66, 1],
+        friction=[1, 0.005, 0.0001],
+    )
 
 
 def _add_cube(spec: mujoco.MjSpec, size: float) -> None:
@@ -200,9 +204,13 @@ def _add_thing(spec: mujoco.MjSpec, name: str, thing: SceneThing) -> None:
         body.add_freejoint(name=name)
     sizes = [each / 2 for each in thing.size or ()] or [thing.radius or 0.0, (thing.height or 0.0) / 2, 0.0]
     body.add_geom(
-        name=name, type=_SHAPES[thing.shape], size=sizes, mass=thing.mass or 1.0, friction=[1, 0.005, 0.0001],
+        name=name,
+        type=_SHAPES[thing.shape],
+        size=sizes,
+        mass=thing.mass or 1.0,
+        friction=[1, 0.005, 0.0001],
         rgba=[0.35, 0.55, 0.35, 1],
-    )  # fmt: skip
+    )
 
 
 def _add_camera(spec: mujoco.MjSpec, camera: SceneCamera) -> None:

@@ -159,9 +159,13 @@ def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """The sections `world` and `tasks`."""
     yield SectionDescriptor(
-        type="world", options=WorldOptions, make=_world, check=find_engines, check_options=_check_world,
+        type="world",
+        options=WorldOptions,
+        make=_world,
+        check=find_engines,
+        check_options=_check_world,
         summary="what planners avoid: boxes, spheres, cylinders, meshes, planes, point clouds; services change it",
-    )  # fmt: skip
+    )
     yield SectionDescriptor(
         type="tasks", make=_tasks, summary="services of a run that perform tasks, with a mode with a planner"
     )

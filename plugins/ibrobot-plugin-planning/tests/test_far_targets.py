@@ -58,10 +58,12 @@ def test_every_service(run: Runtime, far: float):
     bus: Any = run.session.bus
     goal = {"xyz": [far, 0, 0], "axis": [0, 0, -1]}
     for answer in (
-        bus.call(COMPUTE_IK, {"goal": goal}), bus.call(PLAN, {"goals": [goal]}), bus.call(PLAN_GOAL, f"xyz={far},0,0"),
+        bus.call(COMPUTE_IK, {"goal": goal}),
+        bus.call(PLAN, {"goals": [goal]}),
+        bus.call(PLAN_GOAL, f"xyz={far},0,0"),
         bus.call(CARTESIAN, {"waypoints": [{"xyz": [0.2, 0, far]}], "least_fraction": 0.9}),
         bus.call(COMPUTE_IK, {"goal": {"xyz": [far, far, far], "quaternion": [1, 0, 0, 0], "beyond_reach": "nearest"}}),
-    ):  # fmt: skip
+    ):
         # A line is followed as far as possible, so one that is not much too long fails in planning.
         assert answer.code in (PlanCode.NO_IK_SOLUTION, PlanCode.PLANNING_FAILED)
         assert "cannot reach" in answer.message
@@ -99,9 +101,11 @@ def test_numbers_that_are_none(run: Runtime, yaml: Path, value: str):  # noqa: F
     assert f"xyz: '{value}' is not a finite number" in str(failed)
     number = float(value)
     for service, request in (
-        (COMPUTE_IK, {"goal": {"xyz": [number, 0, 0]}}), (PLAN, {"goals": [{"xyz": [number, 0, 0]}]}),
-        (MOVE_ACTION, {"goals": [{"xyz": [0, 0, number]}]}), (CARTESIAN, {"waypoints": [{"xyz": [number, 0, 0]}]}),
-    ):  # fmt: skip
+        (COMPUTE_IK, {"goal": {"xyz": [number, 0, 0]}}),
+        (PLAN, {"goals": [{"xyz": [number, 0, 0]}]}),
+        (MOVE_ACTION, {"goals": [{"xyz": [0, 0, number]}]}),
+        (CARTESIAN, {"waypoints": [{"xyz": [number, 0, 0]}]}),
+    ):
         with pytest.raises(IbrobotError, match=r"finite|number"):
             run.session.bus.call(service, request)
     goal = PositionGoal(Vector3(number, 0, 0))

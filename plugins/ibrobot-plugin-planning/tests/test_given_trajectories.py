@@ -161,7 +161,7 @@ def test_wall_is_seen_for_every_caller(run, through: Callable[[Runtime, JointTra
         ([(0, 0), (LONGEST_S + 1, 0.1)], 1, "at most 300 s are accepted"),
         ([(i, 0) for i in range(MOST_POINTS + 1)], 1, f"at most {MOST_POINTS} are accepted"),
     ],
-)  # fmt: skip
+)
 def test_trajectory_beyond_a_limit_is_refused(run, points: list[tuple[float, float]], fields: int, told: str):
     runtime = at_up(run)
     before = command(runtime)

@@ -59,10 +59,11 @@ BAD_OBJECTS = {
         "object 'a' may touch 'foot', which is neither a link nor an object",
     ),
     "replaced by a bad one": (
-        "{name: cup, replace: true, object: {shape: sphere, radius: 0.01, link: foot}}", "object 'cup': no link 'foot'"
+        "{name: cup, replace: true, object: {shape: sphere, radius: 0.01, link: foot}}",
+        "object 'cup': no link 'foot'",
     ),
     "far away": ("{name: a, object: {shape: sphere, radius: 0.01, position: [1.0e+308, 0, 0]}}", "from -1000 to 1000"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("request_", "told"), BAD_OBJECTS.values(), ids=BAD_OBJECTS)

@@ -25,9 +25,13 @@ from ibrobot_core.api import Context, NamedGoal, PlanningError, PlanRequest, Ste
 from .table_arm import ARM, make_robot
 
 CARRIED = {
-    "pan": "turret_link", "lift": "upper_link", "elbow": "lower_link", "flex": "wrist_link", "roll": "hand_link",
+    "pan": "turret_link",
+    "lift": "upper_link",
+    "elbow": "lower_link",
+    "flex": "wrist_link",
+    "roll": "hand_link",
     "jaw": "finger_link",
-}  # fmt: skip
+}
 
 
 @pytest.fixture

@@ -62,8 +62,12 @@ def run(tmp_path, monkeypatch):
 def test_objects_come_from_the_yaml(run):
     objects = run.call(SNAPSHOT, None).objects
     assert {name: type(thing.shape) for name, thing in objects.items()} == {
-        "table": Box, "can": Cylinder, "ball": Sphere, "pen": Capsule, "wall": Plane,
-    }  # fmt: skip
+        "table": Box,
+        "can": Cylinder,
+        "ball": Sphere,
+        "pen": Capsule,
+        "wall": Plane,
+    }
     assert objects["can"].may_touch == {"table"}
     np.testing.assert_allclose(matrix(objects["pen"].pose)[:3, 2], [1, 0, 0], atol=1e-5)
 
@@ -249,7 +253,7 @@ IMPOSSIBLE = (
     (CLEARANCE, {"positions": {"pam": 1.0}}, PlanningError, "no joint 'pam', did you mean 'pan'"),
     (CLEARANCE, {"positions": [1.0]}, RequestError, "positions: expected a mapping, got a list"),
     (CLEARANCE, [1.0], RequestError, "expected a mapping with positions, got a list"),
-)  # fmt: skip
+)
 
 
 def test_impossible_requests_are_refused(run):
@@ -264,11 +268,15 @@ def mesh(file: str) -> dict[str, Any]:
 
 
 FILES = {
-    "absolute": "/etc/part.stl", "outside of the folder": "../part.stl", "of the home": "~/part.stl",
-    "outside of a package": "package://ibrobot_planning/../part.stl", "no mesh": "/etc/passwd",
-    "of the environment": "${HOME}/part.stl", "long": "a" * 300 + ".stl",
+    "absolute": "/etc/part.stl",
+    "outside of the folder": "../part.stl",
+    "of the home": "~/part.stl",
+    "outside of a package": "package://ibrobot_planning/../part.stl",
+    "no mesh": "/etc/passwd",
+    "of the environment": "${HOME}/part.stl",
+    "long": "a" * 300 + ".stl",
     "long, in a package": "package://ibrobot_planning/" + "a" * 300 + ".stl",
-}  # fmt: skip
+}
 """Files that a request cannot name, whether they exist or not."""
 
 

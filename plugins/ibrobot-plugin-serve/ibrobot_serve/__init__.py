@@ -38,9 +38,13 @@ def ibrobot_engines() -> Iterable[EngineDescriptor]:
     """Engines that run the model in another process or on a server."""
     yield EngineDescriptor(type="process", make=_process, summary="in a process of its own", options=ProcessOptions)
     yield EngineDescriptor(
-        type="distributed", make=_distributed, summary="on a server", options=DistributedOptions,
-        uses_transport=True, weights_here=False,
-    )  # fmt: skip
+        type="distributed",
+        make=_distributed,
+        summary="on a server",
+        options=DistributedOptions,
+        uses_transport=True,
+        weights_here=False,
+    )
 
 
 @hookimpl

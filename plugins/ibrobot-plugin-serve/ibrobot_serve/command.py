@@ -70,13 +70,21 @@ _PANEL_PERIOD_S = 0.5
 @click.option("--batch", type=click.IntRange(min=1), default=8, show_default=True, help="Maximum requests per batch.")
 @click.option("--queue", type=click.IntRange(min=1), default=64, show_default=True, help="Maximum waiting requests.")
 @click.option(
-    "--patience", type=click.FloatRange(0, 1000), default=0.0, show_default=True, metavar="MS",
+    "--patience",
+    type=click.FloatRange(0, 1000),
+    default=0.0,
+    show_default=True,
+    metavar="MS",
     help="How long an incomplete batch waits for more requests.",
-)  # fmt: skip
+)
 @click.option(
-    "--hang-timeout", type=click.FloatRange(min=0, min_open=True), default=30.0, show_default=True, metavar="S",
+    "--hang-timeout",
+    type=click.FloatRange(min=0, min_open=True),
+    default=30.0,
+    show_default=True,
+    metavar="S",
     help="A model that works on one batch for longer hangs: requests fail, and the server restarts.",
-)  # fmt: skip
+)
 @click.option(
     "--metrics-port",
     type=click.IntRange(0, 65535),
@@ -84,9 +92,13 @@ _PANEL_PERIOD_S = 0.5
     help="Port of 127.0.0.1 for /metrics (Prometheus), /healthz and /readyz; 0: any free port.",
 )
 @click.option(
-    "--drain", type=click.FloatRange(min=0), default=10.0, show_default=True, metavar="S",
+    "--drain",
+    type=click.FloatRange(min=0),
+    default=10.0,
+    show_default=True,
+    metavar="S",
     help="How long to wait for pending requests at the end.",
-)  # fmt: skip
+)
 def serve(what: str, **options: Any) -> None:
     """Run a model for robots on other machines.
 

@@ -102,9 +102,13 @@ def seeds(fingerprint: str) -> list[bytes]:
         WireKind.REQUEST, 3, {"state": state, "one": one}, "fuzz", fingerprint, deadline_ns=50_000_000, episode=1
     )
     picture = WireMessage(
-        WireKind.REQUEST, 4, {"top": np.zeros((4, 4, 3), np.uint8), "on": np.array([True])}, "fuzz", fingerprint,
+        WireKind.REQUEST,
+        4,
+        {"top": np.zeros((4, 4, 3), np.uint8), "on": np.array([True])},
+        "fuzz",
+        fingerprint,
         deadline_ns=50_000_000,
-    )  # fmt: skip
+    )
     return [
         bytes(WireEncoder().encode(m))
         for m in (asked, picture, WireMessage(WireKind.FAILURE, 9, text="no"), WireMessage(WireKind.ANSWER, 1))
@@ -214,10 +218,14 @@ def main() -> int:
     begun_s = time.monotonic()
     ended, robot, grown = fuzz_frames(arguments.mutants, arguments.seed)
     summary = {
-        "mutants": arguments.mutants, **ended, "growth_mib": round(grown, 1), "robot_served": robot.served,
-        "robot_slowest_ms": round(robot.slowest_s * 1e3, 1), "robot_wrong": robot.wrong[:3],
+        "mutants": arguments.mutants,
+        **ended,
+        "growth_mib": round(grown, 1),
+        "robot_served": robot.served,
+        "robot_slowest_ms": round(robot.slowest_s * 1e3, 1),
+        "robot_wrong": robot.wrong[:3],
         "seconds": round(time.monotonic() - begun_s),
-    }  # fmt: skip
+    }
     wrong = bool(robot.wrong) or grown > GROWTH_MIB or not robot.served
     print(json.dumps(summary), flush=True)
     if arguments.connections:

@@ -111,9 +111,13 @@ class Cloud:
     def ask(self, robot: str, x: Any, *, wait_ns: int = SOON_NS, **changes: Any) -> Future[WireMessage]:
         """Send a request; its answer comes later."""
         message = WireMessage(
-            WireKind.REQUEST, 5, {"x": np.atleast_1d(np.asarray(x, np.float64))}, robot, self.policy.fingerprint(),
+            WireKind.REQUEST,
+            5,
+            {"x": np.atleast_1d(np.asarray(x, np.float64))},
+            robot,
+            self.policy.fingerprint(),
             deadline_ns=wait_ns,
-        )  # fmt: skip
+        )
         return self.send(bytes(WireEncoder().encode(attrs.evolve(message, **changes))))
 
     def send(self, payload: bytes) -> Future[WireMessage]:

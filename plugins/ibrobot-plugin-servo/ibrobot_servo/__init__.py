@@ -63,7 +63,11 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """The section `tool_pose`."""
     yield SectionDescriptor(
-        type="tool_pose", options=ToolPoseOptions, make=_pose, check_options=_check_pose, without_section=_has_model,
+        type="tool_pose",
+        options=ToolPoseOptions,
+        make=_pose,
+        check_options=_check_pose,
+        without_section=_has_model,
         publishes=lambda options: [(("topic",), options.topic)],
         summary="the tool's pose in the base frame, on /robot_status/ee_pose",
-    )  # fmt: skip
+    )

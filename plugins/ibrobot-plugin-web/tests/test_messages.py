@@ -92,7 +92,7 @@ def test_text_that_is_no_json_is_refused(text: str) -> None:
         ({"do": "mode", "mode": "web", "stops": "0"}, "stops must be a whole number"),
     ],
     ids=lambda value: str(value)[:40],
-)  # fmt: skip
+)
 def test_unknown_keys_and_wrong_types_are_named(message: dict[str, Any], why: str) -> None:
     with pytest.raises(MalformedMessage, match=why):
         from_page(json.dumps(message))

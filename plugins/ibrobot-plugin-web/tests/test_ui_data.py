@@ -126,10 +126,14 @@ def test_nothing_outside_the_opened_folders_is_read_or_written(ui: Ui, tmp_path:
             ask(ui, "training", "POST /apply", {**facts, "digest": "x"})
     train = {"dataset": "a", "out": "b", "steps": 1, "batch_size": 1}
     for wrong, error in (
-        ({"dataset": "/etc"}, "outside"), ({"out": ".."}, "outside"), ({"policy": "--x=1"}, "must be names"),
-        ({"device": "cpu --x"}, "must be names"), ({"steps": 0}, "steps: 0 is too small"),
-        ({"steps": "x"}, "steps: expected a whole number"), ({"gpu": 1}, "gpu: unknown key"),
-    ):  # fmt: skip
+        ({"dataset": "/etc"}, "outside"),
+        ({"out": ".."}, "outside"),
+        ({"policy": "--x=1"}, "must be names"),
+        ({"device": "cpu --x"}, "must be names"),
+        ({"steps": 0}, "steps: 0 is too small"),
+        ({"steps": "x"}, "steps: expected a whole number"),
+        ({"gpu": 1}, "gpu: unknown key"),
+    ):
         with pytest.raises(IbrobotError, match=error):
             ask(ui, "training", "POST /start", {**train, **wrong})
     assert ui.jobs.all() == []
@@ -161,11 +165,15 @@ def test_events_become_progress_results_and_problems() -> None:
         "held_ticks": 0, "lost_messages": 0, "without_prompt": 0, "size_bytes": 2e6,
     }  # fmt: skip
     for line in (
-        "a line", '{"event"', *events(
-            {"event": "begin", "of": 2}, {**step, "done": 0, "frames": 25},
-            {**step, "done": 1, "frames": 50, "episode": "a", "error": "no contract\nat all"}, report,
+        "a line",
+        '{"event"',
+        *events(
+            {"event": "begin", "of": 2},
+            {**step, "done": 0, "frames": 25},
+            {**step, "done": 1, "frames": 50, "episode": "a", "error": "no contract\nat all"},
+            report,
         ),
-    ):  # fmt: skip
+    ):
         facts |= read(line) or {}
     assert facts["problems"] == [{"episode": "a", "error": "no contract\nat all"}]
     assert facts["text"] == "1 episode, 50 frames, left out 1, ticks skipped 3; the dataset has 2.0 MB"

@@ -30,10 +30,14 @@ def _events(options: WebxrOptions) -> Collection[OperatorEvent]:
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """Drive the tool with a hand in space."""
     yield TeleopDescriptor(
-        type="webxr", options=WebxrOptions, make=_make, check_options=_check, events=_events,
+        type="webxr",
+        options=WebxrOptions,
+        make=_make,
+        check_options=_check,
+        events=_events,
         peripherals=lambda options: [(("cameras", i), name) for i, name in enumerate(options.cameras)],
         summary="moves the tool with a phone, a VR controller or a hand, through a web page",
-    )  # fmt: skip
+    )
 
 
 @hookimpl

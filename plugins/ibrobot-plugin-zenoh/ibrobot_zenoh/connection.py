@@ -86,10 +86,14 @@ def zenoh_config(options: ZenohOptions) -> zenoh.Config:
     if (tls := options.tls) is not None:
         tls_context(tls)
         settings["transport/link/tls"] = {
-            "root_ca_certificate": str(tls.ca), "enable_mtls": True, "verify_name_on_connect": True,
-            "connect_certificate": str(tls.certificate), "connect_private_key": str(tls.key),
-            "listen_certificate": str(tls.certificate), "listen_private_key": str(tls.key),
-        }  # fmt: skip
+            "root_ca_certificate": str(tls.ca),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "connect_certificate": str(tls.certificate),
+            "connect_private_key": str(tls.key),
+            "listen_certificate": str(tls.certificate),
+            "listen_private_key": str(tls.key),
+        }
     if options.user is not None:
         settings["transport/auth/usrpwd/user"] = options.user
         settings["transport/auth/usrpwd/password"] = options.password

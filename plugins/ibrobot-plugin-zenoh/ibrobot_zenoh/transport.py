@@ -169,10 +169,14 @@ class ZenohTransport(TopicTransport):
         try:
             # Replies go to a channel of this call, so a late reply is discarded.
             replies = session.get(
-                key, payload=_sendable(payload), timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE,
-                congestion_control=zenoh.CongestionControl.BLOCK, priority=zenoh.Priority.INTERACTIVE_HIGH,
+                key,
+                payload=_sendable(payload),
+                timeout=timeout_s,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.INTERACTIVE_HIGH,
                 express=True,
-            )  # fmt: skip
+            )
         except zenoh.ZError as error:
             raise TransportError(f"{name}: {first_line(error)}") from error
         for reply in replies:

@@ -12,9 +12,13 @@ DEFINITION = "string data\n"
 
 publisher = ROS2Publisher("/reply", "std_msgs/msg/String", DEFINITION, domain_id=0, router_port=port)
 subscriber = ROS2Subscriber(
-    "/lab/chatter", "std_msgs/msg/String", lambda message: publisher.publish(data=f"heard {message.data}"), DEFINITION,
-    domain_id=0, router_port=port,
-)  # fmt: skip
+    "/lab/chatter",
+    "std_msgs/msg/String",
+    lambda message: publisher.publish(data=f"heard {message.data}"),
+    DEFINITION,
+    domain_id=0,
+    router_port=port,
+)
 topics: list[str] = []
 while "/lab/chatter" not in topics or "/reply" not in topics:
     topics = [name for name, _ in get_topic_names_and_types(domain_id=0, router_port=port)]

@@ -104,8 +104,12 @@ def test_list(robot: ZenohTransport, endpoint: str):
 def test_echo(robot: ZenohTransport, endpoint: str):
     documents = list(yaml.safe_load_all(run("echo", "/joint_states", "--endpoint", endpoint, "-n", "2")))
     expected = {
-        "header": {"stamp_ns": 5, "frame_id": "base"}, "name": ["pan"], "position": [0.5], "velocity": [], "effort": [],
-    }  # fmt: skip
+        "header": {"stamp_ns": 5, "frame_id": "base"},
+        "name": ["pan"],
+        "position": [0.5],
+        "velocity": [],
+        "effort": [],
+    }
     assert documents == [expected, expected, None]
 
 

@@ -162,9 +162,13 @@ def lamp_bytes():
     kind = store.types
     time, duration = kind["builtin_interfaces/msg/Time"], kind["builtin_interfaces/msg/Duration"]
     lamp = kind["lamp_msgs/msg/Lamp"](
-        time(1, 2), [duration(0, 5), duration(-1, 0)], kind["std_msgs/msg/Header"](time(3, 4), "roof"),
-        np.array([0.5, 1.0], np.float32), [kind["lamp_msgs/msg/Bulb"](["a", "b"], True)], "E27",
-    )  # fmt: skip
+        time(1, 2),
+        [duration(0, 5), duration(-1, 0)],
+        kind["std_msgs/msg/Header"](time(3, 4), "roof"),
+        np.array([0.5, 1.0], np.float32),
+        [kind["lamp_msgs/msg/Bulb"](["a", "b"], True)],
+        "E27",
+    )
     return bytes(store.serialize_cdr(lamp, "lamp_msgs/msg/Lamp"))
 
 

@@ -15,8 +15,12 @@ from ibrobot_ros2.definitions import standard_types
 from ibrobot_core.api import MESSAGE_TYPES
 
 JAZZY = json.loads((Path(__file__).parent / "jazzy.json").read_text())
-NOT_THERE = {"tf2_msgs/msg/TFMessage", "ibrobot_msgs/msg/Variant", "ibrobot_msgs/msg/VariantsList",
-             "ibrobot_msgs/msg/RobotStatus"}  # fmt: skip
+NOT_THERE = {
+    "tf2_msgs/msg/TFMessage",
+    "ibrobot_msgs/msg/Variant",
+    "ibrobot_msgs/msg/VariantsList",
+    "ibrobot_msgs/msg/RobotStatus",
+}
 """Types that its packages from wheels do not have."""
 
 

@@ -49,8 +49,12 @@ class Colour(Enum):
 def test_objects_become_plain_data():
     state = JointState(Header(5, "base"), ("pan",), [0.5])
     assert plain(state) == {
-        "header": {"stamp_ns": 5, "frame_id": "base"}, "name": ["pan"], "position": [0.5], "velocity": [], "effort": [],
-    }  # fmt: skip
+        "header": {"stamp_ns": 5, "frame_id": "base"},
+        "name": ["pan"],
+        "position": [0.5],
+        "velocity": [],
+        "effort": [],
+    }
     assert plain({"a": np.float64(1), 2: (Path("b"), frozenset({"d", "c"}))}) == {"a": 1.0, "2": ["b", ["c", "d"]]}
     assert plain([Colour.RED, PlanCode.NO_IK_SOLUTION]) == ["RED", "NO_IK_SOLUTION"]
     with pytest.raises(CodecError, match="a object cannot be sent to another process"):

@@ -70,9 +70,13 @@ class Measurement:
         for joint in self._joints:
             measured = ranges.get(joint.name, whole)
             found[joint.name] = JointCalibration(
-                id=joint.servo, drive_mode=int(inverted.get(joint.name, False)), homing_offset=offsets[joint.servo],
-                range_min=measured.least, range_max=measured.greatest, zero_at=self._zero_at,
-            )  # fmt: skip
+                id=joint.servo,
+                drive_mode=int(inverted.get(joint.name, False)),
+                homing_offset=offsets[joint.servo],
+                range_min=measured.least,
+                range_max=measured.greatest,
+                zero_at=self._zero_at,
+            )
         return found
 
     def _encoders(self) -> dict[int, int]:

@@ -15,9 +15,13 @@ from ibrobot_gamepad.options import FUNCTIONS, TOOL_AXES
 _MOVED = 0.6
 """Deflection from rest beyond which an axis counts as chosen."""
 _WAYS = {
-    "x": "forward", "y": "to the left", "z": "up", "roll": "turned about where it points", "pitch": "down",
+    "x": "forward",
+    "y": "to the left",
+    "z": "up",
+    "roll": "turned about where it points",
+    "pitch": "down",
     "yaw": "sideways",
-}  # fmt: skip
+}
 _PRESSES = {
     "deadman": "that must be held for anything to move", "toggle": "that changes between joints and tool",
     "gripper_open": "or trigger that opens the gripper", "gripper_close": "or trigger that closes it",

@@ -52,8 +52,12 @@ def dualsense_features() -> dict[int, bytes]:
 def dualshock_features() -> dict[int, bytes]:
     """What hid-sony reads of a DualShock 4 over USB: calibration, address, versions."""
     calibration = struct.pack("<B17h", 2, 0, 0, 0, 8192, -8192, 8192, -8192, 8192, -8192, 540, 540, *[8192, -8192] * 3)
-    return {0x02: calibration.ljust(37, b"\0"), 0x81: bytes([0x81, 1, 2, 3, 4, 5, 7]),
-            0x12: bytes([0x12, 1, 2, 3, 4, 5, 7]).ljust(16, b"\0"), 0xA3: bytes([0xA3]).ljust(49, b"\0")}  # fmt: skip
+    return {
+        0x02: calibration.ljust(37, b"\0"),
+        0x81: bytes([0x81, 1, 2, 3, 4, 5, 7]),
+        0x12: bytes([0x12, 1, 2, 3, 4, 5, 7]).ljust(16, b"\0"),
+        0xA3: bytes([0xA3]).ljust(49, b"\0"),
+    }
 
 
 def dualshock(*, held: bool = False, x: float = 0.0) -> bytes:

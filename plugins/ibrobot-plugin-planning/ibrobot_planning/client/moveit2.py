@@ -231,9 +231,13 @@ class MoveIt2(CollisionObjects):
             self.set_orientation_goal(quat_xyzw, frame_id, target_link, tolerance_orientation)
 
     def set_position_goal(
-        self, position: Position, frame_id: str | None = None, target_link: str | None = None, tolerance: float = 0.001,
+        self,
+        position: Position,
+        frame_id: str | None = None,
+        target_link: str | None = None,
+        tolerance: float = 0.001,
         weight: float = 1.0,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Set the position of the next goal [m]."""
         self._check_frame(frame_id)
         self._check_link(target_link)
@@ -302,10 +306,14 @@ class MoveIt2(CollisionObjects):
         return future.result() if future.done() else None
 
     def compute_ik(
-        self, position: Position, quat_xyzw: Orientation | None = None, ik_link_name: str | None = None,
-        start_joint_state: JointPositions | None = None, constraints: Any = None,
+        self,
+        position: Position,
+        quat_xyzw: Orientation | None = None,
+        ik_link_name: str | None = None,
+        start_joint_state: JointPositions | None = None,
+        constraints: Any = None,
         wait_for_server_timeout_sec: float | None = 1.0,
-    ) -> JointState | None:  # fmt: skip
+    ) -> JointState | None:
         """Joint positions without contacts for a pose, or for a position with any orientation; None if there are none.
 
         Raises:

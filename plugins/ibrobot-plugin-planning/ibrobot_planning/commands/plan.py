@@ -103,9 +103,13 @@ def plan(start: str, goal: str, speed: float, plot: Path | None, config: str | N
         from_ = _positions(start, robot)
         wanted = target(goal, robot, speed)
     facts: dict[str, Any] = {
-        "robot": robot.name, "mode": mode.name, "planner": mode.planner.type if mode.planner else "",
-        "from": start, "goal": goal, "kind": _kind(wanted),
-    }  # fmt: skip
+        "robot": robot.name,
+        "mode": mode.name,
+        "planner": mode.planner.type if mode.planner else "",
+        "from": start,
+        "goal": goal,
+        "kind": _kind(wanted),
+    }
     try:
         found = _planned(loaded, mode, options["seed"], joints, from_, wanted, facts)
     except PlanningError as error:

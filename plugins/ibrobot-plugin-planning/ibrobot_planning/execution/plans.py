@@ -179,10 +179,14 @@ class GoalPlans:
             joints = self._session.config.executors[name].joints
             planned = self.planned(
                 PlanRequest(
-                    joints, start[robot.indices(joints)], goal,
-                    target.velocity_scaling, target.acceleration_scaling, others,
+                    joints,
+                    start[robot.indices(joints)],
+                    goal,
+                    target.velocity_scaling,
+                    target.acceleration_scaling,
+                    others,
                 )
-            )  # fmt: skip
+            )
             goals[name] = self._checked(planned.trajectory, start, others)
         return goals, planned
 

@@ -161,9 +161,13 @@ class PlanningServices:
             padding, self_padding = planner.options.padding, planner.options.self_padding
         checked = self._checked
         checks = Collisions(
-            checked.arm, world_of(self._session.bus), self._robot.joint_names,
-            padding=padding, self_padding=self_padding, unchecked=checked.unchecked,
-        )  # fmt: skip
+            checked.arm,
+            world_of(self._session.bus),
+            self._robot.joint_names,
+            padding=padding,
+            self_padding=self_padding,
+            unchecked=checked.unchecked,
+        )
         free = [each for each in candidates if checks.free(each.joints)]
         if not free:
             contacts = checks.contacts(candidates[0].joints)

@@ -52,17 +52,24 @@ MOVE_ACTION = Service(
 )
 """Named like MoveIt's action, and so is the next one."""
 EXECUTE = Service(
-    "/execute_trajectory", Execute, int, "Follow a trajectory that begins where the robot is; answers with its number.",
+    "/execute_trajectory",
+    Execute,
+    int,
+    "Follow a trajectory that begins where the robot is; answers with its number.",
     limits=RequestLimits(values=60_000),
-)  # fmt: skip
+)
 MOVE_TO_POSE = Service(
-    "/moveit_gateway/move_to_pose", MoveToPose, MoveResult,
+    "/moveit_gateway/move_to_pose",
+    MoveToPose,
+    MoveResult,
     "Move the tool to a pose; answers when the motion has ended.",
-)  # fmt: skip
+)
 MOVE_TO_CONFIGURATION = Service(
-    "/moveit_gateway/move_to_configuration", MoveToConfiguration, MoveResult,
+    "/moveit_gateway/move_to_configuration",
+    MoveToConfiguration,
+    MoveResult,
     "Move joints to positions; answers when the motion has ended.",
-)  # fmt: skip
+)
 CMD_POSE = "/cmd_pose"
 """geometry_msgs/msg/PoseStamped or Pose: a goal."""
 MOTION_STATUS = "/moveit_gateway/motion_status"

@@ -240,8 +240,11 @@ def _at(
     u = (at_ns / ns(1.0))[:, None] / h
     p0, way = points.positions[pieces], points.positions[pieces + 1] - points.positions[pieces]
     v0, v1, a0, a1 = (
-        velocities[pieces] * h, velocities[pieces + 1] * h, left[pieces] * h * h, right[pieces] * h * h,
-    )  # fmt: skip
+        velocities[pieces] * h,
+        velocities[pieces + 1] * h,
+        left[pieces] * h * h,
+        right[pieces] * h * h,
+    )
     c3 = 10 * way - 6 * v0 - 4 * v1 - 1.5 * a0 + 0.5 * a1
     c4 = -15 * way + 8 * v0 + 7 * v1 + 1.5 * a0 - a1
     c5 = 6 * way - 3 * v0 - 3 * v1 - 0.5 * a0 + 0.5 * a1

@@ -221,9 +221,13 @@ class _Plan:
         return whole
 
     def _reach(
-        self, tool: Tool, goal: JointGoal | NamedGoal | PositionGoal | PoseGoal, number: int,
-        way_out: list[Vector], deadline: float,
-    ) -> PlanResult:  # fmt: skip
+        self,
+        tool: Tool,
+        goal: JointGoal | NamedGoal | PositionGoal | PoseGoal,
+        number: int,
+        way_out: list[Vector],
+        deadline: float,
+    ) -> PlanResult:
         candidates = self._free_goals(self._candidates(tool, goal), goal)
         if np.abs(candidates[0].joints[self._order] - self.start).max() < _ROUNDING and len(way_out) == 1:
             return self._result(Motion(*_still(self.start, self.options.step)), candidates[0], number)

@@ -112,12 +112,16 @@ class Motion:
         way = np.diff(self.positions, axis=0)
         v0, v1 = self.velocities[:-1] * h, self.velocities[1:] * h
         a0, a1 = self.accelerations[:-1] * (h * h), self.accelerations[1:] * (h * h)
-        return np.stack([
-            self.positions[:-1], v0, a0 / 2,
-            10 * way - 6 * v0 - 4 * v1 - 1.5 * a0 + 0.5 * a1,
-            -15 * way + 8 * v0 + 7 * v1 + 1.5 * a0 - a1,
-            6 * way - 3 * v0 - 3 * v1 - 0.5 * a0 + 0.5 * a1,
-        ])  # fmt: skip
+        return np.stack(
+            [
+                self.positions[:-1],
+                v0,
+                a0 / 2,
+                10 * way - 6 * v0 - 4 * v1 - 1.5 * a0 + 0.5 * a1,
+                -15 * way + 8 * v0 + 7 * v1 + 1.5 * a0 - a1,
+                6 * way - 3 * v0 - 3 * v1 - 0.5 * a0 + 0.5 * a1,
+            ]
+        )
 
 
 def motion_of(trajectory: JointTrajectory) -> Motion | None:

@@ -177,9 +177,13 @@ class Step:
 
     def _actions(self) -> dict[str, Action | None]:
         return {
-            "move": self.move, "gripper": self.gripper, "wait": self.wait, "run_policy": self.run_policy,
-            "look": self.look, "record": self.record,
-        }  # fmt: skip
+            "move": self.move,
+            "gripper": self.gripper,
+            "wait": self.wait,
+            "run_policy": self.run_policy,
+            "look": self.look,
+            "record": self.record,
+        }
 
 
 def _some(instance: object, attribute: attrs.Attribute[Any], value: Sequence[object]) -> None:

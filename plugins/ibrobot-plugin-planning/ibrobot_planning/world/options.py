@@ -16,9 +16,13 @@ if TYPE_CHECKING:
 FURTHEST = 1000.0
 """The largest number of a position [m] or an angle [rad] that can be meant."""
 _KEYS = {
-    "box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "height"), "capsule": ("radius", "height"),
-    "plane": (), "mesh": ("file",),
-}  # fmt: skip
+    "box": ("size",),
+    "sphere": ("radius",),
+    "cylinder": ("radius", "height"),
+    "capsule": ("radius", "height"),
+    "plane": (),
+    "mesh": ("file",),
+}
 """Shape -> the keys that it needs."""
 
 

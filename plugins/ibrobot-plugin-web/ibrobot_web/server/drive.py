@@ -75,9 +75,11 @@ class Drive:
     """
 
     def __init__(
-        self, execute: Callable[[Sent[RunCommand], Answer], None], stop: Callable[[Answer], None],
+        self,
+        execute: Callable[[Sent[RunCommand], Answer], None],
+        stop: Callable[[Answer], None],
         release: Callable[[], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._execute = execute
         self._stop = stop
         self._release = release

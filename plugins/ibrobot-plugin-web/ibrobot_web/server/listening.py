@@ -27,9 +27,13 @@ def runner_of(app: web.Application, close_s: float) -> web.AppRunner:
     quiet = logging.getLogger("ibrobot.web.http")
     quiet.setLevel(logging.CRITICAL)
     return web.AppRunner(
-        app, access_log=None, logger=quiet, keepalive_timeout=REQUEST_S, lingering_time=_LINGER_S,
+        app,
+        access_log=None,
+        logger=quiet,
+        keepalive_timeout=REQUEST_S,
+        lingering_time=_LINGER_S,
         shutdown_timeout=close_s,
-    )  # fmt: skip
+    )
 
 
 def tls_of(prefix: str, certificate: str | None, key: str | None) -> ssl.SSLContext | None:

@@ -262,7 +262,10 @@ def cancel(ui: Ui, request: NamesGuide) -> None:
 
 
 ROUTES: dict[str, Route[Any]] = {
-    "GET /list": Route(listing, NoRequest), "GET /state": Route(state, AskState),
-    "GET /picture": Route(picture, NamesPicture), "POST /start": Route(start, StartGuide),
-    "POST /answer": Route(answer, GiveAnswer), "POST /cancel": Route(cancel, NamesGuide),
-}  # fmt: skip
+    "GET /list": Route(listing, NoRequest),
+    "GET /state": Route(state, AskState),
+    "GET /picture": Route(picture, NamesPicture),
+    "POST /start": Route(start, StartGuide),
+    "POST /answer": Route(answer, GiveAnswer),
+    "POST /cancel": Route(cancel, NamesGuide),
+}

@@ -67,9 +67,13 @@ def start(ui: Ui, request: RecordSession) -> dict[str, int]:
     folder = _folder(ui, request.root, request.dataset)
     root = ui.folders.find(request.root)
     arguments = [
-        "record", *run_arguments(ui, request), f"--root={root}", f"--dataset={folder.relative_to(root)}",
-        f"--prompt={prompt}", f"--episodes={count}",
-    ]  # fmt: skip
+        "record",
+        *run_arguments(ui, request),
+        f"--root={root}",
+        f"--dataset={folder.relative_to(root)}",
+        f"--prompt={prompt}",
+        f"--episodes={count}",
+    ]
     known = {"dataset": ui.folders.name(folder), "saved": 0, "episodes": count, "progress": 0.0}
     job = ui.jobs.start(
         "record", f"Record {folder.name}", arguments, facts=known, read=read_status, done_codes=RUN_DONE
