@@ -316,7 +316,7 @@ TYPED = {
 def test_config_check_names_a_missing_calibration(
     folder: Path, terminal: Terminal, deep: tuple[str, ...], code: int, begin: str
 ) -> None:
-    found, out, err = terminal.run("config", "check", "so101_blind", *deep)
+    found, out, err = terminal.run("config", "check", "so101", *deep)
     [line] = [line for line in (out + err).splitlines() if "there is no such calibration" in line]
     assert (found, line.startswith(begin)) == (code, True)
 

@@ -63,6 +63,20 @@ def until(page: Any, expression: str) -> None:
         page.wait_for_timeout(50)
 
 
+def press(page: Any, label: str, expression: str) -> None:
+    """Hold a button until an expression is true; press again as a person does, since a page that stalls releases it."""
+    page.get_by_label(label).hover()
+    deadline_s = time.monotonic() + _WAIT_MS / 1000
+    while True:
+        page.mouse.down()
+        for _ in range(60):
+            if page.evaluate(f"Boolean({expression})"):
+                return
+            page.wait_for_timeout(50)
+        assert time.monotonic() < deadline_s, f"still not: {expression}"
+        page.mouse.up()
+
+
 def record(page: Any, shot: Shot = lambda page, name: None) -> None:
     """Choose the robot, launch a session that records it, jog, and record and judge two episodes."""
     page.get_by_role("link", name="Robots").click()
@@ -77,8 +91,10 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
     page.get_by_label("Dataset").blur()
     shot(page, "record")
     page.get_by_role("button", name="Start the session").click()
+    link = page.get_by_role("link", name="Open the robot's page")
+    link.wait_for(timeout=2 * _WAIT_MS)  # the robot starts
     with page.context.expect_page(timeout=_WAIT_MS) as opened:
-        page.get_by_role("link", name="Open the robot's page").click(timeout=_WAIT_MS)
+        link.click()
     run = opened.value
     until(run, "window.ibrobot?.jogs && ibrobot.status.episode")
     run.get_by_role("tab", name="Episodes").click()
@@ -89,10 +105,8 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
         run.get_by_role("button", name="Begin an episode").click()
         until(run, "ibrobot.status.episode.recording")
         before = run.evaluate("ibrobot.state.position")
-        hold = run.get_by_label(f"{joint} up, hold to move")
-        hold.hover()
-        run.mouse.down()
-        until(run, f"Math.abs(ibrobot.state.position[{index}] - {before[index]}) > 0.3")
+        moved = f"Math.abs(ibrobot.state.position[{index}] - {before[index]}) > 0.3"
+        press(run, f"{joint} up, hold to move", moved)
         if number == 0:
             shot(run, "episode")
         run.mouse.up()
