@@ -207,6 +207,7 @@ def test_a_stream_that_goes_on_over_a_reset_moves_nothing_before_a_zero_twist_or
         assert rig.follow(twist(), 0.3).any()
         begin_operation(rig.teleop, rig.measured())
         assert not rig.follow(twist(), 2.0).any()
+        assert any("the stream went on" in reason for reason in rig.counts())
         for message in release:
             rig.tick(*([] if message is None else [message]))
         assert rig.follow(twist(), 0.3).any()
