@@ -279,6 +279,12 @@ class _Panel:
         self._next_s = 0.0
         self._pressed: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
         """Keys, each with the number of emergency stops when it was pressed."""
+        self._acts: queue.SimpleQueue[tuple[str, Callable[[], object]] | None] = queue.SimpleQueue()
+        self._acting = ""
+        """The name of the present one of `_acts`."""
+        self._thread = threading.Thread(target=self._act_in_turn, name="panel", daemon=True)
+        self._thread.start()
+        stack.callback(self._end)
         _listen(runtime.session, self._pressed.put)
 
     def starting(self, component: str) -> None:
@@ -294,7 +300,8 @@ class _Panel:
             self._handle_key(*self._pressed.get())
         session, hooks = self._runtime.session, self._hooks
         self._rates.sample(session)
-        self._display.update(panel(session, self._log, self._rates, hooks.help(), hooks.rows()), refresh=True)
+        rows = [*([("now", f"{acting} …")] if (acting := self._acting) else ()), *hooks.rows()]
+        self._display.update(panel(session, self._log, self._rates, hooks.help(), rows), refresh=True)
 
     def _handle_key(self, key: str, stops: int) -> None:
         session = self._runtime.session
@@ -304,9 +311,29 @@ class _Panel:
         if self._hooks.key(key):
             return
         if key == "f10":
-            self._try(lambda: self._runtime.reset(stops))
+            self._act("resetting", lambda: self._runtime.reset(stops))
         elif (mode := self._runtime.session.mode_keys.get(key.upper())) is not None:
-            self._try(lambda: self._runtime.switch_mode(mode, stops))
+            self._act(f"entering mode {mode}", lambda: self._runtime.switch_mode(mode, stops))
+
+    def _act(self, name: str, act: Callable[[], object]) -> None:
+        """Do what may take seconds, e.g. set up a device again, in another thread, while the panel goes on."""
+        if self._runtime.session.request.lockstep:
+            self._try(act)
+        else:
+            self._acts.put((name, act))
+
+    def _end(self) -> None:
+        self._acts.put(None)
+        self._thread.join(1.0)  # an act that hangs must not keep the run from ending
+
+    def _act_in_turn(self) -> None:
+        while (each := self._acts.get()) is not None:
+            self._acting, act = each
+            try:
+                self._try(act)
+            except Exception as error:  # noqa: BLE001 - without this thread, the keys of the panel do nothing
+                self._runtime.session.fail(self._acting, error)
+            self._acting = ""
 
     def _try(self, act: Callable[[], object]) -> None:
         try:
