@@ -4,14 +4,16 @@
 
 They go over Zenoh to a simulation. What it offers comes from its bus, in each mode. Meanwhile one more client keeps the
 arm moving, resets it, and enters its modes. It fails if the run ends, if a declared service was never reached, if an
-answer or the log shows the environment or an error of Python, or if a refused request takes more than a second or
-200 MB. Requests that are accepted and take longer are listed: planning has its own time limit.
+answer or the log shows the environment or an error of Python, if a refused request takes more than a second, or if the
+run grows by more than 200 MB within the second in which a request is answered. Requests that are accepted and take
+longer are listed: planning has its own time limit. Each client is a process, so that none waits for another's work.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import queue
 import re
@@ -22,8 +24,10 @@ import sys
 import tempfile
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from contextlib import suppress
+from multiprocessing.queues import Queue
+from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +63,7 @@ def await_port(port: int, run: subprocess.Popen[bytes]) -> None:
 
 
 class Findings:
-    """What the clients saw. Thread-safe by the interpreter's lock."""
+    """What clients saw."""
 
     def __init__(self) -> None:
         self.outcomes = Counter[str]()
@@ -68,7 +72,7 @@ class Findings:
         self.messages = 0
         self.slowest: dict[str, tuple[float, str]] = {}
         self.refused: tuple[float, str] = (0.0, "")
-        self.wrong: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.wrong: list[str] = []
 
     def add(self, service: str, took_s: float, answer: str, *, accepted: bool, request: str) -> None:
         """Note an answer."""
@@ -78,7 +82,38 @@ class Findings:
         if not accepted and service not in WAITS:
             self.refused = max(self.refused, (took_s, f"{service} {request[:300]} -> {answer[:200]}"))
         if shown := SHOWN.search(answer):
-            self.wrong.put(f"{service} {request[:300]} -> {answer[:500]} shows {shown[0]!r}")
+            self.wrong.append(f"{service} {request[:300]} -> {answer[:500]} shows {shown[0]!r}")
+
+    def join(self, other: Findings) -> None:
+        """Add what another client saw."""
+        self.outcomes += other.outcomes
+        self.reached.update(other.reached)
+        self.messages += other.messages
+        for service, slowest in other.slowest.items():
+            self.slowest[service] = max(self.slowest.get(service, slowest), slowest)
+        self.refused = max(self.refused, other.refused)
+        self.wrong += other.wrong
+
+
+class Memory:
+    """Memory of the run [bytes], sampled often.
+
+    Attributes:
+        grown: the largest growth within a second.
+        now: the newest sample.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._samples = deque[int](maxlen=50)
+        self.grown = self.now = 0
+
+    def sample(self) -> None:
+        """Take a sample; call it every 20 ms."""
+        with suppress(OSError, TypeError):  # the run may end at any time
+            self.now = resident(self._pid)
+            self._samples.append(self.now)
+            self.grown = max(self.grown, self.now - min(self._samples))
 
 
 def ask(node: Node, service: str, request: Any, findings: Findings) -> None:
@@ -100,9 +135,12 @@ def connected(name: str, address: str) -> Node:
             time.sleep(0.5)
 
 
-def client(address: str, number: int, count: int, seed: int, known: Offered, findings: Findings) -> None:
+def client(
+    address: str, number: int, count: int, seed: int, known: Offered, begin: Event, results: Queue[Findings]
+) -> None:
     """Ask `count` generated requests, mostly of the service that was reached least, and send as many messages."""
-    requests, topics = Requests(seed), sorted(known.topics)
+    requests, topics, findings = Requests(seed), sorted(known.topics), Findings()
+    begin.wait()
     with connected(f"client{number}", address) as node:
         transport = node._transport
         assert isinstance(transport, TopicTransport)
@@ -119,6 +157,7 @@ def client(address: str, number: int, count: int, seed: int, known: Offered, fin
             with suppress(IbrobotError):  # the client's own end knows the topic by another type
                 transport.publish_message(topic, requests.message(known.topics[topic]))
                 findings.messages += 1
+    results.put(findings)
 
 
 def mover(address: str, modes: list[str], ended: threading.Event, moved: list[int]) -> None:
@@ -140,6 +179,17 @@ def mover(address: str, modes: list[str], ended: threading.Event, moved: list[in
             ended.wait(1.0)
 
 
+def launched(folder: Path, transport: str) -> subprocess.Popen[bytes]:
+    """A run that writes its `log` and `result` into a folder."""
+    ibrobot = str(Path(sys.executable).with_name("ibrobot"))
+    command = [ibrobot, "launch", str(CONFIG), "--sim", "--mode", "moveit_planning", "--json", "--set", transport]
+    command += [part for override in EVERYTHING for part in ("--set", override)]
+    with (folder / "log").open("w") as log, (folder / "result").open("w") as result:
+        return subprocess.Popen(
+            command, env=os.environ | {SECRET: VALUE}, stderr=log, stdout=result, stdin=subprocess.DEVNULL, cwd=folder
+        )
+
+
 def main() -> int:
     """Run it."""
     parser = argparse.ArgumentParser()
@@ -154,60 +204,53 @@ def main() -> int:
     share = f"{{services: [{', '.join(known.services)}], subscribe: {{{types}}}}}"
     transport = f"transport={{type: zenoh, mode: router, listen: [{address}], share: {share}}}"
     findings, ended, moved = Findings(), threading.Event(), [0]
+    context = multiprocessing.get_context("fork")  # a child inherits what is imported; nothing else runs yet
+    begin, results = context.Event(), context.Queue()
     with tempfile.TemporaryDirectory() as folder:
-        log, result = Path(folder) / "log", Path(folder) / "result"
-        ibrobot = str(Path(sys.executable).with_name("ibrobot"))
-        command = [ibrobot, "launch", str(CONFIG), "--sim", "--mode", "moveit_planning", "--json", "--set", transport]
-        command += [part for override in EVERYTHING for part in ("--set", override)]
-        with log.open("w") as told, result.open("w") as summary:
-            run = subprocess.Popen(
-                command,
-                env=os.environ | {SECRET: VALUE},
-                stderr=told,
-                stdout=summary,
-                stdin=subprocess.DEVNULL,
-                cwd=folder,
-            )
+        run = launched(Path(folder), transport)
         try:
-            threads = [
-                threading.Thread(
-                    target=mover, args=(address, sorted(set(known.modes.values())), ended, moved), daemon=True
-                )
-            ]
-            threads += [
-                threading.Thread(
+            clients = [
+                context.Process(
                     target=client,
-                    args=(address, i, options.requests // options.clients, options.seed + i, known, findings),
+                    args=(address, i, options.requests // options.clients, options.seed + i, known, begin, results),
                     daemon=True,
                 )
                 for i in range(options.clients)
             ]
+            for each in clients:
+                each.start()
             await_port(options.port, run)
-            threads[0].start()
+            modes = sorted(set(known.modes.values()))
+            threading.Thread(target=mover, args=(address, modes, ended, moved), daemon=True).start()
             while moved[0] < 3 and run.poll() is None:  # so that all libraries are loaded
                 time.sleep(0.1)
-            before = resident(run.pid)
-            for thread in threads[1:]:
-                thread.start()
-            most = now = before
-            while any(thread.is_alive() for thread in threads[1:]) and run.poll() is None:
-                with suppress(OSError, TypeError):  # it may end at any time
-                    now = resident(run.pid)
-                most = max(most, now)
-                time.sleep(0.02)
+            memory = Memory(run.pid)
+            memory.sample()
+            before, unread = memory.now, len(clients)
+            begin.set()
+            while unread and run.poll() is None:
+                if not any(each.is_alive() for each in clients) and results.empty():
+                    findings.wrong.append("a client died")
+                    break
+                memory.sample()
+                with suppress(queue.Empty):
+                    findings.join(results.get(timeout=0.02))
+                    unread -= 1
             alive = run.poll() is None
         finally:
             ended.set()
             if run.poll() is None:
                 run.send_signal(signal.SIGINT)
             run.wait(30)
-        text = log.read_text(encoding="utf-8")
-        counts = json.loads(result.read_text(encoding="utf-8") or "{}")
-    return report(findings, counts, text, moved[0], most - before, alive=alive)
+        log, result = (Path(folder, name).read_text(encoding="utf-8") for name in ("log", "result"))
+    grown = (memory.grown, memory.now - before)
+    return report(findings, json.loads(result or "{}"), log, moved[0], grown, alive=alive)
 
 
-def report(findings: Findings, summary: dict[str, Any], log: str, moved: int, grown: int, *, alive: bool) -> int:
-    """Print what was found; 1 if something is wrong."""
+def report(
+    findings: Findings, summary: dict[str, Any], log: str, moved: int, grown: tuple[int, int], *, alive: bool
+) -> int:
+    """Print what was found; 1 if something is wrong. `grown`: memory within a second, and in all [bytes]."""
     print(f"{dict(findings.outcomes)}, {moved} motions of the mover, run alive: {alive}")
     missed = sorted({*declared(), *findings.reached} - {name for name, count in findings.reached.items() if count})
     least = min(findings.reached.items(), key=lambda item: item[1], default=("", 0))
@@ -215,20 +258,19 @@ def report(findings: Findings, summary: dict[str, Any], log: str, moved: int, gr
         f"{len(+findings.reached)} services reached, {least[0]} least: {least[1]} times; {findings.messages} messages"
     )
     print(
-        f"memory grew by at most {grown / MIB:.0f} MiB; "
+        f"memory grew by at most {grown[0] / MIB:.0f} MiB within a second, by {grown[1] / MIB:.0f} MiB in all; "
         f"slowest refusal {findings.refused[0]:.2f} s: {findings.refused[1]}"
     )
     for service, (took, request) in sorted(findings.slowest.items(), key=lambda item: -item[1][0])[:8]:
         print(f"  {took:6.2f} s {service} {request[:100]}")
     print(f"faults {summary.get('faults')}, counters {summary.get('counters')}")
-    wrong = [findings.wrong.get() for _ in range(findings.wrong.qsize())]
-    lines = log.splitlines()
+    wrong, lines = [*findings.wrong], log.splitlines()
     wrong += [line for line in lines if VALUE in line]
     wrong += [line for i, each in enumerate(lines) if "Traceback" in each for line in lines[i : i + 40]]
     wrong += [f"never reached: {', '.join(missed)}"] if missed else []
     wrong += [] if alive else ["the run ended:", *log.splitlines()[-20:]]
     wrong += [f"a refusal took {findings.refused[0]:.2f} s"] if findings.refused[0] > 1.0 else []
-    wrong += [f"memory grew by {grown / MIB:.0f} MiB"] if grown > 200 * MIB else []
+    wrong += [f"memory grew by {grown[0] / MIB:.0f} MiB within a second"] if grown[0] > 200 * MIB else []
     for line in wrong[:120]:
         print("WRONG", line)
     return 1 if wrong else 0

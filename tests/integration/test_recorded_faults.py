@@ -28,6 +28,8 @@ PATIENCE_S = 300.0
 MANY = 50
 """Messages of a phase of a run: longer than the greatest age."""
 STATES, COMMANDS = "/joint_states", "/arm/commands"
+OVERHEATING = 0x04
+"""The error bit of a servo that is too hot."""
 ROBOT = """
 robot:
   name: arm
@@ -181,5 +183,19 @@ def test_a_servo_that_lost_its_power_for_a_moment_is_measured_again(begin: Calla
     bench.emulator.faults.brown_out.add(3)
     bench.until(lambda: "fault: " in bench.said())
     bench.go_on(STATES)
+    bench.end()
+    compared(bench)
+
+
+@pytest.mark.parametrize("fault", ["error", "overloaded"])
+def test_a_servo_that_reports_an_error_gives_no_old_state(begin: Callable[[int], Bench], fault: str) -> None:
+    bench = begin(200)
+    bench.go_on(STATES)
+    if fault == "error":
+        bench.emulator.faults.errors[3] = OVERHEATING
+    else:
+        bench.emulator.faults.overloaded.add(3)
+    bench.until(lambda: "fault: " in bench.said())
+    bench.go_on(COMMANDS)
     bench.end()
     compared(bench)
