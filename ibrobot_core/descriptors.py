@@ -55,6 +55,9 @@ class Descriptor[T]:
     """The peripherals of the robot YAML that options name."""
     publishes: Callable[[Any], Iterable[OptionName]] = attrs.field(default=lambda options: (), kw_only=True)
     """The topics that options name and the component publishes, which nothing else may publish."""
+    calibration: Callable[[Any], str | None] = attrs.field(default=lambda options: None, kw_only=True)
+    """Name or path of the calibration in the options, for `load_calibration`; recordings contain that of hardware. None
+    without a calibration."""
     default: bool = attrs.field(default=False, kw_only=True)
     """Whether commands use this type by default; at most one type of each kind."""
 
@@ -68,9 +71,6 @@ class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
     """For simulated hardware: sensor kind, e.g. `camera` -> sensor type that replaces it."""
     torque_off: str = ""
     """For joints that hold even without a process that commands them: the command that switches their torque off."""
-    calibration: Callable[[Any], str | None] = attrs.field(default=lambda options: None, kw_only=True)
-    """Name or path of the calibration in the options, for `load_calibration`; recordings contain it. None without a
-    calibration."""
     anchored: Callable[[Any], tuple[str, ...]] = attrs.field(default=lambda options: (), kw_only=True)
     """The joints whose calibrated closed end is at their lower limit, such as a gripper. In LeRobot's units they range
     from 0 to 100."""

@@ -9,13 +9,17 @@ from typing import TYPE_CHECKING, Any
 import attrs
 import click
 
+from ibrobot_core.calibration import load_calibration
 from ibrobot_core.cli.options import run_options
 from ibrobot_core.errors import CalibrationError, ConfigError, PluginError, Problem
 from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed_plugins
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from ibrobot_core.config import RobotConfig
+    from ibrobot_core.config.schema import HardwareConfig, TeleopConfig
 
 config_options = run_options("config", "sim", "overrides", "mode")
 
@@ -48,14 +52,14 @@ def check(
         found = load_config(path, overrides=overrides, mode=mode, sim=sim)
         modes = [name for name in found.control_modes if name not in found.unavailable]
         models = check_models(found, installed_plugins(), modes) if deep else []
-        uncalibrated = _uncalibrated(found)
-        if uncalibrated and deep:
-            raise ConfigError([Problem(found.source, 0, "hardware", uncalibrated)])
+        uncalibrated = list(_uncalibrated(found))
+        if deep and uncalibrated:
+            raise ConfigError(uncalibrated)
     except ConfigError as error:
         if not as_json:
             raise
-        problems: list[dict[str, Any]] = [{**attrs.asdict(p), "file": str(p.file)} for p in error.problems]
-        echo(json.dumps(problems, indent=2))
+        faults: list[dict[str, Any]] = [{**attrs.asdict(p), "file": str(p.file)} for p in error.problems]
+        echo(json.dumps(faults, indent=2))
         sys.exit(error.exit_code)
     if as_json:
         echo("[]")
@@ -69,21 +73,26 @@ def check(
         echo(f"note: {line}")
     if absent := describe_absent(absent_sensors(found, installed_plugins())):
         echo(f"note: runs start without {absent}")
-    if uncalibrated:
-        echo(f"note: {uncalibrated}")
+    for problem in uncalibrated:
+        echo(f"note: {problem.path}: {problem.message}")
     for line in models:
         echo(line)
 
 
-def _uncalibrated(config: RobotConfig) -> str:
-    """What is wrong with a calibration of the hardware; this machine may not be the robot's."""
-    from ibrobot_core.contract.joint_units import calibrations
-
-    try:
-        calibrations(config)
-    except CalibrationError as error:
-        return str(error)
-    return ""
+def _uncalibrated(config: RobotConfig) -> Iterator[Problem]:
+    """What is wrong with the calibrations that a run needs at its start; this machine may not be the robot's."""
+    mode = config.control_modes[config.default_control_mode]
+    used = {*mode.devices.values(), *(mode.inference.devices.values() if mode.inference is not None else ())}
+    parts: list[tuple[str, HardwareConfig | TeleopConfig]] = [
+        ("hardware" if name == "hardware" else f"hardware.{name}", each) for name, each in config.hardware.items()
+    ]
+    parts += [(f"teleoperation.{name}", each) for name, each in config.teleoperation.items() if name in used]
+    for path, part in parts:
+        try:
+            if part.calibration is not None:
+                load_calibration(part.calibration)
+        except CalibrationError as error:
+            yield Problem(config.source, 0, path, str(error))
 
 
 @config.command()

@@ -185,6 +185,14 @@ class TeleopConfig(NamedComponentConfig):
 
     plugin_kind = "teleop"
 
+    calibration: str | None = not_a_key(None)
+    """Name or path of the calibration."""
+
+    @classmethod
+    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
+        """Its calibration."""
+        return {"calibration": descriptor.calibration(options)}
+
 
 @attrs.frozen
 class PlannerConfig(ComponentConfig):

@@ -317,8 +317,11 @@ def test_config_check_names_a_missing_calibration(
     folder: Path, terminal: Terminal, deep: tuple[str, ...], code: int, begin: str
 ) -> None:
     found, out, err = terminal.run("config", "check", "so101", *deep)
-    [line] = [line for line in (out + err).splitlines() if "there is no such calibration" in line]
-    assert (found, line.startswith(begin)) == (code, True)
+    lines = [line for line in (out + err).splitlines() if "there is no such calibration" in line]
+    assert found == code
+    for line, part in zip(lines, ("hardware", "teleoperation.leader"), strict=True):
+        assert line.startswith(begin)
+        assert f" {part}: " in line
 
 
 def test_recording_that_would_never_end_is_refused(folder: Path, terminal: Terminal) -> None:

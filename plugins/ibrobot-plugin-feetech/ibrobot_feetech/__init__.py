@@ -119,7 +119,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """The SO-101 leader arm."""
     yield TeleopDescriptor(
         type="so101_leader", options=LeaderOptions, make=_leader, summary="SO-101 leader arm, moved by hand",
-        check_options=check_leader, devices=serial_port, keys=leader_keys,
+        check_options=check_leader, devices=serial_port, calibration=calibration_of, keys=leader_keys,
     )  # fmt: skip
 
 

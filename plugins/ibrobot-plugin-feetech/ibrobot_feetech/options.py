@@ -179,7 +179,7 @@ def _unknown(option: str, names: Sequence[str], known: Sequence[str], what: str)
             yield OptionFault((option, i), f"unknown {what} {name!r}{did_you_mean(name, known, 'known')}")
 
 
-def calibration_of(options: FollowerOptions) -> str:
+def calibration_of(options: FollowerOptions | LeaderOptions) -> str:
     """The calibration of the arm."""
     return options.calibration
 
