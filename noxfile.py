@@ -226,6 +226,9 @@ def wheels(session: nox.Session) -> None:
             for command in commands:
                 program, *arguments = shlex.split(command, comments=True)
                 session.run(str(environment / "bin" / program), *arguments, external=True)
+    emulated = Path("tests/house/launch_on_emulators.py").absolute()
+    with session.chdir(folder):
+        session.run("python", str(emulated), str(folder / "ibrobot-plugin-feetech/bin/ibrobot"))
 
 
 @nox.session

@@ -10,6 +10,9 @@ motion and sensor noise. `--lerobot` is an interpreter that has `lerobot[dataset
   episode) and streaming, fed with the same pictures from memory. Streaming is fed no faster than it encodes, since it
   drops pictures otherwise. Both may use all cores.
 
+As root, libsvtav1 gives its threads real-time priority. Ours takes it back, LeRobot does not: here both run without
+the right to it, so that a busy machine slows both.
+
 Three times in turn; printed are medians, and those of the paired ratios. Frames a second leave out what the two
 commands import (not what the converting processes of ours do), and so does LeRobot's CPU time; all else is of the whole
 command. Both should have the same PyAV: its releases bring encoders of very different speed.
@@ -127,6 +130,8 @@ def measure(command: Sequence[str]) -> dict[str, float]:
     """Run a command: seconds, seconds of CPU, and the most memory of its processes together [MiB]."""
     begin = time.monotonic()
     environment = {**os.environ, "TQDM_DISABLE": "1", "SVT_LOG": "1", "HF_HUB_OFFLINE": "1"}
+    if os.geteuid() == 0 and (setpriv := shutil.which("setpriv")):
+        command = [setpriv, "--bounding-set", "-sys_nice", *command]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     peak, cpu, ended = 0.0, 0.0, threading.Event()
 
