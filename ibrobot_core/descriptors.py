@@ -212,6 +212,8 @@ class SectionDescriptor(Descriptor["Component"]):
     Imports what it needs when it is called, and opens nothing."""
     without_section: Callable[[RobotConfig], bool] = attrs.field(default=lambda config: False, kw_only=True)
     """Whether the component also runs if the YAML lacks the section."""
+    records_episodes: bool = attrs.field(default=False, kw_only=True)
+    """Whether its component is the `EpisodeRecorder` of runs with a section `recording`."""
     check_config: Callable[[RobotConfig], Iterable[OptionFault]] = attrs.field(default=lambda config: (), kw_only=True)
     """Yields faults of a robot config in any section; opens no device. The `option` of a fault is a path from the top
     of the file: `("peripherals", 0, "transform")`."""

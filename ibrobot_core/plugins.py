@@ -57,6 +57,8 @@ _UNTYPED = tuple(f"ibrobot_{objects}" for objects in ("readers", "decoders", "co
 OFFICIAL = Path(__file__).with_name("official_plugins.json")
 """The types in this project's packages: package -> kind -> types; kind `default` lists the kinds whose default type the
 package contains. Errors name missing plugins from it. `python tests/house/official_plugins.py` writes it."""
+RECORDS = "records"
+"""The key in `OFFICIAL` for the section whose component records episodes."""
 EXTRAS = Path(__file__).with_name("official_extras.json")
 """Extra of `ibrobot` -> the packages that it installs. `python tests/house/official_plugins.py` writes it."""
 
@@ -136,6 +138,19 @@ class Registry:
             section = config.plugin_sections.get(name)
             if section is not None or descriptor.without_section(config):
                 yield descriptor, None if section is None else section.options
+
+    def require_episode_recorder(self) -> None:
+        """Check that a plugin records the episodes of runs with a section `recording`.
+
+        Raises:
+            PluginNotInstalled: if none does.
+        """
+        sections = self.of_kind("section")
+        if not any(isinstance(each, descriptors.SectionDescriptor) and each.records_episodes for each in sections):
+            ((type_,),) = (offers[RECORDS] for offers in official_plugins().values() if RECORDS in offers)
+            error = self.not_found("section", type_)
+            assert isinstance(error, PluginNotInstalled)
+            raise PluginNotInstalled("section", "recording", error.package, error.reason)
 
     def default(self, kind: str) -> str:
         """The default type of a kind for commands.

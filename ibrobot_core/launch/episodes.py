@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from ibrobot_core.launch.session import Session
 
 
 class Episodes:
-    """Begins and ends episodes. Not thread-safe."""
+    """Begins, ends and counts episodes. Not thread-safe."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -57,3 +57,12 @@ class Episodes:
             session.outcome.successes += outcome == "success"
             session.log.info("episode %d: %s", self.number, outcome)
         session.emit("ibrobot_episode_ended", episode=self.number, outcome=outcome)
+
+
+@runtime_checkable
+class EpisodeRecorder(Protocol):
+    """A component that records a run's episodes; the plan lets its `episodes` begin and end them."""
+
+    @property
+    def episodes(self) -> Episodes:
+        """Begins, ends and counts the episodes."""

@@ -11,9 +11,10 @@ from ibrobot_core.component import CONTROL, Component
 from ibrobot_core.config.missing import unavailable_modes
 from ibrobot_core.config.schema import ActionSpec, ObservationSpec, PeripheralConfig
 from ibrobot_core.descriptors import SourceDescriptor, TransportDescriptor
-from ibrobot_core.errors import ComponentFailed, NotSupported, PluginNotInstalled
+from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.launch.absence import describe_absent
 from ibrobot_core.launch.control import ControlComponent
+from ibrobot_core.launch.episodes import EpisodeRecorder
 from ibrobot_core.launch.outputs.status import Status
 from ibrobot_core.launch.outputs.viewer import ViewerWorker
 from ibrobot_core.launch.perception import SensorWorker
@@ -24,9 +25,6 @@ from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.launch.sources.teleop import TeleopSource
 from ibrobot_core.launch.transport import TransportLink
 from ibrobot_core.messages import MESSAGE_TYPES
-
-RECORDED = "episodes"
-"""The section of a plugin whose component records episodes in runs with a section `recording`."""
 
 
 @attrs.frozen
@@ -134,10 +132,7 @@ def build_plan(session: Session) -> LaunchPlan:
             f"known types: {', '.join(MESSAGE_TYPES)}"
         )
     if config.recording is not None:
-        try:
-            session.registry.find("section", RECORDED)
-        except PluginNotInstalled as error:
-            raise PluginNotInstalled("section", "recording", error.package, error.reason) from None
+        session.registry.require_episode_recorder()
     link = None
     if (transport := config.transport) is not None:
         descriptor = session.registry.find("transport", transport.type)
@@ -152,7 +147,11 @@ def build_plan(session: Session) -> LaunchPlan:
     components += [SensorWorker(session, peripheral, (CONTROL,)) for peripheral in _sensors(session)]
     components += added.sources()
     components.append(Status(session, (CONTROL,)))
-    components += [section.make(options, session) for section, options in session.registry.sections(config)]
+    sections = [section.make(options, session) for section, options in session.registry.sections(config)]
+    for recorder in sections:
+        if isinstance(recorder, EpisodeRecorder):
+            session.episodes = recorder.episodes
+    components += sections
     if config.viewer is not None:
         components.append(ViewerWorker(session, config.viewer, (CONTROL,)))
     if link is not None:

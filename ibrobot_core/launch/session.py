@@ -178,7 +178,7 @@ class Session:
         operator_events: the operator's button presses on a teleoperation device, e.g. to begin and end episodes.
         log: the log of the run.
         command_source: the source that commands the active executors.
-        episodes: begins, ends and counts the episodes; replaced by what records them.
+        episodes: begins, ends and counts the episodes; that of the recorder in a run that records them.
         devices: the open teleoperation devices, which modes share.
         changing: held while the state of the run changes: by a mode switch, a reset, and the beginning or end of a
             simulated episode. An emergency stop never waits for it.

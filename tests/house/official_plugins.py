@@ -11,14 +11,17 @@ import tomllib
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, discover
+from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, RECORDS, discover
 
 CORE = "ibrobot-core"
 DISTRIBUTION = Path(__file__).parents[2] / "plugins" / "ibrobot" / "pyproject.toml"
 
 
 def offers() -> dict[str, dict[str, list[str]]]:
-    """Package -> kind -> types, of all installed plugins of this project; `default`: kinds with a default type."""
+    """Package -> kind -> types, of all installed plugins of this project.
+
+    `default`: kinds with a default type; `RECORDS`: the section that records episodes.
+    """
     found: dict[str, dict[str, list[str]]] = {}
     for entry in entry_points(group="ibrobot"):
         package = entry.dist.name if entry.dist is not None else ""
@@ -35,6 +38,8 @@ def offers() -> dict[str, dict[str, list[str]]]:
             if defaults:
                 kinds[kind] = [*defaults, *(each for each in kinds[kind] if each not in defaults)]
                 kinds.setdefault("default", []).append(kind)
+            if any(each.descriptor.records_episodes for each in mine if kind == "section"):
+                kinds[RECORDS] = kinds[kind]
         if registry.readers:
             kinds["reader"] = sorted(reader.type for reader in registry.readers)
         if commands := sorted(name for name, owner in registry.command_packages.items() if owner == package):

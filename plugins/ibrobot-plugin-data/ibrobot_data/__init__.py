@@ -79,6 +79,7 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         options=EpisodesOptions,
         make=_recording,
         without_section=_records,
+        records_episodes=True,
         check_config=check_keys,
         summary="how an operator corrects a policy, and which parts of a run are kept",
     )

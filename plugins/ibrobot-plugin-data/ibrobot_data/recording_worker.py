@@ -36,7 +36,7 @@ class NoRecording(Component):
 
 
 class RecordingWorker(SessionWorker):
-    """Writes the bus's messages to a recorder during an episode; its `service` begins and ends the run's episodes.
+    """Writes the bus's messages to a recorder during an episode; its `episodes` begins and ends them.
 
     If the recorder fails, e.g. on a full disk, the recording of the episode ends with a fault. The robot continues, and
     the next episode is recorded again. A run of `ibrobot record` whose mode begins the episodes ends instead: nobody is
@@ -50,7 +50,7 @@ class RecordingWorker(SessionWorker):
         self._config = config
         self._contract = Contract.from_config(session.config)
         session.refuse_absent("the recording", self._keeps)
-        self.service = session.episodes = EpisodeService(session, self)
+        self.episodes = EpisodeService(session, self)
         self._pending: deque[tuple[int, Callable[[], None]]] = deque()
         """Pending begins and ends of episodes: stamp [ns] and action."""
         self._pending_lock = threading.Lock()
@@ -80,8 +80,8 @@ class RecordingWorker(SessionWorker):
         self._recorder: Recorder = session.make("recorder", self._config, "recording")
         self._incoming = session.bus.subscribe(None, _DEPTH)
         self.on_end.callback(self._incoming.close)
-        self.service.serve()
-        self.on_end.callback(self.service.unserve)
+        self.episodes.serve()
+        self.on_end.callback(self.episodes.unserve)
         self.on_end.callback(self._give_up)
         self.on_end.callback(self._did, self._recorder.close)
         self.on_end.callback(self.work, 0.0)
