@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 from api_page import api_page
-from option_pages import config_page, options_page
+from option_pages import config_page, jobs_page, options_page
 from plugin_index import plugin_page
 
 from ibrobot_core.cli.main import cli
@@ -46,6 +46,7 @@ def write(directory: Path) -> None:
         "plugins.md": plugin_page,
         "cli.md": cli_page,
         "api.md": api_page,
+        "jobs.md": jobs_page,
     }
     for name, page in pages.items():
         text = "\n".join(page()) + "\n"

@@ -58,6 +58,26 @@ def options_page() -> Iterator[str]:
                 yield "It has no options.\n"
 
 
+def jobs_page() -> Iterator[str]:
+    """Lines of the page on the commands that programs run: their options and events."""
+    yield "# Commands for programs\n"
+    yield "With `--events`, these commands print what they do as lines of JSON: `event` is the name of the event, the"
+    yield "other keys are its fields. A command that ends with an error prints `failed` at last, with the `error`."
+    yield "A plugin declares the options and events of its command; command line, forms and checks derive from that. A"
+    yield "program in Python reads a line with {py:func}`~ibrobot_core.events.decode_event`.\n"
+    registry = installed_plugins()
+    for name, command in sorted(registry.declarations().items()):
+        if not command.events:
+            continue
+        yield f"## `ibrobot {name}`\n"
+        yield f"From `{registry.command_packages[name.partition(' ')[0]]}`: {command.summary}\n"
+        if fields(command.options):
+            yield from _table(command.options, links=False)
+        for event in command.events:
+            yield f"Event `{event.__name__.lower()}`: {_first_line(event)}\n"
+            yield from _table(event, links=False)
+
+
 def _class_lines(path: str, kind: type[Any], shown: set[type]) -> Iterator[str]:
     """The part of the page on a class and those within it, each class once."""
     if kind in shown:

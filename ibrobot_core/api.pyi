@@ -17,7 +17,6 @@ from ibrobot_core.descriptors import (
     DecoderDescriptor as DecoderDescriptor,
     DatasetDescriptor as DatasetDescriptor,
     ViewerDescriptor as ViewerDescriptor,
-    Flag as Flag,
     Check as Check,
 )
 

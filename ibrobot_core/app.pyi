@@ -113,6 +113,13 @@ from ibrobot_core.cli.options import (
     run_overrides as run_overrides,
     EpisodePath as EpisodePath,
 )
+from ibrobot_core.cli.declared import (
+    declared as declared,
+    emit as emit,
+    flag_of as flag_of,
+    read_options as read_options,
+)
+from ibrobot_core.events import Event as Event, Failed as Failed, Shown as Shown, decode_event as decode_event
 from ibrobot_core.outside import echo as echo, LogFormatter as LogFormatter
 from ibrobot_core.screen import Screen as Screen, styled as styled
 from ibrobot_core.terminal import KeyReader as KeyReader, check_key as check_key

@@ -18,6 +18,8 @@ from ibrobot_core.options import did_you_mean, fields
 Key = tuple[str | int, ...]
 """The path of a value in a document: mapping keys and list indices from the root."""
 
+MOST = 5
+"""Largest number of faults in a message."""
 _SHOWN = 200
 """Maximum length of a value in a message, in characters."""
 _YAML_1_1_BOOLS = {"on", "off", "yes", "no", "y", "n", "true", "false"}
@@ -40,6 +42,10 @@ class Faults(ValueError):
     """The faults of a value: keys below it, each with a message."""
 
     found: list[tuple[Key, str]] = attrs.field(factory=list)
+
+    def __str__(self) -> str:
+        lines = [": ".join(filter(None, (".".join(map(str, key)), message))) for key, message in self.found[:MOST]]
+        return "; ".join([*lines, *(["and more"] if len(self.found) > MOST else [])])
 
     def add(self, key: Key, message: str) -> None:
         """Add a fault."""

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ibrobot_core import interfaces
     from ibrobot_core.component import Component
     from ibrobot_core.config.schema import RobotConfig
+    from ibrobot_core.events import Event
     from ibrobot_core.launch.session import Session
     from ibrobot_core.launch.sources.source_worker import SourceWorker
     from ibrobot_core.launch.transport import TransportLink
@@ -171,23 +172,11 @@ class RecorderDescriptor(Descriptor["interfaces.Recorder"]):
 
 
 @attrs.frozen
-class Flag:
-    """A flag of the command line that sets an option of a type."""
-
-    name: str
-    """E.g. `--codec`."""
-    option: str
-    help: str
-    value: str | None = None
-    """The value that the flag sets; None if the value follows the flag."""
-
-
-@attrs.frozen
 class DatasetDescriptor(Descriptor["interfaces.DatasetWriter"]):
     """A dataset writer."""
 
-    flags: tuple[Flag, ...] = ()
-    """Flags of the convert command that set options of this type."""
+    flags: tuple[str, ...] = ()
+    """The options that are flags of the convert command, too."""
 
 
 @attrs.frozen
@@ -287,11 +276,22 @@ class ConfigFile:
 
 @attrs.frozen
 class Command:
-    """A command of a plugin: `ibrobot NAME …`; `load` imports it when it is called."""
+    """A command of a plugin: `ibrobot NAME …`; `load` imports it when it is called.
+
+    Its parameters, forms for it, and the checks and errors of both derive from `options`; see `declared`.
+    """
 
     name: str
     summary: str
     load: Callable[[], click.Command]
+    options: builtins.type[Any] = NoOptions
+    """A frozen attrs class made with `ibrobot_core.options.option`."""
+    events: tuple[builtins.type[Event], ...] = ()
+    """The classes of what it prints with `--events`. Pages can run a command with events, and show its progress."""
+    check: Callable[[], None] = attrs.field(default=lambda: None, kw_only=True)
+    """As `Descriptor.check`."""
+    commands: tuple[Command, ...] = attrs.field(default=(), kw_only=True)
+    """The commands below it that programs use; their names begin with its own, e.g. `episodes trim`."""
 
 
 @attrs.frozen

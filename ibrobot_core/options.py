@@ -65,12 +65,17 @@ def option(
     gt: float | None = None,
     le: float | None = None,
     lt: float | None = None,
-    choices: Sequence[Any] | None = None,
+    choices: Sequence[Any] | Mapping[str, str] | None = None,
+    open: bool = False,
     factory: Any = None,
     validator: Any = None,
     secret: bool = False,
     key: str | None = None,
     plain: Any = None,
+    label: str = "",
+    more: bool = False,
+    names: str = "",
+    argument: bool = False,
 ) -> Any:
     """An attrs field for an options class.
 
@@ -82,23 +87,30 @@ def option(
         gt: lower bound, exclusive.
         le: upper bound, inclusive.
         lt: upper bound, exclusive.
-        choices: the allowed values.
+        choices: the allowed values, or a mapping of them to words for forms. Each item of a tuple is one of them.
+        open: whether other values than the choices are allowed, too.
         factory: creates the default, for mutable values.
         validator: a further attrs validator; its ValueError states the valid values.
         secret: whether to hide the value; recordings and `config show` contain `${NAME}` as in the YAML, else `***`.
         key: the key in the YAML, if it differs from the field's name.
         plain: type of the value in files and requests, if programs may set others as well.
+        label: what forms and their errors call it; the key by default.
+        more: whether forms show it among further options.
+        names: what a path names, for forms: `episodes`, `dataset`, `policy`, `robot`, or `new` for a folder to make.
+        argument: whether it is an argument of the command line, and not a flag.
     """
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
     metadata = {"unit": unit, "help": help, "choices": tuple(choices) if choices is not None else None, **bounds}
-    metadata |= {"secret": secret, "plain": plain}
+    metadata |= {"secret": secret, "plain": plain, "label": label, "more": more, "names": names, "argument": argument}
+    metadata |= {"open": open, "words": dict(choices) if isinstance(choices, Mapping) else {}}
     shown: Any = _hidden if secret else True
 
     def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
         if value is None:
             return
-        if choices is not None and value not in choices:
-            raise ValueError(f"{value!r} is not one of: {', '.join(str(c) for c in choices)}")
+        for item in value if isinstance(value, tuple) else (value,):
+            if choices is not None and not open and item not in choices:
+                raise ValueError(f"{item!r} is not one of: {', '.join(str(c) for c in choices)}")
         for name, bound in bounds.items():
             fits, words = _BOUNDS[name]
             if bound is not None and not fits(value, bound):  # so that NaN fits none

@@ -130,6 +130,20 @@ class Registry:
             raise self.not_found(kind, type_)
         return entry.descriptor
 
+    def declarations(self) -> dict[str, descriptors.Command]:
+        """The commands, and those below them that programs use, e.g. `episodes trim`, by name."""
+        return {each.name: each for first in self.commands.values() for each in (first, *first.commands)}
+
+    def command(self, name: str) -> descriptors.Command:
+        """The declaration of a command.
+
+        Raises:
+            PluginError: if no installed plugin declares it; names the package to install, or the broken plugin.
+        """
+        if (found := self.declarations().get(name)) is None:
+            raise self.not_found("command", name.partition(" ")[0])
+        return found
+
     def sections(self, config: RobotConfig) -> Iterator[tuple[descriptors.SectionDescriptor, Any]]:
         """The plugins' sections for a robot with their options; None for a section that the file lacks."""
         for name in self.types("section"):

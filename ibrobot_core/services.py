@@ -11,15 +11,13 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.convert import Converter, Faults, Key, error_message, no_files, shown
+from ibrobot_core.convert import MOST, Converter, Faults, Key, error_message, no_files, shown
 from ibrobot_core.errors import RequestError
 from ibrobot_core.options import fields
 
 type Plain = bool | int | float | str | Sequence[Plain] | Mapping[str, Plain] | None
 """What JSON can say. Nothing in it is expanded: neither `${NAME}`, nor `~`, nor YAML in a text."""
 
-_SHOWN = 5
-"""Largest number of faults in a message."""
 _UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """Control characters, and halves of characters, which no file and no terminal takes."""
 _INTEGERS = range(-(2**63), 2**63)
@@ -88,22 +86,16 @@ class Service[Q, A]:
             if not isinstance(found, Mapping):
                 raise RequestError(f"{self.name}: expected {self._keys()}, got {shown(found)}")
             try:
-                return Converter(files, _SHOWN + 1).structure(found, self.request)  # type: ignore[no-any-return]
+                return Converter(files, MOST + 1).structure(found, self.request)  # type: ignore[no-any-return]
             except Faults as error:
                 faults = error.found
             except (ValueError, TypeError, ArithmeticError) as error:  # values that exclude each other
                 faults = [((), error_message(error))]
-        raise RequestError(f"{self.name}: {_listed(faults)}")
+        raise RequestError(f"{self.name}: {Faults(faults)}")
 
     def _keys(self) -> str:
         known = fields(self.request)
         return f"a mapping with {', '.join(known)}" if known else "nothing"
-
-
-def _listed(faults: list[tuple[Key, str]]) -> str:
-    lines = [": ".join(filter(None, (".".join(map(str, key)), message))) for key, message in faults[:_SHOWN]]
-    more = ["and more"] if len(faults) > _SHOWN else []
-    return "; ".join([*lines, *more])
 
 
 def _too_much(request: object, limits: RequestLimits) -> list[tuple[Key, str]]:

@@ -58,12 +58,8 @@ class EpisodePath(click.Path):
 _OPTIONS: dict[str, Callable[..., Any]] = {
     "config": argument("config", required=False),
     "sim": option("--sim", is_flag=True, help="Use the simulation section instead of hardware."),
-    "lockstep": option(
-        "--lockstep", is_flag=True, help="Run in simulated time, as fast as possible; equal seeds give equal runs."
-    ),
-    "seed": option(
-        "--seed", type=int, default=0, show_default=True, help="Seed of the first episode; later ones add 1."
-    ),
+    "lockstep": option("--lockstep", is_flag=True, help="Run in simulated time, as fast as possible, reproducibly."),
+    "seed": option("--seed", type=int, default=0, show_default=True, help="First episode's seed; later ones add 1."),
     "mode": option("--mode", metavar="MODE", help="Start in this control mode, instead of default_control_mode."),
     "overrides": option(
         "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override a key, e.g. control.rate_hz=50."
@@ -75,12 +71,8 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     ),
     "viewer": option("--viewer", metavar="TYPE", cls=_ViewerOption, help="Show the robot in this viewer."),
     "headless": option("--headless", is_flag=True, help="Print plain lines, without window, viewer and panel."),
-    "dry_run": option(
-        "--dry-run", is_flag=True, help="Print the plan, compare the model with the contract, and start nothing."
-    ),
-    "as_json": option(
-        "--json", "as_json", is_flag=True, help="Print only JSON on standard output: the summary, or the plan."
-    ),
+    "dry_run": option("--dry-run", is_flag=True, help="Print the plan, compare model and contract; start nothing."),
+    "as_json": option("--json", "as_json", is_flag=True, help="Print the summary, or the plan, as JSON only."),
 }
 
 

@@ -55,7 +55,7 @@ def _allowed(field: attrs.Attribute[Any]) -> str:
     if field.metadata.get("secret"):
         return "secret: ${NAME}"
     if field.metadata.get("choices") is not None:
-        return ", ".join(str(choice) for choice in field.metadata["choices"])
+        return ", ".join(map(str, field.metadata["choices"])) + (", …" if field.metadata["open"] else "")
     signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
     bounds = [f"{sign} {field.metadata[name]}" for name, sign in signs.items() if field.metadata.get(name) is not None]
     return ", ".join(bounds)

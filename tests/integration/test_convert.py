@@ -187,7 +187,7 @@ def test_events_tell_a_program_each_episode_and_the_result(bags: Path, tmp_path:
     result = run(bags, tmp_path / "bad", "--out", tmp_path / "set", "--jobs", 1, "--events")
     events = [json.loads(line) for line in result.out.splitlines()]
     assert (result.code, events[0], result.err) == (1, {"event": "begin", "of": 5}, "")
-    of_episodes = [event for event in events if "episode" in event]
+    of_episodes = [event for event in events if event.get("episode")]
     assert [event["done"] for event in of_episodes] == [1, 2, 3, 4, 5]
     assert [bool(event["error"]) for event in of_episodes].count(True) == 1
     assert "has no contract" in next(event["error"] for event in of_episodes if event["error"])

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from ibrobot_core.api import hookimpl
 from ibrobot_core.app import Command, SectionDescriptor, SourceDescriptor
+from ibrobot_data.conversion import EVENTS, ConvertOptions
 from ibrobot_data.options import EpisodesOptions, check_keys
 
 if TYPE_CHECKING:
@@ -33,10 +34,13 @@ def _replay() -> click.Command:
     return replay
 
 
+CONVERT = Command("convert", "Make a dataset for training from episodes.", _convert, ConvertOptions, EVENTS)
+
+
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot convert`, `ibrobot record` and `ibrobot replay`."""
-    yield Command("convert", "Make a dataset for training from episodes.", _convert)
+    yield CONVERT
     yield Command("record", "Run a robot and record its episodes.", _record)
     yield Command("replay", "Play a recorded episode on a robot, and compare.", _replay)
 

@@ -11,17 +11,18 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import attrs
 import click
 from click.core import ParameterSource
 
-from ibrobot_core.api import Contract, DatasetDescriptor, DatasetError, Flag
-from ibrobot_core.app import NORM_MODES, EpisodePath, echo, installed_plugins, with_closed_ends, wrong_input
+from ibrobot_core.api import Contract, DatasetDescriptor, DatasetError
+from ibrobot_core.app import Failed, declared, echo, emit, installed_plugins, with_closed_ends, wrong_input
+from ibrobot_data import CONVERT, conversion
+from ibrobot_data.conversion import ConvertOptions
 from ibrobot_data.prompt import check_prompt
-from ibrobot_data.request import MISSING, ONLY, OUTCOMES, ConversionRequest, EpisodeReport, Report
+from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
 from ibrobot_data.words import plural
 
 if TYPE_CHECKING:
@@ -32,103 +33,75 @@ _Progress = Callable[[int], AbstractContextManager[Any]]
 _MIB = 1 << 20
 _ONLY_TO_BAG = ("numbers",)
 _ONLY_TO_DATASET = (
-    "append", "type_", "force_contract", "any_robot", "missing", "outcomes", "success", "jobs", "only", "context",
+    "append", "type_", "force_contract", "any_robot", "missing", "outcome", "success", "jobs", "only", "context",
 )  # fmt: skip
 _EVENT_S = 0.1
 _MUCH = 0.1
 """The report names episodes that lost a larger share of their ticks."""
-_MISSING = attrs.fields(ConversionRequest).missing.default
-_CONTEXT = attrs.fields(ConversionRequest).context.default
 
 
-def _flags() -> dict[str, Flag]:
-    """Name of a parameter -> the flag that a dataset writer adds to this command."""
-    descriptors = (entry.descriptor for entry in installed_plugins().entries.values())
-    flags = [flag for each in descriptors if isinstance(each, DatasetDescriptor) for flag in each.flags]
-    return {flag.name.removeprefix("--").replace("-", "_"): flag for flag in flags}
+def _writer_flags() -> dict[str, click.Option]:
+    """Option of a dataset writer -> the flag that it is on this command line."""
+    found = {}
+    for entry in installed_plugins().entries.values():
+        writer = entry.descriptor
+        for name in writer.flags if isinstance(writer, DatasetDescriptor) else ():
+            known = attrs.fields_dict(writer.options)[name]
+            off = known.default is True
+            help_text = f"{writer.type}: {known.metadata['help']}."
+            found[name] = click.Option([f"--no-{name}" if off else f"--{name}", name], is_flag=off, help=help_text)
+    return found
 
 
-def _flags_of_writers(command: Callable[..., Any]) -> Callable[..., Any]:
+def _with_writer_flags(command: click.Command) -> click.Command:
     """Add the flags of the installed dataset writers."""
-    for name, flag in reversed(_flags().items()):
-        command = click.option(flag.name, name, is_flag=flag.value is not None, help=flag.help)(command)
+    command.params += _writer_flags().values()
     return command
 
 
+@_with_writer_flags
 @click.command()
-@click.argument("episodes", nargs=-1, required=True, type=EpisodePath())
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="The dataset: a new folder.")
+@declared(CONVERT)
 @click.option("--to", type=click.Choice(("dataset", "bag")), default="dataset", show_default=True, help="What to make.")
 @click.option("--episodes", "numbers", metavar="N,N-M", help="With --to bag: only these episodes, counted from 0.")
-@click.option("--append", is_flag=True, help="Add new episodes to an existing dataset.")
 @click.option("--type", "type_", help="Dataset writer; by default that of an installed plugin.")
-@_flags_of_writers
 @click.option("--set", "sets", multiple=True, metavar="OPTION=VALUE", help="Any other option of the dataset writer.")
-@click.option("--config", metavar="CONFIG", help="Robot YAML, or a YAML with only a contract, for foreign bags.")
-@click.option("--force-contract", is_flag=True, help="Use --config's contract even if the recorded one differs.")
-@click.option("--any-robot", is_flag=True, help="Merge episodes even if robot, robot type or calibration differ.")
-@click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of the dataset's joints; by default radians.")
-@click.option("--calibration", metavar="NAME", help="Calibration for --norm-mode, instead of the recorded one.")
-@click.option(
-    "--missing",
-    type=click.Choice(MISSING),
-    default=_MISSING,
-    show_default=True,
-    help="If an observation is missing: refuse the episode, skip the tick, or hold the last value.",
-)
-@click.option(
-    "--outcome", "outcomes", multiple=True, type=click.Choice(OUTCOMES), help="Only this outcome; repeatable."
-)
-@click.option("--prompt", default="", metavar="TEXT", help="Task of episodes recorded without one.")
-@click.option(
-    "--only",
-    type=click.Choice(ONLY),
-    default="all",
-    show_default=True,
-    help="Keep only the rows that the operator or the policy commanded; each stretch becomes an episode.",
-)
-@click.option(
-    "--context",
-    type=click.FloatRange(min=0),
-    default=_CONTEXT,
-    show_default=True,
-    metavar="S",
-    help="Seconds to keep before and after an intervention, for --only interventions.",
-)
-@click.option("--success", is_flag=True, help="Add next.success: true in the last row of a success.")
-@click.option(
-    "--jobs",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Episodes in parallel; by default one for each CPU core.",
-)
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
-@click.option("--events", is_flag=True, help="Print the progress as JSON lines, and the report as the last one.")
 @click.pass_context
-def convert(context: click.Context, /, to: str, as_json: bool, events: bool, **asked: Any) -> None:
+def convert(
+    context: click.Context, options: ConvertOptions, /, *, to: str, numbers: str | None, type_: str | None,
+    sets: tuple[str, ...], as_json: bool, events: bool, **flags: Any,
+) -> None:  # fmt: skip
     """Make a dataset for training from recorded episodes, or with --to bag episodes from a dataset.
 
     EPISODES are episodes, folders of them such as episodes/default, or DATASET:N; with --to bag it is one dataset.
     After an interruption, run the same command again to continue. An episode that cannot be converted is reported and
     left out; the command then exits with 1.
     """
-    given = [name for name in asked if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
-    only_other = _ONLY_TO_BAG if to == "dataset" else (*_ONLY_TO_DATASET, *_flags())
-    if wrong := [name for name in given if name in only_other]:
-        option = next(each.opts[0] for each in context.command.params if each.name == wrong[0])
-        raise click.UsageError(f"{option} has no meaning for --to {to}")
+    given = [each for each in context.command.params if _given(context, each)]
+    only_other = _ONLY_TO_BAG if to == "dataset" else (*_ONLY_TO_DATASET, *_writer_flags())
+    if wrong := [each for each in given if each.name in only_other]:
+        raise click.UsageError(f"{wrong[0].opts[0]} has no meaning for --to {to}")
     try:
         with wrong_input():
-            check_prompt(asked["prompt"])
+            check_prompt(options.prompt)
             progress = _events if events else partial(_progress, quiet=as_json)
-            report = (_to_bags if to == "bag" else _to_dataset)(progress=progress, **asked)
+            if to == "bag":
+                unit = options.norm_mode if "norm_mode" in [each.name for each in given] else None
+                report = _to_bags(options, numbers, unit, sets, progress)
+            else:
+                report = _to_dataset(options, type_, (*_overrides(flags), *sets), progress)
     except KeyboardInterrupt:
-        echo("interrupted; finished episodes are kept: run the same command again to continue", err=True)
+        if events:
+            emit(
+                CONVERT,
+                Failed("interrupted; finished episodes are kept: the same conversion continues with the others"),
+            )
+        else:
+            echo("interrupted; finished episodes are kept: run the same command again to continue", err=True)
         sys.exit(130)
     if events:
-        summary = report.summary()
-        del summary["reports"]  # each episode had its event
-        _emit("report", **summary)
+        emit(CONVERT, conversion.Report.of(report.summary()))  # each episode had its event
     elif as_json:
         echo(json.dumps(report.summary()))
     else:
@@ -137,48 +110,48 @@ def convert(context: click.Context, /, to: str, as_json: bool, events: bool, **a
         sys.exit(1)
 
 
-def _to_dataset(
-    *, episodes: tuple[Path, ...], out: Path, type_: str | None, config: str | None, calibration: str | None,
-    progress: _Progress, outcomes: tuple[str, ...], jobs: int | None, sets: tuple[str, ...], norm_mode: str | None,
-    numbers: str | None, **asked: Any,
-) -> Report:  # fmt: skip
+def _given(context: click.Context, parameter: click.Parameter) -> bool:
+    return context.get_parameter_source(parameter.name or "") is ParameterSource.COMMANDLINE
+
+
+def _to_dataset(options: ConvertOptions, type_: str | None, overrides: Sequence[str], progress: _Progress) -> Report:
     from ibrobot_data.run import convert as run
     from ibrobot_data.run import find_episodes
 
-    overrides = [_override(flag, value) for name, flag in _flags().items() if (value := asked.pop(name))]
     type_ = type_ or installed_plugins().default("dataset")
     request = ConversionRequest(
-        out, _options("dataset", type_, (*overrides, *sets)), type_,
-        outcomes=outcomes or OUTCOMES, jobs=jobs or cores(), norm_mode=norm_mode or "radians",
-        **_given(config, calibration), **asked,
+        options.out, _options("dataset", type_, overrides), type_, append=options.append, outcomes=options.outcome,
+        jobs=options.jobs or cores(), norm_mode=options.norm_mode, missing=options.missing, prompt=options.prompt,
+        success=options.success, only=options.only, context=options.context, any_robot=options.any_robot,
+        force_contract=options.force_contract, **_stated(options.config, options.calibration),
     )  # fmt: skip
-    found = find_episodes(episodes)
+    found = find_episodes(options.episodes)
     with progress(len(found)) as watch:
         return run(request, found, watch)
 
 
 def _to_bags(
-    *, episodes: tuple[Path, ...], out: Path, config: str | None, calibration: str | None, progress: _Progress,
-    sets: tuple[str, ...], norm_mode: str | None, numbers: str | None, prompt: str, **_: Any,
-) -> Report:  # fmt: skip
+    options: ConvertOptions, numbers: str | None, norm_mode: str | None, sets: tuple[str, ...], progress: _Progress
+) -> Report:
     from ibrobot_core.api import EpisodeAddress
     from ibrobot_data.episode import make_writer
     from ibrobot_data.given import metadata_from_config
     from ibrobot_data.to_bags import BagRequest, convert_to_bags
 
-    if len(episodes) != 1:
+    if len(options.episodes) != 1:
         raise click.UsageError("--to bag takes one dataset at a time")
-    address = EpisodeAddress.of(episodes[0])
+    address = EpisodeAddress.of(options.episodes[0])
     dataset, recorder = installed_plugins().default("dataset"), installed_plugins().default("recorder")
     writer = make_writer(ConversionRequest(address.path, _options("dataset", dataset, ()), dataset))
     if (summary := writer.summary(address.path)) is None:
         raise DatasetError(f"{address.path}: not a dataset of type {dataset}")
     chosen = (address.number,) if address.number is not None else _numbers(numbers, summary.episodes)
-    robot = _robot(config) if config is not None else None
+    robot = _robot(options.config) if options.config is not None else None
+    calibration = _calibration(options.calibration)
     request = BagRequest(
-        address.path, chosen, out, _options("recorder", recorder, sets), recorder, prompt=prompt,
+        address.path, chosen, options.out, _options("recorder", recorder, sets), recorder, prompt=options.prompt,
         contract=Contract.from_config(robot) if robot is not None else None,
-        given=metadata_from_config(robot, norm_mode, _calibration(calibration)) if robot is not None else {},
+        given=metadata_from_config(robot, norm_mode, calibration) if robot is not None else {},
     )  # fmt: skip
     with progress(len(chosen)) as watch:
         return convert_to_bags(request, watch)
@@ -206,12 +179,17 @@ def _numbers(text: str | None, total: int) -> tuple[int, ...]:
     return tuple(sorted(found))
 
 
-def _override(flag: Flag, value: Any) -> str:
+def _overrides(flags: Mapping[str, Any]) -> list[str]:
+    """The overrides of a dataset writer's options that flags stand for."""
     from ibrobot_core.app import Override
 
-    if flag.value is not None:
-        return Override.of(flag.name, f"{flag.option}={flag.value}")
-    return Override.of(f"{flag.name} {value}", f"{flag.option}={value}")
+    found: list[str] = []
+    for name, flag in _writer_flags().items():
+        if (value := flags[name]) is True:
+            found.append(Override.of(flag.opts[0], f"{name}=false"))
+        elif value:
+            found.append(Override.of(f"{flag.opts[0]} {value}", f"{name}={value}"))
+    return found
 
 
 def cores() -> int:
@@ -232,7 +210,7 @@ def _robot(config: str) -> RobotConfig:
     return load_contract(find_config(config, installed_plugins()))
 
 
-def _given(config: str | None, calibration: str | None) -> dict[str, Any]:
+def _stated(config: str | None, calibration: str | None) -> dict[str, Any]:
     """Fields of the request that come from a robot YAML and a calibration."""
     numbers = _calibration(calibration)
     if config is None:
@@ -253,31 +231,28 @@ def _calibration(name: str | None) -> Mapping[str, Mapping[str, Any]] | None:
     return load_calibration(name).snapshot()
 
 
-def _emit(event: str, **facts: Any) -> None:
-    """Print an event for a program that reads the output."""
-    echo(json.dumps({"event": event, **facts}))
-
-
 @contextmanager
 def _events(episodes: int) -> Iterator[Any]:
     """A function that prints the progress as events: one for each episode, and at most ten a second beside them."""
     begin = last = time.monotonic()
     done = 0
 
-    def event(frames: int, total: int, report: EpisodeReport | None) -> None:
+    def watch(frames: int, total: int, report: EpisodeReport | None) -> None:
         nonlocal done, last
         now = time.monotonic()
         if report is None and now - last < _EVENT_S:
             return
         last = now
         done += report is not None
-        facts: dict[str, Any] = {"done": done, "of": episodes, "frames": frames, "total_frames": max(total, frames)}
-        if report is not None:
-            facts |= {"episode": report.source, "error": report.error}
-        _emit("progress", **facts, seconds=round(now - begin, 3))
+        episode, error = ("", "") if report is None else (report.source, report.error)
+        event = conversion.Progress(
+            done=done, of=episodes, frames=frames, total_frames=max(total, frames), seconds=round(now - begin, 3),
+            episode=episode, error=error,
+        )  # fmt: skip
+        emit(CONVERT, event)
 
-    _emit("begin", of=episodes)
-    yield event
+    emit(CONVERT, conversion.Begin(episodes))
+    yield watch
 
 
 @contextmanager

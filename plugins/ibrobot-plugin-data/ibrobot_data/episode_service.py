@@ -12,14 +12,13 @@ import attrs
 
 from ibrobot_core.api import Contract, NotSupported, RecorderError, documented, option, seconds
 from ibrobot_core.app import DiskFull, Episodes, NoRequest, Service, Session, wrong_input
+from ibrobot_data.conversion import OUTCOMES
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_start import is_kept
 from ibrobot_data.prompt import check_prompt
 
 if TYPE_CHECKING:
     from ibrobot_data.recording_worker import RecordingWorker
-
-OUTCOMES = ("success", "failure", "unknown")
 
 
 @documented

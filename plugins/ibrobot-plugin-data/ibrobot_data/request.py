@@ -10,10 +10,7 @@ import attrs
 
 from ibrobot_core.api import Contract, documented, option
 from ibrobot_core.app import NORM_MODES
-
-MISSING = ("refuse", "skip", "hold")
-OUTCOMES = ("success", "failure", "unknown")
-ONLY = ("all", "interventions", "policy")
+from ibrobot_data.conversion import MISSING, ONLY, OUTCOMES
 
 
 @documented
@@ -38,7 +35,7 @@ class ConversionRequest:
     norm_mode: str = option("radians", choices=NORM_MODES)
     missing: str = option("skip", choices=MISSING)
     """How to treat a tick with a missing observation: refuse the episode, skip the tick, or hold the last value."""
-    outcomes: tuple[str, ...] = OUTCOMES
+    outcomes: tuple[str, ...] = tuple(OUTCOMES)
     """Episodes of other outcomes are passed over."""
     prompt: str = ""
     """Task of the episodes that were recorded without one."""

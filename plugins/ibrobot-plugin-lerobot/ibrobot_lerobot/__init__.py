@@ -6,9 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import DatasetDescriptor, Flag, PolicyDescriptor, ReaderDescriptor, hookimpl
+from ibrobot_core.api import DatasetDescriptor, PolicyDescriptor, ReaderDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions
+from ibrobot_lerobot.training import EVENTS, TrainOptions, check_trainer
 
 if TYPE_CHECKING:
     import click
@@ -47,11 +48,7 @@ def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
         make=_write,
         default=True,
         summary="LeRobot v3.0: videos and tables",
-        flags=(
-            Flag("--codec", "codec", "Video encoder, e.g. h264; auto uses a GPU's if available."),
-            Flag("--crf", "crf", "Video quality; lower values give better quality and larger files."),
-            Flag("--no-videos", "videos", "Store lossless images, as PNG in the tables.", "false"),
-        ),
+        flags=("codec", "crf", "videos"),
     )
 
 
@@ -84,8 +81,11 @@ def _train() -> click.Command:
     return train
 
 
+TRAIN = Command("train", "Train a policy with LeRobot.", _train, TrainOptions, EVENTS, check=check_trainer)
+
+
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot datasets info` and `ibrobot train`."""
     yield Command("datasets", "Show LeRobot datasets.", _datasets)
-    yield Command("train", "Train a policy with LeRobot.", _train)
+    yield TRAIN

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import re
 import shlex
@@ -17,14 +18,13 @@ from typing import Any
 
 import click
 
-from ibrobot_core.api import DatasetError, MissingDependency
-from ibrobot_core.app import Ownership, echo, wrong_input
+from ibrobot_core.api import DatasetError
+from ibrobot_core.app import Failed, Ownership, declared, echo, emit, wrong_input
+from ibrobot_lerobot import TRAIN
 from ibrobot_lerobot.pretrained import check_policy
+from ibrobot_lerobot.training import AUTO, SMALL, Begin, Phase, Progress, Report, TrainOptions, find_trainer
 from ibrobot_lerobot.training_checkpoints import TrainingCheckpoint, begun_in_vain, check_same, newest_checkpoint
 
-LEROBOT = "lerobot[dataset,training]>=0.6.1,<0.7"
-SMALL = "small_act"
-"""The policy of the tutorial: an ACT with 0.5 million parameters, for a CPU."""
 _SMALL = (
     "--policy.type=act", "--policy.use_vae=false", "--policy.dim_model=128", "--policy.n_heads=4",
     "--policy.dim_feedforward=256", "--policy.n_encoder_layers=2", "--policy.dropout=0.0", "--policy.chunk_size=30",
@@ -39,12 +39,11 @@ _PHASES = {
     "Creating policy": "making the policy",
     "Start offline training": "training",
 }
-"""Text in the output of `lerobot-train` -> what it does from then on, for events. Loading torch comes first."""
+"""Text in the output of `lerobot-train` -> what it does from then on. Loading torch comes first."""
 _REPORTS = 200
 """Reports of progress in a training."""
 _END_S = 10.0
 _INTERRUPTED = 130
-AUTO = "auto"
 _WHEN_CONTINUING = ("--policy.device", "--steps", "--save_freq", "--log_freq", "--output_dir")
 """Arguments of a command that continues a training; LeRobot takes the others from the checkpoint."""
 _WATCH = "import os, signal, sys; sys.stdin.read(); os.killpg(0, signal.SIGKILL)"
@@ -53,37 +52,26 @@ _PROGRESS = re.compile(r"\bstep:\S+ .*?\bloss:(?P<loss>[-+.\deinfa]+)(?:.*?\blr:
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
-@click.argument("dataset", type=click.Path(path_type=Path))
-@click.argument("options", nargs=-1, type=click.UNPROCESSED)
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder for the checkpoints.")
-@click.option("--policy", default=SMALL, show_default=True, help="small_act, or a policy type of LeRobot, e.g. act.")
-@click.option("--steps", type=click.IntRange(min=1), default=5000, show_default=True, help="Training steps.")
-@click.option("--batch-size", type=click.IntRange(min=1), default=32, show_default=True, help="Frames per step.")
-@click.option("--save-every", type=click.IntRange(min=1), help="Steps between checkpoints; a tenth of all by default.")
-@click.option("--device", default=AUTO, show_default=True, help="Device of torch: auto (a GPU if there is one), cpu, …")
-@click.option("--download", is_flag=True, help="Let LeRobot download the weights that the policy begins with.")
-@click.option("--events", is_flag=True, help="Print the progress as JSON lines.")
+@declared(TRAIN)
 @wrong_input()
-def train(
-    dataset: Path, options: tuple[str, ...], out: Path, policy: str, steps: int, batch_size: int,
-    save_every: int | None, device: str, download: bool, events: bool,
-) -> None:  # fmt: skip
+def train(options: TrainOptions, events: bool) -> None:
     """Train a policy on a DATASET with LeRobot, which must be installed.
 
     The same command continues a training that was interrupted, from its newest checkpoint.
-    Further OPTIONS are passed to lerobot-train, e.g. --seed=1.
+    LEROBOT_OPTIONS are passed to lerobot-train, e.g. --seed=1.
     """
     from ibrobot_lerobot.merge import reading
 
+    dataset, out, policy, steps = options.dataset, options.out, options.policy, options.steps
     if not (dataset / "meta" / "info.json").is_file():
         raise DatasetError(f"{dataset}: is not a LeRobot dataset: it has no meta/info.json")
-    program = _program()
-    chosen = [*arguments(dataset, out, policy, steps, batch_size, save_every, device), *options]
+    program = find_trainer()
+    chosen = [*arguments(options), *options.lerobot_options]
     with reading(dataset, "is being trained on"), _owning(out):
         newest = _begun(out, chosen)
         if newest is None:
             if policy != SMALL:
-                check_policy(policy, options, download=download)
+                check_policy(policy, options.lerobot_options, download=options.download)
             command = [program, *chosen]
         else:
             kept = [each for each in chosen if each.partition("=")[0] in _WHEN_CONTINUING]
@@ -92,14 +80,19 @@ def train(
         if begun < steps:
             if not events:
                 echo(f"$ {shlex.join(command)}", err=True)
-            code = _run(command, _environment(policy, download=download), begun, steps, events=events)
+            code = _run(command, _environment(policy, download=options.download), begun, steps, events=events)
             newest = newest_checkpoint(out)
             if code or newest is None:
-                echo(_kept(newest, save_every or saving_step(steps), interrupted=code == _INTERRUPTED), err=True)
+                _tell_end(
+                    newest, options.save_every or saving_step(steps), interrupted=code == _INTERRUPTED, events=events
+                )
                 sys.exit(code or 1)
     assert newest is not None
     trained = out / "checkpoints" / "last" / newest.policy.name
-    echo(json.dumps({"event": "report", "checkpoint": str(trained)}) if events else f"trained: {trained}")
+    if events:
+        emit(TRAIN, Report(str(trained)))
+    else:
+        echo(f"trained: {trained}")
 
 
 def _environment(policy: str, *, download: bool) -> dict[str, str]:
@@ -146,12 +139,17 @@ def _begun(out: Path, chosen: Sequence[str]) -> TrainingCheckpoint | None:
     return None
 
 
-def _kept(newest: TrainingCheckpoint | None, first: int, *, interrupted: bool) -> str:
-    """What is kept of a training that has ended early."""
-    ended = "interrupted" if interrupted else "the training failed"
+def _tell_end(newest: TrainingCheckpoint | None, first: int, *, interrupted: bool, events: bool) -> None:
+    """Tell what is kept of a training that has ended early."""
+    text = "interrupted" if interrupted else "the training failed"
     if newest is None:
-        return f"{ended}; nothing is kept, since the first checkpoint would have been written at step {first}"
-    return f"{ended}; kept: {newest.folder} (step {newest.step}); the same command continues from there"
+        text += f"; nothing is kept, since the first checkpoint would have been written at step {first}"
+    else:
+        text += f"; kept: {newest.folder} (step {newest.step}); the same command continues from there"
+    if events:
+        emit(TRAIN, Failed(text.replace("the same command", "the same training")))
+    else:
+        echo(text, err=True)
 
 
 def saving_step(steps: int) -> int:
@@ -159,23 +157,23 @@ def saving_step(steps: int) -> int:
     return max(1, steps // 10)
 
 
-def arguments(
-    dataset: Path, out: Path, policy: str, steps: int, batch_size: int, save_every: int | None, device: str
-) -> list[str]:
+def arguments(options: TrainOptions) -> list[str]:
     """The arguments of `lerobot-train` for a new training."""
-    chosen = [*_SMALL, f"--policy.normalization_mapping={json.dumps(_NORMALISED)}"]
+    small = [*_SMALL, f"--policy.normalization_mapping={json.dumps(_NORMALISED)}"]
+    root, steps = options.dataset.resolve(), options.steps
     return [
-        f"--dataset.repo_id=local/{dataset.resolve().name}", f"--dataset.root={dataset.resolve()}",
-        *(chosen if policy == SMALL else [f"--policy.type={policy}"]),
-        *([] if device == AUTO else [f"--policy.device={device}"]), "--policy.push_to_hub=false",
-        f"--batch_size={batch_size}", f"--steps={steps}", f"--save_freq={save_every or saving_step(steps)}",
+        f"--dataset.repo_id=local/{root.name}", f"--dataset.root={root}",
+        *(small if options.policy == SMALL else [f"--policy.type={options.policy}"]),
+        *([] if options.device == AUTO else [f"--policy.device={options.device}"]), "--policy.push_to_hub=false",
+        f"--batch_size={options.batch_size}", f"--steps={steps}",
+        f"--save_freq={options.save_every or saving_step(steps)}",
         f"--log_freq={max(1, steps // _REPORTS)}", "--num_workers=0", "--wandb.enable=false",
-        f"--output_dir={out.resolve()}",
+        f"--output_dir={options.out.resolve()}",
     ]  # fmt: skip
 
 
-def progress(line: str, reports: int, steps: int, begun: int = 0) -> dict[str, Any] | None:
-    """The progress that a line of `lerobot-train` reports; None if it reports none.
+def progress(line: str, reports: int, steps: int, begun: int = 0) -> tuple[int, float | None, float | None] | None:
+    """Step, loss and learning rate that a line of `lerobot-train` reports; None if it reports none.
 
     Args:
         line: the line.
@@ -188,16 +186,8 @@ def progress(line: str, reports: int, steps: int, begun: int = 0) -> dict[str, A
         return None
     every = max(1, steps // _REPORTS)
     step = min(steps, (begun // every + reports + 1) * every)
-    rate = found["lr"]
-    return {"step": step, "steps": steps, "loss": float(found["loss"]), "lr": float(rate) if rate else None}
-
-
-def _program() -> str:
-    beside = Path(sys.executable).with_name("lerobot-train")
-    found = str(beside) if beside.exists() else shutil.which("lerobot-train")
-    if found is None:
-        raise MissingDependency("LeRobot is not installed", remedy=f"pip install '{LEROBOT}'")
-    return found
+    loss, rate = float(found["loss"]), found["lr"]
+    return step, loss if math.isfinite(loss) else None, float(rate) if rate else None
 
 
 def _run(command: Sequence[str], environment: Mapping[str, str], begun: int, steps: int, *, events: bool) -> int:
@@ -227,13 +217,22 @@ def _run(command: Sequence[str], environment: Mapping[str, str], begun: int, ste
 def _report(output: Any, begun: int, steps: int) -> None:
     """Print the progress as events, and all other lines as they are."""
     begin, reports = time.monotonic(), 0
-    echo(json.dumps({"event": "begin", "step": begun, "steps": steps}))
-    echo(json.dumps({"event": "phase", "text": "loading torch and LeRobot"}))
+    first: tuple[int, float] | None = None
+    """Step and time [s] of the first report, before which LeRobot loads."""
+    emit(TRAIN, Begin(begun, steps))
+    emit(TRAIN, Phase("loading torch and LeRobot"))
     for line in output:
         for text in (text for mark, text in _PHASES.items() if mark in line):
-            echo(json.dumps({"event": "phase", "text": text}))
+            emit(TRAIN, Phase(text))
         if (found := progress(line, reports, steps, begun)) is None:
             echo(line.rstrip("\n"), err=True)
             continue
         reports += 1
-        echo(json.dumps({"event": "progress", **found, "seconds": round(time.monotonic() - begin, 1)}))
+        step, loss, rate = found
+        seconds = round(time.monotonic() - begin, 1)
+        left_s = None
+        if first is None:
+            first = step, seconds
+        elif step > first[0]:
+            left_s = round((seconds - first[1]) / (step - first[0]) * (steps - step), 1)
+        emit(TRAIN, Progress(step=step, steps=steps, loss=loss, lr=rate, seconds=seconds, left_s=left_s))

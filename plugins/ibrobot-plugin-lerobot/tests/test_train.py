@@ -18,6 +18,7 @@ from ibrobot_lerobot import merge as merging
 from ibrobot_lerobot import train as training
 from ibrobot_lerobot.commands import datasets
 from ibrobot_lerobot.train import arguments, progress, train
+from ibrobot_lerobot.training import TrainOptions
 from ibrobot_lerobot.training_checkpoints import newest_checkpoint
 from trainer import install
 
@@ -33,7 +34,7 @@ FEATURES = {"observation.state": Feature("float32", (2,), ("a.pos", "b.pos")), "
 def dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A dataset; `ibrobot train` runs `trainer` in place of LeRobot's program."""
     program = install(tmp_path)
-    monkeypatch.setattr(training, "_program", lambda: str(program))
+    monkeypatch.setattr(training, "find_trainer", lambda: str(program))
     return write(tmp_path / "set", FEATURES, (3,), codec="h264")
 
 
@@ -104,7 +105,7 @@ SCRIPT = """
 import sys
 from ibrobot_lerobot import merge as merging
 from ibrobot_lerobot import train as training
-training._program = lambda: sys.argv[1]
+training.find_trainer = lambda: sys.argv[1]
 training.train(sys.argv[2:])
 """
 
@@ -215,9 +216,10 @@ def test_a_training_without_lerobot_names_the_command_that_installs_it(tmp_path:
 
 
 def test_other_policies_keep_the_settings_of_lerobot():
-    words = arguments(Path("set"), Path("out"), "diffusion", 100, 8, None, "cuda")
+    asked = TrainOptions(dataset=Path("set"), out=Path("out"), policy="diffusion", steps=100, device="cuda")
+    words = arguments(asked)
     assert {"--policy.type=diffusion", "--policy.device=cuda", "--steps=100", "--log_freq=1"} < set(words)
-    small = arguments(Path("set"), Path("out"), "small_act", 100, 8, 7, "auto")
+    small = arguments(TrainOptions(dataset=Path("set"), out=Path("out"), steps=100, save_every=7))
     assert not any(word.startswith("--policy.device") for word in small)  # LeRobot takes a GPU if there is one
     assert "--save_freq=7" in small
     assert not any(word.startswith("--optimizer") for word in words)

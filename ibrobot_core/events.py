@@ -1,0 +1,87 @@
+"""Events: what a command tells the program that started it, one line of JSON each.
+
+A command declares the classes of its events (`Command.events`) and prints them with `--events`. A program that started
+it, such as a page, reads each line as an object of its class, and shows what `shown` returns: it needs no words of its
+own. A line of another shape is an error.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import override
+
+import attrs
+
+from ibrobot_core.errors import WireError
+from ibrobot_core.options import option
+
+_BEGIN = '{"event": '
+
+
+@attrs.frozen
+class Shown:
+    """What a person is shown of an event."""
+
+    text: str = ""
+    """The state of the work in one line; empty if the event does not change it."""
+    progress: float | None = None
+    """Share of the work that is done, 0 to 1."""
+    problem: str = ""
+    """What went wrong with a part of the work, which goes on."""
+    point: Mapping[str, float] = attrs.field(factory=dict)
+    """The next point of a curve, abscissa first, e.g. `{"step": 100, "loss": 0.7}`."""
+    made: Mapping[str, str] = attrs.field(factory=dict)
+    """Paths of what the work has made, by kind as in the `names` of `option`, e.g. `dataset`."""
+
+
+@attrs.frozen
+class Event(ABC):
+    """Base of the events of commands: frozen attrs classes, whose fields (`option`) are plain data."""
+
+    @abstractmethod
+    def shown(self) -> Shown:
+        """What a person is shown of it."""
+
+
+@attrs.frozen
+class Failed(Event):
+    """The last event of a command that ends with an error."""
+
+    error: str = option(help="the reason, as on a terminal")
+
+    @override
+    def shown(self) -> Shown:
+        return Shown(self.error)
+
+
+def encode_event(event: Event) -> str:
+    """An event as a line of JSON, with the name of its class in lower case."""
+    return json.dumps({"event": type(event).__name__.lower(), **attrs.asdict(event)}, allow_nan=False)
+
+
+def decode_event(line: str, kinds: Sequence[type[Event]]) -> Event | None:
+    """The event in a line of a command's output; None for other output.
+
+    Args:
+        line: the line.
+        kinds: the classes of events to expect.
+
+    Raises:
+        WireError: for an event of no such class, or of another shape.
+    """
+    if not line.startswith(_BEGIN):
+        return None
+    from ibrobot_core.convert import Converter
+
+    known = {kind.__name__.lower(): kind for kind in kinds}
+    try:
+        facts = json.loads(line)
+        name = str(facts.pop("event"))
+        if name not in known:
+            raise WireError(f"unknown event {name!r}; declared: {', '.join(known)}")
+        event: Event = Converter().structure(facts, known[name])
+    except (ValueError, RecursionError) as error:
+        raise WireError(f"malformed event: {error}: {line[:200]}") from None
+    return event

@@ -1,0 +1,145 @@
+"""Commands whose options and events are declared: their command line, errors and events derive from that."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import attrs
+import click
+import pytest
+from click.testing import CliRunner, Result
+
+from ibrobot_core.api import option
+from ibrobot_core.app import Command, Event, Failed, Shown, WireError, declared, decode_event, emit
+from ibrobot_core.errors import ConfigError, IbrobotError
+from tests.shared.plugins.counting import COUNT, Counted, CountOptions, count
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "a.txt").write_text("text")
+    (tmp_path / "b.bin").write_bytes(bytes(10))
+    return tmp_path
+
+
+def run(*words: object) -> Result:
+    return CliRunner().invoke(count, [str(word) for word in words])
+
+
+def error(*words: object) -> str:
+    found = run(*words).exception
+    assert isinstance(found, IbrobotError)
+    assert found.exit_code == ConfigError.exit_code
+    return str(found)
+
+
+def test_help_has_choices_units_defaults_and_meaning() -> None:
+    text = " ".join(run("--help").output.split())
+    assert "count [OPTIONS] FOLDERS..." in text
+    assert "--kind all|text Files to count (all: all files; text: texts). [default: all]" in text
+    assert "--at-least BYTES Size from which they count. [default: 0]" in text
+    assert "--events" in text
+
+
+def test_the_function_gets_an_object_of_the_declared_class(folder: Path) -> None:
+    assert run(folder).output == f"{folder} has 2 files\n"
+    assert run(folder, "--kind", "text", folder, "--at-least=4").output == f"{folder} has 1 files\n" * 2
+
+
+def test_errors_of_values_name_the_flag(folder: Path) -> None:
+    assert error(folder, "--kind", "pictures") == "--kind: 'pictures' is not one of: all, text"
+    assert error(folder, "--at-least=-1", "--kind=x") == (
+        "--kind: 'x' is not one of: all, text; --at-least: -1 is too small, must be at least 0 bytes"
+    )
+
+
+def test_events_are_lines_of_their_classes(folder: Path) -> None:
+    (line,) = run(folder, "--events").output.splitlines()
+    assert json.loads(line) == {"event": "counted", "folder": str(folder), "files": 2}
+    found = decode_event(line, COUNT.events)
+    assert found == Counted(str(folder), 2)
+
+
+def test_with_events_an_error_is_an_event_too(folder: Path) -> None:
+    result = run(folder / "none", "--events")
+    assert result.exit_code == 1
+    failed = decode_event(result.output.strip(), (*COUNT.events, Failed))
+    assert failed == Failed(f"{folder / 'none'}: is no folder; leave it out, or choose --kind text")
+    assert json.loads(run(folder, "--kind=x", "--events").output)["error"].startswith("--kind: ")
+
+
+@pytest.mark.parametrize(
+    ("facts", "message"),
+    [
+        ({"event": "counted", "folder": "a"}, "files: required key is missing"),
+        ({"event": "counted", "folder": "a", "files": "2"}, "files: expected a whole number"),
+        ({"event": "counted", "folder": "a", "files": 2, "bytes": 3}, "bytes: unknown key"),
+        ({"event": "ended"}, "unknown event 'ended'; declared: counted"),
+        ({"event": None}, "unknown event 'None'"),
+    ],
+)
+def test_a_line_of_another_shape_is_an_error(facts: dict[str, Any], message: str) -> None:
+    with pytest.raises(WireError, match=message):
+        decode_event(json.dumps(facts), COUNT.events)
+
+
+@pytest.mark.parametrize("line", ['{"event": ', '{"event": "counted"', '{"event": ' + "[" * 100_000])
+def test_a_damaged_line_is_an_error(line: str) -> None:
+    with pytest.raises(WireError, match="malformed event"):
+        decode_event(line, COUNT.events)
+
+
+@pytest.mark.parametrize("line", ["", "begins", '{"other": 1}', "error: no"])
+def test_other_output_is_no_event(line: str) -> None:
+    assert decode_event(line, COUNT.events) is None
+
+
+@attrs.frozen
+class Undeclared(Event):
+    """Not among the events of `count`."""
+
+    def shown(self) -> Shown:
+        return Shown()
+
+
+def test_an_undeclared_event_is_a_bug() -> None:
+    with pytest.raises(TypeError, match="ibrobot count does not declare the event Undeclared"):
+        emit(COUNT, Undeclared())
+
+
+@attrs.frozen(kw_only=True)
+class Every:
+    """An option of each sort."""
+
+    config: Path = option(argument=True, help="a file")
+    length_s: float | None = option(None, unit="s", help="a time")
+    tags: tuple[str, ...] = option(("a",), choices=("a", "b"), help="tags")
+    device: str = option("auto", choices=("auto", "cpu"), open=True, help="a device")
+    sure: bool = option(False, help="whether")
+
+
+def every(*words: str) -> Every:
+    seen: list[Every] = []
+    command: Callable[..., Any] = declared(Command("every", "", lambda: click.Command("every"), Every))(seen.append)
+    result = CliRunner().invoke(click.command()(command), list(words))
+    if result.exception is not None:
+        raise result.exception
+    (found,) = seen
+    return found
+
+
+def test_every_sort_of_option_is_read() -> None:
+    assert every("x") == Every(config=Path("x"))
+    assert every("x", "--length-s", "2", "--tags=b", "--tags=a", "--device=cuda:1", "--sure") == Every(
+        config=Path("x"), length_s=2.0, tags=("b", "a"), device="cuda:1", sure=True
+    )
+    with pytest.raises(IbrobotError, match="--tags: 'c' is not one of: a, b"):
+        every("x", "--tags=c")
+
+
+def test_the_classes_describe_themselves() -> None:
+    assert COUNT.options is CountOptions
+    assert all(field.metadata["help"] for kind in (CountOptions, Counted, Failed) for field in attrs.fields(kind))
