@@ -52,6 +52,7 @@ from ibrobot_core.plugins import (
     Registry as Registry,
     installed_plugins as installed_plugins,
     example_type as example_type,
+    official_plugins as official_plugins,
 )
 
 # A run
@@ -119,6 +120,7 @@ from ibrobot_core.cli.declared import (
     flag_of as flag_of,
     read_options as read_options,
 )
+from ibrobot_core.options import fields as fields, default_of as default_of
 from ibrobot_core.events import Event as Event, Failed as Failed, Shown as Shown, decode_event as decode_event
 from ibrobot_core.outside import echo as echo, LogFormatter as LogFormatter
 from ibrobot_core.screen import Screen as Screen, styled as styled

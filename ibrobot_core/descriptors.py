@@ -105,6 +105,9 @@ class TeleopDescriptor(Descriptor["interfaces.Teleop"]):
 class PolicyDescriptor(Descriptor["interfaces.Policy"]):
     """A policy."""
 
+    reads: Callable[[Path], bool] = attrs.field(default=lambda path: False, kw_only=True)
+    """Whether a folder has a trained policy of this type, the option `path`; checks only names."""
+
 
 @attrs.frozen
 class EngineDescriptor(Descriptor["interfaces.Engine"]):

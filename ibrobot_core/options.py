@@ -72,7 +72,7 @@ def option(
     secret: bool = False,
     key: str | None = None,
     plain: Any = None,
-    label: str = "",
+    label: str | None = "",
     more: bool = False,
     names: str = "",
     argument: bool = False,
@@ -94,9 +94,9 @@ def option(
         secret: whether to hide the value; recordings and `config show` contain `${NAME}` as in the YAML, else `***`.
         key: the key in the YAML, if it differs from the field's name.
         plain: type of the value in files and requests, if programs may set others as well.
-        label: what forms and their errors call it; the key by default.
+        label: what forms and their errors call it; the key by default. None: it is for terminals, and not in forms.
         more: whether forms show it among further options.
-        names: what a path names, for forms: `episodes`, `dataset`, `policy`, `robot`, or `new` for a folder to make.
+        names: what a text or path names, for forms: `episodes`, `dataset`, `policy`, `robot` or `calibration`.
         argument: whether it is an argument of the command line, and not a flag.
     """
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}

@@ -24,14 +24,8 @@ def launch(config: str | None, **options: Any) -> None:
     Exits with 0 if the run succeeded, 1 if a component failed or a fault was raised, 2 for a wrong command line
     or YAML, 3 if an episode or goal did not succeed, 130 on a second Ctrl-C.
     """
-    registry = installed_plugins()
-    robot = load_config(
-        find_config(config, registry),
-        overrides=run_overrides(options),
-        mode=options["mode"],
-        sim=options["sim"],
-        registry=registry,
-    )
+    path = find_config(config, installed_plugins())
+    robot = load_config(path, overrides=run_overrides(options), mode=options["mode"], sim=options["sim"])
     check_end(robot, options)
     request = LaunchRequest(
         options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"]

@@ -87,13 +87,7 @@ def _part(holder: Any, word: str) -> str | int:
 
 
 def single_options[T](
-    kind: type[T],
-    overrides: Sequence[str],
-    name: str,
-    flag: str = "--set",
-    text: str = "{}",
-    *,
-    expands: bool = True,
+    kind: type[T], overrides: Sequence[str], name: str, flag: str = "--set", text: str = "{}", *, expands: bool = True
 ) -> T:
     """An options class, or another attrs class such as a message, checked like a section of a robot YAML.
 

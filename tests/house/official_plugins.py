@@ -44,6 +44,8 @@ def offers() -> dict[str, dict[str, list[str]]]:
             kinds["reader"] = sorted(reader.type for reader in registry.readers)
         if commands := sorted(name for name, owner in registry.command_packages.items() if owner == package):
             kinds["command"] = commands
+        if jobs := [name for name in commands if registry.commands[name].events]:
+            kinds["job"] = jobs
         found[package] = kinds
     return dict(sorted(found.items()))
 

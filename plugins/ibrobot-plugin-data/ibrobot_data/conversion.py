@@ -74,7 +74,7 @@ class ConvertOptions:
         help="use the contract of the YAML even if the recorded one differs",
     )
     calibration: str | None = option(
-        None, label="Calibration", more=True, help="calibration to use instead of the recorded one"
+        None, names="calibration", label="Calibration", more=True, help="calibration to use instead of the recorded one"
     )
     jobs: int | None = option(
         None, ge=1, label="Episodes at once", more=True, help="episodes in parallel; by default one for each CPU core"

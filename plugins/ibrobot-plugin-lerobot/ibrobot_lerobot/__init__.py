@@ -39,6 +39,10 @@ def _policy(options: Any, ctx: Context) -> Policy:
     return LeRobotPolicy(options, ctx)
 
 
+def _is_checkpoint(path: Path) -> bool:
+    return path.name == "pretrained_model" and (path / "config.json").is_file()
+
+
 @hookimpl
 def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
     """The writer of LeRobot datasets."""
@@ -65,6 +69,7 @@ def ibrobot_policies() -> Iterable[PolicyDescriptor]:
         type="lerobot",
         options=LeRobotPolicyOptions,
         make=_policy,
+        reads=_is_checkpoint,
         summary="a LeRobot checkpoint: ACT, Diffusion, VQ-BeT, SmolVLA, pi0, …",
     )
 

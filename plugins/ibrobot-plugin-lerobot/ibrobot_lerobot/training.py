@@ -63,9 +63,7 @@ class TrainOptions:
     """What is trained, on what and how long."""
 
     dataset: Path = option(argument=True, names="dataset", label="Dataset", help="dataset to train on")
-    lerobot_options: tuple[str, ...] = option(
-        (), argument=True, label="Options of lerobot-train", more=True, help="further options, e.g. --seed=1"
-    )
+    lerobot_options: tuple[str, ...] = option((), argument=True, label=None, help="further options, e.g. --seed=1")
     policy: str = option(
         SMALL, choices=POLICIES, open=True, validator=_matches(r"[A-Za-z]\w*", "act"), label="Policy",
         help="a policy type of LeRobot, or small_act",

@@ -12,7 +12,6 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ibrobot_core.api import IbrobotError
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-TYPE = "lerobot"
 NEW_MODEL, NEW_MODE = "trained", "trained"
 
 
@@ -27,7 +26,7 @@ class ModelEdit:
     """The models of the original whose path can be set."""
 
 
-def with_model(text: str, path: str, *, model: str = "", mode: str = "") -> ModelEdit:
+def with_model(text: str, path: str, type_: str, *, model: str = "", mode: str = "") -> ModelEdit:
     """The text of a robot YAML whose model has this path.
 
     A model that the YAML lacks is added, and a mode for it, with the executors of the default mode.
@@ -35,7 +34,8 @@ def with_model(text: str, path: str, *, model: str = "", mode: str = "") -> Mode
     Args:
         text: the YAML.
         path: folder of the trained policy.
-        model: the model; by default the first of type `lerobot`, or else a new one.
+        type_: the policy's type.
+        model: the model; by default the first of this type, or else a new one.
         mode: the name of the mode if a new one is needed.
 
     Raises:
@@ -43,7 +43,7 @@ def with_model(text: str, path: str, *, model: str = "", mode: str = "") -> Mode
     """
     root = _parsed(text)
     models = _at(root, "models")
-    known = tuple(name for name, each in _items(models) if _scalar(_at(each, "type")) == TYPE)
+    known = tuple(name for name, each in _items(models) if _scalar(_at(each, "type")) == type_)
     model = model or (known[0] if known else NEW_MODEL)
     mode = mode or NEW_MODE
     for name in (model, mode):
@@ -58,7 +58,7 @@ def with_model(text: str, path: str, *, model: str = "", mode: str = "") -> Mode
     elif entry is not None:
         raise IbrobotError(f"models.{model} has no path; give it one in the file")
     else:
-        text = _added(text, "models", model, f"{{type: {TYPE}, path: {json.dumps(path)}}}")
+        text = _added(text, "models", model, f"{{type: {type_}, path: {json.dumps(path)}}}")
     root = _parsed(text)
     modes = _at(root, "control_modes")
     users = [name for name, each in _items(modes) if _scalar(_at(_at(each, "inference"), "model")) == model]

@@ -28,7 +28,7 @@ def test_every_view_has_its_module_for_browsers(tmp_path: Path) -> None:
         session = await server.get("session")
         assert (session["role"], session["folders"]) == ("drive", [str(tmp_path)])
         for view in session["views"]:
-            assert "export class View" in await server.text(f"/static/ui/{view['name']}.js")
+            assert "export class View" in await server.text(f"/static/ui/{view['module']}.js")
 
     run(tmp_path, test)
 

@@ -24,7 +24,7 @@ FOREIGN = (
     {"Sec-Fetch-Site": "cross-site"},
     {"Sec-Fetch-Site": "same-site"},
 )
-FILES = ("episodes", "convert", "datasets", "training")
+FILES = ("episodes", "datasets", "policies")
 """Views whose requests name files."""
 WRONG: tuple[Any, ...] = (
     {},
@@ -155,7 +155,7 @@ def test_a_hundred_megabytes_are_refused_without_reading_them(tmp_path: Path) ->
             headers = {"Content-Type": "application/json"} | ({} if size is None else {"Content-Length": str(size)})
             with contextlib.suppress(aiohttp.ClientConnectionError):
                 assert (
-                    await status(server.client, "POST", "/api/convert/start", data=body(), headers=headers, json=None)
+                    await status(server.client, "POST", "/api/jobs/start", data=body(), headers=headers, json=None)
                     == 413
                 )
             assert sent < 30
@@ -186,6 +186,12 @@ def test_no_request_reaches_files_outside_the_opened_folders(tmp_path: Path, out
         facts: dict[str, Any] = dict.fromkeys(("path", "out", "dataset", "robot", "checkpoint", "target"), outside)
         more = {"paths": [outside], "begin_s": 0, "end_s": 1, "id": "x", "outcome": "success", "digest": "x"}
         facts |= {**more, "steps": 1, "batch_size": 1, "topic": "/t", "at_s": 0}
+        for name in ("episodes", "out", "dataset", "config"):
+            for command in ("convert", "train"):
+                values = {"episodes": ["."], "out": "new"} if command == "convert" else {"dataset": ".", "out": "new"}
+                values[name] = [outside] if name == "episodes" else outside
+                with pytest.raises(RuntimeError, match=r"outside the opened folders|no field|not installed"):
+                    await server.post("jobs/start", command=command, values=values)
         for method, path in routes(FILES):
             if path.endswith("/list"):
                 continue

@@ -1,8 +1,7 @@
-"""The views convert, datasets and training of `ibrobot ui`, and trained policies in robot YAMLs."""
+"""Jobs of other plugins, datasets and policies in `ibrobot ui`, and trained policies in robot YAMLs."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import pytest
 import yaml
 from ibrobot_web.model_edit import with_model
-from ibrobot_web.ui import convert, training
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
@@ -19,6 +17,7 @@ from ui_server import UiServer, run_ui
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import find_config, installed_plugins
+from ibrobot_core.plugins import discover
 
 CONFIG = Path(find_config("so101_blind", installed_plugins()))
 needs_data = pytest.mark.skipif("convert" not in installed_plugins().commands, reason="needs ibrobot-plugin-data")
@@ -45,7 +44,7 @@ def ask(ui: Ui, view: str, route: str, facts: Any = None) -> Any:
 @pytest.mark.parametrize("name", ["so101", "so101_blind", "so101_pick_cube", "bi_so101"])
 def test_only_the_policy_changes_in_a_robot_yaml(name: str) -> None:
     old = Path(find_config(name, installed_plugins())).read_text(encoding="utf-8")
-    edit = with_model(old, "/a folder/pretrained_model")
+    edit = with_model(old, "/a folder/pretrained_model", "lerobot")
     before, after = old.splitlines(), edit.text.splitlines()
     kept = [line for line in before if line in after]
     assert len(before) - len(kept) <= 1, "at most the line with the path is another"
@@ -53,7 +52,9 @@ def test_only_the_policy_changes_in_a_robot_yaml(name: str) -> None:
     document = yaml.safe_load(edit.text)
     model = document["control_modes"][edit.mode]["inference"]["model"]
     assert document["models"][model] == {"type": "lerobot", "path": "/a folder/pretrained_model"}
-    assert with_model(edit.text, "/b", model=model).text == edit.text.replace("/a folder/pretrained_model", "/b")
+    assert with_model(edit.text, "/b", "lerobot", model=model).text == edit.text.replace(
+        "/a folder/pretrained_model", "/b"
+    )
 
 
 def test_comments_on_the_first_entries_stay_with_them() -> None:
@@ -61,7 +62,7 @@ def test_comments_on_the_first_entries_stay_with_them() -> None:
         "models:  # all\n  # the first\n  a: {type: x}\n"
         "control_modes: {hold: {executors: [p]}}\nexecutors:\n  p: {type: position}\n"
     )
-    edit = with_model(old, "/p", model="new", mode="run")
+    edit = with_model(old, "/p", "lerobot", model="new", mode="run")
     assert edit.text == (
         'models:  # all\n  new: {type: lerobot, path: "/p"}\n  # the first\n  a: {type: x}\n'
         "control_modes: {hold: {executors: [p]}, run: {executors: [p], inference: {model: new}}}\n"
@@ -82,33 +83,34 @@ def test_comments_on_the_first_entries_stay_with_them() -> None:
 )
 def test_what_cannot_be_edited_is_said(text: str, model: str, error: str) -> None:
     with pytest.raises(IbrobotError, match=error):
-        with_model(text, "/p", model=model)
+        with_model(text, "/p", "lerobot", model=model)
 
 
+@needs_lerobot
 def test_a_shipped_robot_is_copied_and_an_own_one_is_changed(ui: Ui) -> None:
-    checkpoint = ask(ui, "training", "GET /list")["checkpoints"][0]["path"]
+    checkpoint = ask(ui, "policies", "GET /list")[0]["path"]
     assert checkpoint == "training/checkpoints/000010/pretrained_model"
     asked = {"robot": "so101_blind", "checkpoint": checkpoint}
     shipped = CONFIG.read_bytes()
-    seen = ask(ui, "training", "GET /preview", asked)
+    seen = ask(ui, "policies", "GET /preview", asked)
     assert (seen["target"], seen["new"]) == ("so101_blind_trained.yaml", True)
     assert seen["problems"] == [] or ("hardware", "mujoco") not in installed_plugins().entries
     assert sum(line.startswith("+") for line in seen["diff"]) == 3, "a model, a mode, and the diff's head"
     assert not list(ui.folders.first.glob("*.yaml")), "looking changes nothing"
-    done = ask(ui, "training", "POST /apply", {**asked, "digest": seen["digest"]})
+    done = ask(ui, "policies", "POST /apply", {**asked, "digest": seen["digest"]})
     assert CONFIG.read_bytes() == shipped
     own = {"robot": done["robot"], "checkpoint": checkpoint}
-    again = ask(ui, "training", "GET /preview", own)
+    again = ask(ui, "policies", "GET /preview", own)
     assert (again["target"], again["new"], again["diff"]) == ("so101_blind_trained.yaml", False, [])
     with pytest.raises(IbrobotError, match="exists already"):
-        ask(ui, "training", "POST /apply", {**asked, "digest": seen["digest"]})
+        ask(ui, "policies", "POST /apply", {**asked, "digest": seen["digest"]})
     (ui.folders.first / "wrong.yaml").write_text(shipped.decode().replace("upper:", "uper:", 1))
     assert any(
-        "uper" in problem for problem in ask(ui, "training", "GET /preview", {**own, "robot": "wrong.yaml"})["problems"]
+        "uper" in problem for problem in ask(ui, "policies", "GET /preview", {**own, "robot": "wrong.yaml"})["problems"]
     )
     (ui.folders.first / done["robot"]).write_text(shipped.decode() + "# mine\n")
     with pytest.raises(IbrobotError, match="has changed since"):
-        ask(ui, "training", "POST /apply", {**own, "digest": again["digest"]})
+        ask(ui, "policies", "POST /apply", {**own, "digest": again["digest"]})
 
 
 def test_nothing_outside_the_opened_folders_is_read_or_written(ui: Ui, tmp_path: Path) -> None:
@@ -121,84 +123,74 @@ def test_nothing_outside_the_opened_folders_is_read_or_written(ui: Ui, tmp_path:
         {"robot": "so101_blind", "checkpoint": inside, "target": "/etc/x.yaml"},
     ):
         with pytest.raises(IbrobotError, match="outside the opened folders"):
-            ask(ui, "training", "GET /preview", facts)
+            ask(ui, "policies", "GET /preview", facts)
         with pytest.raises(IbrobotError, match="outside the opened folders"):
-            ask(ui, "training", "POST /apply", {**facts, "digest": "x"})
-    train = {"dataset": "a", "out": "b", "steps": 1, "batch_size": 1}
-    for wrong, error in (
+            ask(ui, "policies", "POST /apply", {**facts, "digest": "x"})
+    assert ui.jobs.all() == []
+
+
+def start(ui: Ui, command: str, **values: Any) -> Any:
+    """Ask for a job with the values of its form."""
+    return ask(ui, "jobs", "POST /start", {"command": command, "values": values})
+
+
+@needs_lerobot
+@pytest.mark.parametrize(
+    ("wrong", "error"),
+    [
         ({"dataset": "/etc"}, "outside"),
         ({"out": ".."}, "outside"),
-        ({"policy": "--x=1"}, "must be names"),
-        ({"device": "cpu --x"}, "must be names"),
-        ({"steps": 0}, "steps: 0 is too small"),
-        ({"steps": "x"}, "steps: expected a whole number"),
-        ({"gpu": 1}, "gpu: unknown key"),
-    ):
-        with pytest.raises(IbrobotError, match=error):
-            ask(ui, "training", "POST /start", {**train, **wrong})
+        ({"policy": "--x=1"}, "Policy: '--x=1' is not a name such as act"),
+        ({"device": "cpu --x"}, "Device: 'cpu --x' is not a name such as cuda:0"),
+        ({"steps": 0}, "Steps: 0 is too small, must be at least 1"),
+        ({"steps": "x"}, "Steps: expected a whole number"),
+        ({"gpu": 1}, "has no field gpu"),
+        ({"lerobot_options": ["--output_dir=/etc"]}, "has no field lerobot_options"),
+    ],
+)
+def test_trainings_are_confined_and_checked_in_the_words_of_the_form(ui: Ui, wrong: Any, error: str) -> None:
+    with pytest.raises(IbrobotError, match=error):
+        start(ui, "train", **{"dataset": "a", "out": "b", "steps": 1, "batch_size": 1, **wrong})
     assert ui.jobs.all() == []
 
 
 @needs_data
-def test_conversions_are_confined_and_their_options_checked(ui: Ui) -> None:
-    for wrong, error in (
-        ({"paths": ["/etc"]}, "outside"), ({"out": "../x"}, "outside"), ({"out": "."}, "choose a new folder"),
-        ({"only": "x"}, "only: 'x' is not one of"), ({"missing": "--help"}, "missing: '--help' is not one of"),
-        ({"append": "yes"}, "append: expected true or false"), ({"out": 3}, "out: expected text"),
-        ({"paths": []}, "paths: choose at least one"), ({"paths": None}, "paths: expected a list"),
-    ):  # fmt: skip
-        with pytest.raises(IbrobotError, match=error):
-            ask(ui, "convert", "POST /start", {"paths": ["."], "out": "new", **wrong})
+@pytest.mark.parametrize(
+    ("wrong", "error"),
+    [
+        ({"episodes": ["/etc"]}, "outside"),
+        ({"out": "../x"}, "outside"),
+        ({"config": "/etc/robot.yaml"}, "outside"),
+        ({"calibration": "/etc/passwd"}, "Calibration: '/etc/passwd' is no name"),
+        ({"only": "x"}, "Rows: 'x' is not one of"),
+        ({"missing": "--help"}, "Missing observations: '--help' is not one of"),
+        ({"outcome": ["success", "lost"]}, "Outcomes: 'lost' is not one of"),
+        ({"append": "yes"}, "Add to it: expected true or false"),
+        ({"out": 3}, "Dataset: expected text"),
+        ({"episodes": []}, "Episodes: choose at least one"),
+        ({"episodes": None}, "Episodes: required key is missing"),
+    ],
+)
+def test_conversions_are_confined_and_checked_in_the_words_of_the_form(ui: Ui, wrong: Any, error: str) -> None:
+    with pytest.raises(IbrobotError, match=error):
+        start(ui, "convert", **{"episodes": ["."], "out": "new", **wrong})
     assert ui.jobs.all() == []
 
 
-def events(*found: dict[str, Any]) -> list[str]:
-    return [json.dumps(each) for each in found]
+@pytest.mark.parametrize("command", ["launch", "episodes", "episodes delete", "", "--help"])
+def test_only_jobs_run_by_a_form(ui: Ui, command: str) -> None:
+    with pytest.raises(IbrobotError, match="is no job"):
+        start(ui, command)
 
 
-def test_events_become_progress_results_and_problems() -> None:
-    read = convert.event_reader()
-    facts: dict[str, Any] = {}
-    step = {"event": "progress", "of": 2, "total_frames": 100, "seconds": 1.0}
-    report = {
-        "event": "report", "episodes": 1, "frames": 50, "failed": 1, "passed_over": 0, "skipped_ticks": 3,
-        "held_ticks": 0, "lost_messages": 0, "without_prompt": 0, "size_bytes": 2e6,
-    }  # fmt: skip
-    for line in (
-        "a line",
-        '{"event"',
-        *events(
-            {"event": "begin", "of": 2},
-            {**step, "done": 0, "frames": 25},
-            {**step, "done": 1, "frames": 50, "episode": "a", "error": "no contract\nat all"},
-            report,
-        ),
-    ):
-        facts |= read(line) or {}
-    assert facts["problems"] == [{"episode": "a", "error": "no contract\nat all"}]
-    assert facts["text"] == "1 episode, 50 frames, left out 1, ticks skipped 3; the dataset has 2.0 MB"
-    assert facts["progress"] == 1.0
-
-
-def test_the_loss_of_a_training_is_plotted(ui: Ui) -> None:
-    read = training.event_reader(ui)
-    facts: dict[str, Any] = {}
-    said = []
-    for line in events(
-        {"event": "begin", "step": 0, "steps": 10},
-        {"event": "progress", "step": 1, "steps": 10, "loss": 0.7, "seconds": 300.0},
-        {"event": "progress", "step": 4, "steps": 10, "loss": 0.5, "seconds": 360.0},
-        {"event": "progress", "step": 9, "steps": 10, "loss": 0.4, "seconds": 460.0},
-        {"event": "report", "checkpoint": "training/checkpoints/000010/pretrained_model"},
-    ):
-        facts |= read(line) or {}
-        said.append(facts["text"])
-    assert said[1:4] == [
-        "step 1 of 10, loss 0.7",
-        "step 4 of 10, loss 0.5, about 2 min left",
-        "step 9 of 10, loss 0.4, less than a minute left",
-    ]
-    assert (facts["points"], facts["steps"], facts["progress"]) == ([(1, 0.7), (4, 0.5), (9, 0.4)], 10, 1.0)
+def test_a_job_that_is_not_installed_names_its_package(ui: Ui, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ibrobot_web.ui.forms.installed_plugins", lambda: discover([]))
+    monkeypatch.setattr("ibrobot_web.ui.jobs.installed_plugins", lambda: discover([]))
+    form = ask(ui, "jobs", "GET /form", {"command": "convert"})
+    missing = "ibrobot convert needs a plugin that is not installed: pip install ibrobot-plugin-data"
+    assert (form["fields"], form["missing"]) == ([], missing)
+    with pytest.raises(IbrobotError, match="pip install ibrobot-plugin-data"):
+        start(ui, "convert", out="new")
 
 
 @needs_data
@@ -219,11 +211,15 @@ def test_an_episode_is_converted_and_its_dataset_shown_and_played(tmp_path: Path
     make_episode(tmp_path / "pick/episodes/episode_000001", cameras=(), prompt="pick", contract=contract)
 
     async def test(server: UiServer) -> None:
-        (group,) = (await server.get("convert/list"))["groups"]
-        await server.post("convert/start", paths=[group["path"]], out="datasets/pick")
+        form = await server.get("jobs/form", command="convert")
+        (episodes,) = form["known"]["episodes"]
+        values = {"episodes": [episodes["value"]], "out": "datasets/pick"}
+        await server.post("jobs/start", command="convert", values=values)
         job, lines = await server.job(lambda job: job["state"] in ("done", "failed"))
         assert job["state"] == "done", lines
-        assert (job["facts"]["report"]["episodes"], job["facts"]["problems"]) == (1, [])
+        assert job["facts"]["text"].startswith("1 episode, ")
+        assert job["facts"]["made"] == [{"kind": "dataset", "path": "datasets/pick"}]
+        assert "problems" not in job["facts"]
         assert await server.get("datasets/list") == ["datasets/pick"]
         info = await server.get("datasets/info", path="datasets/pick")
         (feature,) = info["features"]
@@ -241,5 +237,9 @@ def test_an_episode_is_converted_and_its_dataset_shown_and_played(tmp_path: Path
         with pytest.raises(RuntimeError, match="outside the opened folders"):
             await server.get("datasets/info", path="..")
         server.ui.view_state["recordings"].forget()
+        await server.post("jobs/start", command="convert", values={**values, "missing": "hold"})
+        job, _ = await server.job(lambda job: job["number"] == 2 and job["state"] in ("done", "failed"))
+        assert job["state"] == "failed"
+        assert job["facts"]["error"] == "datasets/pick: already has a dataset; “Add to it” adds to it"
 
     run_ui([tmp_path], test)

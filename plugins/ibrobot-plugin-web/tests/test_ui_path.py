@@ -51,7 +51,7 @@ def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
             page.get_by_label("Robot", exact=True).select_option("my_arm.yaml")
             assert page.get_by_role("button", name="Launch").is_disabled()
         record(page)
-        with held(page, "**/api/convert/list"):
+        with held(page, "**/api/jobs/form?*"):
             page.get_by_role("link", name="Convert", exact=True).click()
             assert page.get_by_role("button", name="Convert", exact=True).is_disabled()
         page.go_back()

@@ -122,8 +122,9 @@ async function showView() {
     clearToasts();
     current = name;
     if (!views.has(name)) {
-      const { View } = await import(`./ui/${name}.js`);
-      const view = new View(ui);
+      const known = ui.session.views.find((view) => view.name === name);
+      const { View } = await import(`./ui/${known.module}.js`);
+      const view = new View(ui, known);
       view.element = h("div", { id: `view-${name}` });
       view.mount(view.element);
       views.set(name, view);

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import NoRequest, installed_plugins
 from ibrobot_web.ui import episodes
 from ibrobot_web.ui.context import NamesPath, Route, Ui
@@ -19,8 +18,7 @@ def listing(ui: Ui, request: NoRequest) -> list[str]:
 
 def info(ui: Ui, request: NamesPath) -> dict[str, Any]:
     """What a dataset contains."""
-    if "datasets" not in installed_plugins().commands:
-        raise IbrobotError("datasets need a plugin that is not installed: pip install ibrobot-plugin-lerobot")
+    installed_plugins().command("datasets")  # raises the error that names its package
     path = ui.folders.find(request.path)
     found: dict[str, Any] = json.loads(run_command(ui, "datasets", "info", "--json", str(path)))
     return {**found, "path": ui.folders.name(path)}

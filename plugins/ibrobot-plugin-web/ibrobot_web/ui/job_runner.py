@@ -40,7 +40,7 @@ _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
 _END = re.compile(rb"\r\n|\n|\r(?!\Z)")
 """The end of a line; whether a final CR is one shows in what follows it."""
 Reader = Callable[[str], Mapping[str, Any] | None]
-"""Reads facts from a line of output, e.g. `{"progress": 0.5}`; None if the line contains none."""
+"""Reads facts from a line of output, e.g. `{"progress": 0.5}`; None for a line that is for people."""
 State = Literal["running", "done", "failed", "cancelled"]
 
 
@@ -58,7 +58,7 @@ class Job:
     done_codes: tuple[int, ...] = (0,)
     """Exit codes of a job that did what it was started for."""
     facts: dict[str, Any] = attrs.field(factory=dict)
-    """What is known about the job; `progress` is between 0 and 1."""
+    """What is known about the job: `progress` is between 0 and 1; a job with an `error` has failed."""
     state: State = "running"
     exit_code: int | None = None
     started_s: float = attrs.field(factory=time.time)
@@ -204,18 +204,20 @@ class Jobs:
         code = job.process.wait()
         with self._lock:
             job.exit_code, job.ended_s = code, time.time()
-            job.state = "done" if code in job.done_codes else "cancelled" if job.cancelling else "failed"
+            done = code in job.done_codes and "error" not in job.facts
+            job.state = "done" if done else "cancelled" if job.cancelling else "failed"
         self._change(job)
 
     def _take(self, job: Job, lines: Sequence[bytes], read: Reader | None) -> None:
-        texts = [_CONTROL.sub("", line.decode(errors="replace"))[:_LONGEST] for line in lines]
         with self._lock:
-            job.lines.extend(without_tokens(text) for text in texts)
-            job.count += len(texts)
-            for text in texts if read is not None else ():
-                assert read is not None
-                job.facts.update(read(text) or {})
-        if texts:
+            for line in lines:
+                text = _CONTROL.sub("", line.decode(errors="replace"))
+                found = read(text) if read is not None else None
+                job.facts.update(found or {})
+                if found is None or not text.startswith("{"):
+                    job.lines.append(without_tokens(text[:_LONGEST]))
+                    job.count += 1
+        if lines:
             self._change(job)
 
     def _change(self, job: Job) -> None:

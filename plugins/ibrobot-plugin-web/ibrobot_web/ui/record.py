@@ -59,8 +59,7 @@ def place(ui: Ui, request: NamesDataset) -> dict[str, Any]:
 
 def start(ui: Ui, request: RecordSession) -> dict[str, int]:
     """Begin a session: `ibrobot record`, which ends by itself after the last episode."""
-    if "record" not in installed_plugins().commands:
-        raise IbrobotError("recording needs a plugin that is not installed: pip install ibrobot-plugin-data")
+    installed_plugins().command("record")  # raises the error that names its package
     prompt, count = request.prompt, request.episodes
     if len(prompt) > _LONGEST_PROMPT:
         raise IbrobotError(f"the task has {len(prompt)} characters; at most {_LONGEST_PROMPT} are possible")

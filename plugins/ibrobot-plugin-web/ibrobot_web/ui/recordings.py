@@ -11,7 +11,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import NS_PER_S, IbrobotError
+from ibrobot_core.api import NS_PER_S, IbrobotError, PolicyDescriptor
 from ibrobot_core.app import installed_plugins
 from ibrobot_web.playback import Playback, problems_of
 from ibrobot_web.ui.context import Ui
@@ -19,7 +19,10 @@ from ibrobot_web.ui.job_runner import IBROBOT
 
 _DEPTH = 6
 """Levels of folders below an opened one in which recordings are looked for."""
+_POLICY_DEPTH = 7
 _MOST_FOLDERS = 20_000
+_MOST_POLICIES = 200
+"""Policies that are listed."""
 _OPEN = 4
 """Episodes that stay open."""
 _COMMAND_S = 600.0
@@ -64,6 +67,29 @@ def find_recordings(folders: Sequence[Path]) -> Found:
         look(folder, _DEPTH)
     once = [tuple(dict.fromkeys(each)) for each in (episodes, datasets, trashes)]
     return Found(once[0], once[1], once[2], left > 0)
+
+
+def policy_type(path: Path) -> str | None:
+    """The type of the trained policy in a folder; None if there is none of an installed plugin."""
+    registry = installed_plugins()
+    for type_ in registry.types("policy"):
+        descriptor = registry.find("policy", type_)
+        if isinstance(descriptor, PolicyDescriptor) and descriptor.reads(path):
+            return type_
+    return None
+
+
+def find_policies(ui: Ui) -> list[tuple[Path, str]]:
+    """The folders with a trained policy in the opened folders, and the type of each; the newest first."""
+    found = []
+    for folder in ui.folders.paths:
+        for parent, folders, _ in folder.walk():
+            depth = len(parent.relative_to(folder).parts)
+            folders[:] = [each for each in folders if not each.startswith(".")] if depth < _POLICY_DEPTH else []
+            if (type_ := policy_type(parent)) is not None:
+                found.append((parent, type_))
+                folders.clear()
+    return sorted(found, key=lambda each: each[0].stat().st_mtime_ns, reverse=True)[:_MOST_POLICIES]
 
 
 def _folders_in(folder: Path) -> Iterator[Path]:

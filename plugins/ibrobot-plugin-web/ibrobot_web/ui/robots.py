@@ -67,6 +67,11 @@ def listing(ui: Ui, request: NoRequest) -> list[dict[str, str]]:
     return found
 
 
+def robot_names(ui: Ui) -> list[str]:
+    """The robots to choose from, as requests name them."""
+    return [*shipped_configs(installed_plugins()), *(ui.folders.name(path) for path in _yamls(ui))]
+
+
 def _yamls(ui: Ui) -> Iterator[Path]:
     """The robot YAMLs of the opened folders."""
     seen = 0

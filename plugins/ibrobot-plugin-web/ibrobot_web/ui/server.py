@@ -20,19 +20,19 @@ from ibrobot_web.server.app import STATIC, Files
 from ibrobot_web.server.guard import Guard
 from ibrobot_web.server.listening import REQUEST_S
 from ibrobot_web.ui.context import Blob, Route, Ui
+from ibrobot_web.ui.forms import job_commands, title_of
 
 VIEWS = {
     "robots": "Robots",
     "devices": "Devices",
     "record": "Record",
     "episodes": "Episodes",
-    "convert": "Convert",
     "datasets": "Datasets",
-    "training": "Training",
+    "policies": "Policies",
     "jobs": "Jobs",
 }
 """Name -> title in the navigation. The module `ibrobot_web.ui.NAME` has the view's `ROUTES`; `static/ui/NAME.js` shows
-it."""
+it. Each command that runs as a job has a view, too, all by `static/ui/command.js`."""
 LARGEST_REQUEST = 1 << 20
 """Largest body of a request [bytes]."""
 _HEARTBEAT_S = 5.0
@@ -60,7 +60,12 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
 
     async def session(request: web.Request) -> web.StreamResponse:
         folders = [str(path) for path in ui.folders.paths]
-        views = [{"name": name, "title": title} for name, title in VIEWS.items()]
+        views = [{"name": name, "title": title, "module": name} for name, title in VIEWS.items()]
+        jobs = [
+            {"name": f"job-{name}", "title": title_of(name), "module": "command", "command": name}
+            for name in job_commands()
+        ]
+        views[-1:-1] = jobs  # before the last one, which shows all of them
         return web.json_response({"role": guard.session(request).role, "folders": folders, "views": views})
 
     async def follow(request: web.Request) -> web.StreamResponse:

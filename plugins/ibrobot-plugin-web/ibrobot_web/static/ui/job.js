@@ -1,7 +1,10 @@
 // A card that shows a job: state, progress, output, and the button that ends it.
 
 import { h, refresh, say } from "../dom.js";
+import { drawPlot } from "../plot.js";
 
+// What a job has made -> the view that shows it.
+const MADE = { dataset: ["datasets", "Open the dataset"], policy: ["policies", "Use it in a robot"], episode: ["episodes", "See the episode"] };
 const STATES = { running: "running", done: "done", failed: "failed", cancelled: "ended" };
 
 export class JobCard {
@@ -15,10 +18,14 @@ export class JobCard {
     this.progress = h("progress", { max: "1", "aria-label": "Progress", hidden: true });
     this.facts = h("p", {});
     this.error = h("div", {});
+    this.plot = h("canvas", { class: "plot", role: "img", hidden: true });
+    new ResizeObserver(() => this.draw()).observe(this.plot);
+    this.problems = h("div", {});
+    this.made = h("div", { class: "row" });
     this.output = h("pre", { class: "output", tabindex: "0", "aria-label": "Output" });
     this.details = h("details", { open }, h("summary", {}, "Output"), this.output);
     this.element = h("div", { class: "card job" }, h("div", { class: "row" }, this.title, this.state), this.progress,
-      this.facts, this.error, this.controls, this.details);
+      this.facts, this.error, this.plot, this.problems, this.made, this.controls, this.details);
   }
 
   update(job) {
@@ -29,14 +36,35 @@ export class JobCard {
     this.progress.hidden = progress === undefined || job.state !== "running";
     if (progress !== undefined) this.progress.value = progress;
     say(this.facts, job.facts.text ?? "");
-    refresh(this.error, [job.state, job.exit_code], () => (job.state === "failed" ? failure(job) : []));
+    refresh(this.error, [job.state, job.exit_code, job.facts.error], () => (job.state === "failed" ? failure(job) : []));
     refresh(this.controls, [job.state, job.cancelling, job.facts.url, this.ui.drives], () => this.buttons(job));
+    this.job = job;
+    this.draw();
+    const { problems = [], made = [] } = job.facts;
+    refresh(this.problems, problems, () => problems.map((problem) => h("div", { class: "problem" }, problem)));
+    refresh(this.made, made, () => made.filter(({ kind }) => kind in MADE).map(({ kind, path }) => (
+      h("a", { class: "button", href: `#${MADE[kind][0]}/${encodeURIComponent(path)}` }, MADE[kind][1]))));
     const text = job.lines.join("\n");
+    this.details.hidden = !text;
     if (this.output.textContent !== text) {
       const atEnd = this.output.scrollHeight - this.output.scrollTop - this.output.clientHeight < 30;
       this.output.textContent = text;
       if (atEnd) this.output.scrollTop = this.output.scrollHeight;
     }
+  }
+
+  // The curve of the job, e.g. its loss over its steps.
+  draw() {
+    const { points = [], axes = [], progress } = this.job?.facts ?? {};
+    this.plot.hidden = !points.length;
+    if (!points.length) return;
+    const last = points.at(-1)[0];
+    const end = progress ? Math.max(last, last / progress) : last;
+    this.plot.setAttribute("aria-label", `${axes[1]} over ${axes[0]}`);
+    drawPlot(this.plot, {
+      times: points.map(([x]) => x), lines: [[axes[1], points.map(([, y]) => y)]], begin: 0, end,
+      labels: [`${axes[1]}, ${axes[0]} 0`, String(Math.round(end))],
+    });
   }
 
   buttons(job) {
@@ -53,8 +81,9 @@ export class JobCard {
   }
 }
 
-// Why a job failed: its error lines in full, or else its last lines.
+// Why a job failed: its own error, or else its error lines, or its last lines.
 export function failure(job) {
+  if (job.facts.error) return [h("div", { class: "problem", role: "alert" }, job.facts.error)];
   const errors = job.lines.filter((line) => line.startsWith("error: "));
   const text = errors.length ? errors.map((line) => line.slice("error: ".length)) : job.lines.slice(-8);
   return [h("div", { class: "problem", role: "alert" }, [`exit code ${job.exit_code}`, ...text].join("\n"))];

@@ -1,0 +1,47 @@
+// View: a command that runs as a job: its form, and what it has done.
+
+import { h, refresh } from "../dom.js";
+import { Form } from "./form.js";
+import { JobCard } from "./job.js";
+
+export class View {
+  constructor(ui, { command, title }) {
+    this.ui = ui;
+    this.command = command;
+    this.title = title;
+    this.cards = new Map();
+  }
+
+  mount(element) {
+    this.form = new Form(this.title, (values) => this.start(values));
+    this.list = h("div", { class: "columns" }, h("p", { class: "note" }, "None yet."));
+    element.append(h("h2", {}, this.title), this.form.element, h("h2", {}, "Jobs"), this.list);
+  }
+
+  async show(shown) {
+    if (!shown) return;
+    for (const job of this.ui.of(this.command)) this.job(job);
+    await this.load();
+  }
+
+  async load() {
+    const form = await this.ui.attempt(() => this.ui.get("jobs/form", { command: this.command }));
+    if (form) this.form.show(form, this.ui.drives);
+  }
+
+  async start(values) {
+    this.form.button.disabled = true;
+    await this.ui.attempt(() => this.ui.post("jobs/start", { command: this.command, values }));
+    this.form.button.disabled = !this.ui.drives;
+  }
+
+  job(job) {
+    if (job.kind !== this.command) return;
+    if (!this.cards.has(job.number)) this.cards.set(job.number, new JobCard(this.ui));
+    const card = this.cards.get(job.number);
+    card.update(job);
+    const numbers = this.ui.of(this.command).map(({ number }) => number).filter((number) => this.cards.has(number));
+    refresh(this.list, numbers, () => numbers.map((number) => this.cards.get(number).element));
+    if (job.state !== "running" && card.ended !== job.state) { card.ended = job.state; this.load(); }
+  }
+}

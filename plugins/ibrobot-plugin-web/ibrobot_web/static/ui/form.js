@@ -1,0 +1,87 @@
+// The form of a command, from what its owner declares: labels, words, units, bounds and defaults are all from the server.
+
+import { h, refresh } from "../dom.js";
+
+export class Form {
+  // `title` is on the button; `submit` gets the values by name.
+  constructor(title, submit) {
+    this.fields = [];
+    this.note = h("p", { class: "note" });
+    this.first = h("div", { class: "fields form" });
+    this.more = h("div", { class: "fields form gap" });
+    this.others = h("details", { hidden: true }, h("summary", {}, "More options"), this.more);
+    this.button = h("button", { class: "primary", disabled: true }, title);
+    this.element = h("form", { class: "card" }, this.note, this.first, this.others, h("div", { class: "row" }, this.button));
+    this.element.addEventListener("submit", (event) => { event.preventDefault(); submit(this.values); });
+  }
+
+  get values() { return Object.fromEntries(this.fields.map(({ name, value }) => [name, value()])); }
+
+  // Shows the form; values that were entered stay as long as the fields are the same.
+  show({ summary, missing, fields, known }, drives) {
+    const lacking = fields.filter(({ names, required, open }) => required && !open && known[names]?.length === 0);
+    this.button.disabled = !drives || Boolean(missing) || lacking.length > 0;
+    refresh(this.note, [summary, missing, lacking], () => [missing ? h("span", { class: "problem" }, missing)
+      : lacking.length ? `The opened folders have nothing to choose for: ${lacking.map(({ label }) => label).join(", ")}.` : summary]);
+    refresh(this.first, [fields, known], () => {
+      const entered = this.values;
+      this.fields = fields.map((field) => new Field(field, known[field.names] ?? []));
+      for (const field of this.fields) if (field.name in entered) field.enter(entered[field.name]);
+      this.others.hidden = !fields.some(({ more }) => more);
+      this.more.replaceChildren(...this.fields.filter(({ more }) => more).flatMap(({ elements }) => elements));
+      return this.fields.filter(({ more }) => !more).flatMap(({ elements }) => elements);
+    });
+  }
+}
+
+class Field {
+  constructor(field, known) {
+    this.name = field.name;
+    this.more = field.more;
+    const id = `field-${field.name}`, help = h("small", { class: "help", id: `${id}-help` }, sentence(field));
+    const described = { id, "aria-describedby": help.id };
+    const choices = field.choices.length ? field.choices : known.map(({ value, text }) => [value, text]);
+    const closed = choices.length && !field.open && !(field.names === "robot");
+    if (field.several) {
+      const boxes = choices.map(([value, text]) => {
+        const box = h("input", { type: "checkbox", value });
+        box.checked = field.default ? field.default.includes(value) : choices.length === 1;
+        return h("label", {}, box, ` ${text}`);
+      });
+      const group = h("div", { class: "choices", role: "group", "aria-label": field.label, "aria-describedby": help.id },
+        boxes.length ? boxes : h("span", { class: "note" }, "none in the opened folders"));
+      this.elements = [h("span", { class: "label" }, field.label), h("div", {}, group, help)];
+      this.value = () => [...group.querySelectorAll("input:checked")].map(({ value }) => value);
+      this.enter = (entered) => { for (const box of group.querySelectorAll("input")) box.checked = entered.includes(box.value); };
+      return;
+    }
+    const label = h("label", { for: id }, field.label);
+    if (field.kind === "flag") {
+      const box = h("input", { type: "checkbox", checked: field.default === true, ...described });
+      this.elements = [label, h("div", { class: "flag" }, box, help)];
+      this.value = () => box.checked;
+      this.enter = (entered) => { box.checked = entered; };
+    } else if (closed) {
+      const select = h("select", described, choices.map(([value, text]) => h("option", { value, selected: value === field.default }, text)));
+      this.elements = [label, h("div", {}, select, help)];
+      this.value = () => select.value;
+      this.enter = (entered) => { if (choices.some(([value]) => value === entered)) select.value = entered; };
+    } else {
+      const number = field.kind !== "text";
+      const input = h("input", {
+        type: number ? "number" : "text", value: field.default ?? "", required: field.required, min: field.min, max: field.max,
+        step: number ? (field.kind === "whole" ? "1" : "any") : null, list: choices.length ? `${id}-list` : null, ...described,
+      });
+      const list = choices.length ? h("datalist", { id: `${id}-list` }, choices.map(([value, text]) => h("option", { value }, text))) : null;
+      const unit = field.unit ? h("span", { class: "unit" }, field.unit) : null;
+      this.elements = [label, h("div", {}, h("div", { class: "entry" }, input, unit), ...[list].filter(Boolean), help)];
+      this.value = () => (number && input.value !== "" ? Number(input.value) : input.value);
+      this.enter = (entered) => { input.value = entered; };
+    }
+  }
+}
+
+function sentence({ help, required }) {
+  const text = help.charAt(0).toUpperCase() + help.slice(1);
+  return required ? `${text} (required)` : text;
+}

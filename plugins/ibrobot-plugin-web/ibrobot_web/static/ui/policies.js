@@ -1,0 +1,86 @@
+// View: trained policies, which are put into robot YAMLs.
+
+import { h, refresh, toast } from "../dom.js";
+
+export class View {
+  constructor(ui) { this.ui = ui; }
+
+  mount(element) { element.append(h("h2", {}, "Policies"), this.use()); }
+
+  // The card that puts a trained policy into a robot YAML.
+  use() {
+    this.checkpoint = h("select", { id: "use-checkpoint" });
+    this.robot = h("select", { id: "use-robot" });
+    this.model = h("input", { type: "text", id: "use-model", placeholder: "the first of this type, or a new one" });
+    this.mode = h("input", { type: "text", id: "use-mode", placeholder: "for a new model" });
+    this.change = h("div", { "aria-live": "polite" });
+    this.look = h("button", { class: "primary", disabled: true }, "Show the change");
+    this.none = h("p", { class: "note", hidden: true }, "No trained policies in the opened folders. Train one, or copy one into them.");
+    const form = h("form", {}, h("div", { class: "fields" },
+      h("label", { for: "use-checkpoint" }, "Policy"), this.checkpoint, h("label", { for: "use-robot" }, "Robot"), this.robot,
+      h("label", { for: "use-model" }, "Model"), this.model, h("label", { for: "use-mode" }, "Mode"), this.mode),
+    h("div", { class: "row" }, this.look));
+    form.addEventListener("submit", (event) => { event.preventDefault(); this.preview(); });
+    for (const each of [this.checkpoint, this.robot, this.model, this.mode]) each.addEventListener("change", () => this.change.replaceChildren());
+    return h("section", { class: "card", "aria-labelledby": "use-title" }, h("h3", { id: "use-title" }, "Use a trained policy"), this.none, form, this.change);
+  }
+
+  async show(shown, rest) {
+    if (!shown) return;
+    await this.load();
+    if (rest) { this.checkpoint.value = rest; this.checkpoint.focus(); }
+  }
+
+  async load() {
+    const [found, robots] = await Promise.all([
+      this.ui.attempt(() => this.ui.get("policies/list")), this.ui.attempt(() => this.ui.get("robots/list"))]);
+    if (!found || !robots) return;
+    fill(this.checkpoint, found.map(({ path }) => path),
+      found.map(({ path, changed_s: at }) => `${path} (${new Date(at * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`));
+    fill(this.robot, robots.map(({ robot }) => robot), robots.map(({ robot }) => robot));
+    this.look.disabled = !found.length;
+    this.none.hidden = found.length > 0;
+  }
+
+  get request() {
+    return { checkpoint: this.checkpoint.value, robot: this.robot.value, model: this.model.value.trim(), mode: this.mode.value.trim() };
+  }
+
+  async preview() {
+    const { request } = this;
+    let found;
+    try {
+      found = await this.ui.get("policies/preview", request);
+    } catch (error) {
+      this.change.replaceChildren(h("div", { class: "problem", role: "alert" }, error.message));
+      return;
+    }
+    const write = h("button", {
+      class: "primary", disabled: !this.ui.drives || found.problems.length > 0 || !found.diff.length,
+      onclick: () => this.write(request, found),
+    }, found.new ? `Write the new file ${found.target}` : `Write ${found.target}`);
+    this.change.replaceChildren(
+      found.diff.length ? h("pre", { class: "diff", tabindex: "0", "aria-label": "Change" }, found.diff.map((line) => (
+        h("span", { class: line.startsWith("+") ? "added" : line.startsWith("-") ? "removed" : "" }, `${line}\n`))))
+        : h("p", { class: "note" }, "The robot has this policy already."),
+      ...found.problems.map((problem) => h("div", { class: "problem" }, problem)),
+      h("p", {}, `The mode ${found.mode} runs the policy.`), h("div", { class: "row" }, write));
+  }
+
+  async write(request, { digest }) {
+    const done = await this.ui.attempt(() => this.ui.post("policies/apply", { ...request, digest }));
+    if (!done) return;
+    toast(`${done.robot} is written.`);
+    const key = "robot";
+    sessionStorage.setItem(key, JSON.stringify({ robot: done.robot, sim: true, mode: done.mode }));
+    this.change.replaceChildren(h("p", {}, `${done.robot} is written; its mode ${done.mode} runs the policy.`),
+      h("button", { class: "primary", onclick: () => { location.hash = "robots"; location.reload(); } }, "Launch it"));
+    await this.load();
+  }
+}
+
+function fill(select, values, texts) {
+  const before = select.value;
+  refresh(select, [values, texts], () => values.map((value, i) => h("option", { value }, texts[i])));
+  if (values.includes(before)) select.value = before;
+}

@@ -1,0 +1,136 @@
+"""Forms for commands: their fields, checks and words derive from the declarations of their owners."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, get_args, get_origin
+
+import attrs
+
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import Command, default_of, fields, flag_of, installed_plugins, official_plugins, read_options
+from ibrobot_web.ui.context import Ui
+from ibrobot_web.ui.recordings import find_policies, find_recordings
+from ibrobot_web.ui.robots import robot_names, robot_of
+
+_FLAG = re.compile(r"(?<![\w.])--[a-z][a-z-]*(?![\w.])")
+_COMMAND = re.compile(r"`ibrobot ([a-z]+(?: [a-z]+)?)[^`]*`")
+
+
+def job_commands() -> list[str]:
+    """The commands that run by a form: those with events, and those that packages not installed here would add."""
+    declared = {name for name, command in installed_plugins().commands.items() if command.events}
+    return sorted(declared.union(*(offers.get("job", ()) for offers in official_plugins().values())))
+
+
+def title_of(name: str) -> str:
+    """What the page calls a command, e.g. `Trim` for `episodes trim`."""
+    return name.rpartition(" ")[2].capitalize()
+
+
+def label_of(name: str, field: attrs.Attribute[Any]) -> str:
+    """What the page calls an option."""
+    return str(field.metadata["label"] or name.replace("_", " ").capitalize())
+
+
+def form_of(ui: Ui, name: str) -> dict[str, Any]:
+    """The form of a command, for browsers. `missing` says what the machine lacks for it."""
+    form: dict[str, Any] = {"title": title_of(name), "summary": "", "missing": "", "fields": [], "known": {}}
+    try:
+        command = installed_plugins().command(name)
+        command.check()
+    except IbrobotError as error:
+        return {**form, "missing": str(error)}
+    shown = _shown(command)
+    wanted = {field.metadata["names"] for field in shown.values()}
+    known = {names: found for names, found in _known(ui).items() if names in wanted}
+    found = [_field_json(name, field) for name, field in shown.items()]
+    return {**form, "summary": command.summary, "fields": found, "known": known}
+
+
+def read_form(ui: Ui, command: Command, values: Mapping[str, Any]) -> Any:
+    """The options of a command from the values of its form. Paths are confined to the opened folders.
+
+    Raises:
+        IbrobotError: for values that do not fit, in the words of the form.
+    """
+    shown = _shown(command)
+    plain = {name: value for name, value in values.items() if value not in (None, "")}
+    if unknown := [name for name in plain if name not in shown]:
+        raise IbrobotError(f"the form of {title_of(command.name)} has no field {unknown[0]}")
+    for name, value in plain.items():
+        if shown[name].metadata["names"] == "robot":
+            plain[name] = robot_of(ui, str(value))
+        elif isinstance(value, str) and "/" in value and shown[name].metadata["names"] == "calibration":
+            raise IbrobotError(f"{label_of(name, shown[name])}: {value!r} is no name")
+    labels = {name: label_of(name, field) for name, field in shown.items()}
+    return read_options(command.options, plain, ui.folders.find, labels)
+
+
+def arguments(options: Any) -> list[str]:
+    """The arguments of a command line that give these options."""
+    flags: list[str] = []
+    operands: list[str] = []
+    values = attrs.asdict(options, recurse=False)
+    for name, field in fields(type(options)).items():
+        value = values[field.name]
+        items = value if isinstance(value, tuple) else (value,)
+        if field.metadata["argument"]:
+            operands += map(str, items)
+        elif value != default_of(field):
+            flags += [flag_of(name, field) if item is True else f"{flag_of(name, field)}={item}" for item in items]
+    return [*flags, "--", *operands]
+
+
+def in_page_words(text: str, command: Command | None = None) -> str:
+    """A text of a command with labels in place of its flags, e.g. --append, and of commands of a terminal."""
+    declared = installed_plugins().declarations()
+    options = fields(command.options) if command is not None else {}
+    labels = {flag_of(name, field): label_of(name, field) for name, field in options.items()}
+    text = _COMMAND.sub(lambda found: f"“{title_of(found[1])}”" if found[1] in declared else found[0], text)
+    return _FLAG.sub(lambda found: f"“{labels[found[0]]}”" if found[0] in labels else found[0], text)
+
+
+def _shown(command: Command) -> dict[str, attrs.Attribute[Any]]:
+    """The options in the form."""
+    return {name: each for name, each in fields(command.options).items() if each.metadata["label"] is not None}
+
+
+def _known(ui: Ui) -> dict[str, list[dict[str, str]]]:
+    """What the opened folders have, by what paths name: the value of each, and its words."""
+    found = find_recordings(ui.folders.paths)
+    counts: dict[str, int] = {}
+    for path in found.episodes:
+        name = ui.folders.name(path.parent)
+        counts[name] = counts.get(name, 0) + 1
+    return {
+        "episodes": [
+            {"value": name, "text": f"{name}: {count} episode{'' if count == 1 else 's'}"}
+            for name, count in counts.items()
+        ],
+        "dataset": [{"value": name, "text": name} for name in map(ui.folders.name, found.datasets)],
+        "policy": [{"value": name, "text": name} for name in (ui.folders.name(path) for path, _ in find_policies(ui))],
+        "robot": [{"value": name, "text": name} for name in robot_names(ui)],
+    }
+
+
+def _field_json(name: str, field: attrs.Attribute[Any]) -> dict[str, Any]:
+    """A field for browsers."""
+    metadata, kind, default = field.metadata, _without_none(field.type), default_of(field)
+    several = get_origin(kind) is tuple
+    item = get_args(kind)[0] if several else kind
+    choices = [[value, metadata["words"].get(value, str(value))] for value in metadata["choices"] or ()]
+    return {
+        "name": name, "label": label_of(name, field), "help": metadata["help"], "unit": metadata["unit"],
+        "kind": {bool: "flag", int: "whole", float: "number"}.get(item, "text"), "several": several,
+        "required": default is attrs.NOTHING, "default": None if default is attrs.NOTHING else default,
+        "choices": choices, "open": metadata["open"], "min": metadata["ge"], "max": metadata["le"],
+        "more": metadata["more"], "names": metadata["names"],
+    }  # fmt: skip
+
+
+def _without_none(kind: Any) -> Any:
+    """The type of an option that may be left out, without None."""
+    members = [member for member in get_args(kind) if member is not type(None)]
+    return members[0] if type(None) in get_args(kind) else kind

@@ -1,0 +1,158 @@
+"""Forms and events of commands on the page of `ibrobot ui`, with a command that no plugin has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, override
+
+import attrs
+import click
+import pytest
+from ibrobot_web.ui import forms
+from ibrobot_web.ui.context import Ui
+from ibrobot_web.ui.folders import Folders
+from ibrobot_web.ui.forms import arguments, form_of, in_page_words, read_form
+from ibrobot_web.ui.job_runner import Jobs
+from ibrobot_web.ui.jobs import event_reader
+
+from ibrobot_core.api import IbrobotError, MissingDependency, option
+from ibrobot_core.app import Command, Event, Shown
+from ibrobot_core.cli.declared import declared
+from ibrobot_core.events import encode_event
+from ibrobot_core.plugins import Registry
+
+
+@attrs.frozen(kw_only=True)
+class BrewOptions:
+    """An option of each sort."""
+
+    water: Path = option(argument=True, label="Water", help="where it is")
+    beans: tuple[Path, ...] = option((), names="episodes", help="which")
+    heat: float = option(95.0, ge=0, le=100, unit="degC", label="Heat", help="how hot")
+    cups: int | None = option(None, ge=1, help="how many")
+    roast: str = option("dark", choices={"dark": "dark and bitter", "light": "light"}, help="which roast")
+    flavour: tuple[str, ...] = option((), choices=("nut", "berry"), help="what it tastes of")
+    milk: bool = option(False, label="With milk", more=True, help="whether to add some")
+    grinder: str = option("auto", label=None, help="for experts")
+
+
+@attrs.frozen(kw_only=True)
+class Poured(Event):
+    """A cup is full."""
+
+    cups: int = option(help="cups so far")
+    of: int = option(help="cups in all")
+    spilt: str = option("", help="what went wrong")
+    pot: str = option("", help="the pot, at the end")
+
+    @override
+    def shown(self) -> Shown:
+        made = {"dataset": self.pot} if self.pot else {}
+        return Shown(f"{self.cups} cups", self.cups / self.of, self.spilt, {"cup": self.cups, "ml": 2.5}, made)
+
+
+BREW = Command("brew", "Brew coffee.", lambda: click.Command("brew"), BrewOptions, (Poured,))
+
+
+@pytest.fixture
+def ui(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ui:
+    registry = Registry(commands={"brew": BREW}, command_packages={"brew": "coffee"})
+    monkeypatch.setattr(forms, "installed_plugins", lambda: registry)
+    return Ui(Folders([tmp_path]), Jobs(tmp_path))
+
+
+def test_a_form_has_all_that_its_owner_declares(ui: Ui) -> None:
+    form = form_of(ui, "brew")
+    fields = {field["name"]: field for field in form["fields"]}
+    assert (form["title"], form["summary"], form["missing"]) == ("Brew", "Brew coffee.", "")
+    assert list(fields) == ["water", "beans", "heat", "cups", "roast", "flavour", "milk"], "not those for terminals"
+    assert fields["heat"] == {
+        "name": "heat", "label": "Heat", "help": "how hot", "unit": "degC", "kind": "number", "several": False,
+        "required": False, "default": 95.0, "choices": [], "open": False, "min": 0, "max": 100, "more": False,
+        "names": "",
+    }  # fmt: skip
+    assert fields["roast"]["choices"] == [["dark", "dark and bitter"], ["light", "light"]]
+    assert (fields["cups"]["kind"], fields["cups"]["label"]) == ("whole", "Cups")
+    assert (fields["flavour"]["several"], fields["milk"]["kind"], fields["milk"]["more"]) == (True, "flag", True)
+    assert form["known"] == {"episodes": []}
+
+
+def test_values_of_a_form_become_arguments_that_give_the_same_options(ui: Ui, tmp_path: Path) -> None:
+    values = {"water": "well", "cups": 2, "roast": "light", "flavour": ["nut", "berry"], "milk": True, "heat": 90.5}
+    found = read_form(ui, BREW, values)
+    assert found == BrewOptions(
+        water=tmp_path / "well", cups=2, roast="light", flavour=("nut", "berry"), milk=True, heat=90.5
+    )
+    words = arguments(found)
+    assert words == [
+        "--heat=90.5", "--cups=2", "--roast=light", "--flavour=nut", "--flavour=berry", "--milk", "--",
+        str(tmp_path / "well"),
+    ]  # fmt: skip
+    seen: list[Any] = []
+    attrs_only = attrs.evolve(BREW, events=())
+    click.command()(declared(attrs_only)(seen.append)).main(words, standalone_mode=False)
+    assert seen == [found]
+
+
+def test_empty_fields_leave_the_choice_to_the_command(ui: Ui, tmp_path: Path) -> None:
+    assert read_form(ui, BREW, {"water": "a", "cups": "", "heat": None}) == BrewOptions(water=tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("values", "error"),
+    [
+        ({}, "^Water: required key is missing$"),
+        ({"water": "../x"}, "outside the opened folders"),
+        ({"water": "a", "heat": 101}, "^Heat: 101.0 is too large, must be at most 100 degC$"),
+        ({"water": "a", "grinder": "b"}, "has no field grinder"),
+    ],
+)
+def test_wrong_values_are_named_by_their_labels(ui: Ui, values: Any, error: str) -> None:
+    with pytest.raises(IbrobotError, match=error):
+        read_form(ui, BREW, values)
+
+
+def test_what_a_command_lacks_is_said_in_its_form(ui: Ui, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lacks() -> None:
+        raise MissingDependency("there is no water", remedy="open the tap")
+
+    dry = Registry(commands={"brew": attrs.evolve(BREW, check=lacks)}, command_packages={"brew": "coffee"})
+    monkeypatch.setattr(forms, "installed_plugins", lambda: dry)
+    assert form_of(ui, "brew")["missing"] == "there is no water; open the tap"
+
+
+def test_events_become_facts_in_the_words_of_their_owner(ui: Ui, tmp_path: Path) -> None:
+    read = event_reader(ui.folders, BREW)
+    assert read("grinding") is None
+    facts = dict(read(encode_event(Poured(cups=1, of=2, spilt=f"{tmp_path}/cup: --milk helps"))) or {})
+    facts |= read(encode_event(Poured(cups=2, of=2, pot="pot"))) or {}
+    assert facts == {
+        "text": "2 cups", "progress": 1.0, "problems": ["cup: “With milk” helps"], "axes": ["cup", "ml"],
+        "points": [[1, 2.5], [2, 2.5]], "made": [{"kind": "dataset", "path": "pot"}],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("line", "error"),
+    [
+        ('{"event": "poured", "cups": 1}', "of: required key is missing"),
+        ('{"event": "poured", "cups": 1, "of": 2, "sugar": 3}', "sugar: unknown key"),
+        ('{"event": "drunk"}', "unknown event 'drunk'; declared: poured, failed"),
+    ],
+)
+def test_an_event_of_another_shape_is_an_error_of_the_job(ui: Ui, line: str, error: str) -> None:
+    facts = event_reader(ui.folders, BREW)(line) or {}
+    assert error in facts["error"]
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("--milk adds some", "“With milk” adds some"),
+        ("see --policy.path=x, --other and --milk-foam", "see --policy.path=x, --other and --milk-foam"),
+        ("run `ibrobot brew --milk` first", "run “Brew” first"),
+        ("run `ibrobot paint`", "run `ibrobot paint`"),
+    ],
+)
+def test_errors_have_labels_in_place_of_flags_and_commands(ui: Ui, text: str, shown: str) -> None:
+    assert in_page_words(text, BREW) == shown
