@@ -8,9 +8,7 @@ own. A line of another shape is an error.
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import override
 
 import attrs
 
@@ -37,12 +35,12 @@ class Shown:
 
 
 @attrs.frozen
-class Event(ABC):
+class Event:
     """Base of the events of commands: frozen attrs classes, whose fields (`option`) are plain data."""
 
-    @abstractmethod
     def shown(self) -> Shown:
-        """What a person is shown of it."""
+        """What a person is shown of it; by default nothing."""
+        return Shown()
 
 
 @attrs.frozen
@@ -50,10 +48,6 @@ class Failed(Event):
     """The last event of a command that ends with an error."""
 
     error: str = option(help="the reason, as on a terminal")
-
-    @override
-    def shown(self) -> Shown:
-        return Shown(self.error)
 
 
 def encode_event(event: Event) -> str:

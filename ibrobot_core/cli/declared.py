@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, get_args
@@ -32,7 +33,8 @@ def declared[C: Callable[..., Any]](command: Command) -> Callable[[C], C]:
     def add(function: C) -> C:
         @functools.wraps(function)
         def run(**given: Any) -> Any:
-            plain = {name: _plain(value) for name in known if (value := given.pop(name)) is not None}
+            parsed = {name: value for name in known if (value := given.pop(name)) is not None}
+            plain = json.loads(json.dumps(parsed, default=str))  # no tuples and paths
             try:
                 return function(read_options(command.options, plain, Path, names), **given)
             except (IbrobotError, click.ClickException) as error:
@@ -87,13 +89,6 @@ def read_options(
 def flag_of(name: str, field: attrs.Attribute[Any]) -> str:
     """What the command line calls an option, e.g. `--norm-mode`, or `EPISODES` for an argument."""
     return name.upper() if field.metadata["argument"] else f"--{name.replace('_', '-')}"
-
-
-def _plain(value: Any) -> Any:
-    """A parsed parameter as plain data."""
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
 
 
 def _parameter(name: str, field: attrs.Attribute[Any]) -> Callable[[Any], Any]:

@@ -23,25 +23,6 @@ def _viewer_flags() -> dict[str, str]:
     return {each.type: each.flag for each in found if isinstance(each, ViewerDescriptor) and each.flag}
 
 
-class _ViewerOption(click.Option):
-    """`--viewer TYPE`, and the flags of the installed viewers."""
-
-    def __init__(self, *args: Any, **more: Any) -> None:
-        super().__init__(*args, **more)
-        self.secondary_opts = list(_viewer_flags().values())
-
-    @override
-    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
-        super().add_to_parser(parser, ctx)
-        for type_, flag in _viewer_flags().items():
-            parser.add_option(obj=self, opts=[flag], dest=self.name, action="store_const", const=type_)
-
-    @override
-    def get_help_record(self, ctx: click.Context) -> tuple[str, str]:
-        flags = ", ".join(f"{flag} ({type_})" for type_, flag in _viewer_flags().items())
-        return "--viewer TYPE", f"{self.help} Short: {flags}." if flags else str(self.help)
-
-
 class EpisodePath(click.Path):
     """A recorded episode or a folder of them: a path, or a short name such as `pick:1`; see `find_episode`."""
 
@@ -69,7 +50,7 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     "goals": option(
         "--goal", "goals", multiple=True, metavar="GOAL", help="Planning modes: a pose, joint=rad,… or xyz=X,Y,Z."
     ),
-    "viewer": option("--viewer", metavar="TYPE", cls=_ViewerOption, help="Show the robot in this viewer."),
+    "viewer": option("--viewer", metavar="TYPE", help="Show the robot in this viewer."),
     "headless": option("--headless", is_flag=True, help="Print plain lines, without window, viewer and panel."),
     "dry_run": option("--dry-run", is_flag=True, help="Print the plan, compare model and contract; start nothing."),
     "as_json": option("--json", "as_json", is_flag=True, help="Print the summary, or the plan, as JSON only."),
@@ -89,6 +70,8 @@ def run_options[C: Callable[..., Any]](*names: str) -> Callable[[C], C]:
 
     def add(command: C) -> C:
         for name in reversed(names or tuple(_OPTIONS)):
+            for type_, flag in _viewer_flags().items() if name == "viewer" else ():
+                command = option(flag, "viewer", flag_value=type_, help=f"As --viewer {type_}.")(command)
             command = _OPTIONS[name](command)
         return command
 
