@@ -62,6 +62,7 @@ from ibrobot_core.launch.session import (
     SessionWorker as SessionWorker,
     StateWatch as StateWatch,
 )
+from ibrobot_core.launch.views import RunAccess as RunAccess, RunView as RunView
 from ibrobot_core.launch.runtime import Runtime as Runtime
 from ibrobot_core.component import (
     Component as Component,

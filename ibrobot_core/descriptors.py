@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from ibrobot_core.component import Component
     from ibrobot_core.config.schema import RobotConfig
     from ibrobot_core.events import Event
-    from ibrobot_core.launch.session import Session
     from ibrobot_core.launch.sources.source_worker import SourceWorker
     from ibrobot_core.launch.transport import TransportLink
+    from ibrobot_core.launch.views import RunAccess, RunView
     from ibrobot_core.messages import CompressedImage, Image
     from ibrobot_core.robot import Robot
 
@@ -162,7 +162,7 @@ class TransportDescriptor(Descriptor["interfaces.Transport"]):
     on this machine only. None if servers cannot use this transport."""
     used: Callable[[Any], bool] = attrs.field(default=lambda options: False, kw_only=True)
     """Whether a run with these options uses the transport even if no mode needs it."""
-    components: Callable[[Any, Session, TransportLink], Sequence[Component]] = attrs.field(
+    components: Callable[[Any, RunView, TransportLink], Sequence[Component]] = attrs.field(
         default=lambda options, session, link: (), kw_only=True
     )
     """Returns components that the options add to a run with this transport, e.g. to send topics to other machines. Each
@@ -199,7 +199,7 @@ class SectionDescriptor(Descriptor["Component"]):
     `type` is the section's key at the top level of the file, which core must not have. `options` are its keys.
     """
 
-    make: Callable[[Any, Session], Component] = attrs.field(kw_only=True)  # type: ignore[assignment]
+    make: Callable[[Any, RunAccess], Component] = attrs.field(kw_only=True)  # type: ignore[assignment]
     """Makes the component, from options and session. The options are None if the component runs without its section.
     Imports what it needs when it is called, and opens nothing."""
     without_section: Callable[[RobotConfig], bool] = attrs.field(default=lambda config: False, kw_only=True)
@@ -250,7 +250,7 @@ class PanelDescriptor:
     title: str
     columns: tuple[str, ...]
     """The heads of the columns; the first column names the rows."""
-    rows: Callable[[Session], Sequence[Sequence[str]]]
+    rows: Callable[[RunView], Sequence[Sequence[str]]]
     """Returns the present rows with one text for each column; none for a run that the panel does not concern. Called a
     few times per second, in a thread of the host."""
 

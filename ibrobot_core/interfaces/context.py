@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ibrobot_core.config import RobotConfig
     from ibrobot_core.interfaces.policy import Policy
     from ibrobot_core.interfaces.transport import Transport
-    from ibrobot_core.launch.session import Session
+    from ibrobot_core.launch.views import RunView
 
 
 @attrs.frozen(eq=False)
@@ -58,5 +58,5 @@ class Context:
     """Returns a new queue of keys typed in the terminal (`queue.SimpleQueue[str]`); None without a terminal."""
     model: ModelContext | None = None
     """For engines: the model, whose name is that of the context."""
-    session: Session | None = None
+    session: RunView | None = None
     """For viewers: the run that they show."""

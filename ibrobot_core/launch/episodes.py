@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from ibrobot_core.launch.session import Session
+    from ibrobot_core.launch.views import RunAccess
 
 
 class Episodes:
     """Begins, ends and counts episodes. Not thread-safe."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: RunAccess) -> None:
         self._session = session
         self.number = 0
         """Number of the present episode, from 1; 0 before the first."""

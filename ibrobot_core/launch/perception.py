@@ -18,6 +18,7 @@ _RATE_WINDOW = 31
 class SensorWorker(SessionWorker):
     """Opens a sensor and publishes its messages; ready after the first message."""
 
+    session: Session
     urgent = True
 
     def __init__(self, session: Session, peripheral: PeripheralConfig, needs: tuple[str, ...]) -> None:

@@ -23,6 +23,7 @@ from ibrobot_core.interfaces import Context, EngineStats, JointReading, Operator
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, by_cause
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.launch.pulses import Pulse
+from ibrobot_core.launch.views import RunView
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
 
@@ -450,8 +451,11 @@ class SessionWorker(Worker):
         ready_timeout_s: how long `start` waits to be ready [s].
     """
 
+    session: RunView
+    """A subclass that does more to the run says so: `session: RunAccess`."""
+
     def __init__(
-        self, session: Session, name: str, summary: str, needs: tuple[str, ...] = (), *, ready_timeout_s: float = 60.0
+        self, session: RunView, name: str, summary: str, needs: tuple[str, ...] = (), *, ready_timeout_s: float = 60.0
     ) -> None:
         super().__init__(
             name,

@@ -12,6 +12,8 @@ from ibrobot_core.units import NS_PER_S, ns
 class SimulatedEpisodes(SessionWorker):
     """Episodes of a policy in a simulated scene; seeds count up from the seed of the run."""
 
+    session: Session
+
     def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
         wanted = session.request.episodes
         summary = f"{wanted if wanted is not None else 'endless'} episodes from seed {session.request.seed}"

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import Any, override
 
 from ibrobot_core.interfaces import Severity
-from ibrobot_core.launch.session import Session, SessionWorker
+from ibrobot_core.launch.session import SessionWorker
+from ibrobot_core.launch.views import RunView
 from ibrobot_core.messages import (
     DIAGNOSTICS,
     ROBOT_STATUS,
@@ -30,7 +31,7 @@ class Status(SessionWorker):
 
     urgent = True
 
-    def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
+    def __init__(self, session: RunView, needs: tuple[str, ...]) -> None:
         super().__init__(session, "status", "/robot_status and /diagnostics", needs)
         self._next_ns = 0
 

@@ -7,7 +7,8 @@ from typing import override
 
 from ibrobot_core.config.schema import ComponentConfig
 from ibrobot_core.interfaces import Viewer
-from ibrobot_core.launch.session import Session, SessionWorker
+from ibrobot_core.launch.session import SessionWorker
+from ibrobot_core.launch.views import RunView
 
 _RATE_HZ = 30.0
 
@@ -18,7 +19,7 @@ class ViewerWorker(SessionWorker):
     sends_stops = True
     urgent = True
 
-    def __init__(self, session: Session, component: ComponentConfig, needs: tuple[str, ...]) -> None:
+    def __init__(self, session: RunView, component: ComponentConfig, needs: tuple[str, ...]) -> None:
         super().__init__(session, "viewer", component.type, needs)
         self._component = component
 

@@ -107,6 +107,7 @@ class LoadedModel(Component):
 class PolicySource(SourceWorker):
     """Runs the dispatcher on the contract's ticks, with chunks from a model."""
 
+    session: Session
     autonomous = True
     urgent = True
 

@@ -8,7 +8,8 @@ from typing import override
 
 from ibrobot_core.component import CONTROL
 from ibrobot_core.config.schema import ControlMode
-from ibrobot_core.launch.session import CommandSource, Session, SessionWorker
+from ibrobot_core.launch.session import CommandSource, SessionWorker
+from ibrobot_core.launch.views import RunAccess
 
 
 class SourceWorker(SessionWorker, CommandSource):
@@ -31,7 +32,11 @@ class SourceWorker(SessionWorker, CommandSource):
         lock: held during `begin_mode` and `end_mode`. Hold it while `work` checks `active` and sends commands.
     """
 
-    def __init__(self, session: Session, mode: ControlMode, summary: str, needs: tuple[str, ...] = (CONTROL,)) -> None:
+    session: RunAccess
+
+    def __init__(
+        self, session: RunAccess, mode: ControlMode, summary: str, needs: tuple[str, ...] = (CONTROL,)
+    ) -> None:
         super().__init__(session, f"mode:{mode.name}", summary, needs)
         self.mode = mode
         self.active = False

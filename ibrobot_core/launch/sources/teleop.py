@@ -10,16 +10,16 @@ import numpy as np
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.control.link import ControlState
 from ibrobot_core.errors import TeleopError
-from ibrobot_core.launch.session import Session
 from ibrobot_core.launch.sources.operator_devices import OperatorDevices
 from ibrobot_core.launch.sources.source_worker import SourceWorker
+from ibrobot_core.launch.views import RunAccess
 from ibrobot_core.units import seconds
 
 
 class Braking:
     """Lets joints that are no longer commanded brake as fast as they may, without a return to their last setpoint."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: RunAccess) -> None:
         self._session = session
         self.begin()
 
@@ -54,7 +54,7 @@ class TeleopSource(SourceWorker):
     sends_stops = True
     urgent = True
 
-    def __init__(self, session: Session, mode: ControlMode) -> None:
+    def __init__(self, session: RunAccess, mode: ControlMode) -> None:
         self._devices = OperatorDevices(session, mode.devices)
         self._braking = Braking(session)
         super().__init__(session, mode, f"teleop {self._devices}")

@@ -13,7 +13,7 @@ from ibrobot_data.options import EpisodesOptions, check_keys
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.app import Component, ControlMode, PolicySource, RobotConfig, Session, SourceWorker
+    from ibrobot_core.app import Component, ControlMode, PolicySource, RobotConfig, RunAccess, SourceWorker
 
 
 def _convert() -> click.Command:
@@ -45,7 +45,7 @@ def ibrobot_commands() -> Iterable[Command]:
     yield Command("replay", "Play a recorded episode on a robot, and compare.", _replay)
 
 
-def _corrections(session: Session, mode: ControlMode, policy: PolicySource) -> SourceWorker:
+def _corrections(session: RunAccess, mode: ControlMode, policy: PolicySource) -> SourceWorker:
     from ibrobot_data.corrections import Corrections
 
     return Corrections(session, mode, policy)
@@ -59,7 +59,7 @@ def ibrobot_sources() -> Iterable[SourceDescriptor]:
     )
 
 
-def _recording(options: EpisodesOptions | None, session: Session) -> Component:
+def _recording(options: EpisodesOptions | None, session: RunAccess) -> Component:
     from ibrobot_data.partial_recording import PartialRecording
     from ibrobot_data.recording_worker import NoRecording, RecordingWorker
 

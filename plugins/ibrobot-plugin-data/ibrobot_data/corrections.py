@@ -24,8 +24,8 @@ from ibrobot_core.app import (
     ControlState,
     OperatorDevices,
     PolicySource,
+    RunAccess,
     Service,
-    Session,
     SourceWorker,
 )
 from ibrobot_data.handover import Handover
@@ -69,7 +69,7 @@ class Corrections(SourceWorker):
     sends_stops = True
     urgent = True
 
-    def __init__(self, session: Session, mode: ControlMode, policy: PolicySource) -> None:
+    def __init__(self, session: RunAccess, mode: ControlMode, policy: PolicySource) -> None:
         assert mode.inference is not None
         config = session.config
         self._devices = OperatorDevices(session, mode.inference.devices)

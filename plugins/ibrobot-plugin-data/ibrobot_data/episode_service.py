@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, override
 import attrs
 
 from ibrobot_core.api import Contract, NotSupported, RecorderError, documented, option, seconds
-from ibrobot_core.app import DiskFull, Episodes, NoRequest, Service, Session, wrong_input
+from ibrobot_core.app import DiskFull, Episodes, NoRequest, RunAccess, Service, wrong_input
 from ibrobot_data.conversion import OUTCOMES
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_start import is_kept
@@ -62,7 +62,7 @@ class EpisodeService(Episodes):
             topic of the contract in a run where an operator records.
     """
 
-    def __init__(self, session: Session, recording: RecordingWorker) -> None:
+    def __init__(self, session: RunAccess, recording: RecordingWorker) -> None:
         super().__init__(session)
         self._recording = recording
         self.wanted: int | None = None

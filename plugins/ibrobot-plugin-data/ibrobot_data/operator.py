@@ -7,7 +7,7 @@ from math import inf
 from typing import override
 
 from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, TeleopDescriptor, ViewerDescriptor, seconds
-from ibrobot_core.app import DiskFull, RunHooks, Session
+from ibrobot_core.app import DiskFull, RunAccess, RunHooks
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.words import plural
 
@@ -35,7 +35,7 @@ class Operator(RunHooks):
     """
 
     def __init__(
-        self, run: Session, service: EpisodeService, count: int | None, reset_time_s: float, prompt: str | None, *,
+        self, run: RunAccess, service: EpisodeService, count: int | None, reset_time_s: float, prompt: str | None, *,
         auto: bool, keys: bool, continuous: bool = False,
     ) -> None:  # fmt: skip
         if service.by_mode and continuous:
@@ -228,7 +228,7 @@ class Operator(RunHooks):
         self._not_before_s = self._clock_s() + self._reset_time_s
 
 
-def _has_start_button(run: Session) -> bool:
+def _has_start_button(run: RunAccess) -> bool:
     """Whether the viewer, or a teleoperation device of the mode, can begin episodes."""
     if (viewer := run.config.viewer) is not None:
         shown_by = run.registry.find("viewer", viewer.type)

@@ -11,7 +11,7 @@ from typing import override
 import attrs
 
 from ibrobot_core.api import NS_PER_S, Contract, EpisodeEnd, EpisodeStart, Message, Recorder, RecorderError, seconds
-from ibrobot_core.app import Component, Ownership, Received, RecordingConfig, Session, SessionWorker, error_line
+from ibrobot_core.app import Component, Ownership, Received, RecordingConfig, RunAccess, SessionWorker, error_line
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.episode_start import episode_start, is_kept, take_next_folder
 
@@ -43,9 +43,10 @@ class RecordingWorker(SessionWorker):
     there to make room.
     """
 
+    session: RunAccess
     urgent = True
 
-    def __init__(self, session: Session, config: RecordingConfig) -> None:
+    def __init__(self, session: RunAccess, config: RecordingConfig) -> None:
         super().__init__(session, "recording", f"{config.type} into {config.root}")
         self._config = config
         self._contract = Contract.from_config(session.config)

@@ -8,7 +8,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S, HardwareError, Vector, ns, seconds
-from ibrobot_core.app import ControlMode, ControlState, Session, SourceWorker, StateWatch
+from ibrobot_core.app import ControlMode, ControlState, RunAccess, SourceWorker, StateWatch
 from ibrobot_data.playback import Playback, Track
 
 _APPROACH_SPEED = 0.5
@@ -41,7 +41,7 @@ class ReplaySource(SourceWorker):
     autonomous = True
     urgent = True
 
-    def __init__(self, session: Session, mode: ControlMode, replay: Replay) -> None:
+    def __init__(self, session: RunAccess, mode: ControlMode, replay: Replay) -> None:
         super().__init__(session, mode, f"{replay.source}, {replay.playback.duration / replay.speed:.1f} s")
         self._replay = replay
         self._period_ns = ns(1.0 / session.config.control.rate_hz)

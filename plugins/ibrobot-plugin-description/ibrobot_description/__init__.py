@@ -10,10 +10,10 @@ from ibrobot_core.app import SectionDescriptor
 
 if TYPE_CHECKING:
     from ibrobot_core.api import NoOptions, OptionFault
-    from ibrobot_core.app import Component, RobotConfig, Session
+    from ibrobot_core.app import Component, RobotConfig, RunView
 
 
-def _publisher(options: NoOptions | None, session: Session) -> Component:
+def _publisher(options: NoOptions | None, session: RunView) -> Component:
     from ibrobot_description.component import DescriptionPublisher
 
     return DescriptionPublisher(session)

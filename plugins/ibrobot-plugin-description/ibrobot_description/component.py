@@ -9,7 +9,7 @@ from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.urdf import MOVING, read_urdf
 
 from ibrobot_core.api import JointState, String, TFMessage
-from ibrobot_core.app import CONTROL, Session, SessionWorker, Subscription
+from ibrobot_core.app import CONTROL, RunView, SessionWorker, Subscription
 from ibrobot_description.frames import mounted, transform
 
 
@@ -23,7 +23,7 @@ def _text(path: Path) -> str:
 class DescriptionPublisher(SessionWorker):
     """Publishes the moving links with every joint state; fixed links, mounts and the description once, latched."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: RunView) -> None:
         urdf = session.config.robot.description.urdf
         source = "the mounts of sensors" if urdf is None else urdf.name
         super().__init__(session, "description", f"/tf, /tf_static and /robot_description from {source}", (CONTROL,))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import click
 
     from ibrobot_core.api import Context, Hardware, Sensor, Teleop
-    from ibrobot_core.app import Guide, Question, Session
+    from ibrobot_core.app import Guide, Question, RunView
 
 
 def _follower(options: Any, ctx: Context) -> Hardware:
@@ -45,7 +45,7 @@ def _leader(options: Any, ctx: Context) -> Teleop:
     return LeaderTeleop(options, ctx)
 
 
-def _servos(session: Session) -> list[tuple[str, ...]]:
+def _servos(session: RunView) -> list[tuple[str, ...]]:
     from ibrobot_feetech.panel import servo_rows
 
     return servo_rows(session)

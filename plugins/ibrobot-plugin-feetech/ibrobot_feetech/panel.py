@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-from ibrobot_core.app import Session
+from ibrobot_core.app import RunView
 
 _QUANTITIES = {"temperature": "{:.0f} °C", "voltage": "{:.1f} V", "current": "{:.2f} A", "load": "{:.0%}"}
 
 
-def servo_rows(session: Session) -> list[tuple[str, ...]]:
+def servo_rows(session: RunView) -> list[tuple[str, ...]]:
     """One row for each joint of the arms on servo buses; values that no servo has sent yet are `-`."""
     state, config = session.state, session.config
     if state is None or config.simulated:

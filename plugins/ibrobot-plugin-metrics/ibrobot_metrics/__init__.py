@@ -10,10 +10,10 @@ from ibrobot_core.app import SectionDescriptor
 from ibrobot_metrics.options import MetricsOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.app import Component, Session
+    from ibrobot_core.app import Component, RunView
 
 
-def _port(options: MetricsOptions, session: Session) -> Component:
+def _port(options: MetricsOptions, session: RunView) -> Component:
     from ibrobot_metrics.component import MetricsPort
 
     return MetricsPort(options, session)

@@ -10,7 +10,7 @@ from typing import Any, override
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from ibrobot_core.app import Session
+from ibrobot_core.app import RunView
 
 _NAMED_BY_KEY = {"interventions": "joint", "bus drops": "topic"}
 """Groups whose keys are names of joints or topics, which become labels."""
@@ -24,7 +24,7 @@ NO_LABELS: Mapping[str, str] = MappingProxyType({})
 class RunCollector(Collector):
     """The groups of `/diagnostics`, each number with the label `robot`."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: RunView) -> None:
         self._session = session
 
     @override

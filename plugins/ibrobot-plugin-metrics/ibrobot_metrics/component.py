@@ -7,7 +7,7 @@ from typing import override
 from ibrobot_monitoring import Probes, ProbeServer
 from prometheus_client import generate_latest
 
-from ibrobot_core.app import CONTROL, Component, Session
+from ibrobot_core.app import CONTROL, Component, RunView
 from ibrobot_metrics.collector import RunCollector
 from ibrobot_metrics.options import MetricsOptions
 
@@ -15,7 +15,7 @@ from ibrobot_metrics.options import MetricsOptions
 class MetricsPort(Component):
     """Serves the metrics of a run."""
 
-    def __init__(self, options: MetricsOptions, session: Session) -> None:
+    def __init__(self, options: MetricsOptions, session: RunView) -> None:
         summary = f"/metrics, /healthz and /readyz on port {options.port} of this machine"
         super().__init__("metrics", summary, (CONTROL,))
         self._session = session
@@ -43,12 +43,12 @@ class MetricsPort(Component):
             server.close()
 
 
-def unhealthy(session: Session) -> str:
+def unhealthy(session: RunView) -> str:
     """Why the run must be restarted; empty if it need not."""
     return session.failure_text or ("the run is over" if session.finished.is_set() else "")
 
 
-def unready(session: Session) -> str:
+def unready(session: RunView) -> str:
     """Why the robot cannot work now; empty if it can."""
     state = session.state
     if state is None:

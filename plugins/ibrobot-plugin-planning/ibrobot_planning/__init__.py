@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import click
 
     from ibrobot_core.api import Context, Executor, Planner, Robot
-    from ibrobot_core.app import Component, ControlMode, Session, SourceWorker
+    from ibrobot_core.app import Component, ControlMode, RunAccess, RunView, SourceWorker
 
 
 def _joint(options: Any, ctx: Context) -> Planner:
@@ -56,7 +56,7 @@ def _needs_model(options: RrtConnectOptions, robot: Robot, joints: tuple[str, ..
         yield OptionFault((), "planning around obstacles needs robot.description.mjcf: set it", "mjcf")
 
 
-def _source(session: Session, mode: ControlMode) -> SourceWorker:
+def _source(session: RunAccess, mode: ControlMode) -> SourceWorker:
     from ibrobot_planning.execution.source import PlannerSource
 
     return PlannerSource(session, mode)
@@ -98,7 +98,7 @@ def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
     )
 
 
-def _world(options: WorldOptions, session: Session) -> Component:
+def _world(options: WorldOptions, session: RunView) -> Component:
     if options.clouds:
         from ibrobot_planning.world.clouds import CloudKeeper
 
@@ -108,7 +108,7 @@ def _world(options: WorldOptions, session: Session) -> Component:
     return WorldKeeper(options, session)
 
 
-def _tasks(options: NoOptions, session: Session) -> Component:
+def _tasks(options: NoOptions, session: RunView) -> Component:
     from ibrobot_planning.tasks.runner import TaskRunner
 
     return TaskRunner(session)

@@ -11,7 +11,7 @@ from ibrobot_servo.options import ToolPoseOptions, TwistOptions
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Context, Robot, Teleop
-    from ibrobot_core.app import Component, RobotConfig, Session
+    from ibrobot_core.app import Component, RobotConfig, RunView
 
 
 def _twist(options: TwistOptions, ctx: Context) -> Teleop:
@@ -20,7 +20,7 @@ def _twist(options: TwistOptions, ctx: Context) -> Teleop:
     return TwistTeleop(options, ctx)
 
 
-def _pose(options: ToolPoseOptions | None, session: Session) -> Component:
+def _pose(options: ToolPoseOptions | None, session: RunView) -> Component:
     from ibrobot_servo.tool_pose import ToolPose
 
     return ToolPose(options or ToolPoseOptions(), session)

@@ -8,7 +8,7 @@ from ibrobot_kinematics import KinematicModel, KinematicsError, robot_model
 from ibrobot_kinematics.poses import orientation
 
 from ibrobot_core.api import NS_PER_S, Header, JointState, Pose, PoseStamped, Vector3
-from ibrobot_core.app import CONTROL, Session, SessionWorker, Subscription
+from ibrobot_core.app import CONTROL, RunView, SessionWorker, Subscription
 from ibrobot_servo.options import ToolPoseOptions
 
 
@@ -17,7 +17,7 @@ class ToolPose(SessionWorker):
 
     urgent = True
 
-    def __init__(self, options: ToolPoseOptions, session: Session) -> None:
+    def __init__(self, options: ToolPoseOptions, session: RunView) -> None:
         super().__init__(session, "tool_pose", f"the tool's pose on {options.topic}", (CONTROL,))
         self._options = options
         self._period_ns = round(NS_PER_S / options.rate_hz)

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from ibrobot_core.api import IbrobotError, PlanningError, seconds
-from ibrobot_core.app import Session, error_text, raise_thread_priority
+from ibrobot_core.app import RunView, error_text, raise_thread_priority
 from ibrobot_web.messages import (
     BeginEpisode,
     Cancel,
@@ -33,7 +33,7 @@ from ibrobot_web.teleop import JOG, RELEASE, Released
 from ibrobot_web.teleop import Jog as JogRequest
 
 Reply = Callable[[Mapping[str, Any]], None]
-Handler = Callable[[Session, Any], Any]
+Handler = Callable[[RunView, Any], Any]
 _LATE_MS = 200
 """Age from which on messages of the deadman are refused [ms]."""
 _AHEAD_MS = 5
@@ -59,7 +59,7 @@ class Commands:
     """
 
     def __init__(
-        self, session: Session, finish: Callable[[], None], reply: Reply, on_failure: Callable[[Exception], None]
+        self, session: RunView, finish: Callable[[], None], reply: Reply, on_failure: Callable[[Exception], None]
     ) -> None:
         self._session = session
         self._finish = finish
@@ -159,7 +159,7 @@ def _waiting[T](waiting: queue.SimpleQueue[T]) -> list[T]:
             return found
 
 
-def _jog(session: Session, sent: Sent[Jog]) -> None:
+def _jog(session: RunView, sent: Sent[Jog]) -> None:
     if not session.bus.serves(JOG):
         raise IbrobotError("this mode does not jog from the page: enter a mode whose teleop is of type web")
     jog, now_ms = sent.command, clock_ns() / _NS_PER_MS
@@ -171,25 +171,25 @@ def _jog(session: Session, sent: Sent[Jog]) -> None:
     session.bus.call(JOG, JogRequest(made_ns, began_ns, jog.joints, jog.targets, jog.linear, jog.turn, jog.pose))
 
 
-def _release(session: Session, sent: Sent[Release]) -> None:
+def _release(session: RunView, sent: Sent[Release]) -> None:
     if session.bus.serves(RELEASE):
         at = sent.command.at
         session.bus.call(RELEASE, Released(None if at is None else _run_times(session, at)[0]))
 
 
-def _run_times(session: Session, *times_ms: int) -> list[int]:
+def _run_times(session: RunView, *times_ms: int) -> list[int]:
     """Times of `clock_ms` by the run's clock [ns], in the same order; the present for later ones."""
     now_ns, page_ns = session.clock.now_ns(), clock_ns()
     return [now_ns - max(0, page_ns - time_ms * _NS_PER_MS) for time_ms in times_ms]
 
 
-def _reset(session: Session, sent: Sent[Reset]) -> Any:
+def _reset(session: RunView, sent: Sent[Reset]) -> Any:
     if sent.stops is None:
         raise IbrobotError("this page has seen no state of the robot yet")
     return session.bus.call("/reset", {"stops": sent.stops})
 
 
-def _joints_of(session: Session, pose: str) -> dict[str, float]:
+def _joints_of(session: RunView, pose: str) -> dict[str, float]:
     """The positions of a named pose [rad], of the joints that follow trajectories in this mode."""
     config = session.config
     if pose not in config.robot.description.poses:
@@ -199,7 +199,7 @@ def _joints_of(session: Session, pose: str) -> dict[str, float]:
     return {joint: values[joint] for each in executors if each.goals == "trajectory" for joint in each.joints}
 
 
-def _preview(session: Session, sent: Sent[Preview]) -> Mapping[str, Any]:
+def _preview(session: RunView, sent: Sent[Preview]) -> Mapping[str, Any]:
     """The path to a goal, planned and not executed: joints by index, and rows of positions [rad]."""
     goal = sent.command.goal
     joints = goal.joints if goal.pose is None else _joints_of(session, goal.pose)

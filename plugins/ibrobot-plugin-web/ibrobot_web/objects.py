@@ -9,7 +9,7 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import Float64MultiArray, HardwareDescriptor, IbrobotError, Pose, SceneObject, Vector
-from ibrobot_core.app import Session, Subscription
+from ibrobot_core.app import RunView, Subscription
 
 WORLD = "/world/snapshot"
 """Answers with the objects around the robot, of which the page shows those with simple shapes."""
@@ -24,7 +24,7 @@ class SceneObjects:
         session: the run.
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: RunView) -> None:
         self._session = session
         self._things = [each for each in _simulated(session) if each.shape != "plane"]
         topics = {each.topic for each in self._things if each.topic}
@@ -102,7 +102,7 @@ def _pose(pose: Pose) -> tuple[list[float], list[float]]:
     return [at.x, at.y, at.z], [turn.w, turn.x, turn.y, turn.z]
 
 
-def _simulated(session: Session) -> Sequence[SceneObject]:
+def _simulated(session: RunView) -> Sequence[SceneObject]:
     """The objects of the simulated scene; none on hardware."""
     config = session.config
     if not config.simulated or config.simulation is None:

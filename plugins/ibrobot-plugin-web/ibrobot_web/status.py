@@ -14,7 +14,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S, JointState, Message, Vector
-from ibrobot_core.app import ControlMode, ControlState, Session, error_text
+from ibrobot_core.app import ControlMode, ControlState, RunView, error_text
 
 _TOKEN = re.compile(r"(?<=[?&]token=)[\w-]+")
 _LOG_LINES = 100
@@ -73,7 +73,7 @@ def state_json(state: ControlState) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def robot_json(session: Session) -> dict[str, Any]:
+def robot_json(session: RunView) -> dict[str, Any]:
     """What does not change during a run."""
     config, robot = session.config, session.config.robot
     return {
@@ -91,12 +91,12 @@ def robot_json(session: Session) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _devices(session: Session, mode: ControlMode) -> dict[str, str]:
+def _devices(session: RunView, mode: ControlMode) -> dict[str, str]:
     """The teleoperation devices of a mode: name -> type."""
     return {name: session.config.teleoperation[name].type for name in mode.devices.values()}
 
 
-def _about(session: Session, mode: ControlMode) -> str:
+def _about(session: RunView, mode: ControlMode) -> str:
     if mode.inference is not None:
         return f"policy {mode.inference.model}"
     if devices := _devices(session, mode):
@@ -104,7 +104,7 @@ def _about(session: Session, mode: ControlMode) -> str:
     return f"planner {mode.planner.type}" if mode.planner is not None else "no source of commands"
 
 
-def status_json(session: Session, log: LogLines, pages: int) -> dict[str, Any]:
+def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
     """Everything about a run that changes, except joint states."""
     counts = session.counts()
     conditions = session.control.report["counters"].get("conditions", ())
@@ -131,7 +131,7 @@ def status_json(session: Session, log: LogLines, pages: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _panels(session: Session) -> list[dict[str, Any]]:
+def _panels(session: RunView) -> list[dict[str, Any]]:
     """The tables of plugins; the error of one takes the place of its rows."""
     found = []
     for panel in session.registry.panels:
@@ -144,7 +144,7 @@ def _panels(session: Session) -> list[dict[str, Any]]:
     return found
 
 
-def plan_json(session: Session, now_ns: int) -> dict[str, Any]:
+def plan_json(session: RunView, now_ns: int) -> dict[str, Any]:
     """The part of the plan still to come; without rows if there is none."""
     plan = session.plan
     if plan is None or plan.generation != session.generation or len(plan.positions) < 2:

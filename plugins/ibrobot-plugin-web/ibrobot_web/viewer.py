@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any, override
 
 from ibrobot_core.api import CompressedImage, Context, ContractError, IbrobotError, Image, Viewer
-from ibrobot_core.app import Child, ComponentFailed, Session, Subscription, error_text, raise_thread_priority
+from ibrobot_core.app import Child, ComponentFailed, RunView, Subscription, error_text, raise_thread_priority
 from ibrobot_web.commands import Commands
 from ibrobot_web.desktop import has_desktop
 from ibrobot_web.link import FIRST_PICTURE, PLAN, SAMPLES, STATE, STATUS, FrameSender
@@ -65,7 +65,7 @@ class WebViewer(Viewer):
         session, bus = self._ctx.session, self._ctx.bus
         if session is None or bus is None:
             raise IbrobotError("viewer type web shows a run: use it in `viewer:` or with --web")
-        self._session: Session = session
+        self._session: RunView = session
         self._finish.clear()
         self._dead = ""
         own, far = socket.socketpair()
@@ -140,7 +140,7 @@ class WebViewer(Viewer):
     def where(self) -> str:
         return f"{self.url}  (to watch only: {self.watch_url})" if self.url else ""
 
-    def _order(self, session: Session) -> dict[str, Any]:
+    def _order(self, session: RunView) -> dict[str, Any]:
         """The order of the server's process."""
         options, robot = self._options, session.config.robot
         paths = {"mjcf": robot.description.mjcf, "urdf": robot.description.urdf}

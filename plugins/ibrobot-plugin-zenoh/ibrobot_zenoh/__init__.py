@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import click
 
     from ibrobot_core.api import CompressedImage, Context, Image, Transport
-    from ibrobot_core.app import Component, Session, TransportLink
+    from ibrobot_core.app import Component, RunView, TransportLink
 
 
 def _zenoh(options: Any, ctx: Context) -> Transport:
@@ -22,7 +22,7 @@ def _zenoh(options: Any, ctx: Context) -> Transport:
     return ZenohTransport(options, ctx)
 
 
-def _components(options: ZenohOptions, session: Session, link: TransportLink) -> list[Component]:
+def _components(options: ZenohOptions, session: RunView, link: TransportLink) -> list[Component]:
     from ibrobot_zenoh.sharing import components
 
     return components(options.share, session, link)
@@ -46,7 +46,7 @@ def _subscribed(options: ZenohOptions) -> list[tuple[tuple[str | int, ...], str]
     return [(("share", "subscribe", key), topic) for key, topic in zip(keys, topics, strict=True)]
 
 
-def _peers(session: Session) -> list[tuple[str, ...]]:
+def _peers(session: RunView) -> list[tuple[str, ...]]:
     from ibrobot_zenoh.panel import peer_rows
 
     return peer_rows(session)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import zenoh
 
 from ibrobot_core.api import TransportError
-from ibrobot_core.app import Session
+from ibrobot_core.app import RunView
 from ibrobot_zenoh.connection import Connection, open_connections
 
 
-def peer_rows(session: Session) -> list[tuple[str, ...]]:
+def peer_rows(session: RunView) -> list[tuple[str, ...]]:
     """One row for each peer; for a connection without peers, one with where it listens or why it has none."""
     return [row for connection in open_connections() for row in _rows(connection)]
 

@@ -9,7 +9,7 @@ from typing import override
 from ibrobot_ros2.services import SERVICES, Answer, decode_call, encode_answer, endpoint
 
 from ibrobot_core.api import NS_PER_S, Handler, IbrobotError, Message, NotSupported, Payload, Transport, did_you_mean
-from ibrobot_core.app import Component, Session, SessionWorker, Subscription, TransportLink
+from ibrobot_core.app import Component, RunView, SessionWorker, Subscription, TransportLink
 from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.ros2 import SharedTopic
 
@@ -71,7 +71,7 @@ class TopicTransport(Transport):
         """
 
 
-def components(share: Share, session: Session, link: TransportLink) -> list[Component]:
+def components(share: Share, session: RunView, link: TransportLink) -> list[Component]:
     """The components that share the topics and services in a YAML.
 
     Raises:
@@ -97,7 +97,7 @@ def _topics(link: TransportLink) -> TopicTransport:
 class PublishedTopic(SessionWorker):
     """Sends a topic of the bus to other machines. Messages that cannot be sent are skipped and reported once."""
 
-    def __init__(self, session: Session, link: TransportLink, topic: str) -> None:
+    def __init__(self, session: RunView, link: TransportLink, topic: str) -> None:
         super().__init__(session, f"share:{topic}", "to other machines", (link.name,))
         self._link = link
         self._topic = topic
@@ -142,7 +142,7 @@ class PublishedTopic(SessionWorker):
 class SubscribedTopics(Component):
     """Forwards topics of other machines to the bus."""
 
-    def __init__(self, session: Session, link: TransportLink, topics: Collection[str] | Mapping[str, str]) -> None:
+    def __init__(self, session: RunView, link: TransportLink, topics: Collection[str] | Mapping[str, str]) -> None:
         super().__init__("share", f"{', '.join(topics)} from other machines", (link.name,))
         self._link = link
         self._session = session
@@ -191,7 +191,7 @@ class SharedServices(Component):
     A name that ends with / stands for all services whose names begin with it. `/rosapi/services` lists the services.
     """
 
-    def __init__(self, session: Session, link: TransportLink, names: tuple[str, ...]) -> None:
+    def __init__(self, session: RunView, link: TransportLink, names: tuple[str, ...]) -> None:
         super().__init__("share:services", f"{', '.join(names)} for other machines", (link.name,))
         self._session = session
         self._link = link

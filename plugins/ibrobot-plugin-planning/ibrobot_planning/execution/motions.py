@@ -21,7 +21,7 @@ from ibrobot_core.api import (
     seconds,
     trajectory_goal,
 )
-from ibrobot_core.app import Session
+from ibrobot_core.app import RunView
 from ibrobot_planning.planners.blend import Limits, braking, cut, joined
 from ibrobot_planning.planners.timing import Motion, motion_of, trajectory_of
 
@@ -34,7 +34,7 @@ type ExecutorGoal = JointTrajectory | float
 """A trajectory, or a position [rad]."""
 
 
-def commanded(session: Session) -> Vector:
+def commanded(session: RunView) -> Vector:
     """Commanded positions [rad], shape (J,): unlike the measured ones, they do not sag."""
     return session.state.command if session.state is not None else session.measured().position
 
@@ -76,7 +76,7 @@ class Execution:
         planner: says whether a motion touches anything.
     """
 
-    def __init__(self, session: Session, planner: Planner) -> None:
+    def __init__(self, session: RunView, planner: Planner) -> None:
         self._session = session
         self._planner = planner
         self._lock = threading.RLock()

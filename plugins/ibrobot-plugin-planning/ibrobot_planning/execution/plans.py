@@ -25,7 +25,7 @@ from ibrobot_core.api import (
     Vector,
     ns,
 )
-from ibrobot_core.app import ControlMode, Registry, RobotConfig, Session
+from ibrobot_core.app import ControlMode, Registry, RobotConfig, RunView
 from ibrobot_planning.execution.motions import ExecutorGoal
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import GoalOptions
@@ -49,7 +49,7 @@ class GoalPlans:
 
     planner: Planner
 
-    def __init__(self, session: Session, mode: ControlMode) -> None:
+    def __init__(self, session: RunView, mode: ControlMode) -> None:
         self._session = session
         self._mode = mode
         self._lock = threading.Lock()

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import attrs
 
 from ibrobot_core.api import PlanCode, PlanningError
-from ibrobot_core.app import Session
+from ibrobot_core.app import RunView
 
 type Outcome = Literal["SUCCEEDED", "REJECTED", "PLANNING_FAILED", "EXECUTION_FAILED", "CANCELLED"]
 
@@ -78,9 +78,9 @@ class Results:
             raise PlanningError(f"no goal {number}; /planning/go_to answers with the number of a goal")
 
 
-_RESULTS: WeakKeyDictionary[Session, Results] = WeakKeyDictionary()
+_RESULTS: WeakKeyDictionary[RunView, Results] = WeakKeyDictionary()
 
 
-def results_of(session: Session) -> Results:
+def results_of(session: RunView) -> Results:
     """The results of a run, which its modes share: a number means one goal, also after a switch of the mode."""
     return _RESULTS.setdefault(session, Results())

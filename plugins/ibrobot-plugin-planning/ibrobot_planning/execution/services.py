@@ -21,7 +21,7 @@ from ibrobot_core.api import (
     PoseStamped,
     Vector,
 )
-from ibrobot_core.app import ControlMode, NoRequest, Service, Session
+from ibrobot_core.app import ControlMode, NoRequest, RunView, Service
 from ibrobot_planning.execution.motions import commanded
 from ibrobot_planning.execution.plans import GoalPlans, arm_joints
 from ibrobot_planning.execution.requests import (
@@ -71,7 +71,7 @@ class PlanningServices:
         handlers: service -> its handler.
     """
 
-    def __init__(self, session: Session, mode: ControlMode, plans: GoalPlans) -> None:
+    def __init__(self, session: RunView, mode: ControlMode, plans: GoalPlans) -> None:
         self._session = session
         self._robot = session.config.robot
         self._mode = mode

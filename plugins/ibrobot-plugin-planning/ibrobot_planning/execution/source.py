@@ -29,7 +29,7 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_core.app import ControlMode, ControlState, NoRequest, RequestLimits, Service, Session, SourceWorker
+from ibrobot_core.app import ControlMode, ControlState, NoRequest, RequestLimits, RunAccess, Service, SourceWorker
 from ibrobot_planning.execution.motions import Execution, commanded
 from ibrobot_planning.execution.plans import GoalPlans
 from ibrobot_planning.execution.requests import Execute, GoTo, MoveRequest, MoveToConfiguration, MoveToPose, Numbered
@@ -120,7 +120,7 @@ class PlannerSource(SourceWorker):
         PlanningError: for a goal of the request that makes no sense for this robot.
     """
 
-    def __init__(self, session: Session, mode: ControlMode) -> None:
+    def __init__(self, session: RunAccess, mode: ControlMode) -> None:
         assert mode.planner is not None
         super().__init__(session, mode, f"planner {mode.planner.type}")
         self._plans = GoalPlans(session, mode)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ibrobot_core.api import CompressedImage, IbrobotError, Image, PlanningError, Vector, ns, seconds
-from ibrobot_core.app import SET_MODE, Session, SetMode
+from ibrobot_core.app import SET_MODE, RunView, SetMode
 from ibrobot_planning.execution.motions import commanded
 from ibrobot_planning.execution.requests import GoTo, Numbered, PlanAhead, PlanAnswer
 from ibrobot_planning.execution.results import MoveResult
@@ -78,7 +78,7 @@ class Performance:
         results: of the steps that have ended.
     """
 
-    def __init__(self, session: Session, checked: CheckedTask, begins: Callable[[Step], None]) -> None:
+    def __init__(self, session: RunView, checked: CheckedTask, begins: Callable[[Step], None]) -> None:
         self._session = session
         self.checked = checked
         self._begins = begins

@@ -13,7 +13,7 @@ from typing import Any, override
 import attrs
 
 from ibrobot_core.api import PlanningError, String, documented, option, seconds
-from ibrobot_core.app import CONTROL, NoRequest, RequestLimits, Service, Session, SessionWorker
+from ibrobot_core.app import CONTROL, NoRequest, RequestLimits, RunView, Service, SessionWorker
 from ibrobot_planning.execution.requests import Numbered
 from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
 from ibrobot_planning.tasks.format import Step
@@ -65,7 +65,7 @@ class _Running:
 class TaskRunner(SessionWorker):
     """Performs tasks: `/task/run`, `/task/check`, `/task/result` and `/task/cancel`."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: RunView) -> None:
         world = (SECTION,) if SECTION in session.config.plugin_sections else ()
         super().__init__(session, "tasks", f"performs tasks: {RUN.name}", (CONTROL, *world))
         self._numbers = itertools.count(1)

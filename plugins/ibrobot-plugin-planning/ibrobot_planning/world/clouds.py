@@ -22,7 +22,7 @@ from ibrobot_core.api import (
     ns,
     pixels,
 )
-from ibrobot_core.app import CONTROL, Bus, NoRequest, Received, Service, Session, SessionWorker
+from ibrobot_core.app import CONTROL, Bus, NoRequest, Received, RunView, Service, SessionWorker
 from ibrobot_planning.world.arm import Arm, robot_arm
 from ibrobot_planning.world.coal_shapes import geometry
 from ibrobot_planning.world.objects import Voxels, WorldObject, world_of
@@ -42,7 +42,7 @@ class CloudKeeper(SessionWorker):
     Cells of the arm, of what it carries and of other objects are left out.
     """
 
-    def __init__(self, options: WorldOptions, session: Session) -> None:
+    def __init__(self, options: WorldOptions, session: RunView) -> None:
         self._keeper = WorldKeeper(options, session)
         topics = ", ".join(cloud.topic for cloud in options.clouds.values())
         super().__init__(session, "world", f"{self._keeper.summary}, and cells from {topics}", (CONTROL,))
@@ -104,7 +104,7 @@ class CloudKeeper(SessionWorker):
 class _Cloud:
     """One source of points."""
 
-    def __init__(self, name: str, options: CloudOptions, session: Session) -> None:
+    def __init__(self, name: str, options: CloudOptions, session: RunView) -> None:
         self.options = options
         self._name = name
         self._session = session

@@ -25,7 +25,7 @@ from ibrobot_core.api import (
     did_you_mean,
     resolve_path,
 )
-from ibrobot_core.app import Component, Registry, RobotConfig, Service, Session, Subscription
+from ibrobot_core.app import Component, Registry, RobotConfig, RunView, Service, Subscription
 from ibrobot_planning.world.objects import (
     FLOOR,
     SNAPSHOT,
@@ -115,7 +115,7 @@ class WorldKeeper(Component):
     the simulated scene are where the simulation has them now, unless they are attached.
     """
 
-    def __init__(self, options: WorldOptions, session: Session) -> None:
+    def __init__(self, options: WorldOptions, session: RunView) -> None:
         scene = scene_objects(session.config, session.registry)
         self._world = first_world(options, scene)
         super().__init__("world", f"{len(self._world.objects)} objects for planners", ())

@@ -38,7 +38,7 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_core.app import ControlMode, Session, SourceWorker, Subscription
+from ibrobot_core.app import ControlMode, RunAccess, SourceWorker, Subscription
 
 
 class FakeSensor(Sensor):
@@ -181,7 +181,7 @@ class FakeEngine(Engine):
 class FakeSource(SourceWorker):
     """Commands nothing: the executors hold."""
 
-    def __init__(self, session: Session, mode: ControlMode) -> None:
+    def __init__(self, session: RunAccess, mode: ControlMode) -> None:
         super().__init__(session, mode, "holds")
 
     @override
