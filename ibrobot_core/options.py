@@ -100,7 +100,12 @@ def option(
         argument: whether it is an argument of the command line, and not a flag.
     """
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
-    metadata = {"unit": unit, "help": help, "choices": tuple(choices) if choices is not None else None, **bounds}
+    metadata: dict[str, Any] = {
+        "unit": unit,
+        "help": help,
+        "choices": tuple(choices) if choices is not None else None,
+        **bounds,
+    }
     metadata |= {"secret": secret, "plain": plain, "label": label, "more": more, "names": names, "argument": argument}
     metadata |= {"open": open, "words": dict(choices) if isinstance(choices, Mapping) else {}}
     shown: Any = _hidden if secret else True

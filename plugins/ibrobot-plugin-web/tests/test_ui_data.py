@@ -16,8 +16,7 @@ from ibrobot_web.ui.server import routes_of
 from ui_server import UiServer, run_ui
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import find_config, installed_plugins
-from ibrobot_core.plugins import discover
+from ibrobot_core.app import Registry, find_config, installed_plugins
 
 CONFIG = Path(find_config("so101_blind", installed_plugins()))
 needs_data = pytest.mark.skipif("convert" not in installed_plugins().commands, reason="needs ibrobot-plugin-data")
@@ -184,8 +183,8 @@ def test_only_jobs_run_by_a_form(ui: Ui, command: str) -> None:
 
 
 def test_a_job_that_is_not_installed_names_its_package(ui: Ui, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ibrobot_web.ui.forms.installed_plugins", lambda: discover([]))
-    monkeypatch.setattr("ibrobot_web.ui.jobs.installed_plugins", lambda: discover([]))
+    monkeypatch.setattr("ibrobot_web.ui.forms.installed_plugins", Registry)
+    monkeypatch.setattr("ibrobot_web.ui.jobs.installed_plugins", Registry)
     form = ask(ui, "jobs", "GET /form", {"command": "convert"})
     missing = "ibrobot convert needs a plugin that is not installed: pip install ibrobot-plugin-data"
     assert (form["fields"], form["missing"]) == ([], missing)

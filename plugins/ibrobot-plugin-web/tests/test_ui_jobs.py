@@ -16,10 +16,8 @@ from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.jobs import event_reader
 
 from ibrobot_core.api import IbrobotError, MissingDependency, option
-from ibrobot_core.app import Command, Event, Shown
-from ibrobot_core.cli.declared import declared
+from ibrobot_core.app import Command, Event, Registry, Shown, declared
 from ibrobot_core.events import encode_event
-from ibrobot_core.plugins import Registry
 
 
 @attrs.frozen(kw_only=True)
