@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ibrobot_core.late import LateNames
+from ibrobot_core.late_names import LateNames
 
 _NAMES = LateNames(__name__, __file__)
 

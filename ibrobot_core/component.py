@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from typing import override
 
-from ibrobot_core.bugs import describe_bug
+from ibrobot_core.bug_reports import describe_bug
 from ibrobot_core.errors import ComponentFailed, IbrobotError
 
 CONTROL = "control"

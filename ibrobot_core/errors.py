@@ -17,7 +17,8 @@ _LISTED = 50
 class IbrobotError(Exception):
     """Base of all errors that ibrobot raises on purpose.
 
-    The command line prints `str(error)` and exits with `exit_code`; anything else is a bug: see `ibrobot_core.bugs`.
+    The command line prints `str(error)` and exits with `exit_code`; anything else is a bug, see
+    `ibrobot_core.bug_reports`.
     """
 
     exit_code = 1

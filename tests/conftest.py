@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 from ibrobot_testing.site import Site, made_up_site
 
-from ibrobot_core import outside
+from ibrobot_core import safe_output
 
 
 @pytest.fixture(autouse=True)
 def no_secrets_of_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """A process hides its secrets wherever they come; here each test is a process."""
-    monkeypatch.setattr(outside, "_secrets", set())
+    monkeypatch.setattr(safe_output, "_secrets", set())
 
 
 PLUGINS = Path(__file__).parent / "shared/plugins"

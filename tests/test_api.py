@@ -45,7 +45,7 @@ def test_names_are_listed(floor) -> None:
 def test_importing_it_imports_nothing_else_of_core(floor) -> None:
     code = f"import sys, {floor.__name__}; print([m for m in sys.modules if m.startswith(('ibrobot_core.', 'numpy'))])"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert loaded.strip() == f"['ibrobot_core.late', '{floor.__name__}']"
+    assert loaded.strip() == f"['ibrobot_core.late_names', '{floor.__name__}']"
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ import click
 from ibrobot_core.calibration import load_calibration
 from ibrobot_core.cli.options import run_options
 from ibrobot_core.errors import CalibrationError, ConfigError, PluginError, Problem
-from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.safe_output import echo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -17,7 +17,7 @@ from ibrobot_core.descriptors import Command
 from ibrobot_core.errors import IbrobotError, RequestError
 from ibrobot_core.events import Event, Failed, encode_event
 from ibrobot_core.options import default_of, fields
-from ibrobot_core.outside import echo
+from ibrobot_core.safe_output import echo
 
 
 def declared[C: Callable[..., Any]](command: Command) -> Callable[[C], C]:

@@ -13,8 +13,8 @@ import click
 
 from ibrobot_core.control.realtime import PERMIT
 from ibrobot_core.descriptors import Check
-from ibrobot_core.outside import echo
 from ibrobot_core.plugins import Registry, installed_plugins
+from ibrobot_core.safe_output import echo
 
 MINIMUM_PYTHON = (3, 12)
 LEAST_FREE_BYTES = 2_000_000_000

@@ -13,10 +13,10 @@ from typing import override
 import click
 
 from ibrobot_core import __version__
-from ibrobot_core.bugs import DEBUG, describe_bug
+from ibrobot_core.bug_reports import DEBUG, describe_bug
 from ibrobot_core.cli.command import let_interrupts_raise
 from ibrobot_core.errors import IbrobotError
-from ibrobot_core.outside import echo
+from ibrobot_core.safe_output import echo
 
 _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
 """Exit codes of errors without their own; docs/reference/exit-codes.md lists all."""
@@ -141,7 +141,7 @@ def _system_error(error: OSError) -> tuple[list[str], int] | None:
     if error.strerror and str(error.filename) in sys.argv:
         return [f"{error.filename}: {error.strerror}"], _WRONG
     if error.filename is None and error.errno in _OUTPUT_REFUSED:
-        from ibrobot_core.aside import discard
+        from ibrobot_core.output_thread import discard
 
         discard([1])  # so that the interpreter does not try to write it once more
         return [f"standard output: {error.strerror}"], _FAILED

@@ -11,8 +11,8 @@ import click
 
 from ibrobot_core.errors import PluginError
 from ibrobot_core.options import did_you_mean
-from ibrobot_core.outside import echo
 from ibrobot_core.plugins import Entry, Registry, installed_plugins
+from ibrobot_core.safe_output import echo
 
 
 @click.group(invoke_without_command=True)

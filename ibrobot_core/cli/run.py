@@ -16,7 +16,6 @@ from contextlib import ExitStack, nullcontext, suppress
 import attrs
 import click
 
-from ibrobot_core.aside import discard, output_aside
 from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.errors import IbrobotError, TeleopError
@@ -25,9 +24,10 @@ from ibrobot_core.launch.models import check_models
 from ibrobot_core.launch.pulses import PULSE_S, Pulse
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import LaunchRequest, Session
-from ibrobot_core.outside import LogFormatter, echo
+from ibrobot_core.output_thread import discard, output_aside
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.run_hooks import RunHooks
+from ibrobot_core.safe_output import LogFormatter, echo
 from ibrobot_core.signals import end_signals
 from ibrobot_core.terminal import KeyReader
 

@@ -14,7 +14,7 @@ from ibrobot_core.config.expand import expand
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
 from ibrobot_core.options import HIDDEN, fields
-from ibrobot_core.outside import SHORTEST, redacted, remember_secret, without_credentials
+from ibrobot_core.safe_output import SHORTEST, redacted, remember_secret, without_credentials
 
 _LOG = logging.getLogger("ibrobot.config")
 _NAMES = re.compile(r"(?i)(.*_)?(password|passwd|passphrase|secret|token|api_?key)")

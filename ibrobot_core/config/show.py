@@ -12,7 +12,7 @@ import yaml
 from ibrobot_core.config import schema
 from ibrobot_core.config.yaml_nodes import is_text
 from ibrobot_core.options import HIDDEN, fields
-from ibrobot_core.outside import without_credentials
+from ibrobot_core.safe_output import without_credentials
 
 _RESOLVED: Mapping[type, str] = {schema.PeripheralConfig: "sim", schema.SimulationConfig: "default_control_mode"}
 """Component -> a key resolved by loading: a simulated sensor's options, or the first mode in simulation."""

@@ -18,7 +18,7 @@ from ibrobot_core.config.expand import expand
 from ibrobot_core.convert import Key
 from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.options import did_you_mean
-from ibrobot_core.outside import redacted
+from ibrobot_core.safe_output import redacted
 
 _DEFAULT_TAGS = (BaseResolver.DEFAULT_SCALAR_TAG, BaseResolver.DEFAULT_SEQUENCE_TAG, BaseResolver.DEFAULT_MAPPING_TAG)
 _BOOLS = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}

@@ -26,8 +26,8 @@ from ibrobot_core.control.link import LinkLayout, SharedMemory
 from ibrobot_core.control.phase import Phase
 from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
-from ibrobot_core.outside import echo
 from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.safe_output import echo
 from ibrobot_core.units import NS_PER_S
 
 _STARTUP_TIMEOUT_S = 30.0

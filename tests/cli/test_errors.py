@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from ibrobot_testing import ibrobot_command
 
-from ibrobot_core.bugs import DEBUG
+from ibrobot_core.bug_reports import DEBUG
 
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site

@@ -211,7 +211,7 @@ def _check_excerpt(values: Any, folder: Path, *, sim: bool) -> None:
 
 
 def test_every_robot_yaml_passes_the_check(tmp_path: Path) -> None:
-    from ibrobot_data.given import load_contract
+    from ibrobot_data.config_metadata import load_contract
     from ibrobot_planning.tasks.reading import read_task
 
     for name in ("robot1", "gpu.lab"):  # made by `ibrobot certs` on the same pages

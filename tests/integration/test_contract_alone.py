@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from command_line import run_here
-from ibrobot_data.given import load_contract
+from ibrobot_data.config_metadata import load_contract
 from ibrobot_ros2 import encode
 from recordings import JOINTS, SIZE, START_NS, numbered
 from rosbags.rosbag2 import StoragePlugin, Writer

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import run_here
-from ibrobot_mcap.facts import set_custom
+from ibrobot_mcap.bag_metadata import set_custom
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_testing.contexts import host_context

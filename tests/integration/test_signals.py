@@ -10,8 +10,8 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+from ibrobot_data.config_metadata import load_contract
 from ibrobot_data.episode import DATASET, Job, convert_episode
-from ibrobot_data.given import load_contract
 from ibrobot_data.request import ConversionRequest, EpisodeReport
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_ros2 import encode

@@ -21,9 +21,9 @@ from ibrobot_core.api import Contract, DatasetDescriptor, DatasetError
 from ibrobot_core.app import Failed, declared, echo, emit, installed_plugins, with_closed_ends, wrong_input
 from ibrobot_data import CONVERT, conversion
 from ibrobot_data.conversion import ConvertOptions
+from ibrobot_data.plural import plural
 from ibrobot_data.prompt import check_prompt
 from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
-from ibrobot_data.words import plural
 
 if TYPE_CHECKING:
     from ibrobot_core.app import RobotConfig
@@ -134,8 +134,8 @@ def _to_bags(
     options: ConvertOptions, numbers: str | None, norm_mode: str | None, sets: tuple[str, ...], progress: _Progress
 ) -> Report:
     from ibrobot_core.api import EpisodeAddress
+    from ibrobot_data.config_metadata import metadata_from_config
     from ibrobot_data.episode import make_writer
-    from ibrobot_data.given import metadata_from_config
     from ibrobot_data.to_bags import BagRequest, convert_to_bags
 
     if len(options.episodes) != 1:
@@ -205,7 +205,7 @@ def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:
 
 def _robot(config: str) -> RobotConfig:
     from ibrobot_core.app import find_config
-    from ibrobot_data.given import load_contract
+    from ibrobot_data.config_metadata import load_contract
 
     return load_contract(find_config(config, installed_plugins()))
 

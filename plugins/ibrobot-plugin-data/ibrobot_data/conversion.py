@@ -10,7 +10,7 @@ import attrs
 
 from ibrobot_core.api import option
 from ibrobot_core.app import NORM_MODES, Event, Shown
-from ibrobot_data.words import plural
+from ibrobot_data.plural import plural
 
 OUTCOMES = {"success": "successful", "failure": "failed", "unknown": "not judged"}
 MISSING = {"refuse": "leave the episode out", "skip": "leave the tick out", "hold": "repeat the last value"}

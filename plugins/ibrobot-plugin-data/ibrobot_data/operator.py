@@ -9,7 +9,7 @@ from typing import override
 from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, TeleopDescriptor, ViewerDescriptor, seconds
 from ibrobot_core.app import DiskFull, RunAccess, RunHooks
 from ibrobot_data.episode_service import EpisodeService
-from ibrobot_data.words import plural
+from ibrobot_data.plural import plural
 
 _MIB = 1 << 20
 _START, _FAILURE, _DISCARD = "tab", "f11", "f12"

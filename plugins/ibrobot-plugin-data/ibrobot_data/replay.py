@@ -27,8 +27,8 @@ from ibrobot_core.app import (
     run_robot,
     wrong_input,
 )
+from ibrobot_data.config_metadata import metadata_from_config
 from ibrobot_data.episode import recorded_contract
-from ibrobot_data.given import metadata_from_config
 from ibrobot_data.playback import Playback, read_playback
 from ibrobot_data.replay_source import Replay, ReplaySource
 from ibrobot_data.same_robot import Identity

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ibrobot_data.given import load_contract
+from ibrobot_data.config_metadata import load_contract
 from ibrobot_data.ticks import frames
 
 from ibrobot_core.api import Contract, ContractError, Header, JointState

@@ -24,7 +24,7 @@ def datasets() -> None:
 @wrong_input()
 def info(dataset: Path, as_json: bool) -> None:
     """Show the counts, features, units and statistics of a DATASET."""
-    from ibrobot_lerobot.facts import dataset_facts
+    from ibrobot_lerobot.dataset_facts import dataset_facts
 
     facts = dataset_facts(dataset)
     if as_json:

@@ -23,9 +23,9 @@ from ibrobot_core.api import (
     RecorderError,
     TopicSummary,
 )
+from ibrobot_mcap.bag_metadata import Facts, custom_beside, parse_facts, read_facts
 from ibrobot_mcap.compressed import Expanded, MessageCompressed
 from ibrobot_mcap.damage import reading
-from ibrobot_mcap.facts import Facts, custom_beside, parse_facts, read_facts
 from ibrobot_mcap.metadata import DROPPED, METADATA, MISSING, OUTCOME, RECORD, RECORD_KEY, Topic
 from ibrobot_mcap.options import COMPRESSIONS
 from ibrobot_mcap.sources import McapSource, Raw, Source

@@ -42,7 +42,7 @@ def ask():
 
 @odd.command()
 def say():
-    from ibrobot_core.outside import echo
+    from ibrobot_core.safe_output import echo
 
     echo("größer … ✓")
     raise ValueError("größer … ✓")

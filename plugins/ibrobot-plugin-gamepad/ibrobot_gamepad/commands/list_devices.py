@@ -7,7 +7,7 @@ import json
 import click
 
 from ibrobot_core.app import echo
-from ibrobot_gamepad.commands.chosen import find_all
+from ibrobot_gamepad.commands.devices import find_all
 
 _VIA = {"hid": "its own reports", "sdl": "SDL"}
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import click
 
 from ibrobot_core.app import dump_yaml, echo, find_config, installed_plugins, load_config
-from ibrobot_gamepad.commands.chosen import device_option, opened, watch
+from ibrobot_gamepad.commands.devices import device_option, opened, watch
 from ibrobot_gamepad.controls import Controls
 from ibrobot_gamepad.devices import Device, Found
 from ibrobot_gamepad.options import FUNCTIONS, TOOL_AXES

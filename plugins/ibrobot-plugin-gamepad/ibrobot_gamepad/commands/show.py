@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from ibrobot_core.app import echo
-from ibrobot_gamepad.commands.chosen import device_option, opened, watch
+from ibrobot_gamepad.commands.devices import device_option, opened, watch
 from ibrobot_gamepad.controls import Controls
 
 _STEP = 0.05

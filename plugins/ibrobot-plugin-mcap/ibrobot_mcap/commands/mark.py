@@ -16,8 +16,8 @@ from ibrobot_core.app import EpisodePath, echo, wrong_input
 @wrong_input()
 def mark(episodes: tuple[Path, ...], outcome: str) -> None:
     """Set the OUTCOME of EPISODES, e.g. after a repair. The episode records that its outcome was set by hand."""
-    from ibrobot_mcap.commands.found import opened
-    from ibrobot_mcap.facts import set_custom
+    from ibrobot_mcap.bag_metadata import set_custom
+    from ibrobot_mcap.commands.episodes import opened
     from ibrobot_mcap.metadata import MARKED, OUTCOME
     from ibrobot_mcap.owning import owning
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from ibrobot_core.aside import AsideStream, output_aside
+from ibrobot_core.output_thread import AsideStream, output_aside
 
 PATIENCE_S = 30.0
 FULL = 70_000

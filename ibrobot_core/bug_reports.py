@@ -7,7 +7,7 @@ import sys
 import tempfile
 import traceback
 
-from ibrobot_core.outside import printable
+from ibrobot_core.safe_output import printable
 
 DEBUG = "IBROBOT_DEBUG"
 """Environment variable that enables tracebacks in all processes of a run; `ibrobot --debug` sets it."""
