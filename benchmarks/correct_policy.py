@@ -8,7 +8,7 @@
 3. `ibrobot convert --append --only interventions`: what the operator commanded joins the demonstrations.
 4. `lerobot-train --policy.path=…` trains the policy on with both. A control is trained on for as long with the
    demonstrations alone.
-5. `ibrobot launch` runs the three policies with cubes at the same places, which were in no training data.
+5. `ibrobot eval` runs the three policies with cubes at the same places, which were in no training data.
 
 Needs LeRobot in the same environment, as `train_pick_cube.py`. A stage whose result is in the folder `--work` is not
 done again. Prints one JSON object with the success rates and their 95 % intervals (Wilson), whatever they are.
@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import shutil
 import sys
 from pathlib import Path
@@ -41,15 +40,6 @@ OPERATOR = (
     "teleoperation={operator: {type: scripted_operator}}",
 )
 LOCKSTEP = ("--sim", "--lockstep", "--headless")
-_Z = 1.959964
-
-
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """The 95 % interval of a success rate (Wilson, 1927)."""
-    rate, z2 = successes / trials, _Z * _Z
-    middle = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = _Z / (1 + z2 / trials) * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials * trials))
-    return round(middle - half, 3), round(middle + half, 3)
 
 
 def train(dataset: Path, out: Path, steps: int, rate: float, start: tuple[str, ...]) -> None:
@@ -78,15 +68,15 @@ def record(work: Path, dataset: str, mode: str, episodes: int, seed: int, *more:
     )  # fmt: skip
 
 
-def trial(policy: Path, trials: int) -> dict[str, object]:
+def trial(policy: Path, trials: int, out: Path) -> dict[str, object]:
     """The success rate of a policy, with its interval."""
-    told = run(
-        "ibrobot", "launch", CONFIG, *LOCKSTEP, "--mode", "learned", "--episodes", str(trials), "--seed", "0",
-        "--json", "--set", f"models.act.path={policy}",
+    printed = run(
+        "ibrobot", "eval", CONFIG, "--sim", "--mode", "learned", "--episodes", str(trials), "--json", "--videos", "0",
+        "--set", f"models.act.path={policy}", "--out", out,
     )  # fmt: skip
-    summary = json.loads(told)
-    successes, episodes = summary["successes"], summary["episodes"]
-    return {"successes": successes, "trials": episodes, "interval": wilson(successes, episodes)}
+    (found,) = json.loads(printed)["policies"]
+    ends = [round(found["wilson"][end], 3) for end in ("low", "high")]
+    return {"successes": found["successes"], "trials": found["episodes"], "interval": ends}
 
 
 def main() -> int:
@@ -126,7 +116,10 @@ def main() -> int:
         for result, make in stages:
             if not result.exists():
                 make()
-        before, after, without = (trial(checkpoint(each), arguments.trials) for each in (base, corrected, control))
+        before, after, without = (
+            trial(checkpoint(each), arguments.trials, work / f"{each.name}_evaluation")
+            for each in (base, corrected, control)
+        )
     print(json.dumps({"before": before, "after": after, "control": without}))
     return 0
 

@@ -5,10 +5,10 @@
 1. `ibrobot record`: the scripted pick in simulation, in lockstep, without cameras; the cube's pose is an observation.
 2. `ibrobot convert`: a LeRobot dataset of the successes.
 3. `lerobot-train`: a small ACT (0.5 million parameters) on the CPU; the rate of learning falls to nothing.
-4. `ibrobot launch`: the trained policy in the same simulation, with cubes at places that were in no demonstration.
+4. `ibrobot eval`: the trained policy in the same simulation, with cubes at places that were in no demonstration.
 
 Needs LeRobot in the same environment: `pip install 'lerobot[dataset,training]>=0.6.1,<0.7'`. A stage whose result is in
-the folder `--work` is not done again. Prints one JSON object, the rate of success in it, whatever it is.
+the folder `--work` is not done again. Prints one JSON object with the successes and their 95 % interval.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ CONFIG = Path(__file__).parents[1] / "configs" / "so101_pick_cube.yaml"
 FIRST_TRAINING_SEED = 1000
 """Trials have the seeds from 0 on."""
 NOT_ALL_SUCCEEDED = 3
-"""Exit code of `ibrobot launch` when an episode failed."""
+"""Exit code of `ibrobot record` when an episode failed."""
 NORMALISED = json.dumps(dict.fromkeys(("STATE", "ENV", "ACTION"), "MEAN_STD"))
 """ACT's own choice lacks ENV, `observation.environment_state`: metres, which hardly vary beside joints."""
 
@@ -91,13 +91,13 @@ def main() -> int:
     begin = perf_counter()
     model = f"models.act.path={trained}/checkpoints/last/pretrained_model"
     printed = run(
-        "ibrobot", "launch", CONFIG, "--sim", "--lockstep", "--headless", "--mode", "learned", "--episodes",
-        str(arguments.trials), "--json", "--set", model,
+        "ibrobot", "eval", CONFIG, "--sim", "--mode", "learned", "--episodes", str(arguments.trials), "--json",
+        "--set", model, "--videos", "0", "--out", work / "evaluation",
     )  # fmt: skip
-    summary = json.loads(printed)
+    (found,) = json.loads(printed)["policies"]
     times_s["run"] = round(perf_counter() - begin)
-    rate = summary["successes"] / summary["episodes"]
-    print(json.dumps({"successes": summary["successes"], "trials": summary["episodes"], "rate": rate, "s": times_s}))
+    ends = [round(found["wilson"][end], 3) for end in ("low", "high")]
+    print(json.dumps({"successes": found["successes"], "trials": found["episodes"], "interval": ends, "s": times_s}))
     return 0
 
 

@@ -77,6 +77,8 @@ class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
     from 0 to 100."""
     scene: Callable[[Any, Robot], Sequence[interfaces.SceneObject]] = attrs.field(default=lambda o, r: (), kw_only=True)
     """For simulated hardware: the objects around the robot, for planners."""
+    film: Mapping[str, Any] = attrs.field(factory=dict, kw_only=True)
+    """For simulated hardware: the keys of a peripheral of kind `camera` that films the robot and all of its scene."""
 
 
 @attrs.frozen

@@ -6,7 +6,11 @@ import ast
 from pathlib import Path
 
 PLUGINS = Path(__file__).parents[2] / "plugins"
-PROGRAMS = {"ibrobot_planning/commands/plan.py", "ibrobot_testing/section.py"}
+PROGRAMS = {
+    *(f"ibrobot_eval/{name}.py" for name in ("episodes", "film", "blinded")),
+    "ibrobot_planning/commands/plan.py",
+    "ibrobot_testing/section.py",
+}
 """They make a session."""
 
 

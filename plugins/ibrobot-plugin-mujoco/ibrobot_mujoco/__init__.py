@@ -76,6 +76,7 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     yield HardwareDescriptor(
         type="mujoco", options=MujocoOptions, make=_hardware, default=True, simulated=True,
         sensors={"camera": "mujoco"}, check_options=check_world, scene=_scene,
+        film={"type": "mujoco", "camera": "front", "width": 320, "height": 240, "fps": 10},
         summary="the robot's MJCF in MuJoCo, on an empty table or with a cube and a bin",
     )  # fmt: skip
 

@@ -1,0 +1,138 @@
+"""The statistics of `ibrobot eval` by simulation: coverage of intervals, false positives under peeking, episodes.
+
+    python benchmarks/evaluation_statistics.py [--experiments 20000]
+
+Prints one JSON object: the coverage of the intervals of a success rate and of a difference, at eight rates; the share
+of experiments in which two equal policies are called different, looked at after each of 500 episodes; and for four
+pairs of policies the mean number of episodes of the sequential test beside the number that the exact test of McNemar
+needs for the same probability of finding the difference. Exits with 1 if the exact interval covers less than
+nominally, or more than 5 % of equal policies are called different.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import Any
+
+import numpy as np
+from ibrobot_eval.statistics import (
+    ALPHA,
+    Interval,
+    Pairs,
+    clopper_pearson,
+    decided_by,
+    log_capital,
+    mcnemar_power,
+    tango,
+    wilson,
+)
+
+RATES = (0.02, 0.1, 0.25, 0.5, 0.7, 0.9, 0.95, 0.99)
+EPISODES = 50
+LONGEST = 500
+POLICIES = ((0.9, 0.6), (0.9, 0.8), (0.6, 0.5), (0.94, 0.6))
+
+
+def covered(rate: float, rng: np.random.Generator, experiments: int) -> dict[str, Any]:
+    """Coverage of the intervals of a success rate, and of the difference of two policies of which one is worse."""
+    known: dict[int, tuple[Interval, Interval]] = {}
+    hits = np.zeros(2)
+    for count in rng.binomial(EPISODES, rate, experiments).tolist():
+        known.setdefault(count, (wilson(count, EPISODES), clopper_pearson(count, EPISODES)))
+        hits += [each.low <= rate <= each.high for each in known[count]]
+    worse = rate * 0.8
+    differing = np.array([rate * (1 - worse), worse * (1 - rate)])
+    found: dict[tuple[int, ...], bool] = {}
+    pairs_hit = 0
+    for counts in map(tuple, rng.multinomial(EPISODES, [*differing, 1 - differing.sum()], experiments).tolist()):
+        if counts not in found:
+            interval = tango(Pairs(*counts))
+            found[counts] = interval.low <= rate - worse <= interval.high
+        pairs_hit += found[counts]
+    names = ("wilson", "clopper_pearson")
+    return {
+        "rate": rate,
+        **{name: round(hit / experiments, 4) for name, hit in zip(names, hits, strict=True)},
+        "paired_difference": round(pairs_hit / experiments, 4),
+    }
+
+
+def reached(longest: int) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Whether the sequential test finds a difference, by wins and losses, shape (longest + 1, longest + 1)."""
+    found = np.zeros((longest + 1, longest + 1), dtype=np.bool_)
+    wins = 0
+    for losses in range(longest + 1):
+        while wins <= longest and (wins <= losses or log_capital(wins, losses, 0.0, 0.0) < -np.log(ALPHA)):
+            wins += 1
+        found[wins:, losses] = True
+    return found | found.T
+
+
+def decided_at(first: float, second: float, rng: np.random.Generator, experiments: int) -> list[int]:
+    """The episode after which the sequential test finds a difference, per experiment; 0 if never."""
+    threshold = reached(LONGEST)
+    outcomes = rng.random((2, experiments, LONGEST), dtype=np.float32)
+    ahead, behind = outcomes[0] < first, outcomes[1] < second
+    wins = np.cumsum(ahead & ~behind, axis=1, dtype=np.int16)
+    losses = np.cumsum(behind & ~ahead, axis=1, dtype=np.int16)
+    found = threshold[wins, losses]
+    return [int(each) for each in np.where(found.any(axis=1), found.argmax(axis=1) + 1, 0)]
+
+
+def needed_by_mcnemar(first: float, second: float, power: float) -> int | None:
+    """The smallest number of episodes, in steps of 5, with which the exact test of McNemar has this power."""
+    low, high = 1, 200
+    if mcnemar_power(first, second, 5 * high) < power:
+        return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if mcnemar_power(first, second, 5 * middle) >= power else (middle, high)
+    return 5 * high
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--experiments", type=int, default=20_000)
+    experiments = parser.parse_args().experiments
+    rng = np.random.default_rng(0)
+    coverage = [covered(rate, rng, experiments) for rate in RATES]
+    # With equal rates of 1/2 and independent outcomes the outcomes differ most often, so there is most to be fooled by.
+    peeking = {
+        rate: round(sum(n > 0 for n in decided_at(rate, rate, rng, experiments)) / experiments, 4)
+        for rate in (0.5, 0.7, 0.9)
+    }
+    efficiency = []
+    for first, second in POLICIES:
+        episodes = decided_at(first, second, rng, experiments)
+        power = sum(n > 0 for n in episodes) / experiments
+        mean = float(np.mean([n or LONGEST for n in episodes]))
+        at_most = min(power, 0.95)  # the fixed test of equal power; beyond 95 % the fixed test would look even worse
+        efficiency.append(
+            {
+                "rates": [first, second],
+                "found_within_500": round(power, 3),
+                "mean_episodes": round(mean, 1),
+                "median_episodes": float(np.median([n or LONGEST for n in episodes])),
+                "mcnemar_power": round(at_most, 3),
+                "mcnemar_episodes": needed_by_mcnemar(first, second, at_most),
+                "mcnemar_episodes_for_80_percent": needed_by_mcnemar(first, second, 0.8),
+            }
+        )
+    report = {
+        "experiments": experiments,
+        "coverage": coverage,
+        "false_positives": peeking,
+        "false_positives_exactly": round(float(decided_by(0.5, 0.5, LONGEST)[-1]), 4),
+        "efficiency": efficiency,
+    }
+    print(json.dumps(report, indent=1))
+    # Three standard deviations of what chance adds to a coverage that is exactly nominal.
+    slack = 3 * (ALPHA * (1 - ALPHA) / experiments) ** 0.5
+    exact = all(each["clopper_pearson"] >= 1 - ALPHA - slack for each in coverage)
+    return 0 if exact and max(peeking.values()) <= ALPHA else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,184 @@
+"""`ibrobot eval`: counts the successes of policies on the same seeds, and says whether they differ."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import click
+
+from ibrobot_core.app import Failed, declared, echo, emit, run_options, wrong_input
+from ibrobot_eval import EVAL
+from ibrobot_eval.blinded import Blinded
+from ibrobot_eval.episodes import Result, write
+from ibrobot_eval.evaluation import Evaluation, Request, Watch, opened
+from ibrobot_eval.options import Begin, EvalOptions, Progress
+from ibrobot_eval.options import Report as ReportEvent
+from ibrobot_eval.page import as_page
+from ibrobot_eval.policies import Policy, find_policies
+from ibrobot_eval.report import Report, write_report
+
+_INTERRUPTED = 130
+_KEPT = "interrupted; finished episodes are kept: {} to continue"
+
+
+@click.command("eval")
+@declared(EVAL)
+@run_options("overrides")
+@click.option("--trials", is_flag=True, help="Run blinded trials, as on a real arm, with a simulated one.")
+@click.option("--reset", default="", metavar="COMMAND", help="Blinded trials: run this command before each of them.")
+@click.option("--open", "open_", is_flag=True, help="Blinded trials: open the order now; no trial can follow.")
+@click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
+def evaluate(
+    options: EvalOptions, /, *, overrides: tuple[str, ...], trials: bool, reset: str, open_: bool, as_json: bool,
+    events: bool,
+) -> None:  # fmt: skip
+    """Count the successes of policies, and compare them.
+
+    Each CONFIG is a robot YAML as for `ibrobot launch`, evaluated in each --mode with each --model. In simulation, all
+    policies get the same seeds. An episode depends on files and its seed alone, so it is the same in one process or
+    many, and the report has the command that repeats it.
+
+    With hardware, an operator judges blinded trials at the terminal: in random order, within blocks of one trial of
+    each policy.
+
+    After an interruption, run the same command again to continue; a larger --episodes adds episodes. The verdict stays
+    valid however often you look and whenever you stop. Exits with 0 whatever the policies achieve.
+    """
+    with wrong_input():
+        policies = find_policies(options.config, options.mode, options.model, overrides, sim=options.sim)
+        if options.until_decided and len(policies) < 2:
+            raise click.UsageError("--until-decided compares policies: give at least two")
+        simulated = {each.load().simulated for each in policies}
+        if len(simulated) > 1:
+            raise click.UsageError("some of the robots are simulated, others are not: add --sim")
+        trials = trials or simulated == {False}
+        if not trials and (reset or open_):
+            raise click.UsageError(f"{'--reset' if reset else '--open'} is for blinded trials; episodes are simulated")
+        request = Request(
+            options.out, tuple(policies), options.episodes, options.seed, options.until_decided, options.margin,
+            options.jobs or _cores(), trials,
+        )  # fmt: skip
+        try:
+            with opened(request) as evaluation:
+                if trials:
+                    report = _judged(request, reset, open_=open_)
+                else:
+                    report = _evaluated(request, evaluation, options.videos, events=events, quiet=as_json)
+        except KeyboardInterrupt:
+            if events:
+                emit(EVAL, Failed(_KEPT.format("start the same evaluation again")))
+            else:
+                echo(_KEPT.format("run the same command again"), err=True)
+            sys.exit(_INTERRUPTED)
+    if report is None:
+        echo("to be continued: run the same command again")
+    else:
+        _tell(request, report, events=events, as_json=as_json)
+
+
+def _tell(request: Request, report: Report, *, events: bool, as_json: bool) -> None:
+    """Print the report."""
+    if events:
+        emit(EVAL, ReportEvent(out=str(request.out), lines=tuple(report.lines())))
+    elif as_json:
+        echo(json.dumps(report.facts()))
+    else:
+        for line in report.lines():
+            echo(line)
+        echo(f"report: {request.out / 'report.html'}")
+
+
+def _cores() -> int:
+    """Number of CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _evaluated(request: Request, evaluation: Evaluation, videos: int, *, events: bool, quiet: bool) -> Report:
+    """Run the episodes that are missing, and write the report."""
+    with (_events if events else _lines)(evaluation, quiet) as watch:
+        results = evaluation.run(watch)
+
+    def filming(failures: int) -> None:
+        if not (events or quiet):
+            echo(f"filming {failures} failures", err=True)
+
+    evaluation.film(results, videos, filming)
+    report = Report.of_simulation(request.policies, results, request.margin, until_decided=request.until_decided)
+    _write(request, report)
+    return report
+
+
+def _judged(request: Request, reset: str, *, open_: bool) -> Report | None:
+    """Run blinded trials, and write the report when there are enough; None if the operator goes on another day."""
+    blinded = Blinded(request, reset)
+    if not open_ and not blinded.run():
+        return None
+    report = blinded.report()
+    _write(request, report)
+    return report
+
+
+def _write(request: Request, report: Report) -> None:
+    write_report(request.out, report)
+    write(request.out / "report.html", as_page(request.out, report))
+
+
+@contextmanager
+def _events(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
+    """A function that prints an event for each episode."""
+    begin = time.monotonic()
+    request = evaluation.request
+    emit(EVAL, Begin(of=request.episodes * len(request.policies), done=evaluation.resumed))
+
+    def tell(done: int, total: int, policy: Policy, result: Result) -> None:
+        seconds = round(time.monotonic() - begin, 1)
+        event = Progress(
+            done=done, of=total, policy=policy.label, seed=result.seed, success=result.success, time_s=result.time_s,
+            seconds=seconds,
+        )  # fmt: skip
+        emit(EVAL, event)
+
+    yield tell
+
+
+@contextmanager
+def _lines(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
+    """A function that shows the progress: a bar on a terminal, otherwise one line per episode."""
+    if evaluation.resumed and not quiet:
+        echo(f"continuing: {evaluation.resumed} episodes are there already", err=True)
+    if not sys.stderr.isatty():
+
+        def line(done: int, total: int, policy: Policy, result: Result) -> None:
+            if not quiet:
+                outcome = "success" if result.success else "failure"
+                echo(f"{policy.label}, seed {result.seed}: {outcome} ({done} of {total})", err=True)
+
+        yield line
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from ibrobot_core.app import Screen
+
+    counts_column, successes_column = (
+        TextColumn(each, markup=False) for each in ("{task.description}", "{task.fields[successes]}")
+    )
+    columns = (counts_column, BarColumn(), successes_column, TimeRemainingColumn())
+    with Progress(*columns, console=Screen(stderr=True)) as bar:
+        task = bar.add_task("starting", total=None, successes="")
+        counts: dict[str, list[int]] = {}
+
+        def move(done: int, total: int, policy: Policy, result: Result) -> None:
+            count = counts.setdefault(policy.label, [0, 0])
+            count[0] += result.success
+            count[1] += 1
+            successes = ", ".join(f"{label} {won} of {ran}" for label, (won, ran) in counts.items())
+            bar.update(
+                task, description=f"{done} of {total} episodes", completed=done, total=total, successes=successes
+            )
+
+        yield move

@@ -1,0 +1,155 @@
+"""One episode of an evaluation: a pure function of files and a seed; its result is written as a whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import attrs
+
+from ibrobot_core.api import RecorderError, seconds
+from ibrobot_core.app import ComponentFailed, LaunchRequest, Runtime, Session, installed_plugins
+from ibrobot_eval.policies import Policy, document_hash
+
+SCRATCH = ".unfinished"
+"""Folder within the evaluation for episodes until they are complete."""
+
+
+@attrs.frozen
+class Result:
+    """The result of an episode."""
+
+    seed: int
+    success: bool
+    time_s: float
+    """Duration of the episode, in simulated time; of a success, the time to success [s]."""
+    interventions: Mapping[str, int]
+    """Kind of intervention of the safety layer -> number of interventions, for those that occurred."""
+    faults: tuple[str, ...]
+    factors: Mapping[str, float]
+    """What the scene has drawn from the seed, e.g. the position of an object."""
+    acting: Mapping[str, str]
+    """Model, weights and fingerprint of the policy that acted, as recordings state them."""
+
+    @classmethod
+    def read(cls, file: Path) -> Result:
+        """Read the result in a file."""
+        fields = json.loads(file.read_text(encoding="utf-8"))
+        return cls(**fields | {"faults": tuple(fields["faults"])})
+
+
+@attrs.frozen
+class Place:
+    """Where the result, the recording and the video of an episode are, in the folder of the evaluation."""
+
+    result: Path
+    episode: Path
+    video: Path
+    scratch: Path
+
+    @classmethod
+    def of(cls, out: Path, policy: Policy, seed: int) -> Place:
+        """The place of an episode."""
+        name = f"seed_{seed:06d}"
+        folder = policy.folder
+        return cls(
+            out / "results" / folder / f"{name}.json",
+            out / "episodes" / folder / name,
+            out / "videos" / folder / f"{name}.mp4",
+            out / SCRATCH / f"{folder}-{name}",
+        )
+
+
+def run_episode(out: Path, policy: Policy, seed: int, document: str, go_on: Callable[[], bool] = lambda: True) -> None:
+    """Run an episode in lockstep, and write recording and result.
+
+    Args:
+        out: the folder of the evaluation.
+        policy: the policy.
+        seed: the seed.
+        document: hash of the robot YAML with which the evaluation began.
+        go_on: asked at every tick whether to go on; without an answer of True nothing is written.
+
+    Raises:
+        IbrobotError: e.g. if the policy fails, or the recording is incomplete.
+    """
+    place = Place.of(out, policy, seed)
+    registry = installed_plugins()
+    config = policy.load()
+    if document_hash(config) != document:
+        raise ComponentFailed(f"{config.source}: was changed during the evaluation")
+    assert config.recording is not None
+    shutil.rmtree(place.scratch, ignore_errors=True)
+    # The recording does not state where it is, so that equal episodes have equal bytes.
+    recording = attrs.evolve(config.recording, root=str(place.scratch), dataset="one")
+    config = attrs.evolve(config, recording=recording, viewer=None)
+    request = LaunchRequest(lockstep=True, seed=seed, episodes=1)
+    runtime = Runtime(Session(config, registry, request))
+    session = runtime.session
+    runtime.start()
+    acting: Mapping[str, str] = {}
+    try:
+        while going := go_on():
+            if session.acting is not None and not acting:
+                acting = session.acting.described()
+            if runtime.step():
+                break
+    finally:
+        runtime.stop()
+    if not going:
+        return
+    runtime.raise_failure()
+    if session.state is None or session.state.success is None:
+        raise ComponentFailed(f"{config.source}: the scene has no task, so nothing tells a success from a failure")
+    time_s = seconds(session.clock.now_ns() - session.episodes.begun_ns)
+    bags = list(recording.folder.glob("episodes/*/"))
+    metadata = _checked(bags, "success" if session.outcome.successes else "failure", session.outcome.faults)
+    counts = session.counts()
+    happened = {kind: count for kind, count in counts["safety"].items() if count and kind not in NO_INTERVENTION}
+    result = Result(
+        seed, session.outcome.successes == 1, round(time_s, 6), happened, tuple(session.outcome.faults),
+        json.loads(metadata.get("factors", "{}")), acting,
+    )  # fmt: skip
+    shutil.rmtree(place.episode, ignore_errors=True)  # of a run that was killed before it wrote the result
+    place.episode.parent.mkdir(parents=True, exist_ok=True)
+    bags[0].rename(place.episode)
+    write(place.result, json.dumps(attrs.asdict(result), indent=1) + "\n")
+    shutil.rmtree(place.scratch)
+
+
+NO_INTERVENTION = ("missing", "estop")
+"""Counts of the safety layer that are no interventions: ticks without a request, and emergency stops."""
+
+
+def _checked(bags: list[Path], outcome: str, faults: list[str]) -> Mapping[str, str]:
+    """The metadata of the recording of an episode, which must be complete."""
+    what = f": {'; '.join(faults)}" if faults else ""
+    if len(bags) != 1:
+        raise RecorderError(f"the episode was not recorded{what}")
+    reader = installed_plugins().open_episode(bags[0])
+    try:
+        summary = reader.summary()
+    finally:
+        reader.close()
+    if not summary.finished or summary.outcome != outcome:
+        raise RecorderError(f"the recording of the episode is incomplete{what}")
+    return summary.metadata
+
+
+def write(path: Path, content: str | bytes) -> None:
+    """Write a file as a whole or not at all, whatever dies meanwhile."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    with unfinished.open("wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+        file.flush()
+        os.fsync(file.fileno())
+    unfinished.replace(path)
+    descriptor = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,214 @@
+"""The folder of an evaluation, and the episodes that are run into it by worker processes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import DatasetError
+from ibrobot_core.app import ComponentFailed, Ownership, installed_plugins
+from ibrobot_eval.comparison import Decision
+from ibrobot_eval.episodes import SCRATCH, Place, Result, write
+from ibrobot_eval.film import can_film
+from ibrobot_eval.policies import Identity, Policy, identify
+from ibrobot_eval.processes import Job, run_jobs
+
+SETTINGS = "evaluation.json"
+_FORMAT = 1
+Watch = Callable[[int, int, Policy, Result], None]
+"""Receives the number of episodes done, the number of all, and the episode just done."""
+
+
+@attrs.frozen
+class Request:
+    """An evaluation that a user asks for."""
+
+    out: Path
+    policies: tuple[Policy, ...]
+    episodes: int
+    """Number of episodes of each policy; with `until_decided` the largest number."""
+    seed: int
+    """Seed of the first episode; later ones add 1."""
+    until_decided: bool
+    margin: float
+    jobs: int
+    trials: bool = False
+    """Whether an operator judges blinded trials; otherwise episodes run in simulation."""
+
+
+class Evaluation:
+    """An evaluation and its folder, which nobody else changes while the context of `opened` lasts.
+
+    Attributes:
+        request: what the user asks for.
+        identities: policy -> what its results depend on.
+        resumed: number of episodes that were there already.
+    """
+
+    def __init__(self, request: Request, identities: Mapping[str, Identity]) -> None:
+        self.request = request
+        self.identities = identities
+        self._results: dict[tuple[str, int], Result] = {}
+        for policy in request.policies:
+            for seed in self._seeds:
+                file = Place.of(request.out, policy, seed).result
+                if file.exists():
+                    self._results[policy.label, seed] = Result.read(file)
+        self.resumed = len(self._results)
+        self._decision = Decision(
+            [each.label for each in request.policies] if request.until_decided else [], request.margin
+        )
+
+    @property
+    def _seeds(self) -> range:
+        return range(self.request.seed, self.request.seed + self.request.episodes)
+
+    def results(self) -> dict[str, list[Result]]:
+        """Label -> the results of the first seeds without a gap."""
+        found: dict[str, list[Result]] = {}
+        for policy in self.request.policies:
+            done = found.setdefault(policy.label, [])
+            for seed in self._seeds:
+                if (result := self._results.get((policy.label, seed))) is None:
+                    break
+                done.append(result)
+        return found
+
+    def run(self, watch: Watch) -> dict[str, list[Result]]:
+        """Run the episodes that are missing; returns label -> results in the order of their seeds.
+
+        Raises:
+            IbrobotError: if an episode cannot be run; the others are kept.
+        """
+        request = self.request
+        todo = [
+            Job(str(request.out), policy, seed, self.identities[policy.label].document)
+            for seed in self._seeds
+            for policy in request.policies
+            if (policy.label, seed) not in self._results
+        ]
+        total = len(self._seeds) * len(request.policies)
+        self._decision.look(self.results())
+        if self._decision.after is None:
+            with closing(run_jobs(todo, request.jobs)) as done:
+                for job in done:
+                    result = Result.read(Place.of(request.out, job.policy, job.seed).result)
+                    self._check_policy(job.policy, result)
+                    self._results[job.policy.label, job.seed] = result
+                    watch(len(self._results), total, job.policy, result)
+                    self._decision.look(self.results())
+                    if self._decision.after is not None:
+                        break
+        return self._kept()
+
+    def film(self, results: Mapping[str, Sequence[Result]], most: int, begin: Callable[[int], None]) -> None:
+        """Film failures that have no video yet, at most `most` of each policy; `begin` gets their number, if any."""
+        todo = []
+        for policy in self.request.policies:
+            failed = [each.seed for each in results[policy.label] if not each.success][:most]
+            if failed and can_film(policy):
+                todo += [Job(str(self.request.out), policy, seed) for seed in failed]
+        todo = [job for job in todo if not Place.of(self.request.out, job.policy, job.seed).video.exists()]
+        if todo:
+            begin(len(todo))
+        with closing(run_jobs(todo, self.request.jobs)) as done:
+            for _ in done:
+                pass
+
+    def _check_policy(self, policy: Policy, result: Result) -> None:
+        """Refuse results of other weights, e.g. those of a training that goes on meanwhile."""
+        before = next((r for (label, _), r in self._results.items() if label == policy.label), result)
+        if before.acting != result.acting:
+            raise ComponentFailed(f"{policy.label}: the policy's weights were changed during the evaluation")
+
+    def _kept(self) -> dict[str, list[Result]]:
+        """The results that count; those that processes have run beyond a decision are removed."""
+        found, decided = self.results(), self._decision.after
+        if decided is None:
+            return found
+        for policy in self.request.policies:
+            for seed in self._seeds[decided:]:
+                place = Place.of(self.request.out, policy, seed)
+                place.result.unlink(missing_ok=True)
+                shutil.rmtree(place.episode, ignore_errors=True)
+        return {label: results[:decided] for label, results in found.items()}
+
+
+@contextmanager
+def opened(request: Request) -> Iterator[Evaluation]:
+    """An evaluation in its folder: a new one, or one that an earlier call has begun.
+
+    Raises:
+        InUse: if another process evaluates into it.
+        DatasetError: if the folder has something else, or was made with other settings or files, or cannot be written.
+    """
+    out = request.out
+    registry = installed_plugins()
+    identities = {policy.label: identify(policy, registry) for policy in request.policies}
+    settings = {
+        "format": _FORMAT, "seed": request.seed, "until_decided": request.until_decided, "margin": request.margin,
+        "trials": request.trials,
+        "policies": {
+            each.label: {"mode": each.mode, "model": each.model, **attrs.asdict(identities[each.label])}
+            for each in request.policies
+        },
+        "versions": registry.versions(),
+    }  # fmt: skip
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        owned = Ownership(out, "is being evaluated")
+    except OSError as error:
+        raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
+    with owned:
+        try:
+            _begin(request, settings)
+        except OSError as error:
+            raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
+        try:
+            yield Evaluation(request, identities)
+        finally:
+            shutil.rmtree(out / SCRATCH, ignore_errors=True)
+
+
+def _begin(request: Request, settings: Mapping[str, Any]) -> None:
+    """Write the settings into a new folder, or compare them to the settings of an evaluation that was begun."""
+    out, file = request.out, request.out / SETTINGS
+    if file.is_file():
+        try:
+            known = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise DatasetError(f"{file}: cannot be read: {error}") from None
+        if differences := list(_differences(known, settings)):
+            raise DatasetError(f"{out}: was begun with other settings: {'; '.join(differences)}; choose a new folder")
+        done = max((len(list(each.glob("seed_*.json"))) for each in (out / "results").glob("*")), default=0)
+        if done > request.episodes and not request.until_decided:
+            raise DatasetError(f"{out}: has {done} episodes of a policy already; --episodes must not be smaller")
+        return
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise DatasetError(f"{out}: exists already, and is not an evaluation to continue; choose a new folder")
+    write(file, json.dumps(settings, indent=1) + "\n")
+
+
+def _differences(known: Mapping[str, Any], now: Mapping[str, Any], where: str = "") -> Iterator[str]:
+    """What differs between two nested mappings, in words."""
+    for key in {**known, **now}:
+        old, new = known.get(key), now.get(key)
+        if old == new:
+            continue
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            yield from _differences(old, new, f"{where}{key} ")
+        elif key in _HASHES:
+            yield f"{where}{_HASHES[key]} changed"
+        elif isinstance(old, Mapping) or isinstance(new, Mapping):
+            yield f"{where}{key} is {'new' if old is None else 'missing'}"
+        else:
+            yield f"{where}{key} {old}, now {new}"
+
+
+_HASHES = {"document": "robot YAML", "contract": "contract", "policy": "policy's fingerprint", "files": "files"}

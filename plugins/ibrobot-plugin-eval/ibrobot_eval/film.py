@@ -1,0 +1,103 @@
+"""Films an episode: runs it again with a camera that sees the whole scene. A camera changes nothing in lockstep."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import CompressedImage, HardwareDescriptor, seconds
+from ibrobot_core.app import (
+    ComponentFailed,
+    LaunchRequest,
+    RobotConfig,
+    Runtime,
+    Session,
+    absent_sensors,
+    find_config,
+    installed_plugins,
+    load_config,
+)
+from ibrobot_eval.episodes import Result, write
+from ibrobot_eval.policies import Policy
+
+_CAMERA = "evaluation_film"
+_DEPTH = 10_000
+
+
+def can_film(policy: Policy) -> bool:
+    """Whether the simulation of a policy has a camera for films, and this machine can render."""
+    config = _filmed(policy)
+    return config is not None and all(each.name != _CAMERA for each in absent_sensors(config, installed_plugins()))
+
+
+def _filmed(policy: Policy) -> RobotConfig | None:
+    """The robot with the camera; None if its simulation has none."""
+    registry = installed_plugins()
+    path = find_config(policy.config, registry)
+    plain = load_config(path, overrides=policy.overrides, mode=policy.mode, sim=True, registry=registry)
+    assert plain.simulation is not None
+    descriptor = registry.find("hardware", plain.simulation.type)
+    if not isinstance(descriptor, HardwareDescriptor) or not descriptor.film:
+        return None
+    camera = {"name": _CAMERA, "kind": "camera", **descriptor.film}
+    peripherals = json.dumps([*plain.document.get("peripherals", ()), camera], default=str)
+    overrides = (*policy.overrides, f"peripherals={peripherals}")
+    config = load_config(path, overrides=overrides, mode=policy.mode, sim=True, registry=registry)
+    return attrs.evolve(config, recording=None, viewer=None)
+
+
+def film(file: Path, policy: Policy, result: Result, go_on: Callable[[], bool] = lambda: True) -> None:
+    """Run an episode again, and write it as a video.
+
+    Raises:
+        ComponentFailed: if it does not end as before.
+    """
+    config = _filmed(policy)
+    assert config is not None
+    runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=result.seed, episodes=1)))
+    session = runtime.session
+    images = session.bus.subscribe(f"/camera/{_CAMERA}/image_raw", _DEPTH)
+    runtime.start()
+    try:
+        while going := go_on():
+            if runtime.step():
+                break
+    finally:
+        runtime.stop()
+    if not going:
+        return
+    runtime.raise_failure()
+    time_s = round(seconds(session.clock.now_ns() - session.episodes.begun_ns), 6)
+    if (bool(session.outcome.successes), time_s) != (result.success, result.time_s):
+        raise ComponentFailed("the episode did not end as before when it was run again for its video")
+    frames = images.drain()
+    lasted_s = seconds(frames[-1].received_ns - frames[0].received_ns) if len(frames) > 1 else 1.0
+    pictures = [each.message.data.tobytes() for each in frames if isinstance(each.message, CompressedImage)]
+    write(file, encode(pictures, len(frames) / lasted_s))
+
+
+def encode(pictures: list[bytes], rate_hz: float) -> bytes:
+    """A video (MP4, H.264) of pictures in JPEG. Equal pictures give equal bytes."""
+    import av
+
+    buffer = io.BytesIO()
+    decoder: Any = av.CodecContext.create("mjpeg", "r")
+    with av.open(buffer, "w", format="mp4", options={"fflags": "+bitexact"}) as container:
+        stream: Any = None
+        for picture in pictures:
+            for frame in decoder.decode(av.Packet(picture)):
+                if stream is None:
+                    options = {"crf": "28", "preset": "veryfast", "threads": "1"}
+                    stream = container.add_stream("libx264", rate=round(rate_hz), options=options)
+                    stream.width, stream.height, stream.pix_fmt = frame.width, frame.height, "yuv420p"
+                made = frame.reformat(format="rgb24").reformat(format="yuv420p")  # of the full range, as JPEG has it
+                made.pts = None
+                container.mux(stream.encode(made))
+        if stream is not None:
+            container.mux(stream.encode(None))
+    return buffer.getvalue()

@@ -1,0 +1,87 @@
+"""What `ibrobot eval` takes, and the events that it prints: its command line and forms for it derive from these."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import override
+
+import attrs
+
+from ibrobot_core.api import option
+from ibrobot_core.app import Event, Shown
+
+MARGIN = 0.1
+"""By default, a difference below this counts as none."""
+
+
+@attrs.frozen(kw_only=True)
+class EvalOptions:
+    """Which policies are evaluated, on how many episodes, and where the results go."""
+
+    config: tuple[str, ...] = option(argument=True, names="robot", label="Robot YAML", help="robot YAMLs")
+    mode: tuple[str, ...] = option((), label="Modes", help="a control mode with a policy; repeatable")
+    model: tuple[str, ...] = option(
+        (), label="Models", more=True, help="a model of the YAML, in place of the mode's; repeatable"
+    )
+    sim: bool = option(False, label="Simulation", help="use the simulation section instead of hardware")
+    episodes: int = option(
+        100, ge=1, le=1_000_000, label="Episodes", help="episodes of each policy; the largest number with until-decided"
+    )
+    seed: int = option(0, ge=0, label="Seed", more=True, help="seed of the first episode; later ones add 1")
+    until_decided: bool = option(False, label="Until decided", help="stop as soon as every pair of policies is decided")
+    margin: float = option(
+        MARGIN, gt=0, lt=1, label="Margin", more=True, help="a difference of success rates below this counts as none"
+    )
+    jobs: int | None = option(
+        None, ge=1, label="Episodes at once", more=True, help="episodes in parallel; by default one for each CPU core"
+    )
+    videos: int = option(20, ge=0, label="Videos", more=True, help="failures of each policy to film for the report")
+    out: Path = option(
+        label="Folder", help="folder of results, recordings and report; an evaluation in it is continued"
+    )
+
+
+@attrs.frozen(kw_only=True)
+class Begin(Event):
+    """The evaluation begins."""
+
+    of: int = option(help="number of episodes of all policies")
+    done: int = option(help="episodes that an interrupted evaluation has run")
+
+    @override
+    def shown(self) -> Shown:
+        return Shown(f"{self.done} of {self.of} episodes", self.done / self.of)
+
+
+@attrs.frozen(kw_only=True)
+class Progress(Event):
+    """An episode is done."""
+
+    done: int = option(help="episodes that are done")
+    of: int = option(help="number of episodes of all policies")
+    policy: str = option(help="the policy")
+    seed: int = option(help="seed of the episode")
+    success: bool = option(help="whether it succeeded")
+    time_s: float = option(unit="s", help="its duration in simulated time")
+    seconds: float = option(unit="s", help="time since the begin")
+
+    @override
+    def shown(self) -> Shown:
+        outcome = "success" if self.success else "failure"
+        text = f"{self.done} of {self.of} episodes; {self.policy}, seed {self.seed}: {outcome}"
+        return Shown(text, self.done / self.of)
+
+
+@attrs.frozen(kw_only=True)
+class Report(Event):
+    """The result."""
+
+    out: str = option(help="folder of the evaluation")
+    lines: tuple[str, ...] = option(help="successes of each policy, and the verdict on each pair, in words")
+
+    @override
+    def shown(self) -> Shown:
+        return Shown("; ".join(self.lines), 1.0)
+
+
+EVENTS = (Begin, Progress, Report)

@@ -1,0 +1,217 @@
+"""Plots as SVG, in the colours of the page: `--ok` and `--bad` for outcomes, which also differ by their marks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import attrs
+
+from ibrobot_eval.statistics import wilson
+
+WIDTH = 720
+_LEFT, _RIGHT, _TOP, _BOTTOM = 48, 12, 8, 34
+_BINS = 5
+
+
+@attrs.frozen
+class Axis:
+    """Maps values to positions on the page [px]."""
+
+    low: float
+    high: float
+    begin: float
+    end: float
+
+    def __call__(self, value: float) -> float:
+        """The position of a value, to a tenth of a pixel."""
+        span = (self.high - self.low) or 1.0
+        return round(self.begin + (value - self.low) / span * (self.end - self.begin), 1)
+
+    def ticks(self, most: int = 6) -> list[float]:
+        """Round values along the axis."""
+        span = self.high - self.low
+        if span <= 0:
+            return [self.low]
+        step = 10.0 ** math.floor(math.log10(span / most))
+        step *= next(factor for factor in (1, 2, 5, 10) if span / (step * factor) <= most)
+        first = math.ceil(self.low / step - 1e-9)
+        return [round(step * (first + i), 10) for i in range(int((self.high - step * first) / step + 1e-9) + 1)]
+
+
+def axis_of(values: Sequence[float], begin: float, end: float) -> Axis:
+    """An axis with all values, and some room around them."""
+    low, high = min(values), max(values)
+    room = 0.05 * (high - low) or 0.5
+    return Axis(low - room, high + room, begin, end)
+
+
+def tag(name: str, text: str = "", **attributes: Any) -> str:
+    """An element; underscores in names of attributes stand for hyphens."""
+    given = "".join(f' {key.rstrip("_").replace("_", "-")}="{escape(str(each))}"' for key, each in attributes.items())
+    return f"<{name}{given}>{text}</{name}>"
+
+
+def svg(width: float, height: float, parts: Sequence[str], title: str) -> str:
+    """A picture that is as wide as the page permits, with a title for screen readers."""
+    inner = tag("title", escape(title)) + "".join(parts)
+    return tag("svg", inner, viewBox=f"0 0 {width} {height}", style=f"max-width:{width}px", role="img")
+
+
+def mark(x: float, y: float, success: bool, tip: str) -> str:
+    """The outcome of an episode: a dot for a success, a cross for a failure."""
+    if success:
+        return tag("circle", tag("title", escape(tip)), cx=x, cy=y, r=3.5, class_="ok")
+    path = f"M{x - 3.5:.1f},{y - 3.5:.1f}l7,7m0,-7l-7,7"
+    return tag("path", tag("title", escape(tip)), d=path, class_="bad")
+
+
+def _text(x: float, y: float, text: str, anchor: str = "middle", class_: str = "") -> str:
+    return tag("text", escape(text), x=x, y=y, text_anchor=anchor, **({"class_": class_} if class_ else {}))
+
+
+def _line(x1: float, y1: float, x2: float, y2: float, class_: str) -> str:
+    return tag("line", x1=x1, y1=y1, x2=x2, y2=y2, class_=class_)
+
+
+def _below(axis: Axis, top: float, bottom: float, label: str) -> list[str]:
+    """Grid and labels of a horizontal axis."""
+    parts = []
+    for value in axis.ticks():
+        parts += [_line(axis(value), top, axis(value), bottom, "grid"), _text(axis(value), bottom + 15, f"{value:g}")]
+    return [*parts, _text((axis.begin + axis.end) / 2, bottom + 29, label, class_="label")]
+
+
+def _beside(axis: Axis, left: float, right: float) -> list[str]:
+    """Grid and labels of a vertical axis."""
+    parts = []
+    for value in axis.ticks(5):
+        parts += [
+            _line(left, axis(value), right, axis(value), "grid"),
+            _text(left - 6, axis(value) + 4, f"{value:g}", "end"),
+        ]
+    return parts
+
+
+def rates(rows: Sequence[tuple[str, int, int]]) -> str:
+    """Success rates with their intervals: label, successes and episodes of each policy."""
+    left = 24 + 7 * max(len(label) for label, _, _ in rows)
+    height = _TOP + 30 * len(rows) + _BOTTOM
+    axis = Axis(0, 100, left, WIDTH - _RIGHT)
+    parts = _below(axis, _TOP, height - _BOTTOM, "success rate [%], with 95 % interval")
+    for number, (label, successes, episodes) in enumerate(rows):
+        y = _TOP + 30 * number + 15
+        interval = wilson(successes, episodes)
+        parts += [
+            _text(left - 10, y + 4, label, "end"),
+            _line(axis(100 * interval.low), y, axis(100 * interval.high), y, "range"),
+            mark(axis(100 * successes / episodes), y, True, f"{label}: {successes} of {episodes}"),
+        ]
+    return svg(WIDTH, height, parts, "Success rates with intervals")
+
+
+def course(points: Sequence[tuple[int, float, float, float]], margin: float, title: str) -> str:
+    """Difference over the number of episodes: number, difference, and the ends of the interval that is always valid."""
+    height = 230
+    across = Axis(0, max(points[-1][0], 1), _LEFT, WIDTH - _RIGHT)
+    up = Axis(-100, 100, height - _BOTTOM, _TOP)
+    parts = [*_below(across, _TOP, height - _BOTTOM, "episodes"), *_beside(up, _LEFT, WIDTH - _RIGHT)]
+    upper = [f"{across(n)},{up(100 * high)}" for n, _, _, high in points]
+    lower = [f"{across(n)},{up(100 * low)}" for n, _, low, _ in reversed(points)]
+    parts.append(tag("polygon", points=" ".join([*upper, *lower]), class_="band"))
+    for value, name in ((0.0, "zero"), (margin, "margin"), (-margin, "margin")):
+        parts.append(_line(_LEFT, up(100 * value), WIDTH - _RIGHT, up(100 * value), name))
+    estimate = " ".join(f"{across(n)},{up(100 * difference)}" for n, difference, _, _ in points)
+    parts.append(tag("polyline", points=estimate, class_="estimate"))
+    return svg(WIDTH, height, parts, title)
+
+
+def strips(rows: Sequence[tuple[str, Sequence[tuple[int, bool, float]]]]) -> str:
+    """Outcomes by seed: label, and seed, success and duration [s] of each episode."""
+    left = 24 + 7 * max(len(label) for label, _ in rows)
+    count = max(len(episodes) for _, episodes in rows)
+    step = min(24.0, (WIDTH - left - _RIGHT) / count)
+    parts = []
+    for number, (label, episodes) in enumerate(rows):
+        y = _TOP + 30 * number
+        parts.append(_text(left - 10, y + 16, label, "end"))
+        for place, (seed, success, time_s) in enumerate(episodes):
+            tip = tag("title", f"seed {seed}: {'success' if success else 'failure'} after {time_s:.1f} s")
+            top, size = (y + 9, 13) if success else (y, 22)  # failures are taller
+            shape = {"x": round(left + place * step, 1), "y": top, "width": round(max(step - 1, 1), 1), "height": size}
+            parts.append(tag("rect", tip, **shape, class_="ok" if success else "bad-fill"))
+    first = rows[0][1][0][0]
+    height = _TOP + 30 * len(rows)
+    parts.append(_text(left, height + 14, f"seed {first}", "start", "label"))
+    parts.append(_text(left + count * step, height + 14, f"{first + count - 1}", "end", "label"))
+    return svg(WIDTH, height + 20, parts, "Outcomes by seed")
+
+
+def times(rows: Sequence[tuple[str, Sequence[tuple[int, float]]]]) -> str:
+    """Times to success: label, and seed and time [s] of each success."""
+    left = 24 + 7 * max(len(label) for label, _ in rows)
+    found = [time_s for _, successes in rows for _, time_s in successes]
+    axis = Axis(0, 1.05 * max(found), left, WIDTH - _RIGHT)
+    height = _TOP + 30 * len(rows) + _BOTTOM
+    parts = _below(axis, _TOP, height - _BOTTOM, "time to success [s]")
+    for number, (label, successes) in enumerate(rows):
+        y = _TOP + 30 * number + 15
+        parts.append(_text(left - 10, y + 4, label, "end"))
+        for seed, time_s in successes:
+            parts.append(
+                tag("circle", tag("title", f"seed {seed}: {time_s:.2f} s"), cx=axis(time_s), cy=y, r=4, class_="faint")
+            )
+    return svg(WIDTH, height, parts, "Times to success")
+
+
+def map_of(points: Sequence[tuple[float, float, bool, str]], names: tuple[str, str], title: str) -> str:
+    """Outcomes over two factors, e.g. a position: x, y, success and text of each episode. Both axes have one scale."""
+    width, height = 350, 320
+    across = axis_of([x for x, _, _, _ in points], _LEFT, width - _RIGHT)
+    up = axis_of([y for _, y, _, _ in points], height - _BOTTOM, _TOP + 16)
+    scale = max(
+        (across.high - across.low) / (width - _RIGHT - _LEFT), (up.high - up.low) / (height - _BOTTOM - _TOP - 16)
+    )
+    across, up = _widened(across, scale), _widened(up, scale)
+    parts = [*_below(across, _TOP + 16, height - _BOTTOM, names[0]), *_beside(up, _LEFT, width - _RIGHT)]
+    parts += [_text(_LEFT - 6, _TOP + 6, names[1], "start", "label"), _text(width - _RIGHT, _TOP + 6, title, "end")]
+    parts += [mark(across(x), up(y), success, tip) for x, y, success, tip in points]
+    return svg(width, height, parts, f"{title}: outcomes over {names[0]} and {names[1]}")
+
+
+def _widened(axis: Axis, scale: float) -> Axis:
+    middle, half = (axis.low + axis.high) / 2, scale * abs(axis.end - axis.begin) / 2
+    return attrs.evolve(axis, low=middle - half, high=middle + half)
+
+
+def by_factor(points: Sequence[tuple[float, bool]], name: str, title: str) -> str:
+    """Success rate over a factor, in bins of equal numbers of episodes, with intervals: value and success."""
+    width, height = 350, 190
+    ordered = sorted(points)
+    across = axis_of([value for value, _ in ordered], _LEFT, width - _RIGHT)
+    up = Axis(0, 100, height - _BOTTOM, _TOP + 16)
+    parts = [*_below(across, _TOP + 16, height - _BOTTOM, name), *_beside(up, _LEFT, width - _RIGHT)]
+    parts += [
+        _text(_LEFT - 6, _TOP + 6, "successes [%]", "start", "label"),
+        _text(width - _RIGHT, _TOP + 6, title, "end"),
+    ]
+    bins = min(_BINS, len(ordered))
+    for number in range(bins):
+        part = ordered[number * len(ordered) // bins : (number + 1) * len(ordered) // bins]
+        successes, count = sum(success for _, success in part), len(part)
+        x = across((part[0][0] + part[-1][0]) / 2)
+        interval = wilson(successes, count)
+        parts.append(_line(x, up(100 * interval.low), x, up(100 * interval.high), "range"))
+        parts.append(
+            _line(
+                across(part[0][0]),
+                up(100 * successes / count),
+                across(part[-1][0]),
+                up(100 * successes / count),
+                "estimate",
+            )
+        )
+        parts.append(mark(x, up(100 * successes / count), True, f"{successes} of {count}"))
+    return svg(width, height, parts, f"{title}: success rate over {name}")

@@ -1,0 +1,172 @@
+"""The policies of an evaluation: robot YAML, mode and model, and what identifies their files."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import re
+import shlex
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import Contract
+from ibrobot_core.app import (
+    ConfigError,
+    Problem,
+    Registry,
+    RobotConfig,
+    build_policy,
+    find_config,
+    installed_plugins,
+    load_config,
+)
+
+
+@attrs.frozen
+class Policy:
+    """A policy to evaluate: a mode of a robot."""
+
+    label: str
+    """Its name in the report, unique in the evaluation."""
+    config: str
+    """The robot YAML, as the user names it."""
+    mode: str
+    model: str
+    """The name of the model that the mode uses."""
+    overrides: tuple[str, ...]
+    """Overrides of the YAML, those for the model included."""
+    sim: bool = True
+    """Whether it runs in simulation."""
+
+    @property
+    def folder(self) -> str:
+        """The label as the name of a folder."""
+        return re.sub(r"[^\w.,=+-]+", "_", self.label)
+
+    def load(self) -> RobotConfig:
+        """The robot of an episode. It records, as a robot does that `ibrobot record` runs.
+
+        Raises:
+            ConfigError: with all faults of the YAML.
+        """
+        registry = installed_plugins()
+        path = find_config(self.config, registry)
+        plain = load_config(path, overrides=self.overrides, mode=self.mode, sim=self.sim, registry=registry)
+        if plain.recording is not None:
+            return plain
+        made = f"recording={{type: {registry.default('recorder')}, root: episodes, topics: contract}}"
+        return load_config(path, overrides=(made, *self.overrides), mode=self.mode, sim=self.sim, registry=registry)
+
+    def command(self, seed: int) -> str:
+        """The command that repeats an episode in simulation."""
+        sets = (word for override in self.overrides for word in ("--set", override))
+        options = ("--sim", "--lockstep", "--headless", "--mode", self.mode, "--seed", str(seed), "--episodes", "1")
+        return shlex.join(["ibrobot", "record", self.config, *options, *sets])
+
+
+@attrs.frozen
+class Identity:
+    """What a policy's results depend on beside the seed."""
+
+    document: str
+    """Hash of the robot YAML with its overrides."""
+    contract: str
+    policy: str
+    """The policy's own fingerprint."""
+    files: str
+    """Hash of the files that the model's options and the robot's description name; empty if there are none."""
+
+
+def find_policies(
+    configs: Sequence[str], modes: Sequence[str], models: Sequence[str], overrides: Sequence[str], *, sim: bool
+) -> list[Policy]:
+    """The policies that a command line means: each robot YAML in each mode with each model.
+
+    Raises:
+        ConfigError: for faults of a YAML, a mode without a model, an unknown model, or policies that are the same.
+    """
+    found = []
+    for config, mode, model in itertools.product(configs, modes or (None,), models or (None,)):
+        registry = installed_plugins()
+        path = find_config(config, registry)
+        robot = load_config(path, overrides=overrides, mode=mode, sim=sim, registry=registry)
+        chosen = robot.control_modes[robot.default_control_mode]
+        if chosen.inference is None:
+            raise _fault(path, f"control_modes.{chosen.name}", "has no inference; only policies can be evaluated")
+        if model is not None and model not in robot.models:
+            raise _fault(path, "models", f"has no model {model!r}; the models are: {', '.join(robot.models)}")
+        made = () if model is None else (f"control_modes.{chosen.name}.inference.model={model}",)
+        policy = Policy("", config, chosen.name, model or chosen.inference.model, (*overrides, *made), sim)
+        if policy in found:
+            raise _fault(path, f"control_modes.{chosen.name}", "is given twice")
+        found.append(policy)
+    return _labelled(found)
+
+
+def _fault(path: Path, key: str, message: str) -> ConfigError:
+    return ConfigError([Problem(path, 0, key, message)])
+
+
+def _labelled(policies: Sequence[Policy]) -> list[Policy]:
+    """The policies with the shortest labels that tell them apart: of mode, robot YAML and model."""
+    names = [(each.mode, Path(each.config).stem, each.model) for each in policies]
+    parts = [chosen for size in (1, 2, 3) for chosen in itertools.combinations(range(3), size)]
+    labels = [[" ".join(each[part] for part in chosen) for each in names] for chosen in parts]
+    telling = next((each for each in labels if len(set(each)) == len(policies)), labels[-1])
+    made: dict[str, Policy] = {}
+    for policy, label in zip(policies, telling, strict=True):
+        tries = (label if number == 1 else f"{label} {number}" for number in itertools.count(1))
+        named = next(each for text in tries if (each := attrs.evolve(policy, label=text)).folder not in made)
+        made[named.folder] = named
+    return list(made.values())
+
+
+def identify(policy: Policy, registry: Registry) -> Identity:
+    """Identify the files of a policy, without loading its weights.
+
+    Raises:
+        IbrobotError: e.g. for a checkpoint that is missing.
+    """
+    robot = policy.load()
+    model = robot.models[policy.model]
+    made = build_policy(robot, registry, policy.model)
+    described = robot.robot.description
+    named = [each for each in (described.mjcf, described.urdf) if each is not None]
+    named += [Path(value) for value in _leaves(attrs.asdict(model.options)) if isinstance(value, str | Path) and value]
+    return Identity(
+        document_hash(robot), Contract.from_config(robot).fingerprint(), made.fingerprint(), _hash_of_files(named)
+    )
+
+
+def document_hash(robot: RobotConfig) -> str:
+    """Hash of a robot YAML with its overrides."""
+    return hashlib.sha256(json.dumps(robot.document, default=str).encode()).hexdigest()
+
+
+def _leaves(value: Any) -> Iterable[Any]:
+    if isinstance(value, dict):
+        value = value.values()
+    elif not isinstance(value, list | tuple):
+        yield value
+        return
+    for each in value:
+        yield from _leaves(each)
+
+
+def _hash_of_files(named: Sequence[Path]) -> str:
+    """Hash of the content of files, and of all files in folders; those that do not exist are left out."""
+    digest = hashlib.sha256()
+    found = False
+    for top in named:
+        files = sorted(path for path in top.rglob("*") if path.is_file()) if top.is_dir() else [top]
+        for path in files:
+            if path.is_file():
+                found = True
+                digest.update(f"{path.relative_to(top)}\n".encode())
+                with path.open("rb") as file:
+                    digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest() if found else ""

@@ -1,0 +1,383 @@
+"""The statistics of an evaluation: intervals of success rates, and tests of two policies on the same episodes.
+
+Sources:
+- Wilson's and Clopper and Pearson's intervals: Brown, Cai and DasGupta, "Interval estimation for a binomial
+  proportion", Statistical Science 16 (2001).
+- The exact test of McNemar: Fagerland, Lydersen and Laake, "The McNemar test for binary matched-pairs data", BMC
+  Medical Research Methodology 13 (2013).
+- The score interval of a paired difference: Tango, "Equivalence test and confidence interval for the difference in
+  proportions for the paired-sample design", Statistics in Medicine 17 (1998).
+- Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6 (1979).
+- Betting against a mean: Waudby-Smith and Ramdas, "Estimating means of bounded random variables by betting", JRSS B 86
+  (2024). That a mixture of bets is a martingale, so that its inverse is a p-value whenever one looks: Robbins,
+  "Statistical methods related to the law of the iterated logarithm", Annals of Mathematical Statistics 41 (1970);
+  Ramdas, Grünwald, Vovk and Shafer, "Game-theoretic statistics and safe anytime-valid inference", Statistical Science
+  38 (2023).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+ALPHA = 0.05
+"""Probability of a wrong statement: intervals have a level of 95 %."""
+POWER = 0.8
+"""Probability of finding a difference with the number of episodes that `episodes_for` returns."""
+_NODES = 256
+"""Number of bets in the mixture."""
+_EDGE = 1e-9
+_TOLERANCE = 1e-6
+"""Accuracy of the ends of intervals."""
+_MOST = 100_000
+"""Projections end at this number of episodes."""
+
+Array = NDArray[np.float64]
+
+
+@attrs.frozen
+class Interval:
+    """A confidence interval."""
+
+    low: float
+    high: float
+
+
+@attrs.frozen
+class Pairs:
+    """Outcomes of two policies on the same episodes."""
+
+    first: int
+    """Number of episodes in which only the first policy succeeded."""
+    second: int
+    """Number of episodes in which only the second policy succeeded."""
+    same: int
+    """Number of episodes in which both succeeded, or both failed."""
+
+    @classmethod
+    def of(cls, first: Sequence[bool], second: Sequence[bool]) -> Pairs:
+        """Count the outcomes of two policies, episode by episode."""
+        ahead = sum(a and not b for a, b in zip(first, second, strict=True))
+        behind = sum(b and not a for a, b in zip(first, second, strict=True))
+        return cls(ahead, behind, len(first) - ahead - behind)
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return self.first + self.second + self.same
+
+    @property
+    def difference(self) -> float:
+        """Success rate of the first policy minus that of the second; 0 without episodes."""
+        return (self.first - self.second) / self.episodes if self.episodes else 0.0
+
+
+def wilson(successes: int, episodes: int, alpha: float = ALPHA) -> Interval:
+    """Wilson's interval of a success rate. Its level is nominal on average; at some rates it is lower."""
+    return _proportion(successes, episodes, alpha, "wilson")
+
+
+def clopper_pearson(successes: int, episodes: int, alpha: float = ALPHA) -> Interval:
+    """The exact interval of a success rate, of Clopper and Pearson. Its level is at least nominal at every rate."""
+    return _proportion(successes, episodes, alpha, "beta")
+
+
+def _proportion(successes: int, episodes: int, alpha: float, method: str) -> Interval:
+    from statsmodels.stats.proportion import proportion_confint
+
+    if episodes == 0:
+        return Interval(0.0, 1.0)
+    low, high = proportion_confint(successes, episodes, alpha, method)
+    return Interval(float(low), float(high))
+
+
+def mcnemar_exact(pairs: Pairs) -> float:
+    """p-value of the exact test of McNemar. Valid for one look, after a number of episodes fixed beforehand."""
+    from statsmodels.stats.contingency_tables import mcnemar
+
+    return float(mcnemar([[0, pairs.first], [pairs.second, pairs.same]], exact=True).pvalue)
+
+
+def tango(pairs: Pairs, alpha: float = ALPHA) -> Interval:
+    """The score interval of the difference of two success rates on the same episodes, of Tango.
+
+    Valid for one look, after a number of episodes fixed beforehand; its level is close to nominal.
+    """
+    from scipy.optimize import brentq
+    from scipy.stats import norm
+
+    n, b, c = pairs.episodes, pairs.first, pairs.second
+    if n == 0:
+        return Interval(-1.0, 1.0)
+    quantile = float(norm.isf(alpha / 2))
+
+    def score(difference: float) -> float:
+        """The standardised distance between the observed difference and a supposed one."""
+        # The likeliest rate of episodes that only the second policy wins, under the supposed difference.
+        linear = -b - c + (2 * n - b + c) * difference
+        square = linear**2 + 8 * n * c * difference * (1 - difference)
+        rate = (math.sqrt(max(square, 0.0)) - linear) / (4 * n)
+        variance = n * (2 * rate + difference * (1 - difference))
+        distance = b - c - n * difference
+        if abs(distance) < _EDGE:
+            return 0.0
+        return distance / math.sqrt(variance) if variance > 0 else math.copysign(math.inf, distance)
+
+    def end(side: float, near: float, far: float) -> float:
+        beyond = [side * score(each) - quantile for each in (near, far)]
+        return far if beyond[1] <= 0 else float(brentq(lambda x: min(side * score(x) - quantile, 1e6), near, far))
+
+    edge = 1.0 - _EDGE
+    estimate = min(max(pairs.difference, -edge), edge)
+    low = end(1.0, estimate, -edge) if estimate > -edge else -1.0
+    high = end(-1.0, estimate, edge) if estimate < edge else 1.0
+    return Interval(-1.0 if low == -edge else low, 1.0 if high == edge else high)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """p-values corrected for their number, by the method of Holm."""
+    if not p_values:
+        return []
+    from statsmodels.stats.multitest import multipletests
+
+    return [float(p) for p in multipletests(p_values, method="holm")[1]]
+
+
+@cache
+def _bets() -> tuple[Array, Array]:
+    """The mixture of bets: the stake of each as a fraction of the capital, and the logarithm of its weight.
+
+    Stakes follow a Beta(2, 2) distribution, which needs the fewest episodes over a range of differences
+    (`benchmarks/evaluation_statistics.py`). Any weights that do not depend on the outcomes are valid.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    stakes = (nodes + 1) / 2
+    density = weights * stakes * (1 - stakes)
+    return stakes, np.log(density / density.sum())
+
+
+def _log_mean(exponents: Array) -> float:
+    top = exponents.max()
+    return float(top + np.log(np.exp(exponents - top).sum()))
+
+
+def log_capital(first: float, second: float, same: float, difference: float) -> float:
+    """Logarithm of the capital that bets against a supposed difference of success rates have won, from a capital of 1.
+
+    Half of the capital bets that the true difference is larger, half that it is smaller. With every episode a bet
+    multiplies its capital by 1 + stake * (x / mean - 1), where x is 1, 1/2 or 0 if the first policy, neither or the
+    second one did better, and `mean` the supposed mean of x. If the supposed difference is the true one, the expected
+    capital never grows, so the probability that it ever reaches 1 / alpha is at most alpha (Ville's inequality).
+
+    Args:
+        first: number of episodes that only the first policy won.
+        second: number of episodes that only the second one won.
+        same: number of the others.
+        difference: the supposed difference, between -1 and 1.
+    """
+    stakes, weights = _bets()
+    mean = (1 + difference) / 2
+    lost = np.log1p(-stakes)
+
+    def side(mean: float, won: float, not_won: float) -> float:
+        gain = np.log1p(stakes * (1 / mean - 1))
+        tie = np.log1p(stakes * (0.5 / mean - 1))
+        return _log_mean(weights + won * gain + same * tie + not_won * lost)
+
+    return float(np.logaddexp(side(mean, first, second), side(1 - mean, second, first)) - math.log(2))
+
+
+class PairedTest:
+    """A test of two policies on the same episodes that stays valid however often one looks, and whenever one stops.
+
+    It assumes that episodes are drawn independently, as those of different seeds are.
+
+    Args:
+        alpha: the probability that `interval` ever misses the true difference.
+
+    Attributes:
+        pairs: the outcomes so far.
+        p_value: the smallest so far: the probability of a value at most that small, ever, is at most that small if the
+            policies do not differ.
+        sign: 1 if the first policy was ahead when `p_value` was reached, -1 if it was behind.
+        interval: the differences that were never refuted. It holds at all times at once.
+    """
+
+    def __init__(self, alpha: float = ALPHA) -> None:
+        self._log_limit = -math.log(alpha)
+        self.pairs = Pairs(0, 0, 0)
+        self.p_value = 1.0
+        self.sign = 0
+        self.interval = Interval(-1.0, 1.0)
+
+    def add(self, first: bool, second: bool) -> None:
+        """Add the next episode: whether each policy succeeded."""
+        old = self.pairs
+        ahead, behind = first and not second, second and not first
+        self.pairs = pairs = Pairs(old.first + ahead, old.second + behind, old.same + (first == second))
+        p_value = math.exp(-max(0.0, self._log_capital(0.0)))
+        if p_value < self.p_value:
+            self.p_value, self.sign = p_value, 1 if pairs.first > pairs.second else -1
+        self.interval = self._narrowed()
+
+    def _log_capital(self, difference: float) -> float:
+        return log_capital(self.pairs.first, self.pairs.second, self.pairs.same, difference)
+
+    def _refuted(self, difference: float) -> bool:
+        return self._log_capital(difference) >= self._log_limit
+
+    def _narrowed(self) -> Interval:
+        """The interval without the differences that the outcomes so far refute."""
+        # The capital is a log-convex function of the difference, so those that are not refuted are an interval around
+        # the observed difference. If that is outside of the interval so far, nothing can be said with certainty.
+        low, high = self.interval.low, self.interval.high
+        middle = self.pairs.difference
+        if not low <= middle <= high:
+            return self.interval
+        return Interval(self._end(middle, low), self._end(middle, high))
+
+    def _end(self, inside: float, end: float) -> float:
+        outside = min(max(end, _EDGE - 1), 1 - _EDGE)
+        nearer = outside + math.copysign(min(_TOLERANCE, abs(inside - outside)), inside - outside)
+        if abs(inside - outside) <= _TOLERANCE or not self._refuted(nearer):
+            return end
+        while abs(outside - inside) > _TOLERANCE:
+            middle = (inside + outside) / 2
+            if self._refuted(middle):
+                outside = middle
+            else:
+                inside = middle
+        return outside
+
+
+def episodes_to_decide(pairs: Pairs, margin: float, alpha: float = ALPHA) -> int | None:
+    """About how many more episodes decide, if outcomes keep their present frequencies.
+
+    Args:
+        pairs: the outcomes so far, of which there is at least one.
+        margin: differences below it count as none.
+        alpha: as for `PairedTest`.
+
+    Returns:
+        The number; None if it exceeds 100,000.
+    """
+    limit = -math.log(alpha)
+
+    def decided(episodes: int) -> bool:
+        scale = episodes / pairs.episodes
+        counts = pairs.first * scale, pairs.second * scale, pairs.same * scale
+        if pairs.first != pairs.second and log_capital(*counts, 0.0) >= limit:
+            return True
+        ends = [log_capital(*counts, end) for end in (-margin, margin)]
+        return abs(pairs.difference) < margin and min(ends) >= limit
+
+    total = _first(decided, pairs.episodes, _MOST + pairs.episodes)
+    return None if total is None else total - pairs.episodes
+
+
+def _first(holds: Callable[[int], bool], low: int, most: int) -> int | None:
+    """The first number above `low` for which something holds that then goes on to hold; None if above `most`."""
+    high = low + 1
+    while not holds(high):
+        if high >= most:
+            return None
+        low, high = high, min(2 * high, most)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if holds(middle):
+            high = middle
+        else:
+            low = middle
+    return high
+
+
+@cache
+def _wins_needed(losses: int, alpha: float) -> tuple[int, ...]:
+    """The number of wins that refutes equal success rates, for 0 to `losses` losses."""
+    needed: list[int] = []
+    wins = 0
+    for lost in range(losses + 1):
+        while wins <= lost or log_capital(wins, lost, 0.0, 0.0) < -math.log(alpha):
+            wins += 1
+        needed.append(wins)
+    return tuple(needed)
+
+
+def decided_by(first: float, second: float, episodes: int, alpha: float = ALPHA) -> Array:
+    """The probability that `PairedTest` finds a difference within n episodes, for n from 0 to `episodes`.
+
+    It is computed exactly, for policies with these success rates and independent outcomes.
+
+    Args:
+        first: success rate of the first policy.
+        second: success rate of the second one.
+        episodes: the largest number of episodes.
+        alpha: as for `PairedTest`.
+
+    Returns:
+        Probabilities, shape (episodes + 1,).
+    """
+    from scipy.stats import binom
+
+    ahead, behind = first * (1 - second), second * (1 - first)
+    differing = ahead + behind
+    if differing == 0:
+        return np.zeros(episodes + 1)
+    needed = np.array(_wins_needed(episodes, alpha))
+    share = ahead / differing
+    after = np.zeros(episodes + 1)
+    """Probability of a decision within so many episodes with different outcomes."""
+    undecided = np.array([1.0])
+    """Probability of being undecided with 0, 1, … wins."""
+    for number in range(1, episodes + 1):
+        wins = np.arange(number + 1)
+        going = np.zeros(number + 1)
+        going[1:] += undecided * share
+        going[:-1] += undecided * (1 - share)
+        now = (wins >= needed[number - wins]) | (number - wins >= needed[wins])
+        after[number] = after[number - 1] + going[now].sum()
+        going[now] = 0.0
+        undecided = going
+    numbers = np.arange(episodes + 1)
+    return np.array([float(binom.pmf(numbers[: n + 1], n, differing) @ after[: n + 1]) for n in numbers])
+
+
+def mcnemar_power(first: float, second: float, episodes: int, alpha: float = ALPHA) -> float:
+    """The probability that the exact test of McNemar finds a difference after a fixed number of episodes.
+
+    For policies with these success rates and independent outcomes.
+    """
+    from scipy.stats import binom
+
+    ahead, behind = first * (1 - second), second * (1 - first)
+    numbers = np.arange(episodes + 1)
+    found: Any = np.zeros(episodes + 1)
+    for number in numbers:
+        wins = np.arange(number + 1)
+        p_values = np.minimum(1.0, 2 * binom.cdf(np.minimum(wins, number - wins), number, 0.5))
+        found[number] = binom.pmf(wins, number, ahead / (ahead + behind))[p_values <= alpha].sum()
+    return float(binom.pmf(numbers, episodes, ahead + behind) @ found)
+
+
+def episodes_for(difference: float, power: float = POWER, alpha: float = ALPHA, most: int = 2000) -> int | None:
+    """The number of episodes of each policy with which `PairedTest` finds a difference with probability `power`.
+
+    The success rates are 0.5 plus and minus half the difference, for which most episodes are needed.
+
+    Returns:
+        The number; None if it exceeds `most`.
+    """
+    size = 64
+    while True:
+        found = np.flatnonzero(decided_by(0.5 + difference / 2, 0.5 - difference / 2, size, alpha) >= power)
+        if len(found):
+            return int(found[0])
+        if size >= most:
+            return None
+        size = min(2 * size, most)

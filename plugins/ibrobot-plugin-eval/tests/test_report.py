@@ -1,0 +1,113 @@
+import base64
+import csv
+import json
+import re
+from fractions import Fraction
+from xml.etree import ElementTree
+
+import pytest
+from ibrobot_eval.film import encode
+from ibrobot_eval.page import as_page
+from ibrobot_eval.plots import Axis
+from ibrobot_eval.report import Report, write_report
+
+from .made_results import policy, result
+
+HOSTILE = '<script>alert("x")</script>'
+
+
+def made(label="good", *, episodes=12):
+    """A report on a policy that succeeds, and one that fails where the cube is far away."""
+    found = {label: [], "bad": []}
+    for seed in range(episodes):
+        where = {"cube_x": 0.1 + seed / 100, "cube_y": 0.05 * (seed % 3), "light": 1.0 + seed % 5}
+        found[label].append(result(seed, True, factors=where))
+        found["bad"].append(result(seed, seed < 3, factors=where, faults=("joint: <stuck>",) if seed == 5 else ()))
+    return Report.of_simulation([policy(label), policy("bad")], found, 0.1, until_decided=False)
+
+
+def test_json_has_each_episode_and_its_command():
+    facts = made().facts()
+    assert [each["successes"] for each in facts["policies"]] == [12, 3]
+    assert facts["comparisons"][0]["words"] == "good is better than bad"
+    last = facts["episodes"][-1]
+    assert (last["policy"], last["seed"], last["success"]) == ("bad", 11, False)
+    assert last["command"].startswith("ibrobot record robot.yaml --sim --lockstep --headless --mode bad --seed 11 ")
+    assert last["recording"] == "episodes/bad/seed_000011"
+    json.dumps(facts, allow_nan=False)
+
+
+def test_csv_has_a_line_for_each_episode_with_its_factors():
+    rows = list(csv.DictReader(made().as_csv().splitlines()))
+    assert len(rows) == 24
+    assert (rows[0]["policy"], rows[0]["success"], float(rows[3]["cube_x"])) == ("good", "1", pytest.approx(0.13))
+
+
+def test_markdown_lists_failures_and_verdict():
+    text = made().as_markdown()
+    assert "**good is better than bad.**" in text
+    assert "12 of 12" in text
+    assert text.count("`ibrobot record") == 9
+
+
+def test_page_is_one_file_without_network_and_well_formed(tmp_path):
+    text = as_page(tmp_path, made())
+    assert not re.search(r"(?:src|href)=\"(?!data:|episodes/)", text)
+    assert "http" not in text.replace("http-equiv", "")
+    for picture in re.findall(r"<svg.*?</svg>", text, re.DOTALL):
+        ElementTree.fromstring(picture)
+    assert text.count('class="failure"') == 9
+    assert "good: outcomes over cube_x and cube_y" in text
+    assert "bad: success rate over light" in text
+
+
+def test_page_escapes_names_and_faults(tmp_path):
+    text = as_page(tmp_path, made(HOSTILE))
+    assert HOSTILE not in text
+    assert "<stuck>" not in text
+
+
+def test_page_has_the_videos_of_the_folder(tmp_path):
+    report = made()
+    video = tmp_path / report.failures[0].video
+    video.parent.mkdir(parents=True)
+    video.write_bytes(b"a video")
+    text = as_page(tmp_path, report)
+    assert text.count("<video") == 1
+    assert base64.b64encode(b"a video").decode() in text
+
+
+def test_report_of_one_policy_compares_nothing(tmp_path):
+    report = Report.of_simulation([policy("a")], {"a": [result(0, False)]}, 0.1, until_decided=False)
+    assert report.comparisons == ()
+    assert "Comparison" not in as_page(tmp_path, report)
+    write_report(tmp_path, report)
+    assert {each.name for each in tmp_path.iterdir()} == {"report.json", "report.csv", "report.md"}
+
+
+@pytest.mark.parametrize("ends", [(0.0, 1.0), (-0.3, 0.31), (0.0, 480.0), (2.0, 2.0)])
+def test_ticks_are_round_and_within_the_axis(ends):
+    ticks = Axis(*ends, 0, 100).ticks()
+    assert 1 <= len(ticks) <= 7
+    assert all(ends[0] - 1e-9 <= tick <= ends[1] + 1e-9 for tick in ticks)
+
+
+def test_video_of_pictures_can_be_decoded_and_is_repeatable():
+    import io
+
+    import av
+    import numpy as np
+
+    encoder = av.CodecContext.create("mjpeg", "w")
+    encoder.width, encoder.height, encoder.pix_fmt, encoder.time_base = 64, 48, "yuvj420p", Fraction(1, 10)
+    pictures = []
+    for shade in range(0, 250, 25):
+        frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), shade, np.uint8), "rgb24").reformat(format="yuvj420p")
+        pictures += [bytes(packet) for packet in encoder.encode(frame)]
+    video = encode(pictures, 10.0)
+    assert video == encode(pictures, 10.0)
+    with av.open(io.BytesIO(video)) as container:
+        shades = [frame.to_ndarray(format="rgb24").mean() for frame in container.decode(video=0)]
+    assert (len(shades), shades) == (10, sorted(shades))
+    assert shades[0] < 20
+    assert shades[-1] > 200

@@ -1,0 +1,164 @@
+"""Blinded trials with a simulated arm, as an operator runs them at a terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import chdir, suppress
+from pathlib import Path
+
+import pytest
+from command_line import run_here
+
+from ibrobot_core.config import find_config
+from ibrobot_core.plugins import installed_plugins
+
+pytestmark = pytest.mark.integration
+PATIENCE_S = 240.0
+NAMES = ("careful", "hasty")
+
+
+class Terminal:
+    """`ibrobot eval` with blinded trials at a terminal of its own."""
+
+    def __init__(self, folder: Path, *more: str) -> None:
+        self._master, slave = pty.openpty()
+        program = "from ibrobot_core.cli.command import main; main()"
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", program, *command(*more)],
+            cwd=folder, stdin=slave, stdout=slave, stderr=slave, start_new_session=True,
+        )  # fmt: skip
+        os.close(slave)
+        self.shown = ""
+        self._seen = 0
+
+    def see(self, pattern: str) -> str:
+        """Wait until the terminal shows something new."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not (found := re.search(pattern, self.shown[self._seen :])):
+            if not select.select([self._master], [], [], 0.5)[0]:
+                assert time.monotonic() < deadline, f"{pattern!r} did not come: {self.shown}"
+                continue
+            try:
+                self.shown += os.read(self._master, 4096).decode()
+            except OSError:
+                pytest.fail(f"{pattern!r} did not come: {self.shown}")
+        self._seen += found.end()
+        return found[0]
+
+    def press(self, keys: str) -> None:
+        os.write(self._master, keys.encode())
+
+    def judge(self, trial: int, key: str) -> None:
+        """Begin a trial, and judge it when it has ended."""
+        self.press("\r")
+        self.see(f"trial {trial} has ended: s success, f failure, v void")
+        self.press(key)
+
+    def end(self) -> int:
+        with suppress(OSError):
+            while data := os.read(self._master, 4096):
+                self.shown += data.decode()
+        return self.process.wait(PATIENCE_S)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self._master)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    text = find_config("so101_pick_cube", installed_plugins()).read_text(encoding="utf-8")
+    text = text.replace("max_duration_s: 20", "max_duration_s: 0.5")
+    text = text.replace("\nmodels:\n", "\nmodels:\n  quick: {type: scripted_pick, speed: 1.0}\n")
+    executors = "executors: [arm_position, gripper_position]"
+    pairs = zip(NAMES, ("scripted_pick", "quick"), strict=True)
+    modes = "".join(f"  {name}: {{{executors}, inference: {{model: {model}}}}}\n" for name, model in pairs)
+    (tmp_path / "arm.yaml").write_text(
+        text.replace("\ncontrol_modes:\n", f"\ncontrol_modes:\n{modes}"), encoding="utf-8"
+    )
+    return tmp_path
+
+
+@pytest.fixture
+def terminals(folder: Path) -> Iterator[list[Terminal]]:
+    started: list[Terminal] = []
+    yield started
+    for each in started:
+        each.close()
+
+
+def command(*more: str) -> list[str]:
+    modes = [word for name in NAMES for word in ("--mode", name)]
+    return ["eval", "arm.yaml", "--sim", "--trials", *modes, "--episodes", "2", "--out", "blind", *more]
+
+
+def test_operator_judges_blind_and_goes_on_after_a_crash(folder: Path, terminals: list[Terminal]) -> None:
+    first = Terminal(folder)
+    terminals.append(first)
+    first.see("find a difference of success rates")
+    first.see(r"trial 1 \(start 1 of 2\).*Enter begins")
+    first.judge(1, "s")
+    first.see("trial 1: success")
+    first.see(r"trial 2 \(start 1 of 2\)")
+    first.judge(2, "v")
+    first.see("reason: ")
+    first.press("the light went out\r")
+    first.see("trial 2: void")
+    first.see("trial 3")
+    first.press("\r")
+    first.see("running")
+    os.kill(first.process.pid, signal.SIGKILL)  # a crash in the middle of a trial
+    first.process.wait()
+
+    early = _analysis(folder)
+    assert (early.returncode, "need a terminal" in early.stderr) != (0, False)
+
+    second = Terminal(folder)
+    terminals.append(second)
+    for number in (3, 4, 5):
+        second.see(rf"trial {number} \(start {1 if number == 3 else 2} of 2\)")
+        second.judge(number, "f")
+        second.see(f"trial {number}: failure")
+    assert second.end() == 0
+
+    blind = first.shown + second.shown[: second.shown.index("trial 5: failure")]
+    out = folder / "blind"
+    log = (out / "trials.log").read_text(encoding="utf-8")
+    names = [str(path.relative_to(out)) for path in out.rglob("*")]
+    assert "episode 1: failure" in log, "the log has what the run says, without names"
+    for name in (*NAMES, "scripted_pick", "quick"):
+        assert name not in blind
+        assert name not in log
+        assert not [path for path in names if name in path]
+    trials = [json.loads(each.read_text()) for each in sorted((out / "trials").glob("*.json"))]
+    assert [each["outcome"] for each in trials] == ["success", "void", "failure", "failure", "failure"]
+    assert trials[1]["reason"] == "the light went out"
+    assert not any(name in json.dumps(trials) for name in NAMES)
+    report = json.loads((out / "report.json").read_text())
+    assert sorted((each["label"], each["successes"], each["episodes"]) for each in report["policies"]) in (
+        [("careful", 0, 2), ("hasty", 1, 2)],
+        [("careful", 1, 2), ("hasty", 0, 2)],
+    )
+    assert len(list((out / "episodes").glob("trial_*"))) == 5
+
+    repeated = _analysis(folder)
+    assert repeated.returncode == 0, "what is complete can be analysed again"
+    file = sorted((out / "trials").glob("*.json"))[-1]
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"seal": "0"}))
+    refused = _analysis(folder)
+    assert (refused.returncode, "so they are not blind" in refused.stderr) == (2, True), refused.stderr
+
+
+def _analysis(folder: Path) -> subprocess.CompletedProcess[str]:
+    with chdir(folder):
+        return run_here(*command())

@@ -1,0 +1,242 @@
+"""`ibrobot eval` as a user runs it: the scripted pick in simulation, beside one whose gripper stays open."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from contextlib import chdir
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from command_line import run_here
+
+from ibrobot_core.config import find_config
+from ibrobot_core.plugins import installed_plugins
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+pytestmark = pytest.mark.integration
+PATIENCE_S = 120.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the robot YAML `picks`, whose modes are one good policy twice, and one that cannot grasp."""
+    folder = tmp_path_factory.mktemp("eval")
+    text = find_config("so101_pick_cube", installed_plugins()).read_text(encoding="utf-8")
+    text = text.replace("max_duration_s: 20", "max_duration_s: 6")
+    text = text.replace("\nmodels:\n", "\nmodels:\n  broken: {type: scripted_pick, gripper_closed: 0.6}\n")
+    executors = "executors: [arm_position, gripper_position]"
+    modes = "".join(
+        f"  {name}: {{{executors}, inference: {{model: {model}}}}}\n"
+        for name, model in (("again", "scripted_pick"), ("faulty", "broken"))
+    )
+    text = text.replace("\ncontrol_modes:\n", f"\ncontrol_modes:\n{modes}")
+    (folder / "picks.yaml").write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(folder: Path) -> Path:
+    """An evaluation of two policies with three episodes each, in one process."""
+    done = evaluate(folder, "--out", "whole", "--jobs", 1)
+    assert done.returncode == 0, done.stderr
+    assert "scripted  3 of 3 succeeded" in done.stdout
+    assert "faulty    0 of 3 succeeded" in done.stdout
+    return folder / "whole"
+
+
+def arguments(*more: object) -> list[str]:
+    return ["eval", "picks.yaml", "--mode", "scripted", "--mode", "faulty", "--episodes", "3", *map(str, more)]
+
+
+def evaluate(folder: Path, *more: object) -> subprocess.CompletedProcess[str]:
+    with chdir(folder):
+        return run_here(*arguments(*more))
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Hash of every file of an evaluation."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+class Started:
+    """An evaluation in a process of its own."""
+
+    def __init__(self, folder: Path, *more: object) -> None:
+        program = "from ibrobot_core.cli.command import main; main()"
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", program, *arguments(*more)],
+            cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        )  # fmt: skip
+
+    def await_episode(self) -> str:
+        """Wait for the next episode."""
+        assert self.process.stderr is not None
+        return self.process.stderr.readline()
+
+    def children(self) -> list[int]:
+        """The worker processes."""
+        return [
+            int(pid) for pid in Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        ]
+
+    def end(self) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, out, err
+
+
+@pytest.fixture
+def start(folder: Path) -> Iterator[Any]:
+    started: list[Started] = []
+
+    def begin(*more: object) -> Started:
+        started.append(Started(folder, *more))
+        return started[-1]
+
+    yield begin
+    for each in started:
+        each.process.kill()
+        each.process.communicate()
+
+
+def test_two_processes_give_the_bytes_of_one(folder: Path, whole: Path) -> None:
+    assert evaluate(folder, "--out", "two", "--jobs", 2).returncode == 0
+    assert digests(folder / "two") == digests(whole)
+    assert len(list(whole.rglob("*.mcap"))) == 6
+
+
+def test_printed_command_repeats_an_episode_byte_by_byte(folder: Path, whole: Path, tmp_path: Path) -> None:
+    episode = json.loads((whole / "report.json").read_text())["episodes"][-1]
+    assert (episode["policy"], episode["seed"], episode["success"]) == ("faulty", 2, False)
+    program, *command = shlex.split(episode["command"])
+    (tmp_path / "picks.yaml").write_bytes((folder / "picks.yaml").read_bytes())
+    with chdir(tmp_path):
+        assert (program, run_here(*command).returncode) == ("ibrobot", 3)
+    repeated = tmp_path / "episodes/default/episodes/episode_000001"
+    assert digests(repeated) == digests(whole / episode["recording"])
+
+
+def test_episode_of_a_killed_worker_is_run_again(start: Any, folder: Path, whole: Path) -> None:
+    running = start("--out", "killed", "--jobs", 1)
+    assert "(1 of 6)" in running.await_episode()
+    (worker,) = running.children()
+    os.kill(worker, signal.SIGKILL)
+    code, _, err = running.end()
+    assert (code, [f"({n} of 6)" in err for n in range(2, 7)]) == (0, [True] * 5), err
+    assert digests(folder / "killed") == digests(whole)
+
+
+def test_interrupted_evaluation_goes_on_with_nothing_twice(start: Any, folder: Path, whole: Path) -> None:
+    running = start("--out", "stopped", "--jobs", 1)
+    running.await_episode()
+    os.killpg(running.process.pid, signal.SIGINT)  # as a terminal does
+    code, _, err = running.end()
+    assert (code, "Traceback" in err) == (130, False), err
+    assert "run the same command again to continue" in err
+    results = {path: path.stat().st_mtime_ns for path in (folder / "stopped" / "results").rglob("*.json")}
+    assert 1 <= len(results) < 6
+    done = evaluate(folder, "--out", "stopped", "--jobs", 2)
+    assert (done.returncode, done.stderr.count("success (") + done.stderr.count("failure (")) == (0, 6 - len(results))
+    assert {path: path.stat().st_mtime_ns for path in results} == results
+    assert digests(folder / "stopped") == digests(whole)
+
+
+def test_workers_end_with_a_killed_command(start: Any) -> None:
+    running = start("--out", "orphaned", "--jobs", 1)
+    running.await_episode()
+    (worker,) = running.children()
+    os.kill(running.process.pid, signal.SIGKILL)
+    deadline = time.monotonic() + PATIENCE_S
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{worker}").exists()
+
+
+def test_it_stops_as_soon_as_the_fault_is_certain(folder: Path) -> None:
+    reports = []
+    for jobs in (1, 2):
+        options = ("--until-decided", "--episodes", 30, "--jobs", jobs, "--out", f"decided{jobs}")
+        done = evaluate(folder, *options)
+        assert done.returncode == 0, done.stderr
+        assert "scripted  8 of 8 succeeded" in done.stdout
+        assert "scripted is better than faulty" in done.stdout
+        reports.append(digests(folder / f"decided{jobs}"))
+    assert reports[0] == reports[1]
+    done = evaluate(folder, "--until-decided", "--episodes", 30, "--out", "decided1")
+    assert (done.returncode, digests(folder / "decided1")) == (0, reports[0]), "the same command adds nothing"
+
+
+def test_policy_beside_itself_is_no_different(folder: Path) -> None:
+    with chdir(folder):
+        command = ("eval", "picks.yaml", "--mode", "scripted", "--mode", "again", "--episodes", 3, "--out", "self")
+        done = run_here(*command, "--json")
+    (comparison,) = json.loads(done.stdout)["comparisons"]
+    assert comparison["pairs"] == {"first": 0, "second": 0, "same": 3}
+    assert comparison["verdict"] == "undecided"
+    assert comparison["more_episodes"] > 10
+
+
+def test_folder_of_other_settings_is_refused(folder: Path, whole: Path, tmp_path: Path) -> None:
+    before = digests(whole)
+    for more, said in (
+        (("--seed", 5), "seed 0, now 5"),
+        (("--margin", 0.2), "margin 0.1, now 0.2"),
+        (("--set", "control.rate_hz=50"), "policies scripted robot YAML changed"),
+        (("--mode", "again"), "policies again is new"),
+        (("--episodes", 2), "--episodes must not be smaller"),
+    ):
+        done = evaluate(folder, "--out", whole, *more)
+        assert (done.returncode, said in done.stderr) == (2, True), done.stderr
+    assert digests(whole) == before
+    (tmp_path / "else").write_text("something else")
+    done = evaluate(folder, "--out", tmp_path)
+    assert (done.returncode, "is not an evaluation to continue" in done.stderr) == (2, True), done.stderr
+
+
+def test_folder_has_one_owner(start: Any, folder: Path) -> None:
+    running = start("--out", "owned", "--jobs", 1)
+    running.await_episode()
+    done = evaluate(folder, "--out", "owned")
+    assert done.returncode == 1
+    assert f"owned: is being evaluated by process {running.process.pid}" in done.stderr
+
+
+def test_wrong_command_lines_name_the_remedy(folder: Path) -> None:
+    for words, said in (
+        (("--mode", "planned"), "control_modes.planned: has no inference; only policies can be evaluated"),
+        (("--mode", "script"), "script"),
+        (("--model", "other"), "has no model 'other'; the models are:"),
+        (("--until-decided",), "--until-decided compares policies: give at least two"),
+        (("--mode", "scripted", "--mode", "scripted"), "control_modes.scripted: is given twice"),
+    ):
+        with chdir(folder):
+            done = run_here("eval", "picks.yaml", *words, "--out", "wrong")
+        assert (done.returncode, said in done.stderr) == (2, True), done.stderr
+        assert not (folder / "wrong").exists()
+
+
+def test_scene_without_a_task_is_an_error(folder: Path) -> None:
+    with chdir(folder):
+        done = run_here(
+            "eval", "so101_blind", "--sim", "--set", "simulation.scene=empty", "--episodes", 1, "--out", "no"
+        )
+    assert done.returncode != 0
+    assert "error:" in done.stderr
+
+
+def test_events_tell_a_program_the_result(folder: Path, whole: Path) -> None:
+    done = evaluate(folder, "--out", whole, "--events")
+    begin, report = (json.loads(line) for line in done.stdout.splitlines())
+    assert (done.returncode, begin) == (0, {"event": "begin", "of": 6, "done": 6})
+    assert (report["event"], report["out"]) == ("report", str(whole))
+    assert report["lines"][1].startswith("faulty    0 of 3 succeeded")
