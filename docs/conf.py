@@ -25,7 +25,8 @@ author = "the ibrobot authors"
 project_copyright = "2026, the ibrobot authors"
 version = release = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.doctest", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.doctest", "sphinx.ext.napoleon", "sphinxcontrib.mermaid"]
+myst_fence_as_directive = ["mermaid"]  # hosts of repositories draw ```mermaid, too
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
 html_theme = "furo"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
-from importlib.metadata import entry_points, metadata
+from importlib.metadata import entry_points, metadata, requires
 from typing import Any
 
 import pluggy
@@ -22,6 +23,7 @@ def plugin_page() -> Iterator[str]:
     yield "# Plugins\n"
     yield "This page lists what core and the plugins of the repository offer. Each type links to its"
     yield "options. `ibrobot plugins` prints the list for your own installation.\n"
+    yield from _drawing(sorted({package for package, _ in shown if package != CORE}))
     for package, name in shown:
         yield f"## {package}\n"
         yield f"{metadata(package)['Summary']}.\n"
@@ -30,6 +32,29 @@ def plugin_page() -> Iterator[str]:
         for kind, title, summary in _offers(managers[name]):
             yield f"| {kind} | {title} | {summary} |"
         yield ""
+
+
+def _drawing(plugins: list[str]) -> Iterator[str]:
+    """A drawing of the packages, from their metadata: plugins with the libraries that they share, on top of core."""
+    yield "All packages need `ibrobot-core`; the arrows show what else of the project they need.\n"
+    yield "```mermaid"
+    yield "flowchart LR"
+    alone = []
+    for plugin in plugins:
+        needed = {re.split(r"[^\w-]", each)[0] for each in requires(plugin) or () if "extra ==" not in each} - {
+            CORE,
+            plugin,
+        }
+        libraries = sorted(name for name in needed if name.startswith("ibrobot-"))
+        name = plugin.removeprefix("ibrobot-plugin-")
+        if not libraries:
+            alone.append(f"    {name}")
+        for library in libraries:
+            yield f"  {name} --> {library}[[{library}]]"
+    yield '  subgraph alone ["core alone"]'
+    yield from alone
+    yield "  end"
+    yield "```\n"
 
 
 def _offers(manager: pluggy.PluginManager) -> Iterator[tuple[str, str, str]]:

@@ -26,7 +26,6 @@ class SourceWorker(SessionWorker, CommandSource):
         needs: names of the components that must be ready before it starts.
 
     Attributes:
-        session: the run.
         mode: the mode.
         active: whether the mode is entered; `work` must not send commands otherwise.
         lock: held during `begin_mode` and `end_mode`. Hold it while `work` checks `active` and sends commands.
