@@ -22,11 +22,11 @@ from typing import Any
 import attrs
 import mujoco
 import numpy as np
-from ibrobot_mujoco.model import build_model
+from ibrobot_mujoco.model import build_world
 from ibrobot_mujoco.options import MujocoOptions
-from ibrobot_mujoco.pick_cube import PickCube
+from ibrobot_mujoco.scenes import scene as made_scene
 from ibrobot_mujoco.so101 import so101
-from ibrobot_mujoco.state import OBJECTS_TOPIC, PHYSICS_TOPIC, pose_scene
+from ibrobot_mujoco.state import OBJECTS_TOPIC, PHYSICS_TOPIC, DrawnWorld
 from ibrobot_planning.tasks.reading import find_task
 from ibrobot_planning.tasks.result import TaskResult
 from ibrobot_planning.tasks.runner import RESULT, RUN
@@ -75,7 +75,10 @@ def scene(seed: int, robot: Robot) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     while True:
         values = sample(rng)
-        options = single_options(MujocoOptions, (), "scene", text=json.dumps(values))
+        options = single_options(MujocoOptions, (), "scene", text=json.dumps({"objects": values["objects"]}))
+        options = attrs.evolve(
+            options, scene=made_scene(**{name: value for name, value in values["scene"].items() if name != "type"})
+        )
         with suppress(HardwareError):  # no place for the cube
             if len(options.objects) == OBSTACLES and clear_of_start(options, robot):
                 return values
@@ -83,10 +86,10 @@ def scene(seed: int, robot: Robot) -> dict[str, Any]:
 
 def clear_of_start(options: MujocoOptions, robot: Robot) -> bool:
     """Whether all objects are far enough from the robot at the beginning."""
-    model = build_model(options, robot, visual=False)
-    physics = mujoco.MjData(model)
+    world, made = build_world(options, robot, visual=False)
+    model, physics = world.model, world.data
     physics.qpos[: len(robot.joints)] = robot.pose(options.start_pose)
-    PickCube(options, model).place(physics, np.random.default_rng(0))  # the only place in its ranges
+    made.begin(world, np.random.default_rng(0))  # the only place in its ranges
     robots = [i for i in range(model.ngeom) if model.body(int(model.geom_bodyid[i])).name not in around(options)]
     things = [model.geom(name).id for name in options.objects]
     for opening in np.linspace(0.0, 0.6, 4):
@@ -132,7 +135,8 @@ def sample(rng: np.random.Generator) -> dict[str, Any]:
         objects[f"obstacle_{len(objects)}"] = thing
         places.append(place)
     ranges = {"cube_distance": distance, "cube_bearing": bearing, "cube_yaw": yaw}
-    return {**{key: [float(value)] * 2 for key, value in ranges.items()}, "objects": objects}
+    place = {name: [float(value)] * 2 for name, value in ranges.items()}
+    return {"scene": {"type": "pick_cube", **place}, "objects": objects}
 
 
 def perform(seed: int, speed: float = 1.0) -> Outcome:
@@ -187,13 +191,13 @@ def values(subscription: Subscription) -> list[Vector]:
 
 def contacts(config: Any, states: list[Vector]) -> list[str]:
     """Pairs of the robot or the cube with something else that touched; names of bodies."""
-    model = build_model(config.simulation.options, config.robot, visual=False)
-    physics = mujoco.MjData(model)
+    followed = DrawnWorld.of(config.simulation.options, config.robot, visual=False)
+    model, physics = followed.model, followed.data
     names = [model.body(int(body)).name for body in model.geom_bodyid]
     allowed = {("world", "cube"), ("bin", "cube")}
     found = []
     for state in states:
-        pose_scene(model, physics, state)
+        followed.follow(state)
         mujoco.mj_collision(model, physics)
         for contact in physics.contact:
             if contact.dist > 0:

@@ -42,7 +42,7 @@ def make_variant(name: str, model: mujoco.MjModel, *, shadows: bool) -> Variant:
 
 
 def full_model() -> mujoco.MjModel:
-    spec = build_spec(MujocoOptions(), so101())
+    spec, _ = build_spec(MujocoOptions(), so101())
     spec.visual.quality.offsamples = 0
     return spec.compile()
 

@@ -10,8 +10,9 @@ from typing import override
 
 import attrs
 import numpy as np
-from ibrobot_mujoco.policy_options import ScriptedPickOptions
-from ibrobot_mujoco.scripted_pick import ACTION, SCENE, STATE, ScriptedPick
+from ibrobot_mujoco.experts import EXPERTS
+from ibrobot_mujoco.experts.expert import ACTION, SCENE, STATE
+from ibrobot_mujoco.experts.options import ExpertOptions
 
 from ibrobot_core.api import (
     NS_PER_S,
@@ -49,7 +50,7 @@ class ScriptedOperator(Teleop):
         assert ctx.bus is not None
         self._options = options
         self._bus, self._joints = ctx.bus, ctx.robot.joint_names
-        self._expert = ScriptedPick(ScriptedPickOptions(), ctx)
+        self._expert = EXPERTS[0].make(ExpertOptions(), ctx)
         self._scene = np.empty(0)
         self._taken = self._asked = self._commands = False
         """Whether it took the robot in this episode, waits for it, and commands it."""

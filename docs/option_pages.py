@@ -9,8 +9,9 @@ from typing import Any, get_args
 
 import attrs
 
+from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config.describe import described
-from ibrobot_core.config.schema import SECTIONS, ComponentConfig
+from ibrobot_core.config.schema import SECTIONS
 from ibrobot_core.convert import is_mapping, is_sequence
 from ibrobot_core.options import fields
 from ibrobot_core.plugins import KINDS, installed_plugins

@@ -5,6 +5,7 @@ from ibrobot_core.hookspecs import hookimpl as hookimpl
 from ibrobot_core.descriptors import (
     Descriptor as Descriptor,
     HardwareDescriptor as HardwareDescriptor,
+    SceneDescriptor as SceneDescriptor,
     SensorDescriptor as SensorDescriptor,
     TeleopDescriptor as TeleopDescriptor,
     PolicyDescriptor as PolicyDescriptor,
@@ -30,6 +31,7 @@ from ibrobot_core.options import (
     did_you_mean as did_you_mean,
 )
 from ibrobot_core.executor_options import StreamOptions as StreamOptions
+from ibrobot_core.component_config import SceneConfig as SceneConfig
 
 # The robot
 from ibrobot_core.robot import Robot as Robot, Joint as Joint, Description as Description, Vector as Vector
@@ -51,6 +53,7 @@ from ibrobot_core.interfaces import (
     Severity as Severity,
     Signal as Signal,
     EpisodeSetup as EpisodeSetup,
+    Scene as Scene,
     SceneObject as SceneObject,
     Sensor as Sensor,
     Teleop as Teleop,

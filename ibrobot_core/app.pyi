@@ -101,7 +101,7 @@ from ibrobot_core.interfaces.policy import copied_tensors as copied_tensors
 from ibrobot_core.ownership import Ownership as Ownership
 from ibrobot_core.interfaces import find_episode as find_episode
 from ibrobot_core.contract.metadata import robot_metadata as robot_metadata
-from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler
+from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, FrameSampler as FrameSampler
 from ibrobot_core.selection import Selection as Selection, Leaf as Leaf, value_at as value_at
 from ibrobot_core.contract.specs import SignalPart as SignalPart
 from ibrobot_core.contract.joint_units import calibrations as calibrations, with_closed_ends as with_closed_ends

@@ -82,6 +82,14 @@ class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
 
 
 @attrs.frozen
+class SceneDescriptor(Descriptor["interfaces.Scene[Any, Any]"]):
+    """A scene of a simulation, whose options have a field of type `SceneConfig`; the simulation makes it."""
+
+    make: Callable[[Any, Robot], interfaces.Scene[Any, Any]] = attrs.field(kw_only=True)  # type: ignore[assignment]
+    """Options and robot -> the scene."""
+
+
+@attrs.frozen
 class SensorDescriptor(Descriptor["interfaces.Sensor"]):
     """A sensor of a kind, e.g. `camera` or `imu`."""
 

@@ -8,7 +8,8 @@ from typing import Any, get_args
 
 import attrs
 
-from ibrobot_core.config.schema import SECTIONS, ComponentConfig, component_of
+from ibrobot_core.component_config import ComponentConfig, component_of
+from ibrobot_core.config.schema import SECTIONS
 from ibrobot_core.config.show import plain
 from ibrobot_core.convert import is_literal, is_mapping, is_sequence, is_union
 from ibrobot_core.options import default_of, fields

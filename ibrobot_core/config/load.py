@@ -10,12 +10,13 @@ from typing import Any
 import attrs
 
 import ibrobot_core
+from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config.checks import Checks
 from ibrobot_core.config.contract_checks import ContractChecks
 from ibrobot_core.config.missing import split
 from ibrobot_core.config.name_checks import check_names
 from ibrobot_core.config.overrides import apply_overrides, put
-from ibrobot_core.config.schema import ComponentConfig, ContractConfig, PeripheralConfig, RobotConfig
+from ibrobot_core.config.schema import ContractConfig, PeripheralConfig, RobotConfig
 from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_secrets
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections, SectionParser
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse_yaml

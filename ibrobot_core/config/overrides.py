@@ -61,8 +61,8 @@ def put(document: Document, path: str, value: Document, place: Place) -> None:
         key = (*key, part)
         if last:
             holder[part] = value.root
-        elif isinstance(part, str) and holder.get(part) is None:
-            holder[part] = {}
+        elif isinstance(part, str) and isinstance(found := holder.get(part), str | None):
+            holder[part] = {} if found is None else {"type": found}  # a component in short
             document.places[key] = place
         holder = holder[part]
     # Remove the places of keys below, so that their faults are reported as faults of the override.

@@ -10,11 +10,12 @@ import math
 import types
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import attrs
 
 from ibrobot_core.clock import Clock
+from ibrobot_core.component_config import ComponentConfig, NamedComponentConfig, component_of
 from ibrobot_core.descriptors import (
     Descriptor,
     EngineDescriptor,
@@ -30,53 +31,6 @@ from ibrobot_core.units import NORM_MODES, ns
 
 _UNIT = 1e-3
 """Tolerance for the length of a quaternion, which may be rounded."""
-
-
-@documented
-@attrs.frozen
-class ComponentConfig:
-    """A section with a `type`, which selects a plugin, and the options of the plugin."""
-
-    plugin_kind: ClassVar[str] = ""
-    """The kind of plugins for its types."""
-    may_be_alone: ClassVar[bool] = False
-    """Whether the section may be a single component instead of named components."""
-
-    type: str = option(help="type of plugin; `ibrobot plugins` lists them")
-    options: Any = not_a_key()
-    """An instance of the plugin's options class."""
-
-    @classmethod
-    def __attrs_init_subclass__(cls) -> None:
-        documented(cls)
-
-    @classmethod
-    def type_key(cls) -> str:
-        """The key that names the plugin."""
-        return str(attrs.fields(cls).type.alias)
-
-    @classmethod
-    def takes(cls, descriptor: Descriptor[Any]) -> bool:
-        """Whether a plugin of the kind may be used in this section."""
-        return True
-
-    @classmethod
-    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """Fields that are not keys, derived from the options by the plugin's descriptor."""
-        return {}
-
-
-@attrs.frozen
-class NamedComponentConfig(ComponentConfig):
-    """One of several named components."""
-
-    name: str = not_a_key()
-
-
-def component_of(kind: Any) -> type[ComponentConfig] | None:
-    """The component class in a type annotation: that of a section, or of each of its items."""
-    members = (kind, *get_args(kind))
-    return next((each for each in members if isinstance(each, type) and issubclass(each, ComponentConfig)), None)
 
 
 @attrs.frozen
@@ -440,7 +394,7 @@ class ControlMode:
 def _check_dataset(_: object, __: object, value: str) -> None:
     folder = Path(value)
     if folder.is_absolute() or ".." in folder.parts or not folder.parts:
-        raise ValueError(f"{str(folder)!r} is not below recording.root; give a folder's name, e.g. pick_cube")
+        raise ValueError(f"{str(folder)!r} is not below recording.root; give a folder's name, e.g. picks")
 
 
 @attrs.frozen

@@ -9,6 +9,7 @@ from typing import Any
 import attrs
 import yaml
 
+from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config import schema
 from ibrobot_core.config.yaml_nodes import is_text
 from ibrobot_core.options import HIDDEN, fields
@@ -21,7 +22,7 @@ _RESOLVED: Mapping[type, str] = {schema.PeripheralConfig: "sim", schema.Simulati
 def plain(value: Any) -> Any:
     """A config value as plain YAML or JSON: attrs classes as mappings, tuples as lists, paths as text."""
     match value:
-        case schema.ComponentConfig():
+        case ComponentConfig():
             return _fields(value, but=(_RESOLVED.get(type(value)),)) | plain(value.options)
         case schema.ControlMode():
             left_out = ("dispatch",) if value.inference is None else ()

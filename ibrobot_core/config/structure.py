@@ -10,6 +10,7 @@ from typing import Any
 
 import attrs
 
+from ibrobot_core.component_config import ComponentConfig, NamedComponentConfig, component_of
 from ibrobot_core.config import schema
 from ibrobot_core.config.expand import missing_package, resolve_path
 from ibrobot_core.config.missing import Missing
@@ -28,7 +29,7 @@ _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @attrs.frozen
-class ParsedComponent[C: schema.ComponentConfig]:
+class ParsedComponent[C: ComponentConfig]:
     """A structured component with its place and its plugin's descriptor."""
 
     key: Key
@@ -56,7 +57,7 @@ class ParsedSections:
     recording: ParsedComponent[schema.RecordingConfig] | None = None
     transport: ParsedComponent[schema.TransportConfig] | None = None
     viewer: ParsedComponent[schema.ViewerConfig] | None = None
-    plugin_sections: dict[str, ParsedComponent[schema.ComponentConfig]] = attrs.field(factory=dict)
+    plugin_sections: dict[str, ParsedComponent[ComponentConfig]] = attrs.field(factory=dict)
     """The sections of plugins."""
     missing: list[Missing] = attrs.field(factory=list)
     """Components without an installed plugin."""
@@ -82,7 +83,7 @@ class _Outline(Converter):
     """Keeps components as mappings, to be structured later by their plugins."""
 
     def structure(self, value: Any, kind: Any) -> Any:
-        component = schema.component_of(kind)
+        component = component_of(kind)
         if component is kind or (component is not None and component.may_be_alone):
             kind = Mapping[str, Any]
         return super().structure(value, kind)
@@ -203,7 +204,7 @@ class SectionParser:
                 note(self.document, found.descriptor.options, value, (name,))
             with faults.at(name):
                 options = self._converter.structure(value, found.descriptor.options)
-                section = schema.ComponentConfig(name, options)
+                section = ComponentConfig(name, options)
                 sections.plugin_sections[name] = ParsedComponent((name,), section, found.descriptor)
 
     def _report(self, key: Key, faults: Faults, below_sim: Collection[str] = ()) -> None:
@@ -212,7 +213,7 @@ class SectionParser:
             self.document.add((*key, *middle, *inner), message)
             self.document.unread.add((*key, *middle, *inner))  # other checks do not report it again
 
-    def _component[C: schema.ComponentConfig](
+    def _component[C: ComponentConfig](
         self,
         key: Key,
         kind: type[C],
@@ -249,7 +250,7 @@ class SectionParser:
         descriptor = self._find(key, kind, type_, needed, faults) if isinstance(type_, str) else None
         if descriptor is not None:
             note(self.document, descriptor.options, value, key)
-            options = self._options(descriptor, kind, value, faults)
+            options = self._options(key, descriptor, kind, value, faults)
         self._report(key, faults, below_sim)
         if options is None or descriptor is None:
             return None
@@ -263,7 +264,7 @@ class SectionParser:
             return None  # without a required key
 
     def _find(
-        self, key: Key, kind: type[schema.ComponentConfig], type_: str, needed: bool, faults: Faults
+        self, key: Key, kind: type[ComponentConfig], type_: str, needed: bool, faults: Faults
     ) -> Descriptor[Any] | None:
         if not needed and (kind.plugin_kind, type_) not in self.registry.entries:
             return None
@@ -276,8 +277,9 @@ class SectionParser:
         return None
 
     def _options(
-        self, descriptor: Descriptor[Any], kind: type[schema.ComponentConfig], value: Mapping[str, Any], faults: Faults
-    ) -> Any:
+        self, key: Key, descriptor: Descriptor[Any], kind: type[ComponentConfig], value: Mapping[str, Any],
+        faults: Faults,
+    ) -> Any:  # fmt: skip
         own = fields(kind)
         known = {name: field for name, field in fields(descriptor.options).items() if name not in own}
         for name in value:
@@ -287,7 +289,14 @@ class SectionParser:
                 message = f"unknown key with {kind.type_key()} {descriptor.type!r}; it belongs to {types}"
                 faults.add((name,), message if others else unknown_key(name, [*own, *known]))
         before = len(faults.found)
-        arguments = self._converter.arguments(known, value, faults)
+        kinds = {name: component_of(field.type) for name, field in known.items()}
+        inner = {name: each for name, each in kinds.items() if each is not None}
+        plain = {name: field for name, field in known.items() if name not in inner}
+        arguments = self._converter.arguments(plain, value, faults)
+        for name in (name for name in inner if name in value):
+            alone = value[name] if isinstance(value[name], Mapping) else {"type": value[name]}
+            if (part := self._component((*key, name), inner[name], alone)) is not None:
+                arguments[name] = part.component
         try:  # without faulty options, for the checks of the others
             return descriptor.options(**arguments)
         except (ValueError, TypeError) as error:
@@ -295,7 +304,7 @@ class SectionParser:
                 faults.add((), error_message(error))
             return None
 
-    def _named[C: schema.NamedComponentConfig](self, section: str, kind: type[C]) -> dict[str, ParsedComponent[C]]:
+    def _named[C: NamedComponentConfig](self, section: str, kind: type[C]) -> dict[str, ParsedComponent[C]]:
         found = {}
         for name in self.document.names(section):
             self._check_name((section, name), name)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from ibrobot_core.clock import Clock
+from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.schema import ComponentConfig
 from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.errors import ConfigError, Problem

@@ -475,7 +475,7 @@ class ControlCore:
         """Set up the scene again, which clears faults; not an emergency stop, since only a person may do so.
 
         Returns:
-            `begun`: whether it was set up; false if an emergency stop is latched.
+            `begun`: whether it was set up; false if an emergency stop is latched. `factors`: what it has drawn.
         """
         self.take_stops()
         if self._safety.estopped:
@@ -484,7 +484,7 @@ class ControlCore:
         self._hardware.reset_episode(EpisodeSetup(seed))
         self._hardware.reset_faults()
         self._begin_again(self._readings.first())
-        return {"begun": True}
+        return {"begun": True, "factors": self._hardware.factors}
 
     def emergency_stop(self) -> None:
         """Brake and hold, whatever the robot does; a load that was to be shed is given its time again."""

@@ -193,6 +193,11 @@ class HardwareGroup:
         for part in self._simulated:
             part.reset(episode)
 
+    @property
+    def factors(self) -> dict[str, float]:
+        """What the present episode of the simulated parts has drawn."""
+        return {name: value for part in self._simulated for name, value in part.factors.items()}
+
     def success(self) -> bool | None:
         """Whether the scene's task is done; None if it has no task."""
         return self._simulated[0].success() if self._simulated else None

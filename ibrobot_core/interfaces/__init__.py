@@ -41,6 +41,7 @@ from ibrobot_core.interfaces.reader import (
     find_episode,
 )
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
+from ibrobot_core.interfaces.scene import Scene
 from ibrobot_core.interfaces.sensor import Sensor
 from ibrobot_core.interfaces.teleop import OperatorEvent, Teleop, TeleopCommand, begin_operation, operate
 from ibrobot_core.interfaces.transport import Handler, Payload, Transport

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from enum import Enum, StrEnum
+from types import MappingProxyType
 from typing import Literal
 
 import attrs
@@ -214,6 +215,9 @@ class EpisodeSetup:
 
 class SimulatedHardware(Hardware):
     """Hardware with simulated time: the loop advances it by exactly one period per tick."""
+
+    factors: Mapping[str, float] = MappingProxyType({})
+    """What the present episode has drawn, e.g. the cube's position or the light; see `Scene.factors`."""
 
     @abstractmethod
     def advance(self, step_ns: int) -> None:

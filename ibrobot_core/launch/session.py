@@ -15,8 +15,9 @@ import numpy as np
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock, RealClock, SteppedClock
 from ibrobot_core.component import Worker, error_line
+from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.schema import ComponentConfig, ControlMode
+from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed, MissingDependency
 from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent, Teleop
@@ -167,6 +168,7 @@ class Session:
         on_state: called with each state before its messages are published, in the thread that receives states.
         mode: name of the active control mode.
         generation: counts mode switches and resets; plans of an earlier generation are ignored.
+        factors: what the present episode of a simulation has drawn; see `Scene.factors`.
         plan: the newest plan that control was sent; None before the first.
         acting: the policy that moves the robot; None in a mode without inference.
         sensors: sensor -> its measurements, for sensors that have published messages.
@@ -199,6 +201,7 @@ class Session:
         self.outcome = Outcome()
         self.mode = config.default_control_mode
         self.generation = 0
+        self.factors: Mapping[str, float] = {}
         self.command_source = CommandSource()
         self.episodes = Episodes(self)
         self.devices = SharedDevices()
@@ -340,6 +343,7 @@ class Session:
         with self._commanding:  # keep the generation of the last command
             answer = self.control.call(do, **arguments)
             self.generation = int(answer["generation"])
+            self.factors = answer.get("factors", self.factors)
             return answer
 
     def begin_source(self) -> None:

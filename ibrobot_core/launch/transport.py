@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import override
 
 from ibrobot_core.component import Component
-from ibrobot_core.config.schema import ComponentConfig as Section
+from ibrobot_core.component_config import ComponentConfig as Section
 from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.interfaces import Transport
 from ibrobot_core.launch.session import Session

@@ -328,10 +328,7 @@ CASES = {
     "recording_dataset_outside": (
         "recording: {type: log}",
         "recording: {type: log, dataset: ../pick}",
-        (
-            "robot.yaml:40: recording.dataset: '../pick' is not below recording.root; give a folder's name, "
-            "e.g. pick_cube"
-        ),
+        ("robot.yaml:40: recording.dataset: '../pick' is not below recording.root; give a folder's name, e.g. picks"),
     ),
 }
 

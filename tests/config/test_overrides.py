@@ -69,7 +69,7 @@ def test_mode_overrides_the_default(load_text: Load, base: str) -> None:
         ("peripherals.tpo.fps=15", "peripherals.tpo: the list has no such item, did you mean 'top'?"),
         ("peripherals.9.fps=15", "peripherals.9: the list has no such item; items: top, chest"),
         ("contract.actions.7.topic=/x", "contract.actions.7: the list has no such item; items: 0, 1"),
-        ("robot.name.x=1", "robot.name.x: 'mini' has no keys"),
+        ("robot.name.x=1", "robot.name: expected text, got a mapping"),
         ("control.stop=[hold", "control.stop: not valid YAML: expected ',' or ']', but got '<stream end>'"),
         ("control={rate_hz: 50, rate_hz: 60}", "control.rate_hz: repeated key, first given in line 1"),
         ("hardware={type: bus, prot: a, port: b}", "hardware.prot: unknown key, did you mean 'port'?"),

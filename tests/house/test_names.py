@@ -12,6 +12,7 @@ from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, example_type, official
 
 CORE = OFFICIAL.parent
 ORDINARY = {"gripper", "imu", "joint", "keyboard", "process", "trajectory", "twist"}
+ORDINARY |= {"drawer", "empty", "handover", "push", "sort", "stack"}
 """Types that are words of the language too: they count where a YAML would name them, as in `type: WORD`."""
 ALLOWED = {("config/models.py", 'read_xml(path, "mujoco")')}
 """File and text: the root element of MJCF files."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import override
 
-from ibrobot_core.config.schema import ComponentConfig
+from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.interfaces import Viewer
 from ibrobot_core.launch.session import SessionWorker
 from ibrobot_core.launch.views import RunView

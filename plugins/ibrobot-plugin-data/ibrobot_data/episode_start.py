@@ -46,7 +46,7 @@ def take_next_folder(recording: RecordingConfig) -> Ownership:
 def episode_start(
     config: RobotConfig, recording: RecordingConfig, topics: Mapping[str, str], directory: Path, *, mode: str,
     seed: int, stamp_ns: int, lockstep: bool, prompt: str = "", plugins: Mapping[str, str] | None = None,
-    policy: Mapping[str, str] | None = None,
+    policy: Mapping[str, str] | None = None, factors: Mapping[str, float] | None = None,
 ) -> EpisodeStart:  # fmt: skip
     """The start of an episode.
 
@@ -64,6 +64,7 @@ def episode_start(
         prompt: the operator's description of the task.
         plugins: package -> version of the plugins.
         policy: the acting policy and its weights; None without a policy.
+        factors: what the simulated episode has drawn, e.g. the position of a cube; None or empty otherwise.
 
     Raises:
         RecorderError: if the dataset has another contract.
@@ -79,6 +80,8 @@ def episode_start(
     }  # fmt: skip
     if policy is not None:
         metadata["policy"] = json.dumps(dict(policy))
+    if factors:
+        metadata["factors"] = json.dumps(dict(factors))
     metadata["uuid"] = str(uuid5(NAMESPACE_OID, json.dumps(metadata)) if lockstep else uuid4())
     if recording.topics == "contract":
         kept = {**contract.topics, **({COMMANDER: String.ros_type} if COMMANDER in topics else {})}

@@ -1,4 +1,4 @@
-"""The SO-101 in MuJoCo: hardware, cameras, scenes, a scripted pick policy and a viewer for ibrobot."""
+"""The SO-101 in MuJoCo: hardware, cameras, scenes with scripted experts, and a viewer for ibrobot."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from ibrobot_core.api import (
     DecoderDescriptor,
     HardwareDescriptor,
     PolicyDescriptor,
+    SceneDescriptor,
     SensorDescriptor,
     ViewerDescriptor,
     hookimpl,
 )
+from ibrobot_mujoco.experts import EXPERTS
 from ibrobot_mujoco.gl import check_asked, choose
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions, check_world, picture_size
-from ibrobot_mujoco.policy_options import ScriptedPickOptions, check_pick
+from ibrobot_mujoco.scenes import SCENES
 
 if TYPE_CHECKING:
     from ibrobot_core.api import (
@@ -23,7 +25,6 @@ if TYPE_CHECKING:
         Context,
         Hardware,
         Image,
-        Policy,
         Robot,
         SceneObject,
         Sensor,
@@ -40,7 +41,7 @@ def _hardware(options: Any, ctx: Context) -> Hardware:
 
 def _scene(options: Any, robot: Robot) -> Sequence[SceneObject]:
     check_asked()
-    from ibrobot_mujoco.scene import scene_objects
+    from ibrobot_mujoco.scene_objects import scene_objects
 
     return scene_objects(options, robot)
 
@@ -54,13 +55,6 @@ def _camera(options: Any, ctx: Context) -> Sensor:
 
 def _can_render() -> None:
     choose()
-
-
-def _scripted_pick(options: Any, ctx: Context) -> Policy:
-    check_asked()
-    from ibrobot_mujoco.scripted_pick import ScriptedPick
-
-    return ScriptedPick(options, ctx)
 
 
 def _viewer(options: Any, ctx: Context) -> Viewer:
@@ -77,8 +71,14 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
         type="mujoco", options=MujocoOptions, make=_hardware, default=True, simulated=True,
         sensors={"camera": "mujoco"}, check_options=check_world, scene=_scene,
         film={"type": "mujoco", "camera": "front", "width": 320, "height": 240, "fps": 10},
-        summary="the robot's MJCF in MuJoCo, on an empty table or with a cube and a bin",
+        summary="the robot's MJCF in MuJoCo, with the objects of a scene",
     )  # fmt: skip
+
+
+@hookimpl
+def ibrobot_scenes() -> Iterable[SceneDescriptor]:
+    """Objects around the robot, and tasks."""
+    yield from SCENES.values()
 
 
 @hookimpl
@@ -92,14 +92,8 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
 
 @hookimpl
 def ibrobot_policies() -> Iterable[PolicyDescriptor]:
-    """A scripted expert."""
-    yield PolicyDescriptor(
-        type="scripted_pick",
-        options=ScriptedPickOptions,
-        make=_scripted_pick,
-        check_options=check_pick,
-        summary="picks the cube and puts it into the bin, by inverse kinematics and the scene's ground truth",
-    )
+    """Scripted experts."""
+    yield from EXPERTS
 
 
 def _decoder() -> Callable[[CompressedImage], Image | None]:

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import CameraInfo, CompressedImage, Context, Header, Image, Message, Sensor, SensorError, ns
 from ibrobot_core.app import Subscription
-from ibrobot_mujoco.model import build_model
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.render import Renderer
-from ibrobot_mujoco.state import PHYSICS_TOPIC, newest, pose_scene, stamp_of
+from ibrobot_mujoco.state import PHYSICS_TOPIC, DrawnWorld, newest, stamp_of
 
 # One second of states at 100 Hz; states that arrive during rendering are skipped, not lost from the queue.
 _QUEUE = 100
@@ -45,8 +44,8 @@ class MujocoCamera(Sensor):
         simulation, bus = self._ctx.simulation, self._ctx.bus
         if not isinstance(simulation, MujocoOptions) or bus is None:
             raise SensorError(f"camera {self._ctx.name!r}: type mujoco needs a running simulation: {{type: mujoco}}")
-        self._model = build_model(simulation, self._ctx.robot, visual=True)
-        self._drawn = mujoco.MjData(self._model)
+        self._drawn = DrawnWorld.of(simulation, self._ctx.robot)
+        self._model = self._drawn.model
         camera = self._find_camera()
         self._fovy = math.radians(self._model.cam_fovy[camera])
         size = self._options.width, self._options.height
@@ -77,10 +76,10 @@ class MujocoCamera(Sensor):
                 return None
             stamp_ns = stamp_of(state)
             if self._is_due(stamp_ns):
-                pose_scene(self._model, self._drawn, state)
+                self._drawn.follow(state)
                 if self._is_depth:
-                    return self._depth_image(stamp_ns, self._renderer.render_depth(self._drawn))
-                return self._image(stamp_ns, self._renderer.render(self._drawn))
+                    return self._depth_image(stamp_ns, self._renderer.render_depth(self._drawn.data))
+                return self._image(stamp_ns, self._renderer.render(self._drawn.data))
             if timeout_s <= 0:
                 return None
 

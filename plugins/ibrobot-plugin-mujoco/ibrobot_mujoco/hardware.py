@@ -22,18 +22,9 @@ from ibrobot_core.api import (
     ns,
 )
 from ibrobot_mujoco.faults import Faults
-from ibrobot_mujoco.model import build_model
+from ibrobot_mujoco.model import build_world
 from ibrobot_mujoco.options import MujocoOptions
-from ibrobot_mujoco.pick_cube import PickCube
-from ibrobot_mujoco.state import (
-    OBJECTS_TOPIC,
-    PHYSICS_TOPIC,
-    POSE_SIZE,
-    SCENE_SIZE,
-    SCENE_TOPIC,
-    physics_size,
-    write_physics,
-)
+from ibrobot_mujoco.state import OBJECTS_TOPIC, PHYSICS_TOPIC, POSE_SIZE, SCENE_TOPIC, physics_size, write_physics
 
 _RELAXED = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
 
@@ -59,27 +50,28 @@ class MujocoHardware(SimulatedHardware):
         self.joints = ctx.joints
         self._options = options
         self._ctx = ctx
-        self._model = model = build_model(options, ctx.robot, visual=False)
+        self._built, self._scene = build_world(options, ctx.robot, visual=False)
+        self._model = model = self._built.model
         self._physics: mujoco.MjData | None = None
         self._qpos = _addresses(model, ctx.joints, model.jnt_qposadr)
         self._dofs = _addresses(model, ctx.joints, model.jnt_dofadr)
         self._servos = _servos(model, ctx.joints)
         self._start = _start_pose(options, ctx)
-        self._task = PickCube(options, model) if options.scene == "pick_cube" else None
         self._faults = Faults(options.faults, ctx.joints)
         self._latency_ns = ns(options.latency)
         self._timestep_ns = ns(options.timestep)
         self._stride = options.velocity_limit * options.timestep
-        physics = Signal(PHYSICS_TOPIC, physics_size(model), "stamp and state, for cameras and viewers")
-        scene = Signal(SCENE_TOPIC, SCENE_SIZE, "cube position, cube quaternion wxyz, bin centre [m, base frame]")
+        size, values = physics_size(self._built, self._scene), self._scene.values
+        physics = Signal(PHYSICS_TOPIC, size, "stamp, state and factors, for cameras and viewers")
+        scene = Signal(SCENE_TOPIC, len(values), f"{', '.join(values)} [m, base frame]")
         free = [name for name, thing in options.objects.items() if thing.mass is not None]
         self._objects = [int(model.joint(name).qposadr[0]) for name in free]
         objects = Signal(OBJECTS_TOPIC, POSE_SIZE * len(free), f"pose of each of {', '.join(free)}: position, wxyz")
-        self.signals = (physics, *([scene] if self._task is not None else ()), *([objects] if free else ()))
+        self.signals = (physics, *([scene] if values else ()), *([objects] if free else ()))
 
     @override
     def connect(self) -> None:
-        self._physics = mujoco.MjData(self._model)
+        self._physics = self._built.data
         self.reset(EpisodeSetup(self._ctx.seed))
 
     @override
@@ -95,9 +87,9 @@ class MujocoHardware(SimulatedHardware):
         physics.qpos[_addresses(model, every_joint, model.jnt_qposadr)] = self._start
         physics.ctrl[_servos(model, every_joint)] = self._start
         rng = np.random.default_rng(episode.seed)
-        if self._task is not None:
-            self._task.place(physics, rng)
         self._noise = rng.spawn(1)[0]
+        self._drawn = self._scene.begin(self._built, rng)
+        self.factors = dict(zip(self._scene.factors, self._drawn.tolist(), strict=True))
         mujoco.mj_forward(model, physics)
         self._faults.restart()
         self._now_ns = self._stepped_ns = 0
@@ -191,8 +183,8 @@ class MujocoHardware(SimulatedHardware):
 
     @override
     def success(self) -> bool | None:
-        physics = self._connected()
-        return None if self._task is None else self._task.success(physics)
+        self._connected()
+        return self._scene.success(self._built)
 
     @override
     def read_signal(self, index: int, out: Vector) -> None:
@@ -201,9 +193,9 @@ class MujocoHardware(SimulatedHardware):
             raise HardwareError(f"no signal {index}, there are {len(self.signals)}")
         topic = self.signals[index].topic
         if topic == PHYSICS_TOPIC:
-            write_physics(self._model, physics, self._stamp_ns, out)
-        elif topic == SCENE_TOPIC and self._task is not None:
-            self._task.observe(physics, out)
+            write_physics(self._built, self._drawn, self._stamp_ns, out)
+        elif topic == SCENE_TOPIC:
+            self._scene.observe(self._built, out)
         else:
             for number, address in enumerate(self._objects):
                 first = POSE_SIZE * number

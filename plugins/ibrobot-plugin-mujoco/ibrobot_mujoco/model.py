@@ -1,4 +1,4 @@
-"""The scene as a MuJoCo model: the robot's MJCF, a table, added objects, and for `pick_cube` a cube and a bin.
+"""The scene as a MuJoCo model: the robot's MJCF, a table, the objects of the scene, and further ones.
 
 The physics model has no visual meshes, the visual model has low-poly ones; both have the same layout of qpos and qvel.
 """
@@ -14,21 +14,12 @@ import numpy as np
 from ibrobot_kinematics.rotations import quaternion
 from numpy.typing import NDArray
 
-from ibrobot_core.api import NS_PER_S, HardwareError, Robot, ns
+from ibrobot_core.api import NS_PER_S, HardwareError, Robot, Scene, ns
 from ibrobot_mujoco.lowpoly import GRID_M, low_poly
 from ibrobot_mujoco.options import MujocoOptions, SceneCamera, SceneThing
-
-CUBE = "cube"
-"""Name of the cube's body, free joint and geom."""
-TABLE = "table"
-BIN = "bin"
-"""Name of the bin's body; its frame is at the middle of the bin's floor, on the table."""
-BIN_INNER = 0.11
-"""Inner edge of the square bin [m]."""
-BIN_HEIGHT = 0.05
-"""Height of the bin's rim above the table [m]."""
-BIN_WALL = 0.004
-CUBE_DENSITY = 1000.0
+from ibrobot_mujoco.scenes.solids import FRICTION
+from ibrobot_mujoco.scenes.table import TABLE
+from ibrobot_mujoco.world import World
 
 CAMERAS = (
     SceneCamera(name="top", pos=(0.16, 0.04, 0.80), lookat=(0.16, 0.04, 0.0), fovy=42.0),
@@ -41,13 +32,16 @@ _Box = mujoco.mjtGeom.mjGEOM_BOX
 _SHAPES = {"box": _Box, "sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER}
 
 
-def build_model(options: MujocoOptions, robot: Robot, *, visual: bool) -> mujoco.MjModel:
-    """The compiled scene: for rendering if `visual`, otherwise for physics.
+type AnyScene = Scene[mujoco.MjSpec, World]
+
+
+def build_world(options: MujocoOptions, robot: Robot, *, visual: bool) -> tuple[World, AnyScene]:
+    """The compiled world, for rendering if `visual`, otherwise for physics; and its scene.
 
     Raises:
         HardwareError: e.g. if there is no MJCF, or it has no position actuator for a joint.
     """
-    spec = build_spec(options, robot)
+    spec, scene = build_spec(options, robot)
     if visual:
         # Multisampling doubles the time of a software renderer.
         spec.visual.quality.offsamples = 0
@@ -56,13 +50,18 @@ def build_model(options: MujocoOptions, robot: Robot, *, visual: bool) -> mujoco
     else:
         _strip(spec)
     try:
-        return spec.compile()
+        return World.of(spec.compile()), scene
     except ValueError as error:
         raise HardwareError(f"{robot.description.mjcf} does not compile: {error}") from error
 
 
-def build_spec(options: MujocoOptions, robot: Robot) -> mujoco.MjSpec:
-    """The editable scene, with the MJCF's full meshes.
+def build_model(options: MujocoOptions, robot: Robot, *, visual: bool) -> mujoco.MjModel:
+    """The model of `build_world`."""
+    return build_world(options, robot, visual=visual)[0].model
+
+
+def build_spec(options: MujocoOptions, robot: Robot) -> tuple[mujoco.MjSpec, AnyScene]:
+    """The editable model, with the MJCF's full meshes, and the scene that it has.
 
     Raises:
         HardwareError: e.g. if there is no MJCF, or it has no position actuator for a joint.
@@ -78,9 +77,8 @@ def build_spec(options: MujocoOptions, robot: Robot) -> mujoco.MjSpec:
     spec.option.impratio = 10
     _tune_servos(spec, options, robot)
     _add_surroundings(spec)
-    if options.scene == "pick_cube":
-        _add_cube(spec, options.cube_size)
-        _add_bin(spec, options.bin_position)
+    scene: AnyScene = options.scene.make(robot)
+    scene.build(spec)
     for name, thing in options.objects.items():
         _add_thing(spec, name, thing)
     present = {camera.name for camera in spec.cameras}
@@ -89,7 +87,7 @@ def build_spec(options: MujocoOptions, robot: Robot) -> mujoco.MjSpec:
             _add_camera(spec, camera)
     for camera in options.cameras:
         _add_camera(spec, camera)
-    return spec
+    return spec, scene
 
 
 def _load(path: Path) -> mujoco.MjSpec:
@@ -167,32 +165,8 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
         pos=[0.15, 0, 0],
         size=[0.6, 0.6, 0.05],
         rgba=[0.72, 0.70, 0.66, 1],
-        friction=[1, 0.005, 0.0001],
+        friction=FRICTION,
     )
-
-
-def _add_cube(spec: mujoco.MjSpec, size: float) -> None:
-    body = spec.worldbody.add_body(name=CUBE, pos=[0.24, 0, size / 2])
-    body.add_freejoint(name=CUBE)
-    body.add_geom(
-        name=CUBE, type=_Box, size=[size / 2] * 3, density=CUBE_DENSITY, condim=4, friction=[1, 0.005, 0.0001],
-        rgba=[0.85, 0.12, 0.1, 1],
-    )  # fmt: skip
-
-
-def _add_bin(spec: mujoco.MjSpec, position: tuple[float, float]) -> None:
-    body = spec.worldbody.add_body(name=BIN, pos=[*position, 0])
-    inner, wall, rim = BIN_INNER / 2, BIN_WALL / 2, BIN_HEIGHT / 2
-    outer, middle = inner + BIN_WALL, inner + wall
-    boxes = {
-        "floor": ([0, 0, wall], [outer, outer, wall]),
-        "left": ([0, middle, rim], [outer, wall, rim]),
-        "right": ([0, -middle, rim], [outer, wall, rim]),
-        "front": ([middle, 0, rim], [wall, inner, rim]),
-        "back": ([-middle, 0, rim], [wall, inner, rim]),
-    }
-    for name, (pos, size) in boxes.items():
-        body.add_geom(name=f"{BIN}_{name}", type=_Box, pos=pos, size=size, rgba=[0.16, 0.36, 0.62, 1])
 
 
 def _add_thing(spec: mujoco.MjSpec, name: str, thing: SceneThing) -> None:
@@ -208,7 +182,7 @@ def _add_thing(spec: mujoco.MjSpec, name: str, thing: SceneThing) -> None:
         type=_SHAPES[thing.shape],
         size=sizes,
         mass=thing.mass or 1.0,
-        friction=[1, 0.005, 0.0001],
+        friction=FRICTION,
         rgba=[0.35, 0.55, 0.35, 1],
     )
 

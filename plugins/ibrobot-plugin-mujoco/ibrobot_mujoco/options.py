@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import attrs
 
-from ibrobot_core.api import OptionFault, did_you_mean, documented, option
+from ibrobot_core.api import OptionFault, SceneConfig, did_you_mean, documented, option
+from ibrobot_mujoco.scenes import scene
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
 
 Vec3 = tuple[float, float, float]
-Range = tuple[float, float]
-
-
-def _ordered(instance: Any, attribute: attrs.Attribute[Any], value: Range) -> None:
-    if not value[0] <= value[1]:
-        raise ValueError(f"[{value[0]}, {value[1]}] is not a valid range: the first value must not exceed the second")
 
 
 @documented
@@ -85,7 +80,7 @@ class SceneThing:
 class MujocoOptions:
     """Options of the simulation. Servo values of None use those of the MJCF."""
 
-    scene: str = option("pick_cube", choices=("empty", "pick_cube"), help="objects on the table")
+    scene: SceneConfig = option(factory=scene, help="type of scene, or a mapping with type and its options")
     timestep: float = option(0.002, unit="s", ge=1e-4, le=0.02, help="step of the physics")
     start_pose: str = option("rest", help="named pose of the robot at the beginning of an episode")
 
@@ -101,13 +96,6 @@ class MujocoOptions:
     noise: float = option(0.0, unit="rad", ge=0, help="standard deviation of the measured positions")
     faults: tuple[Fault, ...] = option((), help="faults to inject")
 
-    cube_size: float = option(0.025, unit="m", gt=0, le=0.1, help="edge of the cube")
-    cube_distance: Range = option(
-        (0.20, 0.27), unit="m", validator=_ordered, help="distance of the cube from the base's origin"
-    )
-    cube_bearing: Range = option((-0.7, 0.5), unit="rad", validator=_ordered, help="direction of the cube; 0 is ahead")
-    cube_yaw: Range = option((-3.14159, 3.14159), unit="rad", validator=_ordered, help="cube's rotation")
-    bin_position: Range = option((0.10, 0.24), unit="m", help="x and y of the bin's centre")
     objects: Mapping[str, SceneThing] = option(factory=dict, help="further objects, e.g. obstacles, by name")
     cameras: tuple[SceneCamera, ...] = option((), help="cameras in addition to `top`, `front` and those of the MJCF")
 

@@ -6,13 +6,10 @@ import threading
 import warnings
 from typing import Any, override
 
-import mujoco
-
 from ibrobot_core.api import Context, IbrobotError, Viewer
 from ibrobot_core.app import Subscription
-from ibrobot_mujoco.model import build_model
 from ibrobot_mujoco.options import MujocoOptions
-from ibrobot_mujoco.state import PHYSICS_TOPIC, newest, pose_scene
+from ibrobot_mujoco.state import PHYSICS_TOPIC, DrawnWorld, newest
 
 _QUEUE = 100
 _CLOSING_S = 5.0
@@ -41,10 +38,9 @@ class MujocoViewer(Viewer):
             if not glfw.init():
                 why = "; ".join(str(reason.message) for reason in reasons)
                 raise IbrobotError(f"no display for the viewer's window, see DISPLAY and WAYLAND_DISPLAY: {why}")
-        self._model = build_model(simulation, self._ctx.robot, visual=True)
-        self._drawn = mujoco.MjData(self._model)
+        self._drawn = drawn = DrawnWorld.of(simulation, self._ctx.robot)
         others = set(threading.enumerate())
-        self._window = viewer.launch_passive(self._model, self._drawn, show_left_ui=False, show_right_ui=False)
+        self._window = viewer.launch_passive(drawn.model, drawn.data, show_left_ui=False, show_right_ui=False)
         self._threads = [t for t in threading.enumerate() if t not in others and "_launch_internal" in t.name]
         with self._window.lock():
             self._window.cam.lookat[:] = 0.16, 0.05, 0.08
@@ -58,7 +54,7 @@ class MujocoViewer(Viewer):
         state = newest(self._states)
         if state is not None:
             with self._window.lock():
-                pose_scene(self._model, self._drawn, state)
+                self._drawn.follow(state)
             self._window.sync()
         return True
 

@@ -8,13 +8,15 @@ from time import perf_counter
 import attrs
 import mujoco
 import numpy as np
+from ibrobot_mujoco.experts import EXPERTS
+from ibrobot_mujoco.experts.expert import SCENE, STATE
+from ibrobot_mujoco.experts.options import ExpertOptions
 from ibrobot_mujoco.hardware import MujocoHardware
-from ibrobot_mujoco.model import BIN, CUBE, TABLE, build_model
 from ibrobot_mujoco.options import MujocoOptions
-from ibrobot_mujoco.policy_options import ScriptedPickOptions
-from ibrobot_mujoco.scripted_pick import SCENE, STATE, ScriptedPick
+from ibrobot_mujoco.scenes.pick_cube import BIN, CUBE
+from ibrobot_mujoco.scenes.table import TABLE
 from ibrobot_mujoco.so101 import so101
-from ibrobot_mujoco.state import PHYSICS_TOPIC, SCENE_TOPIC, pose_scene
+from ibrobot_mujoco.state import PHYSICS_TOPIC, SCENE_TOPIC, DrawnWorld
 
 from ibrobot_core.api import NS_PER_S, Context, EpisodeSetup, Executor, Frame, Plan, SteppedClock, Vector, seconds
 from ibrobot_core.app import installed_plugins
@@ -48,16 +50,15 @@ class Outcome:
 class PickLoop:
     """One robot in one scene, for any number of episodes."""
 
-    def __init__(self, simulation: MujocoOptions | None = None, options: ScriptedPickOptions | None = None) -> None:
+    def __init__(self, simulation: MujocoOptions | None = None, options: ExpertOptions | None = None) -> None:
         simulation, robot = simulation or MujocoOptions(), so101()
         self.clock = SteppedClock(NS_PER_S)
         self.ctx = Context("loop", self.clock, logging.getLogger("ibrobot.test"), robot, robot.joint_names, PERIOD_NS)
         self.hardware = MujocoHardware(simulation, self.ctx)
         self.hardware.connect()
-        self.policy = ScriptedPick(options or ScriptedPickOptions(), self.ctx)
+        self.policy = EXPERTS[0].make(options or ExpertOptions(), self.ctx)
         self.policy.load()
-        self._watched = build_model(simulation, robot, visual=False)
-        self._watch = mujoco.MjData(self._watched)
+        self._watch = DrawnWorld.of(simulation, robot, visual=False)
 
     def run(self, seed: int, duration_s: float = 6.5) -> Outcome:
         """One episode."""
@@ -114,10 +115,10 @@ class PickLoop:
 
     def _look(self, outcome: Outcome) -> None:
         """Note where the robot touches table or bin."""
-        model = self._watched
-        pose_scene(model, self._watch, self._signal(PHYSICS_TOPIC))
-        mujoco.mj_collision(model, self._watch)
-        for pair in self._watch.contact.geom:
+        model, data = self._watch.model, self._watch.data
+        self._watch.follow(self._signal(PHYSICS_TOPIC))
+        mujoco.mj_collision(model, data)
+        for pair in data.contact.geom:
             bodies = [model.body(model.geom_bodyid[geom]).name for geom in pair]
             names = [model.geom(int(geom)).name for geom in pair]
             for mine, other in ((0, 1), (1, 0)):

@@ -12,13 +12,14 @@ from ibrobot_kinematics import robot_model
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.model import build_model
 from ibrobot_mujoco.options import MujocoOptions
+from ibrobot_mujoco.scenes import scene
 from ibrobot_mujoco.so101 import so101
 from ibrobot_testing import control_context
 
 from ibrobot_core.api import Robot, SteppedClock
 
 PLACES = {"left_": (0.0, 0.2, 0.0, 0.0), "right_": (0.05, -0.2, 0.01, -math.pi / 2)}
-OPTIONS = MujocoOptions(scene="pick_cube", cube_distance=(0.22, 0.3), bin_position=(0.12, 0.0))
+OPTIONS = MujocoOptions(scene=scene("pick_cube", cube_distance=(0.22, 0.3), bin_position=(0.12, 0.0)))
 PERIOD_NS = 10_000_000
 
 
@@ -34,8 +35,8 @@ def two_arms() -> Robot:
 
 @pytest.mark.parametrize("visual", [False, True])
 def test_every_arm_has_the_model_of_one(visual: bool) -> None:
-    alone = build_model(MujocoOptions(scene="empty"), so101(), visual=visual)
-    model = build_model(attrs.evolve(OPTIONS, scene="empty"), two_arms(), visual=visual)
+    alone = build_model(MujocoOptions(scene=scene("empty")), so101(), visual=visual)
+    model = build_model(attrs.evolve(OPTIONS, scene=scene("empty")), two_arms(), visual=visual)
     assert model.nq == 2 * alone.nq
     for prefix in PLACES:
         for name in so101().joint_names:

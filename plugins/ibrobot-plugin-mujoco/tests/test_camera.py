@@ -15,7 +15,8 @@ from ibrobot_mujoco.model import build_spec
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.render import Renderer
 from ibrobot_mujoco.so101 import so101
-from ibrobot_mujoco.state import PHYSICS_TOPIC, pose_scene
+from ibrobot_mujoco.state import PHYSICS_TOPIC, DrawnWorld
+from ibrobot_mujoco.world import World
 from ibrobot_ros2.jpeg import to_jpeg
 from ibrobot_testing import SensorSuite, control_context, host_context
 
@@ -228,16 +229,14 @@ def test_low_poly_looks_like_the_full_meshes(ctx: Context) -> None:
     finally:
         camera.close()
     assert isinstance(image, Image)
-    spec = build_spec(OPTIONS, ROBOT)
+    spec, made = build_spec(OPTIONS, ROBOT)
     spec.visual.quality.offsamples = 0
     full = spec.compile()
-    import mujoco
-
-    drawn = mujoco.MjData(full)
-    pose_scene(full, drawn, STATE)
+    drawn = DrawnWorld(World.of(full), made)
+    drawn.follow(STATE)
     renderer = Renderer(full, full.camera("top").id, 64, 48, shadows=False)
     try:
-        expected = renderer.render(drawn).astype(int)
+        expected = renderer.render(drawn.data).astype(int)
     finally:
         renderer.close()
     low_poly = image.data.reshape(48, 64, 3).astype(int)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.options import Fault, MujocoOptions
+from ibrobot_mujoco.scenes import scene
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import stamp_of
 from ibrobot_testing import SimulatedHardwareSuite, control_context
@@ -41,7 +42,7 @@ class TestConformance(SimulatedHardwareSuite):
 class TestConformanceWithLatency(TestConformance):
     @override
     def make(self, ctx: Context) -> MujocoHardware:
-        return MujocoHardware(MujocoOptions(latency=0.02, scene="empty"), ctx)
+        return MujocoHardware(MujocoOptions(latency=0.02, scene=scene("empty")), ctx)
 
 
 class TestConformanceOfSomeJoints(TestConformance):
@@ -161,7 +162,7 @@ def test_speed_stays_within_its_limit() -> None:
 
 
 def test_relaxed_arm_falls_until_the_next_command() -> None:
-    rig = connected(MujocoOptions(scene="empty", start_pose="home"))
+    rig = connected(MujocoOptions(scene=scene("empty"), start_pose="home"))
     rig.hardware.relax()
     fallen = rig.run(1.0)
     np.testing.assert_array_equal(fallen[-1].effort, 0)
@@ -261,17 +262,17 @@ def test_physics_signal_carries_the_stamp_of_the_reading() -> None:
 
 
 def test_the_empty_scene_has_no_task() -> None:
-    hardware = connected(MujocoOptions(scene="empty")).hardware
+    hardware = connected(MujocoOptions(scene=scene("empty"))).hardware
     assert [signal.topic for signal in hardware.signals] == ["/simulation/physics"]
     assert hardware.success() is None
 
 
 def test_ground_truth_names_cube_and_bin() -> None:
-    rig = connected(MujocoOptions(bin_position=(0.12, 0.22)))
-    scene = rig.signal(1)
-    assert 0.20 <= np.linalg.norm(scene[:2]) <= 0.27
-    assert np.linalg.norm(scene[3:7]) == pytest.approx(1)
-    np.testing.assert_allclose(scene[7:], [0.12, 0.22, 0.025])
+    rig = connected(MujocoOptions(scene=scene(bin_position=(0.12, 0.22))))
+    truth = rig.signal(1)
+    assert 0.20 <= np.linalg.norm(truth[:2]) <= 0.27
+    assert np.linalg.norm(truth[3:7]) == pytest.approx(1)
+    np.testing.assert_allclose(truth[7:], [0.12, 0.22, 0.025])
 
 
 def test_seed_of_the_context_sets_the_first_scene() -> None:

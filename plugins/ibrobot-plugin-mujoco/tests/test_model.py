@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from ibrobot_kinematics.meshes import cluster
 from ibrobot_mujoco.lowpoly import read_stl
-from ibrobot_mujoco.model import build_model
+from ibrobot_mujoco.model import build_model, build_world
 from ibrobot_mujoco.options import MujocoOptions, SceneCamera
+from ibrobot_mujoco.scenes import SCENES, scene
 from ibrobot_mujoco.so101 import so101
-from ibrobot_mujoco.state import physics_size, pose_scene, stamp_of, write_physics
+from ibrobot_mujoco.state import DrawnWorld, physics_size, stamp_of, write_physics
 
 from ibrobot_core.api import Description, HardwareError, Joint, Robot, SensorError
 
@@ -33,9 +34,9 @@ def other_robot(tmp_path: Path, actuators: str) -> Robot:
     return Robot("other", (joint,), description=Description(mjcf=path))
 
 
-@pytest.mark.parametrize("scene", ["empty", "pick_cube"])
-def test_visual_and_physics_model_have_one_layout(scene: str) -> None:
-    options = MujocoOptions(scene=scene)
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "handover"])
+def test_visual_and_physics_model_have_one_layout(name: str) -> None:
+    options = MujocoOptions(scene=scene(name))
     physics, visual = (build_model(options, ROBOT, visual=v) for v in (False, True))
     assert (physics.nq, physics.nv) == (visual.nq, visual.nv)
     names = [physics.joint(i).name for i in range(physics.njnt)]
@@ -45,30 +46,41 @@ def test_visual_and_physics_model_have_one_layout(scene: str) -> None:
 
 
 def test_state_travels_from_physics_to_picture() -> None:
-    physics, visual = (build_model(MujocoOptions(), ROBOT, visual=v) for v in (False, True))
-    moving, drawn = mujoco.MjData(physics), mujoco.MjData(visual)
-    moving.ctrl[:] = 0.3
-    mujoco.mj_step(physics, moving, 200)
-    vector = np.full(physics_size(physics), np.nan)
-    write_physics(physics, moving, STAMP_NS, vector)
-    pose_scene(visual, drawn, vector)
-    mujoco.mj_kinematics(physics, moving)
+    options = MujocoOptions(
+        scene=scene("stack", cube_size=(0.02, 0.03), cube_colour=(0, 1), light=0.5, camera_turn=0.1)
+    )
+    world, made = build_world(options, ROBOT, visual=False)
+    drawn = DrawnWorld.of(options, ROBOT)
+    factors = made.begin(world, np.random.default_rng(3))
+    world.data.ctrl[:] = 0.3
+    mujoco.mj_step(world.model, world.data, 200)
+    vector = np.full(physics_size(world, made), np.nan)
+    write_physics(world, factors, STAMP_NS, vector)
+    drawn.follow(vector)
+    mujoco.mj_kinematics(world.model, world.data)
     assert stamp_of(vector) == STAMP_NS
-    assert abs(moving.body("gripper").xpos - physics.body("gripper").pos).max() > 0.01
-    for body in ("gripper", "moving_jaw_so101_v1", "cube", "bin"):
-        np.testing.assert_array_equal(drawn.body(body).xpos, moving.body(body).xpos)
-        np.testing.assert_array_equal(drawn.body(body).xquat, moving.body(body).xquat)
+    assert abs(world.data.body("gripper").xpos - world.model.body("gripper").pos).max() > 0.01
+    for body in ("gripper", "moving_jaw_so101_v1", "cube", "base_cube"):
+        np.testing.assert_array_equal(drawn.data.body(body).xpos, world.data.body(body).xpos)
+        np.testing.assert_array_equal(drawn.data.body(body).xquat, world.data.body(body).xquat)
+    for name in ("cube", "base_cube"):
+        np.testing.assert_array_equal(drawn.model.geom(name).size, world.model.geom(name).size)
+        np.testing.assert_array_equal(drawn.model.geom(name).rgba, world.model.geom(name).rgba)
+    plain = build_model(MujocoOptions(scene=scene("stack")), ROBOT, visual=True)
+    np.testing.assert_allclose(drawn.model.light_diffuse, 0.5 * plain.light_diffuse)
+    assert abs(drawn.model.camera("top").quat - plain.camera("top").quat).max() > 0.01
+    assert not np.array_equal(drawn.model.geom("cube").size, plain.geom("cube").size)
 
 
 def test_state_of_another_scene_is_refused() -> None:
-    empty = build_model(MujocoOptions(scene="empty"), ROBOT, visual=False)
-    with pytest.raises(SensorError, match=r"/simulation/physics has 15 values, but this scene has 8"):
-        pose_scene(empty, mujoco.MjData(empty), np.zeros(15))
+    empty = DrawnWorld.of(MujocoOptions(scene=scene("empty")), ROBOT)
+    with pytest.raises(SensorError, match=r"/simulation/physics has 15 values, but this scene has 17"):
+        empty.follow(np.zeros(15))
 
 
 def test_physics_model_weighs_what_the_mjcf_says() -> None:
     whole = mujoco.MjModel.from_xml_path(str(ROBOT.description.mjcf))
-    stripped = build_model(MujocoOptions(scene="empty"), ROBOT, visual=False)
+    stripped = build_model(MujocoOptions(scene=scene("empty")), ROBOT, visual=False)
     np.testing.assert_array_equal(stripped.body_mass, whole.body_mass)
     np.testing.assert_array_equal(stripped.body_inertia, whole.body_inertia)
     assert stripped.nmeshface < whole.nmeshface / 10
@@ -119,7 +131,7 @@ def test_impossible_cameras_are_refused(camera: SceneCamera, message: str) -> No
 
 def test_another_robot_with_position_actuators_works(tmp_path: Path) -> None:
     robot = other_robot(tmp_path, '<position joint="slide" kp="10"/>')
-    assert build_model(MujocoOptions(scene="empty"), robot, visual=False).nu == 1
+    assert build_model(MujocoOptions(scene=scene("empty")), robot, visual=False).nu == 1
 
 
 @pytest.mark.parametrize("actuators", ["", '<motor joint="slide"/>'])

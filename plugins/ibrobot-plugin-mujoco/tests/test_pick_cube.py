@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ibrobot_mujoco.model import build_model
+from ibrobot_mujoco.model import build_world
 from ibrobot_mujoco.options import MujocoOptions
-from ibrobot_mujoco.pick_cube import CLEARANCE, PickCube
+from ibrobot_mujoco.scenes import scene
+from ibrobot_mujoco.scenes.options import PickCubeOptions
+from ibrobot_mujoco.scenes.table import CLEARANCE
 from ibrobot_mujoco.so101 import so101
 
 from ibrobot_core.api import HardwareError, Vector
@@ -23,11 +26,13 @@ REST = ROBOT.pose("rest")
 class Table:
     """The scene at rest, with the arm in its rest pose."""
 
-    def __init__(self, options: MujocoOptions) -> None:
-        self.model = build_model(options, ROBOT, visual=False)
-        self.physics = mujoco.MjData(self.model)
-        self.task = PickCube(options, self.model)
+    def __init__(self, **options: Any) -> None:
+        self.world, self.task = build_world(MujocoOptions(scene=scene(**options)), ROBOT, visual=False)
+        self.model, self.physics = self.world.model, self.world.data
         self.pose_arm(REST)
+
+    def place(self, rng: np.random.Generator) -> None:
+        self.task.begin(self.world, rng)
 
     def pose_arm(self, positions: Vector) -> None:
         self.physics.qpos[:6] = positions
@@ -39,23 +44,23 @@ class Table:
         mujoco.mj_forward(self.model, self.physics)
 
     def success(self) -> bool:
-        return self.task.success(self.physics)
+        return bool(self.task.success(self.world))
 
 
 @pytest.fixture(scope="module")
 def table() -> Table:
-    return Table(MujocoOptions())
+    return Table()
 
 
 @settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_cube_begins_within_its_ranges_and_clear_of_everything(table: Table, seed: int) -> None:
-    options = MujocoOptions()
-    table.task.place(table.physics, np.random.default_rng(seed))
+    options = PickCubeOptions()
+    table.place(np.random.default_rng(seed))
     x, y, z, w, *axis, last = table.physics.joint("cube").qpos
     assert options.cube_distance[0] <= math.hypot(x, y) <= options.cube_distance[1]
     assert options.cube_bearing[0] <= math.atan2(y, x) <= options.cube_bearing[1]
-    assert z == options.cube_size / 2
+    assert z == 0.0125
     assert axis == [0, 0]
     assert w**2 + last**2 == pytest.approx(1)
     assert max(abs(x - 0.10), abs(y - 0.24)) > 0.055 + CLEARANCE, "the cube is in the bin"
@@ -68,7 +73,7 @@ def test_poses_cover_their_ranges(table: Table) -> None:
     rng = np.random.default_rng(0)
     places = []
     for _ in range(200):
-        table.task.place(table.physics, rng)
+        table.place(rng)
         places.append(table.physics.joint("cube").qpos.copy())
     bearings = np.arctan2(*np.stack(places)[:, 1::-1].T)
     assert bearings.min() < -0.6
@@ -76,10 +81,10 @@ def test_poses_cover_their_ranges(table: Table) -> None:
 
 
 def test_cube_is_never_put_into_the_bin_or_under_the_arm() -> None:
-    everywhere = Table(MujocoOptions(cube_distance=(0.1, 0.35), cube_bearing=(-0.5, 1.5)))
+    everywhere = Table(cube_distance=(0.1, 0.35), cube_bearing=(-0.5, 1.5))
     rng = np.random.default_rng(0)
     for _ in range(100):
-        everywhere.task.place(everywhere.physics, rng)
+        everywhere.place(rng)
         x, y, _ = everywhere.physics.joint("cube").qpos[:3]
         assert max(abs(x - 0.10), abs(y - 0.24)) > 0.055 + CLEARANCE
         mujoco.mj_forward(everywhere.model, everywhere.physics)
@@ -88,9 +93,9 @@ def test_cube_is_never_put_into_the_bin_or_under_the_arm() -> None:
 
 
 def test_no_place_for_the_cube_is_an_error() -> None:
-    full = Table(MujocoOptions(cube_distance=(0.0, 0.01)))
+    full = Table(cube_distance=(0.0, 0.01))
     with pytest.raises(HardwareError, match=r"no place for the cube 0.03 m clear .* cube_distance \[0.0, 0.01\]"):
-        full.task.place(full.physics, np.random.default_rng(0))
+        full.place(np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(
@@ -116,7 +121,7 @@ def test_success_is_a_cube_lying_in_the_bin(
 
 def test_success_needs_the_gripper_to_let_go() -> None:
     # The bin stands under the resting arm, whose jaws reach into it.
-    table = Table(MujocoOptions(bin_position=(0.212, 0.0)))
+    table = Table(bin_position=(0.212, 0.0))
     tip = table.physics.site("gripperframe").xpos.copy()
     table.put_cube(*tip)
     assert not table.success()

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 from ibrobot_mujoco import gl
+from ibrobot_mujoco.experts.options import ExpertOptions
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.options import Fault, MujocoOptions, SceneCamera
-from ibrobot_mujoco.policy_options import ScriptedPickOptions
+from ibrobot_mujoco.scenes import scene
 from ibrobot_mujoco.so101 import MJCF, so101
 from ibrobot_testing import control_context
 
@@ -25,9 +26,9 @@ def test_importing_the_plugin_imports_nothing_heavy() -> None:
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("kind", ["hardware", "sensor", "policy", "viewer"])
+@pytest.mark.parametrize("kind", ["hardware", "scene", "sensor", "policy", "viewer"])
 def test_is_found_by_discovery(kind: str) -> None:
-    name = "scripted_pick" if kind == "policy" else "mujoco"
+    name = {"policy": "scripted_pick", "scene": "pick_cube"}.get(kind, "mujoco")
     assert installed_plugins().entries[kind, name].package == "ibrobot-plugin-mujoco"
 
 
@@ -53,9 +54,8 @@ def test_the_so101_of_scripts_is_that_of_the_robot_yaml() -> None:
         (lambda: Fault(at=1.0, kind="freeze_joint"), "a fault of kind freeze_joint needs joint"),
         (lambda: Fault(at=1.0, kind="silent", joint="gripper"), "a fault of kind silent takes no joint"),
         (lambda: Fault(at=1.0, kind="explode"), "'explode' is not one of: silent, freeze_joint, read_error"),
-        (lambda: MujocoOptions(scene="kitchen"), "'kitchen' is not one of: empty, pick_cube"),
         (
-            lambda: MujocoOptions(cube_distance=(0.3, 0.2)),
+            lambda: scene(cube_distance=(0.3, 0.2)),
             r"\[0.3, 0.2\] is not a valid range: the first value must not exceed",
         ),
         (lambda: MujocoOptions(timestep=1.0), "1.0 is too large, must be at most 0.02 s"),
@@ -132,7 +132,7 @@ class TestOpenGl:
         remedy = r"MUJOCO_GL=osmesa does not work on this machine \(or unset it\); sudo apt-get install libosmesa6"
         policy = installed_plugins().find("policy", "scripted_pick")
         with pytest.raises(MissingDependency, match=remedy):
-            policy.make(ScriptedPickOptions(), control_context("pick"))
+            policy.make(ExpertOptions(), control_context("pick"))
 
     def test_an_unknown_backend_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("MUJOCO_GL", "vulkan")

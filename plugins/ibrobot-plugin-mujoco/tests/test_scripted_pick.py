@@ -10,13 +10,14 @@ import mujoco
 import numpy as np
 import pytest
 from ibrobot_kinematics import robot_model
+from ibrobot_mujoco.experts import EXPERTS
+from ibrobot_mujoco.experts.expert import SCENE, STATE
+from ibrobot_mujoco.experts.options import ExpertOptions
 from ibrobot_mujoco.options import Fault, MujocoOptions
-from ibrobot_mujoco.policy_options import ScriptedPickOptions
-from ibrobot_mujoco.scripted_pick import SCENE, STATE, ScriptedPick
 from ibrobot_mujoco.so101 import so101
 from ibrobot_testing import PolicySuite, host_context
 
-from ibrobot_core.api import Context, Frame, PolicyError, Vector, ns, seconds
+from ibrobot_core.api import Context, Frame, Policy, PolicyError, Vector, ns, seconds
 
 from .pick_loop import PERIOD_NS, RATE_HZ, Outcome, PickLoop
 
@@ -25,19 +26,23 @@ CUBE = (0.24, 0.03, 0.0125)
 BIN = (0.10, 0.24, 0.025)
 
 
+def scripted_pick(ctx: Context) -> Policy:
+    return EXPERTS[0].make(ExpertOptions(), ctx)
+
+
 def frame(time_s: float, cube: tuple[float, float, float] = CUBE, state: Vector | None = None) -> Frame:
     scene = np.array([*cube, 1, 0, 0, 0, *BIN], dtype=np.float32)
     position = ROBOT.pose("rest") if state is None else state
     return Frame(ns(100 + time_s), {STATE: position.astype(np.float32), SCENE: scene})
 
 
-def chunk(policy: ScriptedPick, *args: object) -> Vector:
+def chunk(policy: Policy, *args: object) -> Vector:
     return policy.postprocess(policy.infer(policy.preprocess(frame(*args))))  # type: ignore[arg-type]
 
 
 @pytest.fixture
-def policy() -> ScriptedPick:
-    made = ScriptedPick(ScriptedPickOptions(), host_context(robot=ROBOT))
+def policy() -> Policy:
+    made = scripted_pick(host_context(robot=ROBOT))
     made.load()
     made.reset(0)
     return made
@@ -66,8 +71,8 @@ def assert_within_limits(outcome: Outcome) -> None:
 
 class TestConformance(PolicySuite):
     @override
-    def make(self, ctx: Context) -> ScriptedPick:
-        return ScriptedPick(ScriptedPickOptions(), ctx)
+    def make(self, ctx: Context) -> Policy:
+        return scripted_pick(ctx)
 
     @override
     def context(self) -> Context:
@@ -115,7 +120,7 @@ def test_equal_seeds_give_equal_commands(loop: PickLoop) -> None:
     np.testing.assert_array_equal(first.commands, again.commands)
 
 
-def test_rests_where_it_is_then_moves_and_ends_where_it_began(policy: ScriptedPick) -> None:
+def test_rests_where_it_is_then_moves_and_ends_where_it_began(policy: Policy) -> None:
     first = chunk(policy, 0.0)
     rest = ROBOT.pose("rest").astype(np.float32).astype(np.float64)
     np.testing.assert_array_equal(first[:6], np.tile(rest, (6, 1)))
@@ -124,12 +129,12 @@ def test_rests_where_it_is_then_moves_and_ends_where_it_began(policy: ScriptedPi
 
 
 @pytest.mark.parametrize("jitter_s", [-0.016, 0.0, 0.009, 0.016])
-def test_chunks_agree_whatever_the_jitter_of_the_stamps(policy: ScriptedPick, jitter_s: float) -> None:
+def test_chunks_agree_whatever_the_jitter_of_the_stamps(policy: Policy, jitter_s: float) -> None:
     first = chunk(policy, 0.0)
     np.testing.assert_array_equal(chunk(policy, 30 / RATE_HZ + jitter_s)[:20], first[30:])
 
 
-def test_a_cube_pushed_away_is_followed_from_where_it_is_clear(policy: ScriptedPick) -> None:
+def test_a_cube_pushed_away_is_followed_from_where_it_is_clear(policy: Policy) -> None:
     undisturbed = [chunk(policy, float(second)) for second in range(4)]
     policy.reset(0)
     pushed = [chunk(policy, 0.0), *(chunk(policy, float(second), (0.20, -0.12, 0.0125)) for second in range(1, 6))]
@@ -142,7 +147,7 @@ def test_a_cube_pushed_away_is_followed_from_where_it_is_clear(policy: ScriptedP
     assert min(np.linalg.norm(position - (0.20, -0.12, 0.0125)) for position in there) < 0.002
 
 
-def test_a_cube_taken_out_again_is_picked_again(policy: ScriptedPick) -> None:
+def test_a_cube_taken_out_again_is_picked_again(policy: Policy) -> None:
     chunk(policy, 0.0)
     held, taken = chunk(policy, 60.0, BIN), [chunk(policy, 61.0 + second) for second in range(3)]
     np.testing.assert_allclose(taken[0][:20], held[30:], rtol=0, atol=1e-12)
@@ -152,7 +157,7 @@ def test_a_cube_taken_out_again_is_picked_again(policy: ScriptedPick) -> None:
     assert np.abs(way[-1] - held[0]).max() > 0.5
 
 
-def test_a_cube_lost_on_the_way_is_not_carried_on(policy: ScriptedPick) -> None:
+def test_a_cube_lost_on_the_way_is_not_carried_on(policy: Policy) -> None:
     ends = []
     for lost in (False, True):
         policy.reset(0)
@@ -164,7 +169,7 @@ def test_a_cube_lost_on_the_way_is_not_carried_on(policy: ScriptedPick) -> None:
     assert np.abs(ends[1][-1] - ends[0][-1]).max() > 0.1
 
 
-def test_jaws_close_on_faces_whichever_face_the_cube_lies_on(policy: ScriptedPick) -> None:
+def test_jaws_close_on_faces_whichever_face_the_cube_lies_on(policy: Policy) -> None:
     half = np.pi / 4
     yaw = np.array([np.cos(0.15), 0, 0, np.sin(0.15)])
     ways = []
@@ -182,33 +187,31 @@ def test_jaws_close_on_faces_whichever_face_the_cube_lies_on(policy: ScriptedPic
     assert np.abs(chunk(policy, 0.0)[-1] - ways[0][-1])[4] > 0.2, "the wrist does not turn with the cube"
 
 
-def test_a_reset_forgets_the_episode(policy: ScriptedPick) -> None:
+def test_a_reset_forgets_the_episode(policy: Policy) -> None:
     first = chunk(policy, 0.0)
     chunk(policy, 1.0)
     policy.reset(0)
     np.testing.assert_array_equal(chunk(policy, 7.0), first)
 
 
-def test_a_cube_out_of_reach_is_named(policy: ScriptedPick) -> None:
-    message = r"cannot pick the cube at \(0.600, 0.000, 0.013\) m: gripperframe cannot reach \(0.600, 0.000, 0.083\) m"
+def test_a_cube_out_of_reach_is_named(policy: Policy) -> None:
+    message = r"scripted_pick cannot do its task: gripperframe cannot reach \(0.600, 0.000, 0.083\) m"
     with pytest.raises(PolicyError, match=message):
         chunk(policy, 0.0, (0.6, 0.0, 0.0125))
 
 
-def test_a_frame_that_is_not_finite_is_refused(policy: ScriptedPick) -> None:
+def test_a_frame_that_is_not_finite_is_refused(policy: Policy) -> None:
     with pytest.raises(PolicyError, match=r"needs observation.environment_state with 10 finite numbers, got \[nan"):
         policy.preprocess(frame(0.0, (np.nan, 0.0, 0.0)))
 
 
-def test_a_vector_of_another_length_is_refused(policy: ScriptedPick) -> None:
+def test_a_vector_of_another_length_is_refused(policy: Policy) -> None:
     with pytest.raises(PolicyError, match=r"needs observation.state with 6 finite numbers, got \[0.0, 0.0\]"):
         policy.preprocess(frame(0.0, state=np.zeros(2)))
 
 
 @pytest.mark.parametrize("wrong", [None, np.zeros(3), np.full(6, np.nan)], ids=["none", "shape", "nan"])
-def test_a_request_with_other_tensors_is_refused_and_nothing_forgotten(
-    policy: ScriptedPick, wrong: Vector | None
-) -> None:
+def test_a_request_with_other_tensors_is_refused_and_nothing_forgotten(policy: Policy, wrong: Vector | None) -> None:
     first = chunk(policy, 0.0)
     tensors = dict(policy.preprocess(frame(1.0)))
     policy.check(tensors)
@@ -222,7 +225,7 @@ def test_a_request_with_other_tensors_is_refused_and_nothing_forgotten(
 
 
 def test_infer_before_load_is_refused() -> None:
-    policy = ScriptedPick(ScriptedPickOptions(), host_context(robot=ROBOT))
+    policy = scripted_pick(host_context(robot=ROBOT))
     with pytest.raises(PolicyError, match="is not loaded"):
         chunk(policy, 0.0)
 
@@ -230,10 +233,10 @@ def test_infer_before_load_is_refused() -> None:
 def test_a_robot_without_a_gripper_is_refused() -> None:
     robot = attrs.evolve(ROBOT, groups={"arm": ROBOT.joint_names})
     with pytest.raises(PolicyError, match=r"one joint in robot.groups.gripper, got \[\]"):
-        ScriptedPick(ScriptedPickOptions(), host_context(robot=robot))
+        scripted_pick(host_context(robot=robot))
 
 
 def test_a_robot_without_a_model_is_refused() -> None:
     robot = attrs.evolve(ROBOT, description=attrs.evolve(ROBOT.description, mjcf=None))
     with pytest.raises(PolicyError, match=r"cannot be loaded: robot 'so101' has no robot\.description\.mjcf"):
-        ScriptedPick(ScriptedPickOptions(), host_context(robot=robot)).load()
+        scripted_pick(host_context(robot=robot)).load()

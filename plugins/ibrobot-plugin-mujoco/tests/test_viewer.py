@@ -11,7 +11,7 @@ import glfw
 import mujoco
 import numpy as np
 import pytest
-from ibrobot_mujoco.model import build_model
+from ibrobot_mujoco.model import build_world
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import PHYSICS_TOPIC, physics_size
@@ -24,12 +24,14 @@ from ibrobot_core.api import Context, Float64MultiArray, IbrobotError, Message, 
 
 ROBOT = so101()
 OPTIONS = MujocoOptions()
-MODEL = build_model(OPTIONS, ROBOT, visual=False)
+WORLD, SCENE = build_world(OPTIONS, ROBOT, visual=False)
+MODEL = WORLD.model
+FACTORS = SCENE.begin(WORLD, np.random.default_rng(0))
 
 
 def state(i: int) -> Float64MultiArray:
     qpos = MODEL.qpos0 + 1e-3 * i * (np.arange(MODEL.nq) < 6)
-    return Float64MultiArray(np.concatenate([[0.0, 0.0], qpos]))
+    return Float64MultiArray(np.concatenate([[0.0, 0.0], qpos, FACTORS]))
 
 
 class Window:
@@ -83,7 +85,7 @@ class TestConformance(_Subject, ViewerSuite):
 
     @override
     def shown(self, viewer: Viewer) -> Message:
-        return Float64MultiArray(np.concatenate([[0.0, 0.0], Window.latest.shown]))
+        return Float64MultiArray(np.concatenate([[0.0, 0.0], Window.latest.shown, FACTORS]))
 
 
 def test_no_display_is_an_error_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,4 +119,4 @@ def test_a_real_window_opens_follows_and_closes() -> None:
             viewer.close()
         assert not viewer.update()
     glfw.terminate()  # MuJoCo keeps the connection to the display until the process ends
-    assert physics_size(MODEL) == state(0).data.size
+    assert physics_size(WORLD, SCENE) == state(0).data.size

@@ -18,6 +18,7 @@ from ibrobot_testing.leaks import LeakCheck
 from ibrobot_testing.planner import PlannerSuite
 from ibrobot_testing.policy import PolicySuite
 from ibrobot_testing.recorder import RecorderSuite
+from ibrobot_testing.scene import SceneSuite
 from ibrobot_testing.section import SectionSuite, make_session
 from ibrobot_testing.sensor import SensorSuite
 from ibrobot_testing.service import stand_in
@@ -35,6 +36,7 @@ __all__ = [
     "PlannerSuite",
     "PolicySuite",
     "RecorderSuite",
+    "SceneSuite",
     "SectionSuite",
     "SensorSuite",
     "SimulatedHardwareSuite",

@@ -10,6 +10,7 @@ from ibrobot_testing.fakes.host import (
     FakeTeleop,
     FakeViewer,
 )
+from ibrobot_testing.fakes.scene import FakeScene, FakeWorld
 from ibrobot_testing.fakes.storage import FakeDataset, FakeRecorder
 from ibrobot_testing.fakes.transport import FakeTransport
 
@@ -22,10 +23,12 @@ __all__ = [
     "FakePolicy",
     "FakeRealHardware",
     "FakeRecorder",
+    "FakeScene",
     "FakeSensor",
     "FakeSource",
     "FakeTeleop",
     "FakeTrajectoryExecutor",
     "FakeTransport",
     "FakeViewer",
+    "FakeWorld",
 ]

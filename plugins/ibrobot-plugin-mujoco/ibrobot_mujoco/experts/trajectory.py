@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import attrs
 import numpy as np
@@ -18,6 +18,15 @@ _VELOCITY = 15 / 8
 _ACCELERATION = 10 / np.sqrt(3)
 
 
+type Expectation = Callable[[Vector, Vector], bool]
+"""Measured joints [rad], shape (J,), and the scene's ground truth, shape (V,) -> whether all goes as planned."""
+
+
+def anything(state: Vector, scene: Vector) -> bool:
+    """The expectation that is always met."""
+    return True
+
+
 @attrs.frozen(eq=False)
 class Segment:
     """A straight motion from rest at `start` to rest at `end`, both shape (J,) [rad], over `duration_s`."""
@@ -26,6 +35,10 @@ class Segment:
     start: Vector
     end: Vector
     duration_s: float
+    clear: bool = False
+    """Whether it ends clear of all objects, so that another plan can begin there."""
+    expects: Expectation = anything
+    """Has to be met during the segment; otherwise another plan is made."""
 
 
 @attrs.frozen(eq=False)
@@ -36,17 +49,12 @@ class Limits:
     acceleration: Vector
 
 
-def move(name: str, start: Vector, end: Vector, limits: Limits) -> Segment:
-    """The fastest segment from `start` to `end`, both shape (J,) [rad]."""
+def duration(start: Vector, end: Vector, limits: Limits) -> float:
+    """The shortest duration of a segment [s]."""
     way = np.abs(end - start)
     by_velocity = float(np.max(_VELOCITY * way / limits.velocity))
     by_acceleration = float(np.sqrt(np.max(_ACCELERATION * way / limits.acceleration)))
-    return Segment(name, start, end, max(SHORTEST_S, by_velocity, by_acceleration))
-
-
-def rest(name: str, position: Vector, duration_s: float) -> Segment:
-    """A segment that stays at `position`, shape (J,) [rad]."""
-    return Segment(name, position, position, duration_s)
+    return max(SHORTEST_S, by_velocity, by_acceleration)
 
 
 class Trajectory:

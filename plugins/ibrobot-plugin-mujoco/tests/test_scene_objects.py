@@ -9,7 +9,7 @@ import pytest
 from ibrobot_mujoco import ibrobot_hardware
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.options import MujocoOptions
-from ibrobot_mujoco.scene import scene_objects
+from ibrobot_mujoco.scene_objects import scene_objects
 from ibrobot_mujoco.so101 import so101
 from ibrobot_testing import SimulatedHardwareSuite, control_context
 

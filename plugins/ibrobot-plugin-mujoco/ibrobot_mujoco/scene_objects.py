@@ -6,28 +6,30 @@ import mujoco
 from ibrobot_kinematics.poses import orientation
 
 from ibrobot_core.api import Pose, Robot, SceneObject, Vector3
-from ibrobot_mujoco.model import BIN, CUBE, TABLE, build_model
+from ibrobot_mujoco.model import build_world
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.state import OBJECTS_TOPIC, POSE_SIZE, SCENE_TOPIC
+from ibrobot_mujoco.world import bodies_of
 
 
 def scene_objects(options: MujocoOptions, robot: Robot) -> tuple[SceneObject, ...]:
-    """The table, with `pick_cube` the cube and the parts of the bin, and `objects`, with the names of their geoms.
+    """The table, the solid geoms of the scene, and `objects`, with the names of their geoms.
 
     Raises:
         HardwareError: as `build_model`.
     """
-    model = build_model(options, robot, visual=False)
-    physics = mujoco.MjData(model)
+    world, scene = build_world(options, robot, visual=False)
+    model, physics = world.model, world.data
     mujoco.mj_kinematics(model, physics)
     free = [name for name, thing in options.objects.items() if thing.mass is not None]
-    signals = {CUBE: (SCENE_TOPIC, 0)} | {name: (OBJECTS_TOPIC, POSE_SIZE * i) for i, name in enumerate(free)}
-    bodies = {*options.objects, *((CUBE, BIN) if options.scene == "pick_cube" else ())}
+    signals = {name: (OBJECTS_TOPIC, POSE_SIZE * i) for i, name in enumerate(free)}
+    signals |= {name: (SCENE_TOPIC, first) for name, first in scene.poses.items()}
+    robots = bodies_of(model, robot)
     found = []
     for geom in range(model.ngeom):
-        name, body = model.geom(geom).name, model.body(int(model.geom_bodyid[geom])).name
-        if name == TABLE or body in bodies:
-            topic, first = signals.get(name, ("", 0))
+        body = int(model.geom_bodyid[geom])
+        if body not in robots and (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+            topic, first = signals.get(model.body(body).name, ("", 0))
             found.append(_object(model, physics, geom, topic, first))
     return tuple(found)
 

@@ -1,0 +1,81 @@
+"""Sections and options with a `type`, which selects a plugin; imports nothing heavy, for the options of plugins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, get_args
+
+import attrs
+
+from ibrobot_core import descriptors
+from ibrobot_core.descriptors import Descriptor
+from ibrobot_core.options import documented, not_a_key, option
+
+if TYPE_CHECKING:
+    from ibrobot_core import interfaces
+    from ibrobot_core.robot import Robot
+
+
+@documented
+@attrs.frozen
+class ComponentConfig:
+    """A section with a `type`, which selects a plugin, and the options of the plugin."""
+
+    plugin_kind: ClassVar[str] = ""
+    """The kind of plugins for its types."""
+    may_be_alone: ClassVar[bool] = False
+    """Whether the section may be a single component instead of named components."""
+
+    type: str = option(help="type of plugin; `ibrobot plugins` lists them")
+    options: Any = not_a_key()
+    """An instance of the plugin's options class."""
+
+    @classmethod
+    def __attrs_init_subclass__(cls) -> None:
+        documented(cls)
+
+    @classmethod
+    def type_key(cls) -> str:
+        """The key that names the plugin."""
+        return str(attrs.fields(cls).type.alias)
+
+    @classmethod
+    def takes(cls, descriptor: Descriptor[Any]) -> bool:
+        """Whether a plugin of the kind may be used in this section."""
+        return True
+
+    @classmethod
+    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
+        """Fields that are not keys, derived from the options by the plugin's descriptor."""
+        return {}
+
+
+@attrs.frozen
+class NamedComponentConfig(ComponentConfig):
+    """One of several named components."""
+
+    name: str = not_a_key()
+
+
+def component_of(kind: Any) -> type[ComponentConfig] | None:
+    """The component class in a type annotation: that of a section, or of each of its items."""
+    members = (kind, *get_args(kind))
+    return next((each for each in members if isinstance(each, type) and issubclass(each, ComponentConfig)), None)
+
+
+@attrs.frozen
+class SceneConfig(ComponentConfig):
+    """The scene in the options of a simulation."""
+
+    plugin_kind = "scene"
+
+    descriptor: descriptors.SceneDescriptor = not_a_key()
+
+    @classmethod
+    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
+        """Its descriptor, with which the simulation makes it."""
+        return {"descriptor": descriptor}
+
+    def make(self, robot: Robot) -> interfaces.Scene[Any, Any]:
+        """The scene, around a robot."""
+        return self.descriptor.make(self.options, robot)

@@ -1,0 +1,38 @@
+"""What an expert does in one scene: a plan from the scene's ground truth."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import attrs
+
+from ibrobot_core.api import Vector
+from ibrobot_mujoco.experts.options import ExpertOptions
+from ibrobot_mujoco.experts.trajectory import Limits, Segment
+from ibrobot_mujoco.experts.way import Hand
+
+
+@attrs.frozen(eq=False)
+class Task(ABC):
+    """Plans with the robot's hands: one, or the left and the right one."""
+
+    hands: tuple[Hand, ...]
+    options: ExpertOptions
+    limits: Limits
+
+    sides: ClassVar[tuple[str, ...]] = ("",)
+    """Prefixes of the groups of joints that the hands are made of."""
+
+    @property
+    def hand(self) -> Hand:
+        """The only or first hand."""
+        return self.hands[0]
+
+    @abstractmethod
+    def plan(self, start: Vector, scene: Vector, home: Vector) -> list[Segment]:
+        """The segments that do the task from `start` and end at `home`; both shape (J,) [rad].
+
+        Raises:
+            UnreachableError: if an object is out of reach.
+        """

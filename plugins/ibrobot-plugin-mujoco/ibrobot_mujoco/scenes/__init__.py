@@ -1,0 +1,46 @@
+"""The scenes of the simulation; importing this package imports no MuJoCo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from ibrobot_core.api import SceneConfig, SceneDescriptor
+from ibrobot_mujoco.gl import check_asked
+from ibrobot_mujoco.scenes.options import PickCubeOptions, PushOptions, SceneOptions, SortOptions, StackOptions
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot, Scene
+
+
+def _maker(module: str, name: str) -> Callable[[Any, Robot], Scene[Any, Any]]:
+    def make(options: Any, robot: Robot) -> Scene[Any, Any]:
+        check_asked()
+        made: Scene[Any, Any] = getattr(import_module(f"{__name__}.{module}"), name)(options, robot)
+        return made
+
+    return make
+
+
+def _descriptor(type_: str, name: str, options: type[Any], summary: str, module: str = "") -> SceneDescriptor:
+    return SceneDescriptor(type=type_, options=options, summary=summary, make=_maker(module or type_, name))
+
+
+SCENES: Mapping[str, SceneDescriptor] = {
+    each.type: each
+    for each in (
+        _descriptor("empty", "TableScene", SceneOptions, "an empty table, without a task", "table"),
+        _descriptor("pick_cube", "PickCube", PickCubeOptions, "a cube and a bin: put the cube into the bin"),
+        _descriptor("push", "Push", PushOptions, "a block and a goal on the table: push the block onto the goal"),
+        _descriptor("stack", "Stack", StackOptions, "two cubes: put the smaller one on the other"),
+        _descriptor("sort", "Sort", SortOptions, "red and blue cubes: put each into the bin of its colour"),
+    )
+}
+"""Type -> descriptor of the scenes of this package."""
+
+
+def scene(type_: str = "pick_cube", **options: Any) -> SceneConfig:
+    """A scene of this package for `MujocoOptions.scene`, e.g. `scene("stack", light=(0.5, 1.5))`."""
+    descriptor = SCENES[type_]
+    return SceneConfig(type=type_, options=descriptor.options(**options), descriptor=descriptor)

@@ -1,0 +1,60 @@
+"""Scene `pick_cube`: a cube has to be put into a bin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, override
+
+import mujoco
+import numpy as np
+
+from ibrobot_core.api import Robot, Vector
+from ibrobot_mujoco.scenes.options import PickCubeOptions
+from ibrobot_mujoco.scenes.solids import BLUE, add_bin, add_cube, bin_centre, hue, is_in_bin
+from ibrobot_mujoco.scenes.table import TableScene, polar
+from ibrobot_mujoco.spans import ends
+from ibrobot_mujoco.world import World
+
+CUBE, BIN = "cube", "bin"
+
+
+class PickCube(TableScene):
+    """Observation: the cube's pose, then the centre of the bin [m] (3)."""
+
+    moving = (CUBE,)
+    sizes: ClassVar = {"cube_size": (CUBE,)}
+    colours: ClassVar = {"cube_colour": (CUBE,)}
+
+    def __init__(self, options: PickCubeOptions, robot: Robot) -> None:
+        super().__init__(options, robot)
+        self._given = options
+        self._centre = bin_centre(options.bin_position)
+        self.values += ("bin.x", "bin.y", "bin.z")
+
+    @override
+    def placed(self) -> tuple[str, ...]:
+        return ("cube_x", "cube_y", "cube_yaw")
+
+    @override
+    def add(self, spec: mujoco.MjSpec) -> None:
+        add_cube(spec, CUBE, ends(self._given.cube_size)[0], hue(ends(self._given.cube_colour)[0]))
+        add_bin(spec, BIN, self._given.bin_position, BLUE)
+
+    @override
+    def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
+        given, size = self._given, look["cube_size"]
+        x, y, _, yaw = self.place(
+            world, CUBE, lambda: polar(rng, given.cube_distance, given.cube_bearing, given.cube_yaw, size),
+            f"cube_distance {list(given.cube_distance)} and cube_bearing {list(given.cube_bearing)}",
+        )  # fmt: skip
+        return x, y, yaw
+
+    @override
+    def observe(self, world: World, out: Vector) -> None:
+        super().observe(world, out)
+        out[7:] = self._centre
+
+    @override
+    def success(self, world: World) -> bool:
+        """Whether the cube lies in the bin, below the rim, and the robot does not touch it."""
+        return is_in_bin(world.pose(CUBE)[:3], self._centre) and self.at_rest(world, CUBE)

@@ -1,0 +1,67 @@
+"""Scene `stack`: a cube has to be put on another one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import ClassVar, override
+
+import mujoco
+import numpy as np
+
+from ibrobot_core.api import Robot
+from ibrobot_mujoco.scenes.options import StackOptions
+from ibrobot_mujoco.scenes.solids import add_cube, hue
+from ibrobot_mujoco.scenes.table import TableScene, polar
+from ibrobot_mujoco.spans import ends
+from ibrobot_mujoco.world import World
+
+CUBE, BASE = "cube", "base_cube"
+_GAP = 0.004
+"""Allowed difference between the cube's height and that of a cube that lies on the other [m]."""
+
+
+class Stack(TableScene):
+    """Observation: the poses of the cube and of the one below."""
+
+    moving = (CUBE, BASE)
+    sizes: ClassVar = {"cube_size": (CUBE,), "base_size": (BASE,)}
+    colours: ClassVar = {"cube_colour": (CUBE,), "base_colour": (BASE,)}
+
+    def __init__(self, options: StackOptions, robot: Robot) -> None:
+        super().__init__(options, robot)
+        self._given = options
+
+    @override
+    def placed(self) -> tuple[str, ...]:
+        return ("cube_x", "cube_y", "cube_yaw", "base_x", "base_y", "base_yaw")
+
+    @override
+    def add(self, spec: mujoco.MjSpec) -> None:
+        given = self._given
+        add_cube(spec, CUBE, ends(given.cube_size)[0], hue(ends(given.cube_colour)[0]))
+        add_cube(spec, BASE, ends(given.base_size)[0], hue(ends(given.base_colour)[0]))
+
+    @override
+    def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
+        given = self._given
+        factors: list[float] = []
+        for body, size in ((BASE, look["base_size"]), (CUBE, look["cube_size"])):
+            place = self.place(
+                world, body, partial(polar, rng, given.cube_distance, given.cube_bearing, given.cube_yaw, size),
+                f"cube_distance {list(given.cube_distance)} and cube_bearing {list(given.cube_bearing)}",
+            )  # fmt: skip
+            factors = [*place[[0, 1, 3]].tolist(), *factors]
+        return factors
+
+    @override
+    def success(self, world: World) -> bool:
+        """Whether the cube lies on the other one, both at rest, and the robot touches neither."""
+        cube, base = world.pose(CUBE)[:3], world.pose(BASE)[:3]
+        sizes = [2 * float(world.model.geom(name).size[0]) for name in (CUBE, BASE)]
+        over = float(np.hypot(*(cube - base)[:2])) < sizes[1] / 2
+        return (
+            over
+            and abs(cube[2] - sizes[1] - sizes[0] / 2) < _GAP
+            and all(self.at_rest(world, body) for body in self.moving)
+        )

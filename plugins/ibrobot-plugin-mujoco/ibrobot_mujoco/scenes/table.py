@@ -1,0 +1,235 @@
+"""What all scenes have: light, friction and cameras by factors, distractors, and places clear of everything else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import ClassVar, override
+
+import attrs
+import mujoco
+import numpy as np
+
+from ibrobot_core.api import HardwareError, Robot, Scene, Vector
+from ibrobot_mujoco.scenes.options import SceneOptions
+from ibrobot_mujoco.scenes.solids import FRICTION, hue, resize_cube
+from ibrobot_mujoco.spans import Span, ends
+from ibrobot_mujoco.world import World, bodies_of
+
+TABLE = "table"
+CLEARANCE = 0.03
+"""Minimum distance between an object's initial pose and everything except the table [m]."""
+REST_SPEED = 0.05
+"""Speed below which an object counts as at rest [m/s]."""
+_TRIES = 1000
+_CAMERA = tuple(f"camera_{axis}" for axis in ("x", "y", "z", "roll", "pitch", "yaw"))
+_SHAPES = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
+_APART = (0.13, 0.36)
+"""Distances of distractors from the base's origin [m]."""
+
+type Draw = Callable[[], tuple[float, float, float, float]]
+"""Draws x, y, z [m] and yaw [rad]."""
+
+
+@attrs.frozen(eq=False)
+class _Original:
+    """A model as it was compiled; factors change it from there."""
+
+    model: mujoco.MjModel
+    friction: Vector
+    diffuse: Vector
+    ambient: Vector
+    headlight: Vector
+    positions: Vector
+    turns: Vector
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel) -> _Original:
+        head = np.concatenate([model.vis.headlight.ambient, model.vis.headlight.diffuse])
+        return cls(
+            model, model.geom_friction[:, 0].copy(), model.light_diffuse.copy(), model.light_ambient.copy(), head,
+            model.cam_pos.copy(), model.cam_quat.copy(),
+        )  # fmt: skip
+
+
+class TableScene(Scene[mujoco.MjSpec, World]):
+    """A table without a task; the base class of this package's scenes.
+
+    Attributes:
+        moving: the bodies that move; their poses, position [m] and quaternion wxyz, begin the observation.
+        sizes: factor of an edge -> cubes that have it.
+        colours: factor of a hue -> geoms that have it.
+    """
+
+    moving: ClassVar[tuple[str, ...]] = ()
+    sizes: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    colours: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+
+    def __init__(self, options: SceneOptions, robot: Robot) -> None:
+        self._options = options
+        self._robot = robot
+        self._look = {name: ends(getattr(options, name)) for name in (*self.sizes, *self.colours, "friction", "light")}
+        shift, turn = ends(options.camera_shift), ends(options.camera_turn)
+        self._look |= dict(zip(_CAMERA, (shift,) * 3 + (turn,) * 3, strict=True))
+        self._distractors = [f"distractor{i + 1}" for i in range(options.distractors)]
+        self._of_robot: frozenset[int] = frozenset()
+        self._original: _Original | None = None
+        placed = self.placed()
+        self.factors = (*placed, *self._look, "distractors")
+        self.values = tuple(
+            f"{body}.{part}" for body in self.moving for part in ("x", "y", "z", "qw", "qx", "qy", "qz")
+        )
+        self.poses = {body: 7 * i for i, body in enumerate(self.moving)}
+
+    def placed(self) -> tuple[str, ...]:
+        """Names of the factors that `arrange` returns."""
+        return ()
+
+    def add(self, spec: mujoco.MjSpec) -> None:
+        """Add the objects of the task."""
+
+    def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
+        """Place the objects of the task; returns the values of `placed`."""
+        return ()
+
+    @override
+    def build(self, spec: mujoco.MjSpec) -> None:
+        self.add(spec)
+        for i, name in enumerate(self._distractors):
+            _add_distractor(spec, name, i)
+
+    @override
+    def begin(self, world: World, rng: np.random.Generator) -> Vector:
+        look_rng, aside = rng.spawn(2)
+        look = {name: float(low + u * (high - low)) for (name, (low, high)), u in self._drawn(look_rng)}
+        free = [*self.moving, *self._distractors]
+        for body in free:  # until it is placed, it is in nobody's way
+            world.put(body, np.array([0, 0, -1.0, 1, 0, 0, 0]))
+        values = dict(look)
+        self._apply(world, values)
+        if self.sizes:
+            _recompute(world)
+        values |= dict(zip(self.placed(), self.arrange(world, rng, look), strict=True))
+        for body in self._distractors:
+            self.place(world, body, partial(_aside, aside, world.model.geom(body).size), "distractors")
+        values["distractors"] = len(self._distractors)
+        factors = np.array([values[name] for name in self.factors])
+        self.show(world, factors)
+        return factors
+
+    def _drawn(self, rng: np.random.Generator) -> list[tuple[tuple[str, tuple[float, float]], float]]:
+        return list(zip(self._look.items(), rng.random(len(self._look)).tolist(), strict=True))
+
+    @override
+    def show(self, world: World, factors: Vector) -> None:
+        self._apply(world, dict(zip(self.factors, factors.tolist(), strict=True)))
+
+    def _apply(self, world: World, values: Mapping[str, float]) -> None:
+        model = world.model
+        if self._original is None or self._original.model is not model:
+            self._original = _Original.of(model)
+        original = self._original
+        model.geom_friction[:, 0] = values["friction"] * original.friction
+        model.light_diffuse[:] = values["light"] * original.diffuse
+        model.light_ambient[:] = values["light"] * original.ambient
+        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = values["light"] * original.headlight.reshape(
+            2, 3
+        )
+        _move_cameras(original, [values[name] for name in _CAMERA])
+        for name, cubes in self.sizes.items():
+            for cube in cubes:
+                resize_cube(model, cube, values[name])
+        for name, geoms in self.colours.items():
+            for geom in geoms:
+                model.geom(geom).rgba = hue(values[name])
+
+    @override
+    def observe(self, world: World, out: Vector) -> None:
+        for body, first in self.poses.items():
+            out[first : first + 7] = world.pose(body)
+
+    @override
+    def success(self, world: World) -> bool | None:
+        return None
+
+    def touched(self, world: World, body: str) -> bool:
+        """Whether the robot touches a body."""
+        model = world.model
+        self._of_robot = self._of_robot or bodies_of(model, self._robot)
+        pairs = model.geom_bodyid[world.data.contact.geom]
+        others = pairs[(pairs == model.body(body).id).any(axis=1)].ravel()
+        return not self._of_robot.isdisjoint(others.tolist())
+
+    def at_rest(self, world: World, body: str) -> bool:
+        """Whether a body is at rest, and the robot does not touch it."""
+        return world.speed(body) <= REST_SPEED and not self.touched(world, body)
+
+    def place(self, world: World, body: str, draw: Draw, options: str, apart: float = CLEARANCE) -> Vector:
+        """Place a body at random on the table, clear of everything else; returns x, y, z [m] and yaw [rad].
+
+        Raises:
+            HardwareError: if the options leave no such place.
+        """
+        model, data = world.model, world.data
+        own = model.body(body).id
+        geom = int(model.body_geomadr[own])
+        solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        solid[model.geom_bodyid == own] = False
+        solid[model.geom(TABLE).id] = False
+        obstacles = [int(i) for i in np.flatnonzero(solid)]
+        for _ in range(_TRIES):
+            x, y, z, yaw = draw()
+            world.put(body, np.array([x, y, z, math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]))
+            mujoco.mj_kinematics(model, data)
+            if all(mujoco.mj_geomDistance(model, data, geom, each, apart, None) >= apart for each in obstacles):
+                return np.array([x, y, z, yaw])
+        raise HardwareError(
+            f"found no place for the {body} {apart} m clear of robot and objects in {_TRIES} tries: "
+            f"{options} must leave one"
+        )
+
+
+def polar(
+    rng: np.random.Generator, distance: Span, bearing: Span, yaw: Span, size: float
+) -> tuple[float, float, float, float]:
+    """Draw a place on the table for a cube of edge `size` [m]."""
+    radius, angle = rng.uniform(*ends(distance)), rng.uniform(*ends(bearing))
+    turn = rng.uniform(*ends(yaw))
+    return radius * math.cos(angle), radius * math.sin(angle), size / 2, turn
+
+
+def _aside(rng: np.random.Generator, size: Vector) -> tuple[float, float, float, float]:
+    radius, angle, yaw = rng.uniform(*_APART), rng.uniform(-1.4, 1.4), rng.uniform(-math.pi, math.pi)
+    return radius * math.cos(angle), radius * math.sin(angle), float(size[1] or size[0]), yaw
+
+
+def _add_distractor(spec: mujoco.MjSpec, name: str, number: int) -> None:
+    half = 0.010 + 0.002 * (number % 4)
+    body = spec.worldbody.add_body(name=name, pos=[0, 0, -1])
+    body.add_freejoint(name=name)
+    shape = _SHAPES[number % len(_SHAPES)]
+    size = [half, 0.0 if shape == mujoco.mjtGeom.mjGEOM_SPHERE else half, half]
+    # Rolling friction keeps balls and cylinders where they are.
+    body.add_geom(
+        name=name, type=shape, size=size, density=1000.0, condim=6, friction=[*FRICTION[:2], 0.01],
+        rgba=hue(0.35 + 0.618 * number),
+    )  # fmt: skip
+
+
+def _recompute(world: World) -> None:
+    """Recompute what depends on masses; MuJoCo does it in the reference state."""
+    kept = world.data.qpos.copy()
+    mujoco.mj_setConst(world.model, world.data)
+    world.data.qpos[:] = kept
+
+
+def _move_cameras(original: _Original, offsets: Sequence[float]) -> None:
+    model = original.model
+    fixed = model.cam_bodyid == 0
+    turn, turned = np.empty(4), np.empty(4)
+    mujoco.mju_euler2Quat(turn, np.array(offsets[3:]), "XYZ")
+    for camera in np.flatnonzero(fixed):
+        mujoco.mju_mulQuat(turned, turn, original.turns[camera])
+        model.cam_quat[camera] = turned
+        model.cam_pos[camera] = original.positions[camera] + offsets[:3]
