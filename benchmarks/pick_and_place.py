@@ -76,9 +76,8 @@ def scene(seed: int, robot: Robot) -> dict[str, Any]:
     while True:
         values = sample(rng)
         options = single_options(MujocoOptions, (), "scene", text=json.dumps({"objects": values["objects"]}))
-        options = attrs.evolve(
-            options, scene=made_scene(**{name: value for name, value in values["scene"].items() if name != "type"})
-        )
+        ranges = {name: tuple(ends) for name, ends in values["scene"].items() if name != "type"}
+        options = attrs.evolve(options, scene=made_scene(**ranges))
         with suppress(HardwareError):  # no place for the cube
             if len(options.objects) == OBSTACLES and clear_of_start(options, robot):
                 return values

@@ -23,7 +23,7 @@ from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import installed_plugins
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-SCENES = ("pick_cube", "push", "stack", "sort")
+SCENES = ("pick_cube", "push", "stack", "sort", "drawer")
 REPEATED = 10
 """Episodes that are run twice."""
 

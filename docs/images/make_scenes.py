@@ -17,7 +17,7 @@ SIZE = (320, 240)
 TOPIC = "/camera/front/image_raw"
 CAMERA = "{name: front, kind: camera, type: mujoco, width: 320, height: 240, fps: 30, encoding: raw, shadows: true}"
 SCENES = {"pick_cube": ("so101_scenes", 3.3), "push": ("so101_scenes", 3.2), "stack": ("so101_scenes", 3.6),
-          "sort": ("so101_scenes", 6.3)}  # fmt: skip
+          "sort": ("so101_scenes", 6.3), "drawer": ("so101_scenes", 3.6)}  # fmt: skip
 """Scene -> robot YAML, and when the picture is taken [s]."""
 
 

@@ -43,6 +43,7 @@ EXPERTS = (
     ),
     _expert("push", "PushTask", "pushes the block onto the goal", lambda _: 10),
     _expert("stack", "StackTask", "puts the cube on the other one", lambda _: 14),
+    _expert("drawer", "DrawerTask", "opens the drawer", lambda _: 6),
     _expert(
         "sort", "SortTask", "puts each cube into the bin of its colour", lambda given: 8 * given.cubes + 6,
         SortExpertOptions,

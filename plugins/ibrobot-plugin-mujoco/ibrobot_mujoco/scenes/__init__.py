@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import SceneConfig, SceneDescriptor
 from ibrobot_mujoco.gl import check_asked
-from ibrobot_mujoco.scenes.options import PickCubeOptions, PushOptions, SceneOptions, SortOptions, StackOptions
+from ibrobot_mujoco.scenes.options import (
+    DrawerOptions,
+    PickCubeOptions,
+    PushOptions,
+    SceneOptions,
+    SortOptions,
+    StackOptions,
+)
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot, Scene
@@ -34,6 +41,7 @@ SCENES: Mapping[str, SceneDescriptor] = {
         _descriptor("pick_cube", "PickCube", PickCubeOptions, "a cube and a bin: put the cube into the bin"),
         _descriptor("push", "Push", PushOptions, "a block and a goal on the table: push the block onto the goal"),
         _descriptor("stack", "Stack", StackOptions, "two cubes: put the smaller one on the other"),
+        _descriptor("drawer", "Drawer", DrawerOptions, "a closed drawer: open it"),
         _descriptor("sort", "Sort", SortOptions, "red and blue cubes: put each into the bin of its colour"),
     )
 }

@@ -92,6 +92,21 @@ class PushOptions(SceneOptions):
 
 @documented
 @attrs.frozen(kw_only=True)
+class DrawerOptions(SceneOptions):
+    """Options of scene `drawer`."""
+
+    drawer_colour: Span = _colour(0.08, "drawer")
+    handle_distance: Range = _distance((0.24, 0.27), "handle of the closed drawer")
+    handle_bearing: Range = _bearing((-0.6, 0.6), "handle")
+    drawer_turn: Range = option(
+        (-0.2, 0.2), unit="rad", validator=ordered, help="turn of the drawer away from facing the base"
+    )
+    drawer_damping: Span = span(2.0, unit="N s/m", ge=0.0, le=20.0, help="viscous friction of the drawer")
+    opened: float = option(0.08, unit="m", gt=0, le=0.11, help="distance that counts as open")
+
+
+@documented
+@attrs.frozen(kw_only=True)
 class SortOptions(SceneOptions):
     """Options of scene `sort`."""
 

@@ -60,8 +60,5 @@ class Stack(TableScene):
         cube, base = world.pose(CUBE)[:3], world.pose(BASE)[:3]
         sizes = [2 * float(world.model.geom(name).size[0]) for name in (CUBE, BASE)]
         over = float(np.hypot(*(cube - base)[:2])) < sizes[1] / 2
-        return (
-            over
-            and abs(cube[2] - sizes[1] - sizes[0] / 2) < _GAP
-            and all(self.at_rest(world, body) for body in self.moving)
-        )
+        lies = over and abs(cube[2] - sizes[1] - sizes[0] / 2) < _GAP
+        return bool(lies) and all(self.at_rest(world, body) for body in self.moving)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import ClassVar, override
 
@@ -171,22 +171,28 @@ class TableScene(Scene[mujoco.MjSpec, World]):
         Raises:
             HardwareError: if the options leave no such place.
         """
-        model, data = world.model, world.data
-        own = model.body(body).id
-        geom = int(model.body_geomadr[own])
-        solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-        solid[model.geom_bodyid == own] = False
-        solid[model.geom(TABLE).id] = False
-        obstacles = [int(i) for i in np.flatnonzero(solid)]
+        own = {world.model.body(body).id}
         for _ in range(_TRIES):
             x, y, z, yaw = draw()
             world.put(body, np.array([x, y, z, math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]))
-            mujoco.mj_kinematics(model, data)
-            if all(mujoco.mj_geomDistance(model, data, geom, each, apart, None) >= apart for each in obstacles):
+            if self.is_clear(world, own, apart):
                 return np.array([x, y, z, yaw])
         raise HardwareError(
             f"found no place for the {body} {apart} m clear of robot and objects in {_TRIES} tries: "
             f"{options} must leave one"
+        )
+
+    @staticmethod
+    def is_clear(world: World, bodies: Collection[int], apart: float) -> bool:
+        """Whether everything but the table is at least `apart` [m] away from some bodies, by their ids."""
+        model, data = world.model, world.data
+        solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        own = np.isin(model.geom_bodyid, list(bodies))
+        solid[model.geom(TABLE).id] = False
+        mine, others = np.flatnonzero(solid & own).tolist(), np.flatnonzero(solid & ~own).tolist()
+        mujoco.mj_kinematics(model, data)
+        return all(
+            mujoco.mj_geomDistance(model, data, geom, other, apart, None) >= apart for geom in mine for other in others
         )
 
 
