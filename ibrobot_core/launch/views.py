@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock
+from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.schema import ComponentConfig
 from ibrobot_core.interfaces import JointReading, OperatorEvent
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
@@ -56,6 +56,8 @@ class RunView(Protocol):
     def mode_keys(self) -> dict[str, str]: ...
     @property
     def generation(self) -> int: ...
+    @property
+    def factors(self) -> Mapping[str, float]: ...
     @property
     def state(self) -> ControlState | None: ...
     @property
