@@ -96,6 +96,12 @@ class SensorDescriptor(Descriptor["interfaces.Sensor"]):
     kind: str = "camera"
     picture: Callable[[Any], tuple[int, int] | None] = attrs.field(default=lambda options: None, kw_only=True)
     """Height and width of the images [px], if the options define them."""
+    find: Callable[[Any], None] = attrs.field(default=lambda options: None, kw_only=True)
+    """Looks for the device that the options name, without opening it.
+
+    Raises:
+        MissingDependency: if it is not there. A run continues without a sensor that it does not need.
+    """
 
 
 @attrs.frozen

@@ -182,8 +182,10 @@ class Registry:
         package = next(name for name, offers in official_plugins().items() if kind in offers.get("default", ()))
         raise PluginError(f"no {kind} is named, and no installed plugin has a default: pip install {package}")
 
-    def missing(self, kind: str, type_: str) -> MissingDependency | None:
+    def missing(self, kind: str, type_: str, options: Any = None) -> MissingDependency | None:
         """The dependency that this machine lacks for `type_`, or None. A check that raises is reported too.
+
+        With the options of a sensor, also the device that they name.
 
         Raises:
             PluginError: as `find`.
@@ -191,6 +193,8 @@ class Registry:
         descriptor = self.find(kind, type_)
         try:
             descriptor.check()
+            if isinstance(descriptor, descriptors.SensorDescriptor) and options is not None:
+                descriptor.find(options)
         except MissingDependency as missing:
             return missing
         except Exception as error:  # noqa: BLE001 - contained: a plugin's fault must not hide the other checks

@@ -1,4 +1,4 @@
-"""Sensors that this machine cannot run. A run continues without them, but refuses parts that need their messages."""
+"""Sensors that cannot run on this machine. A run continues without them, but refuses parts that need their messages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class AbsentSensor:
 
 
 def absent_sensors(config: RobotConfig, registry: Registry) -> tuple[AbsentSensor, ...]:
-    """The peripherals whose plugins lack a dependency on this machine.
+    """The peripherals whose plugins lack a dependency on this machine, and those that are not connected.
 
     Raises:
         MissingDependency: for a peripheral whose topic is unknown before it runs, so that its users are unknown too.
@@ -33,7 +33,7 @@ def absent_sensors(config: RobotConfig, registry: Registry) -> tuple[AbsentSenso
     absent = []
     for name, peripheral in config.peripherals.items():
         try:
-            missing = registry.missing("sensor", peripheral.type)
+            missing = registry.missing("sensor", peripheral.type, peripheral.options)
         except PluginNotInstalled as error:
             missing = MissingDependency(error.missing, remedy=error.remedy)
         if missing is None:

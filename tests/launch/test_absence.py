@@ -35,6 +35,15 @@ def test_a_mode_without_cameras_runs_without_them(bare: Runs, mode: str, caplog:
     assert bare.parts.MADE.keys() & {"top", "side"} == set()
 
 
+def test_a_mode_without_cameras_runs_while_one_is_not_connected(runs: Runs, caplog: pytest.LogCaptureFixture):
+    runs.make()  # imports the parts
+    runs.parts.TROUBLE["unplugged"] = True
+    runtime = runs.start(*SEER, mode="teleop")
+    assert "running without camera top, camera side: /dev/video0: there is no such device; plug it in" in caplog.text
+    with pytest.raises(ComponentFailed, match="model 'seer' needs camera top: /dev/video0: there is no such device"):
+        runtime.switch_mode("policy")
+
+
 def test_the_plan_and_the_diagnostics_name_what_is_absent(bare: Runs):
     runtime = bare.start(mode="teleop")
     assert f"without camera top, camera side: {REMEDY}" in runtime.plan.lines()

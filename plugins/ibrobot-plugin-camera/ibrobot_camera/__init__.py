@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_camera.device import realsense_stream, video_device
+from ibrobot_camera.device import realsense_stream, require_device, video_device
 from ibrobot_camera.options import OpenCvOptions, RealSenseOptions, picture_size
 from ibrobot_core.api import Check, DecoderDescriptor, OptionFault, SensorDescriptor, SensorError, hookimpl
 from ibrobot_core.app import Command, GuideDescriptor
@@ -51,7 +51,7 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Cameras."""
     yield SensorDescriptor(
         type="opencv", options=OpenCvOptions, make=_opencv, devices=video_device, picture=picture_size,
-        check_options=_check, summary="V4L2 device, RTSP or HTTP stream, or video file",
+        check_options=_check, find=require_device, summary="V4L2 device, RTSP or HTTP stream, or video file",
     )  # fmt: skip
     yield SensorDescriptor(
         type="realsense",

@@ -67,7 +67,10 @@ class OpenCvCamera(Sensor):
 
     @override
     def open(self) -> None:
-        device = find_device(self._options.device, self._ctx.name)
+        try:
+            device = find_device(self._options.device)
+        except SensorError as error:
+            raise SensorError(f"camera {self._ctx.name}: {error}") from None
         if device.kind != "file" and isinstance(self._ctx.clock, SteppedClock):
             raise SensorError(
                 f"camera {self._ctx.name}: {device}: a live source cannot run in lockstep; a video file can"

@@ -15,7 +15,7 @@ import numpy as np
 from ibrobot_ros2.jpeg import own_jpeg
 from numpy.typing import NDArray
 
-from ibrobot_camera.device import Device
+from ibrobot_camera.device import LIST, NO_DEVICE, Device
 from ibrobot_camera.options import OpenCvOptions
 from ibrobot_camera.v4l2 import Mode, modes
 from ibrobot_core.api import NS_PER_S, CompressedImage, ContractError, Header, SensorError
@@ -138,7 +138,7 @@ class Capture:
         device = self._device
         if device.kind == "v4l2":
             if not os.path.exists(device.target):
-                raise self._error("there is no such device; `ibrobot camera list` shows the available ones")
+                raise self._error(f"{NO_DEVICE}; {LIST}")
             if not os.access(device.target, os.R_OK | os.W_OK):
                 raise self._error("no permission: add yourself to the group `video`, then log in again")
             capture = cv2.VideoCapture(device.target, cv2.CAP_V4L2)

@@ -11,9 +11,11 @@ from urllib.parse import urlsplit
 import attrs
 
 from ibrobot_camera.options import OpenCvOptions, RealSenseOptions
-from ibrobot_core.api import SensorError
+from ibrobot_core.api import MissingDependency, SensorError
 
 BY_ID = Path("/dev/v4l/by-id")
+LIST = "`ibrobot camera list` shows the available ones"
+NO_DEVICE = "there is no such device"
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
 
@@ -35,7 +37,7 @@ class Device:
         return parts._replace(netloc=host, query="…" if parts.query else "").geturl()
 
 
-def find_device(device: int | str, name: str) -> Device:
+def find_device(device: int | str) -> Device:
     """Find the device that `device` refers to.
 
     Raises:
@@ -54,7 +56,7 @@ def find_device(device: int | str, name: str) -> Device:
     if path.is_file():
         return Device("file", str(path))
     there = ", ".join(sorted(entry.name for entry in BY_ID.iterdir())) if BY_ID.is_dir() else "none"
-    raise SensorError(f"camera {name}: no file, URL or device {text!r}; devices under {BY_ID}: {there}")
+    raise SensorError(f"no file, URL or device {text!r}; devices under {BY_ID}: {there}")
 
 
 def video_device(options: OpenCvOptions) -> Mapping[str, str]:
@@ -64,6 +66,20 @@ def video_device(options: OpenCvOptions) -> Mapping[str, str]:
         return {"device": f"/dev/video{text}"}
     path = text if text.startswith("/dev/") else str(BY_ID / text)
     return {"device": os.path.realpath(path)} if text.startswith("/dev/") or Path(path).exists() else {}
+
+
+def require_device(options: OpenCvOptions) -> None:
+    """Look for the V4L2 device or the video file that the options name.
+
+    Raises:
+        MissingDependency: if it is not there.
+    """
+    try:
+        device = find_device(options.device)
+    except SensorError as error:
+        raise MissingDependency(str(error), remedy=LIST) from None
+    if device.kind == "v4l2" and not os.path.exists(device.target):
+        raise MissingDependency(f"{device.target}: {NO_DEVICE}", remedy=LIST)
 
 
 def realsense_stream(options: RealSenseOptions) -> Mapping[str, str]:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from ibrobot_camera import capture as capture_module
+from ibrobot_camera import ibrobot_sensors
 from ibrobot_camera.camera import OpenCvCamera, to_image
 from ibrobot_camera.capture import Capture
 from ibrobot_camera.commands.sources import decoded
@@ -26,6 +27,7 @@ from ibrobot_core.api import (
     Context,
     Header,
     Image,
+    MissingDependency,
     RealClock,
     Sensor,
     SensorError,
@@ -331,16 +333,29 @@ class TestDevices:
         ],
     )
     def test_what_a_device_means(self, device: int | str, kind: str, target: str) -> None:
-        assert find_device(device, "top") == Device(kind, target)
+        assert find_device(device) == Device(kind, target)
 
     def test_missing_device_is_reported(self, tmp_path: Path) -> None:
         with pytest.raises(SensorError, match=r"camera top: no file, URL or device 'usb-cam'"):
-            find_device("usb-cam", "top")
+            camera(host_context("top", clock=RealClock()), "usb-cam").open()
         with pytest.raises(SensorError, match=r"/dev/video77: there is no such device; `ibrobot camera list`"):
             camera(host_context("top", clock=RealClock()), 77).open()
         (tmp_path / "no.mp4").write_text("no video")
         with pytest.raises(SensorError, match="is not a video that can be decoded"):
             camera(host_context("top"), str(tmp_path / "no.mp4")).open()
+
+    @pytest.mark.parametrize(
+        ("device", "message"),
+        [
+            ("usb-cam", "no file, URL or device 'usb-cam'"),
+            (77, "/dev/video77: there is no such device; `ibrobot camera list` shows"),
+        ],
+    )
+    def test_a_run_learns_beforehand_what_is_not_connected(self, device: int | str, message: str) -> None:
+        [descriptor] = [each for each in ibrobot_sensors() if each.type == "opencv"]
+        with pytest.raises(MissingDependency, match=message):
+            descriptor.find(OpenCvOptions(device=device))
+        descriptor.find(OpenCvOptions(device="rtsp://host/live"))
 
 
 def test_depth_is_16uc1_with_its_bytes() -> None:

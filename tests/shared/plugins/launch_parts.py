@@ -179,6 +179,11 @@ class Far(FakeEngine):
         self.options, self.name = options, ctx.name
 
 
+def is_plugged_in(options):
+    if TROUBLE.get("unplugged"):
+        raise MissingDependency("/dev/video0: there is no such device", remedy="plug it in")
+
+
 def can_draw():
     if "no OpenGL" in TROUBLE:
         raise MissingDependency("no OpenGL", apt=["libegl1", "libopengl0"])
@@ -201,7 +206,7 @@ def ibrobot_hardware():
 @hookimpl
 def ibrobot_sensors():
     yield SensorDescriptor("webcam", make(Camera), "a camera")
-    yield SensorDescriptor("drawn", make(Camera), "a camera in the scene", check=can_draw)
+    yield SensorDescriptor("drawn", make(Camera), "a camera in the scene", check=can_draw, find=is_plugged_in)
     yield SensorDescriptor("imu", make(Camera), "a sensor of a kind of its own", kind="imu", check=can_draw)
 
 
