@@ -34,6 +34,7 @@ WRONG_FILES = {
     "convert EPISODE --out new --config BAD": (),
     "convert EPISODE --out new --norm-mode range_m100_100 --calibration BAD": (),
     "convert BAD --to bag --out new": (),
+    "eval BAD --mode scripted --out new": (),
     "serve BAD": (),
     "serve BAD --type lerobot": (),
     "config check BAD": (),
@@ -201,6 +202,8 @@ JSON = {
     "replay BAD --json": 2,
     "convert EPISODE --out new --jobs 1 --json": 0,
     "convert BAD --out new --json": 2,
+    "eval so101_pick_cube --mode scripted --episodes 1 --out new --jobs 1 --json": 0,
+    "eval BAD --out new --json": 2,
     "config check so101 --json": 0,
     "config check BAD --json": 2,
     "plugins --json": 0,
@@ -258,7 +261,7 @@ def test_every_command_with_json_is_tested() -> None:
 def test_json_is_alone_on_standard_output(
     line: str, folder: Path, ibrobot: tuple[str, ...], terminal: Terminal
 ) -> None:
-    if "EPISODE" in line or "lockstep" in line:  # it runs a robot or converts
+    if "EPISODE" in line or "lockstep" in line or "--jobs" in line:  # it runs a robot or converts
         ran = subprocess.run([*ibrobot, *line.split()], capture_output=True, text=True, timeout=120, check=False)
         code, out, err = ran.returncode, ran.stdout, ran.stderr
     else:

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 from ibrobot_mcap import trash
 from ibrobot_mcap.commands import episodes
-from ibrobot_mcap.commands.episodes import episodes_in
+from ibrobot_mcap.commands.find_episodes import episodes_in
 from ibrobot_mcap.reader import Rosbag2Reader
 
 from ibrobot_core.api import RecorderError

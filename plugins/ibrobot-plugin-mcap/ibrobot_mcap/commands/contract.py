@@ -24,7 +24,7 @@ def init(bag: Path, output: Path | None) -> None:
 
     The draft is a YAML file for `ibrobot convert --config`. Lines marked CHOOSE need a decision: read them all.
     """
-    from ibrobot_mcap.commands.episodes import opened
+    from ibrobot_mcap.commands.find_episodes import opened
     from ibrobot_mcap.draft import draft
 
     with opened(bag) as reader:

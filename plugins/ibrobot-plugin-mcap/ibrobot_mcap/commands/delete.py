@@ -22,7 +22,7 @@ def delete(episodes: tuple[Path, ...], yes: bool, to_trash: bool) -> None:
     """
     from ibrobot_mcap import trash
     from ibrobot_mcap.commands.ask import agree
-    from ibrobot_mcap.commands.episodes import size_of, told_size
+    from ibrobot_mcap.commands.find_episodes import size_of, told_size
     from ibrobot_mcap.reader import is_rosbag2
 
     for episode in episodes:

@@ -31,7 +31,7 @@ def export(episode: Path, topic: str, output: Path) -> None:
 
     Numbers and texts become a CSV file, images PNG files and a CSV file of their stamps.
     """
-    from ibrobot_mcap.commands.episodes import opened
+    from ibrobot_mcap.commands.find_episodes import opened
 
     with opened(episode) as reader:
         topics = reader.summary().topics

@@ -25,7 +25,7 @@ def info(episode: Path, as_json: bool) -> None:
 
     The episode may be unfinished.
     """
-    from ibrobot_mcap.commands.episodes import date_of, duration_s, size_of, summary_of, told_size
+    from ibrobot_mcap.commands.find_episodes import date_of, duration_s, size_of, summary_of, told_size
 
     summary = summary_of(episode)
     if as_json:

@@ -27,7 +27,7 @@ def list_episodes(path: Path, as_json: bool) -> None:
     PATH is a folder of datasets (by default `episodes`), a dataset, or an episode. All commands take the names that it
     prints, e.g. pick:1.
     """
-    from ibrobot_mcap.commands.episodes import (
+    from ibrobot_mcap.commands.find_episodes import (
         date_of,
         duration_s,
         episodes_in,

@@ -17,7 +17,7 @@ from ibrobot_core.app import EpisodePath, echo, wrong_input
 def mark(episodes: tuple[Path, ...], outcome: str) -> None:
     """Set the OUTCOME of EPISODES, e.g. after a repair. The episode records that its outcome was set by hand."""
     from ibrobot_mcap.bag_metadata import set_custom
-    from ibrobot_mcap.commands.episodes import opened
+    from ibrobot_mcap.commands.find_episodes import opened
     from ibrobot_mcap.metadata import MARKED, OUTCOME
     from ibrobot_mcap.owning import owning
 

@@ -39,8 +39,8 @@ class Facts:
     """The data of an episode to plot."""
 
     def __init__(self, episode: Path) -> None:
-        from ibrobot_mcap.commands.episodes import opened
         from ibrobot_mcap.commands.export import pixels_of
+        from ibrobot_mcap.commands.find_episodes import opened
 
         self.name = episode.name
         self.stamps: dict[str, list[int]] = defaultdict(list)

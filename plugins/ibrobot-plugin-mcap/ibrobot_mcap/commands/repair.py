@@ -23,7 +23,7 @@ def repair(path: Path) -> None:
     repairs and deletions that were interrupted are finished.
     """
     from ibrobot_mcap import rewrite
-    from ibrobot_mcap.commands.episodes import duration_s, episodes_in
+    from ibrobot_mcap.commands.find_episodes import duration_s, episodes_in
     from ibrobot_mcap.owning import interrupted, owning
 
     failed = 0
@@ -48,7 +48,7 @@ def repair(path: Path) -> None:
 
 def _description(summary: EpisodeSummary) -> str:
     """A description of missing messages, and the former outcome."""
-    from ibrobot_mcap.commands.episodes import told_stated
+    from ibrobot_mcap.commands.find_episodes import told_stated
 
     missing = sum(topic.missing for topic in summary.topics.values())
     return (f", {missing} are missing" if missing else "") + told_stated(summary)

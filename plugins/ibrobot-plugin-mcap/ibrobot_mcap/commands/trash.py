@@ -27,7 +27,7 @@ def trash_command(path: Path, restore: str | None, empty: bool, yes: bool, as_js
     """
     from ibrobot_mcap import trash
     from ibrobot_mcap.commands.ask import agree
-    from ibrobot_mcap.commands.episodes import size_of, told_size
+    from ibrobot_mcap.commands.find_episodes import size_of, told_size
 
     if restore is not None and empty:
         raise click.UsageError("give either --restore or --empty")

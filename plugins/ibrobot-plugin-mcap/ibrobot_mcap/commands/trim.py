@@ -24,7 +24,7 @@ def trim(episode: Path, begin_s: float, end_s: float | None, output: Path | None
     it. After --in-place, `ibrobot episodes trash --restore` puts the original back.
     """
     from ibrobot_mcap import trash
-    from ibrobot_mcap.commands.episodes import duration_s, opened, told_stated
+    from ibrobot_mcap.commands.find_episodes import duration_s, opened, told_stated
 
     if in_place == (output is not None):
         raise click.UsageError("give either --output or --in-place")

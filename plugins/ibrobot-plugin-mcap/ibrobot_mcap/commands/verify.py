@@ -23,7 +23,7 @@ def verify(path: Path, gap: float) -> None:
     times its median period, and different contracts within one dataset.
     """
     from ibrobot_mcap.checks import problems_of
-    from ibrobot_mcap.commands.episodes import episodes_in, summary_of
+    from ibrobot_mcap.commands.find_episodes import episodes_in, summary_of
 
     bad = 0
     contracts: dict[Path, tuple[str, Path]] = {}
