@@ -11,11 +11,11 @@ import attrs
 import click
 import pytest
 from click.testing import CliRunner, Result
+from plugins.counting import COUNT, Counted, CountOptions, count
 
 from ibrobot_core.api import option
 from ibrobot_core.app import Command, Event, Failed, Shown, WireError, declared, decode_event, emit
 from ibrobot_core.errors import ConfigError, IbrobotError
-from tests.shared.plugins.counting import COUNT, Counted, CountOptions, count
 
 
 @pytest.fixture
