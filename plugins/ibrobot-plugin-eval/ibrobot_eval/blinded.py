@@ -7,6 +7,7 @@ import queue
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -25,6 +26,7 @@ from ibrobot_core.app import (
     Runtime,
     Session,
     echo,
+    end_signals,
     error_line,
     installed_plugins,
 )
@@ -213,10 +215,8 @@ class Blinded:
         """Have the scene reset, and wait for the operator."""
         if self._reset:
             echo("resetting the scene …")
-            done = subprocess.run(self._reset, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
-            if done.returncode != 0:
-                last = (done.stderr or done.stdout).strip().splitlines()[-1:]
-                echo(self._blinding(f"the reset failed with exit code {done.returncode}: {' '.join(last)}"))
+            if failed := _failure_of(self._reset):
+                echo(self._blinding(f"the reset failed: {failed}"))
         scene = "the simulation resets the scene" if self._simulated else f"set the scene to start {block + 1}"
         text = (
             f"trial {number} (start {block + 1} of {self._request.episodes}): {scene}; Enter begins, q ends for today"
@@ -238,9 +238,10 @@ class Blinded:
         runtime = Runtime(session)
         keys.gone = lambda: session.fail("keys", TeleopError("the terminal is gone"))
         judged: list[str] = []
-        with _listening(pressed, session, lambda key: _judge(session, judged, key)):
-            echo(f"running: {_JUDGE}, Esc emergency stop")
+        with _ended_by_signals(session) as came, _listening(pressed, session, lambda key: _judge(session, judged, key)):
+            echo("starting …")
             runtime.start()
+            echo(f"running: {_JUDGE}, Esc emergency stop")
             try:
                 while not runtime.wait(_POLL_S):
                     if session.faults:
@@ -248,9 +249,11 @@ class Blinded:
                 time_s = seconds(session.clock.now_ns() - session.episodes.begun_ns)
             finally:
                 runtime.stop()
-        runtime.raise_failure()
         for line in session.outcome.holding:
             echo(self._blinding(line))
+        if came:
+            raise Quit
+        runtime.raise_failure()
         episode = self._request.out / "episodes" / f"trial_{number:04d}"
         for bag in recording.folder.glob("episodes/*/"):
             shutil.rmtree(episode, ignore_errors=True)  # of a trial that was not judged
@@ -273,12 +276,40 @@ class _Ran:
     faults: tuple[str, ...]
 
 
+def _failure_of(command: Sequence[str]) -> str:
+    """Run a command; returns why it failed, empty if it did not."""
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    except OSError as error:
+        return f"{command[0]}: {error.strerror}"
+    last = (done.stderr or done.stdout).strip().splitlines()[-1:]
+    return f"exit code {done.returncode}: {' '.join(last)}" if done.returncode else ""
+
+
 def _judge(session: Session, judged: list[str], key: str) -> None:
     """Handle a key of a running trial: a judgement ends it."""
-    if key in _KEYS and not judged:
-        judged.append(key)
-        session.episodes.end({SUCCESS: SUCCESS, FAILURE: FAILURE}.get(_KEYS[key], "unknown"))
-        session.finish()
+    with session.changing:  # a simulated episode may end at the same time
+        if key in _KEYS and session.episodes.running:
+            judged.append(key)
+            session.episodes.end({SUCCESS: SUCCESS, FAILURE: FAILURE}.get(_KEYS[key], "unknown"))
+            session.finish()
+
+
+@contextmanager
+def _ended_by_signals(session: Session) -> Iterator[list[int]]:
+    """End the run in an orderly way at Ctrl-C, SIGTERM and SIGHUP; gives a list of those that came."""
+    came: list[int] = []
+
+    def end(number: int, frame: object) -> None:
+        came.append(number)
+        threading.Thread(target=session.finish, name="signal", daemon=True).start()
+
+    before = {number: signal.signal(number, end) for number in end_signals()}
+    try:
+        yield came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -184,8 +184,8 @@ def _begin(request: Request, settings: Mapping[str, Any]) -> None:
             known = json.loads(file.read_text(encoding="utf-8"))
         except ValueError as error:
             raise DatasetError(f"{file}: cannot be read: {error}") from None
-        if differences := list(_differences(known, settings)):
-            raise DatasetError(f"{out}: was begun with other settings: {'; '.join(differences)}; choose a new folder")
+        if differing := list(differences(known, settings)):
+            raise DatasetError(f"{out}: was begun with other settings: {'; '.join(differing)}; choose a new folder")
         done = max((len(list(each.glob("seed_*.json"))) for each in (out / "results").glob("*")), default=0)
         if done > request.episodes and not request.until_decided:
             raise DatasetError(f"{out}: has {done} episodes of a policy already; --episodes must not be smaller")
@@ -195,14 +195,14 @@ def _begin(request: Request, settings: Mapping[str, Any]) -> None:
     write(file, json.dumps(settings, indent=1) + "\n")
 
 
-def _differences(known: Mapping[str, Any], now: Mapping[str, Any], where: str = "") -> Iterator[str]:
+def differences(known: Mapping[str, Any], now: Mapping[str, Any], where: str = "") -> Iterator[str]:
     """What differs between two nested mappings, in words."""
     for key in {**known, **now}:
         old, new = known.get(key), now.get(key)
         if old == new:
             continue
         if isinstance(old, Mapping) and isinstance(new, Mapping):
-            yield from _differences(old, new, f"{where}{key} ")
+            yield from differences(old, new, f"{where}{key} ")
         elif key in _HASHES:
             yield f"{where}{_HASHES[key]} changed"
         elif isinstance(old, Mapping) or isinstance(new, Mapping):

@@ -104,14 +104,14 @@ def find_policies(
         if policy in found:
             raise _fault(path, f"control_modes.{chosen.name}", "is given twice")
         found.append(policy)
-    return _labelled(found)
+    return labelled(found)
 
 
 def _fault(path: Path, key: str, message: str) -> ConfigError:
     return ConfigError([Problem(path, 0, key, message)])
 
 
-def _labelled(policies: Sequence[Policy]) -> list[Policy]:
+def labelled(policies: Sequence[Policy]) -> list[Policy]:
     """The policies with the shortest labels that tell them apart: of mode, robot YAML and model."""
     names = [(each.mode, Path(each.config).stem, each.model) for each in policies]
     parts = [chosen for size in (1, 2, 3) for chosen in itertools.combinations(range(3), size)]
@@ -138,7 +138,7 @@ def identify(policy: Policy, registry: Registry) -> Identity:
     named = [each for each in (described.mjcf, described.urdf) if each is not None]
     named += [Path(value) for value in _leaves(attrs.asdict(model.options)) if isinstance(value, str | Path) and value]
     return Identity(
-        document_hash(robot), Contract.from_config(robot).fingerprint(), made.fingerprint(), _hash_of_files(named)
+        document_hash(robot), Contract.from_config(robot).fingerprint(), made.fingerprint(), hash_of_files(named)
     )
 
 
@@ -157,7 +157,7 @@ def _leaves(value: Any) -> Iterable[Any]:
         yield from _leaves(each)
 
 
-def _hash_of_files(named: Sequence[Path]) -> str:
+def hash_of_files(named: Sequence[Path]) -> str:
     """Hash of the content of files, and of all files in folders; those that do not exist are left out."""
     digest = hashlib.sha256()
     found = False

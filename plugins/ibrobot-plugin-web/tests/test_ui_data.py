@@ -19,6 +19,7 @@ from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import Registry, find_config, installed_plugins
 
 CONFIG = Path(find_config("so101_blind", installed_plugins()))
+needs_eval = pytest.mark.skipif("eval" not in installed_plugins().commands, reason="needs ibrobot-plugin-eval")
 needs_data = pytest.mark.skipif("convert" not in installed_plugins().commands, reason="needs ibrobot-plugin-data")
 needs_lerobot = pytest.mark.skipif(
     "datasets" not in installed_plugins().commands, reason="needs ibrobot-plugin-lerobot"
@@ -173,6 +174,24 @@ def test_trainings_are_confined_and_checked_in_the_words_of_the_form(ui: Ui, wro
 def test_conversions_are_confined_and_checked_in_the_words_of_the_form(ui: Ui, wrong: Any, error: str) -> None:
     with pytest.raises(IbrobotError, match=error):
         start(ui, "convert", **{"episodes": ["."], "out": "new", **wrong})
+    assert ui.jobs.all() == []
+
+
+@needs_eval
+@pytest.mark.parametrize(
+    ("wrong", "error"),
+    [
+        ({"config": ["/etc/robot.yaml"]}, "outside"),
+        ({"config": ["so101_pick_cube", "../robot.yaml"]}, "outside"),
+        ({"out": "/etc"}, "outside"),
+        ({"margin": 2}, "Margin: 2.0 is too large"),
+        ({"mode": "scripted"}, "Modes: expected a list"),
+        ({"config": None}, "Config: required key is missing|Robot YAML: required key is missing"),
+    ],
+)
+def test_evaluations_are_confined_and_checked_in_the_words_of_the_form(ui: Ui, wrong: Any, error: str) -> None:
+    with pytest.raises(IbrobotError, match=error):
+        start(ui, "eval", **{"config": ["so101_pick_cube"], "mode": ["scripted"], "out": "new", **wrong})
     assert ui.jobs.all() == []
 
 

@@ -61,7 +61,8 @@ def read_form(ui: Ui, command: Command, values: Mapping[str, Any]) -> Any:
         raise IbrobotError(f"the form of {title_of(command.name)} has no field {unknown[0]}")
     for name, value in plain.items():
         if shown[name].metadata["names"] == "robot":
-            plain[name] = robot_of(ui, str(value))
+            several = isinstance(value, list)
+            plain[name] = [robot_of(ui, str(each)) for each in value] if several else robot_of(ui, str(value))
         elif isinstance(value, str) and "/" in value and shown[name].metadata["names"] == "calibration":
             raise IbrobotError(f"{label_of(name, shown[name])}: {value!r} is no name")
     labels = {name: label_of(name, field) for name, field in shown.items()}
