@@ -240,3 +240,28 @@ def test_events_tell_a_program_the_result(folder: Path, whole: Path) -> None:
     assert (done.returncode, begin) == (0, {"event": "begin", "of": 6, "done": 6})
     assert (report["event"], report["out"]) == ("report", str(whole))
     assert report["lines"][1].startswith("faulty    0 of 3 succeeded")
+
+
+def test_episode_with_a_varied_key_is_repeated_by_its_command(folder: Path, tmp_path: Path) -> None:
+    with chdir(folder):
+        options = (
+            "--vary",
+            "simulation.latency=0:0.02:2",
+            "--episodes",
+            2,
+            "--seed",
+            1,
+            "--jobs",
+            1,
+            "--out",
+            "varied",
+        )
+        done = run_here("eval", "picks.yaml", "--mode", "scripted", *options)
+    assert done.returncode == 0, done.stderr
+    episodes = json.loads((folder / "varied/report.json").read_text())["episodes"]
+    assert [each["factors"]["latency"] for each in episodes] == [0.02, 0.0]
+    (tmp_path / "picks.yaml").write_bytes((folder / "picks.yaml").read_bytes())
+    with chdir(tmp_path):
+        run_here(*shlex.split(episodes[0]["command"])[1:])
+    repeated = tmp_path / "episodes/default/episodes/episode_000001"
+    assert digests(repeated) == digests(folder / "varied" / episodes[0]["recording"])

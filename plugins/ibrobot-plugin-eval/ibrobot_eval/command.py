@@ -50,13 +50,15 @@ def evaluate(
     valid however often you look and whenever you stop. Exits with 0 whatever the policies achieve.
     """
     with wrong_input():
-        policies = find_policies(options.config, options.mode, options.model, overrides, sim=options.sim)
+        policies = find_policies(options.config, options.mode, options.model, overrides, options.vary, sim=options.sim)
         if options.until_decided and len(policies) < 2:
             raise click.UsageError("--until-decided compares policies: give at least two")
         simulated = {each.load().simulated for each in policies}
         if len(simulated) > 1:
             raise click.UsageError("some of the robots are simulated, others are not: add --sim")
         trials = trials or simulated == {False}
+        if trials and options.vary:
+            raise click.UsageError("--vary is for episodes in simulation, not for blinded trials")
         if not trials and (reset or open_):
             raise click.UsageError(f"{'--reset' if reset else '--open'} is for blinded trials; episodes are simulated")
         request = Request(

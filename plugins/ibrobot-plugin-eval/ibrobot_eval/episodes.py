@@ -30,7 +30,7 @@ class Result:
     """Kind of intervention of the safety layer -> number of interventions, for those that occurred."""
     faults: tuple[str, ...]
     factors: Mapping[str, float]
-    """What the scene has drawn from the seed, e.g. the position of an object."""
+    """What the scene has drawn from the seed, e.g. the position of an object, and what varies."""
     acting: Mapping[str, str]
     """Model, weights and fingerprint of the policy that acted, as recordings state them."""
 
@@ -78,9 +78,9 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str, go_on: Call
     """
     place = Place.of(out, policy, seed)
     registry = installed_plugins()
-    config = policy.load()
-    if document_hash(config) != document:
-        raise ComponentFailed(f"{config.source}: was changed during the evaluation")
+    if document_hash(policy.load()) != document:
+        raise ComponentFailed(f"{policy.config}: was changed during the evaluation")
+    config = policy.load(seed)
     assert config.recording is not None
     shutil.rmtree(place.scratch, ignore_errors=True)
     # The recording does not state where it is, so that equal episodes have equal bytes.
@@ -107,11 +107,12 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str, go_on: Call
     time_s = seconds(session.clock.now_ns() - session.episodes.begun_ns)
     bags = list(recording.folder.glob("episodes/*/"))
     metadata = _checked(bags, "success" if session.outcome.successes else "failure", session.outcome.faults)
+    varied = {key.rpartition(".")[2]: value for key, value in policy.varied(seed).items()}
     counts = session.counts()
     happened = {kind: count for kind, count in counts["safety"].items() if count and kind not in NO_INTERVENTION}
     result = Result(
         seed, session.outcome.successes == 1, round(time_s, 6), happened, tuple(session.outcome.faults),
-        json.loads(metadata.get("factors", "{}")), acting,
+        json.loads(metadata.get("factors", "{}")) | varied, acting,
     )  # fmt: skip
     shutil.rmtree(place.episode, ignore_errors=True)  # of a run that was killed before it wrote the result
     place.episode.parent.mkdir(parents=True, exist_ok=True)

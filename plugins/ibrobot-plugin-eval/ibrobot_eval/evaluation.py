@@ -154,6 +154,7 @@ def opened(request: Request) -> Iterator[Evaluation]:
     settings = {
         "format": _FORMAT, "seed": request.seed, "until_decided": request.until_decided, "margin": request.margin,
         "trials": request.trials,
+        "vary": list(request.policies[0].vary),
         "policies": {
             each.label: {"mode": each.mode, "model": each.model, **attrs.asdict(identities[each.label])}
             for each in request.policies

@@ -31,22 +31,22 @@ _DEPTH = 10_000
 
 def can_film(policy: Policy) -> bool:
     """Whether the simulation of a policy has a camera for films, and this machine can render."""
-    config = _filmed(policy)
+    config = _filmed(policy, None)
     return config is not None and all(each.name != _CAMERA for each in absent_sensors(config, installed_plugins()))
 
 
-def _filmed(policy: Policy) -> RobotConfig | None:
+def _filmed(policy: Policy, seed: int | None) -> RobotConfig | None:
     """The robot with the camera; None if its simulation has none."""
     registry = installed_plugins()
     path = find_config(policy.config, registry)
-    plain = load_config(path, overrides=policy.overrides, mode=policy.mode, sim=True, registry=registry)
+    plain = load_config(path, overrides=policy.overrides_of(seed), mode=policy.mode, sim=True, registry=registry)
     assert plain.simulation is not None
     descriptor = registry.find("hardware", plain.simulation.type)
     if not isinstance(descriptor, HardwareDescriptor) or not descriptor.film:
         return None
     camera = {"name": _CAMERA, "kind": "camera", **descriptor.film}
     peripherals = json.dumps([*plain.document.get("peripherals", ()), camera], default=str)
-    overrides = (*policy.overrides, f"peripherals={peripherals}")
+    overrides = (*policy.overrides_of(seed), f"peripherals={peripherals}")
     config = load_config(path, overrides=overrides, mode=policy.mode, sim=True, registry=registry)
     return attrs.evolve(config, recording=None, viewer=None)
 
@@ -57,7 +57,7 @@ def film(file: Path, policy: Policy, result: Result, go_on: Callable[[], bool] =
     Raises:
         ComponentFailed: if it does not end as before.
     """
-    config = _filmed(policy)
+    config = _filmed(policy, result.seed)
     assert config is not None
     runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=result.seed, episodes=1)))
     session = runtime.session

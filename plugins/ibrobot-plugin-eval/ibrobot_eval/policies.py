@@ -18,12 +18,41 @@ from ibrobot_core.app import (
     ConfigError,
     Problem,
     Registry,
+    RequestError,
     RobotConfig,
     build_policy,
     find_config,
     installed_plugins,
     load_config,
 )
+
+_MOST_VALUES = 1000
+
+
+@attrs.frozen
+class Variation:
+    """A key of the robot YAML that varies over the episodes."""
+
+    key: str
+    values: tuple[float, ...]
+
+    @classmethod
+    def of(cls, text: str) -> Variation:
+        """Parse e.g. `simulation.scene.light=0.2:1.5:5`: five values from 0.2 to 1.5.
+
+        Raises:
+            RequestError: for another text.
+        """
+        key, _, ends = text.partition("=")
+        try:
+            low, high, count = ends.split(":")
+            first, last, number = float(low), float(high), int(count)
+        except ValueError:
+            raise RequestError(f"--vary {text}: expected PATH=LOW:HIGH:COUNT, e.g. control.rate_hz=50:200:4") from None
+        if not key or not first < last < float("inf") or not 2 <= number <= _MOST_VALUES:
+            raise RequestError(f"--vary {text}: LOW must be below HIGH, and COUNT from 2 to {_MOST_VALUES}")
+        step = (last - first) / (number - 1)
+        return cls(key, tuple(round(first + step * i, 9) for i in range(number)))
 
 
 @attrs.frozen
@@ -41,29 +70,49 @@ class Policy:
     """Overrides of the YAML, those for the model included."""
     sim: bool = True
     """Whether it runs in simulation."""
+    vary: tuple[str, ...] = ()
+    """Keys of the YAML that vary over the seeds; see `Variation.of`."""
 
     @property
     def folder(self) -> str:
         """The label as the name of a folder."""
         return re.sub(r"[^\w.,=+-]+", "_", self.label)
 
-    def load(self) -> RobotConfig:
+    def varied(self, seed: int) -> dict[str, float]:
+        """Key -> its value in the episode of a seed. So many seeds as there are combinations in a row have them all."""
+        found = {}
+        for text in self.vary:
+            variation = Variation.of(text)
+            seed, place = divmod(seed, len(variation.values))
+            found[variation.key] = variation.values[place]
+        return found
+
+    def overrides_of(self, seed: int | None) -> tuple[str, ...]:
+        """The overrides for the episode of a seed; None for those that all episodes have."""
+        varied = self.varied(seed) if seed is not None else {}
+        return (*self.overrides, *(f"{key}={value!r}" for key, value in varied.items()))
+
+    def load(self, seed: int | None = None) -> RobotConfig:
         """The robot of an episode. It records, as a robot does that `ibrobot record` runs.
+
+        Args:
+            seed: that of the episode; None for the YAML before keys vary.
 
         Raises:
             ConfigError: with all faults of the YAML.
         """
         registry = installed_plugins()
         path = find_config(self.config, registry)
-        plain = load_config(path, overrides=self.overrides, mode=self.mode, sim=self.sim, registry=registry)
+        overrides = self.overrides_of(seed)
+        plain = load_config(path, overrides=overrides, mode=self.mode, sim=self.sim, registry=registry)
         if plain.recording is not None:
             return plain
         made = f"recording={{type: {registry.default('recorder')}, root: episodes, topics: contract}}"
-        return load_config(path, overrides=(made, *self.overrides), mode=self.mode, sim=self.sim, registry=registry)
+        return load_config(path, overrides=(made, *overrides), mode=self.mode, sim=self.sim, registry=registry)
 
     def command(self, seed: int) -> str:
         """The command that repeats an episode in simulation."""
-        sets = (word for override in self.overrides for word in ("--set", override))
+        sets = (word for override in self.overrides_of(seed) for word in ("--set", override))
         options = ("--sim", "--lockstep", "--headless", "--mode", self.mode, "--seed", str(seed), "--episodes", "1")
         return shlex.join(["ibrobot", "record", self.config, *options, *sets])
 
@@ -82,8 +131,9 @@ class Identity:
 
 
 def find_policies(
-    configs: Sequence[str], modes: Sequence[str], models: Sequence[str], overrides: Sequence[str], *, sim: bool
-) -> list[Policy]:
+    configs: Sequence[str], modes: Sequence[str], models: Sequence[str], overrides: Sequence[str],
+    vary: Sequence[str] = (), *, sim: bool,
+) -> list[Policy]:  # fmt: skip
     """The policies that a command line means: each robot YAML in each mode with each model.
 
     Raises:
@@ -100,7 +150,10 @@ def find_policies(
         if model is not None and model not in robot.models:
             raise _fault(path, "models", f"has no model {model!r}; the models are: {', '.join(robot.models)}")
         made = () if model is None else (f"control_modes.{chosen.name}.inference.model={model}",)
-        policy = Policy("", config, chosen.name, model or chosen.inference.model, (*overrides, *made), sim)
+        named = model or chosen.inference.model
+        policy = Policy("", config, chosen.name, named, (*overrides, *made), sim, tuple(vary))
+        for seed in range(max((len(Variation.of(text).values) for text in vary), default=0)):
+            load_config(path, overrides=policy.overrides_of(seed), mode=mode, sim=sim, registry=registry)
         if policy in found:
             raise _fault(path, f"control_modes.{chosen.name}", "is given twice")
         found.append(policy)

@@ -41,7 +41,8 @@ class Job:
     @classmethod
     def of(cls, order: dict[str, Any]) -> Job:
         """The job of an order to a worker."""
-        policy = Policy(**order["policy"] | {"overrides": tuple(order["policy"]["overrides"])})
+        fields = order["policy"]
+        policy = Policy(**fields | {name: tuple(fields[name]) for name in ("overrides", "vary")})
         return cls(order["out"], policy, order["seed"], order["document"])
 
 

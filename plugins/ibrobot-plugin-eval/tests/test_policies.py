@@ -1,5 +1,8 @@
+import pytest
 from ibrobot_eval.evaluation import differences
-from ibrobot_eval.policies import Policy, hash_of_files, labelled
+from ibrobot_eval.policies import Policy, Variation, hash_of_files, labelled
+
+from ibrobot_core.api import IbrobotError
 
 
 def policy(config, mode, model):
@@ -54,3 +57,18 @@ def test_command_repeats_an_episode_with_all_overrides():
         "ibrobot record 'my robot.yaml' --sim --lockstep --headless --mode act --seed 7 --episodes 1 "
         "--set 'simulation.scene={type: stack}'"
     )
+
+
+def test_consecutive_seeds_have_all_combinations_of_what_varies():
+    made = Policy("act", "a.yaml", "act", "m", ("x=1",), vary=("scene.light=0.2:1.5:3", "rate=1:2:2"))
+    found = [tuple(made.varied(seed).values()) for seed in range(6)]
+    assert found == [(0.2, 1.0), (0.85, 1.0), (1.5, 1.0), (0.2, 2.0), (0.85, 2.0), (1.5, 2.0)]
+    assert made.varied(6) == made.varied(0)
+    assert made.command(1).endswith("--set x=1 --set scene.light=0.85 --set rate=1.0")
+    assert made.overrides_of(None) == ("x=1",)
+
+
+@pytest.mark.parametrize("text", ["light", "light=1", "light=1:2", "light=2:1:5", "light=1:2:1", "=1:2:3", "a=0:inf:3"])
+def test_other_variations_are_refused(text):
+    with pytest.raises(IbrobotError, match="--vary"):
+        Variation.of(text)
