@@ -260,6 +260,7 @@ def test_episode_with_a_varied_key_is_repeated_by_its_command(folder: Path, tmp_
     assert done.returncode == 0, done.stderr
     episodes = json.loads((folder / "varied/report.json").read_text())["episodes"]
     assert [each["factors"]["latency"] for each in episodes] == [0.02, 0.0]
+    assert all(0.1 < each["factors"]["cube_x"] < 0.3 for each in episodes)
     (tmp_path / "picks.yaml").write_bytes((folder / "picks.yaml").read_bytes())
     with chdir(tmp_path):
         run_here(*shlex.split(episodes[0]["command"])[1:])

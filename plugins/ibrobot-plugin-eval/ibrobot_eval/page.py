@@ -97,7 +97,8 @@ def _episodes(report: Report, label: str) -> list[Episode]:
 
 def _factors(report: Report) -> Iterator[str]:
     """Plots of the outcomes over what the scene has drawn."""
-    names = report.factors
+    values_of = {name: {each.result.factors.get(name) for each in report.episodes} for name in report.factors}
+    names = [name for name, values in values_of.items() if len(values) > 1]
     if not names:
         return
     yield tag("h2", "Where it succeeds and fails")

@@ -20,7 +20,7 @@ def made(label="good", *, episodes=12):
     """A report on a policy that succeeds, and one that fails where the cube is far away."""
     found = {label: [], "bad": []}
     for seed in range(episodes):
-        where = {"cube_x": 0.1 + seed / 100, "cube_y": 0.05 * (seed % 3), "light": 1.0 + seed % 5}
+        where = {"cube_x": 0.1 + seed / 100, "cube_y": 0.05 * (seed % 3), "light": 1.0 + seed % 5, "friction": 1.0}
         found[label].append(result(seed, True, factors=where))
         found["bad"].append(result(seed, seed < 3, factors=where, faults=("joint: <stuck>",) if seed == 5 else ()))
     return Report.of_simulation([policy(label), policy("bad")], found, 0.1, until_decided=False)
@@ -59,6 +59,7 @@ def test_page_is_one_file_without_network_and_well_formed(tmp_path):
     assert text.count('class="failure"') == 9
     assert "good: outcomes over cube_x and cube_y" in text
     assert "bad: success rate over light" in text
+    assert "over friction" not in text, "it never varies"
 
 
 def test_page_escapes_names_and_faults(tmp_path):
