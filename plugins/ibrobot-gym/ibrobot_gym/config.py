@@ -1,0 +1,63 @@
+"""The robot YAML of an environment: that of a run, with its scene and its cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ibrobot_core.api import HardwareDescriptor
+from ibrobot_core.app import RobotConfig, find_config, from_document, installed_plugins, load_config
+
+RENDERED = "gym_render"
+"""Peripheral whose pictures `render` returns."""
+
+
+def environment_config(
+    name: str, scene: str | None, cameras: Sequence[str], size: tuple[int, int], rendered: str | None,
+    overrides: Sequence[str],
+) -> RobotConfig:  # fmt: skip
+    """A config with its scene and cameras.
+
+    Args:
+        name: a robot YAML, or the name of a shipped one.
+        scene: the type of scene; None: that of the file.
+        cameras: cameras of the scene to observe, in addition to those of the file.
+        size: height and width of their pictures [px].
+        rendered: the camera that `render` shows; None for an environment that renders nothing.
+        overrides: `path.to.key=value`, as of `ibrobot launch --set`.
+
+    Raises:
+        ConfigError: with all faults.
+    """
+    registry = installed_plugins()
+    chosen = [f"simulation.scene={scene}"] if scene is not None else []
+    config = load_config(find_config(name, registry), sim=True, overrides=[*chosen, *overrides])
+    assert config.simulation is not None
+    descriptor = registry.find("hardware", config.simulation.type)
+    assert isinstance(descriptor, HardwareDescriptor)
+    type_ = descriptor.sensors["camera"]
+    names = {f"gym_{camera}": camera for camera in cameras}
+    shown = {RENDERED: rendered} if rendered is not None else {}
+    if not names and not shown:
+        return config
+    height, width = size
+
+    def peripheral(camera: str, of: str, shape: Mapping[str, int]) -> dict[str, Any]:
+        rate_hz = config.contract.rate_hz
+        return {
+            "name": camera, "kind": "camera", "type": type_, "camera": of, "fps": rate_hz, "encoding": "raw", **shape,
+        }  # fmt: skip
+
+    document = dict(config.document)
+    document["peripherals"] = [
+        *document.get("peripherals", ()),
+        *(peripheral(camera, of, {"width": width, "height": height}) for camera, of in names.items()),
+        *(peripheral(camera, of, {"width": 640, "height": 480}) for camera, of in shown.items()),
+    ]
+    observed = [
+        {"key": f"observation.images.{of}", "peripheral": camera, "align": {"strategy": "asof", "tol_ms": 100.0}}
+        for camera, of in names.items()
+    ]
+    contract = dict(document.get("contract", {}))
+    document["contract"] = {**contract, "observations": [*contract.get("observations", ()), *observed]}
+    return from_document(document, source=config.source, sim=True)
