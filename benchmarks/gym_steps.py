@@ -3,8 +3,8 @@
     python benchmarks/gym_steps.py [--blocks 10] [--steps 60]
 
 In each block, the three make the same number of steps of a thirtieth of a second, in turns of order; without cameras,
-and with two of 320 x 240 pixels. The run is that of the scripted pick. The bare loop steps the physics, reads the joints
-and renders. Prints a line of JSON for each, with the median ratios of the times and their quartiles.
+and with two of 320 x 240 pixels. The run is that of the scripted pick. The bare loop steps the physics, reads the
+joints and renders. Prints a line of JSON for each, with the median ratios of the times and their quartiles.
 """
 
 from __future__ import annotations
