@@ -387,7 +387,7 @@ def run(times: int, kills: int, seed: int, only: str | None = None) -> bool:
         folder = Path(name)
         template = folder / "template"
         program = str(install_trainer(folder))
-        training_module.find_trainer = lambda: program
+        vars(training_module)["find_trainer"] = lambda: program
         aside(prepare, template)
         pairs = [pair for pair in itertools.combinations_with_replacement(COMMANDS, 2) if only is None or only in pair]
         for pair in pairs:

@@ -76,7 +76,7 @@ def scene(seed: int, robot: Robot) -> dict[str, Any]:
     while True:
         values = sample(rng)
         options = single_options(MujocoOptions, (), "scene", text=json.dumps({"objects": values["objects"]}))
-        ranges = {name: tuple(ends) for name, ends in values["scene"].items() if name != "type"}
+        ranges: dict[str, Any] = {name: tuple(ends) for name, ends in values["scene"].items() if name != "type"}
         options = attrs.evolve(options, scene=made_scene(**ranges))
         with suppress(HardwareError):  # no place for the cube
             if len(options.objects) == OBSTACLES and clear_of_start(options, robot):
@@ -134,8 +134,8 @@ def sample(rng: np.random.Generator) -> dict[str, Any]:
         objects[f"obstacle_{len(objects)}"] = thing
         places.append(place)
     ranges = {"cube_distance": distance, "cube_bearing": bearing, "cube_yaw": yaw}
-    place = {name: [float(value)] * 2 for name, value in ranges.items()}
-    return {"scene": {"type": "pick_cube", **place}, "objects": objects}
+    drawn = {name: [float(value)] * 2 for name, value in ranges.items()}
+    return {"scene": {"type": "pick_cube", **drawn}, "objects": objects}
 
 
 def perform(seed: int, speed: float = 1.0) -> Outcome:

@@ -122,7 +122,7 @@ def ways_around(tree: ast.AST) -> Iterator[str]:
         for each in ast.walk(node)
     }
     of_rich = {
-        name.name
+        name.asname or name.name: name.name
         for node in ast.walk(tree)
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rich")
         for name in node.names
@@ -138,7 +138,7 @@ def ways_around(tree: ast.AST) -> Iterator[str]:
             called, given = ast.unparse(node.func), {word.arg: word.value for word in node.keywords}
             if called in ("click.echo", "click.secho", "print", "logging.Formatter"):
                 yield f"{called}: use echo or LogFormatter"
-            elif called in {"Live", "Progress"} & of_rich and "console" not in given:
+            elif of_rich.get(called) in ("Live", "Progress") and "console" not in given:
                 yield f"{called} without console=: its own takes markup"
             elif called == "TextColumn" and "markup" not in given:
                 yield "TextColumn without markup=False"

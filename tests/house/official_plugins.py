@@ -11,6 +11,7 @@ import tomllib
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from ibrobot_core.descriptors import SectionDescriptor
 from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, RECORDS, discover
 
 CORE = "ibrobot-core"
@@ -38,7 +39,9 @@ def offers() -> dict[str, dict[str, list[str]]]:
             if defaults:
                 kinds[kind] = [*defaults, *(each for each in kinds[kind] if each not in defaults)]
                 kinds.setdefault("default", []).append(kind)
-            if any(each.descriptor.records_episodes for each in mine if kind == "section"):
+            if any(
+                isinstance(each.descriptor, SectionDescriptor) and each.descriptor.records_episodes for each in mine
+            ):
                 kinds[RECORDS] = kinds[kind]
         if registry.readers:
             kinds["reader"] = sorted(reader.type for reader in registry.readers)

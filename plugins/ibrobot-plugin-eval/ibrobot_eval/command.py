@@ -162,7 +162,8 @@ def _lines(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
 
         yield line
         return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
 
     from ibrobot_core.app import Screen
 
@@ -170,7 +171,7 @@ def _lines(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
         TextColumn(each, markup=False) for each in ("{task.description}", "{task.fields[successes]}")
     )
     columns = (counts_column, BarColumn(), successes_column, TimeRemainingColumn())
-    with Progress(*columns, console=Screen(stderr=True)) as bar:
+    with Bar(*columns, console=Screen(stderr=True)) as bar:
         task = bar.add_task("starting", total=None, successes="")
         counts: dict[str, list[int]] = {}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from ibrobot_eval.episodes import Result
 from ibrobot_eval.policies import Policy
 
@@ -11,7 +13,14 @@ def policy(label: str) -> Policy:
 
 
 def result(seed: int, success: bool, **more: object) -> Result:
-    fields = {"time_s": 2.0 + seed % 7 / 10, "interventions": {}, "faults": (), "factors": {}, "acting": {}, **more}
+    fields: dict[str, Any] = {
+        "time_s": 2.0 + seed % 7 / 10,
+        "interventions": {},
+        "faults": (),
+        "factors": {},
+        "acting": {},
+        **more,
+    }
     return Result(seed, success, **fields)
 
 

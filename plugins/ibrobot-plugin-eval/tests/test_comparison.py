@@ -10,6 +10,7 @@ def test_25_and_29_of_50_are_undecided_and_say_how_many_more():
     assert found.verdict == UNDECIDED
     assert found.words.startswith("undecided between a and b; about ")
     assert found.words.endswith(" more episodes of each would decide")
+    assert found.more_episodes is not None
     assert found.more_episodes > 50
 
 

@@ -124,7 +124,9 @@ def test_25_and_29_of_50_are_undecided_and_94_and_91_of_100_too():
             test.add(seed * 37 % episodes < first, seed * 11 % episodes < second)
         assert (test.pairs.first - test.pairs.second) == first - second
         assert test.p_value > ALPHA
-        assert episodes_to_decide(test.pairs, 0.1) > 50
+        more = episodes_to_decide(test.pairs, 0.1)
+        assert more is not None
+        assert more > 50
 
 
 def test_policy_that_always_fails_where_another_succeeds_is_found_after_eight_episodes():
@@ -168,6 +170,7 @@ def test_true_difference_is_seldom_refuted_under_peeking():
 def test_projection_is_what_the_present_frequencies_need():
     pairs = Pairs(4, 1, 5)
     more = episodes_to_decide(pairs, 0.05)
+    assert more is not None
     scale = (pairs.episodes + more) / pairs.episodes
     assert log_capital(4 * scale, scale, 5 * scale, 0.0) >= -np.log(ALPHA)
     scale = (pairs.episodes + more - 1) / pairs.episodes
@@ -176,6 +179,8 @@ def test_projection_is_what_the_present_frequencies_need():
 
 def test_equal_outcomes_will_be_called_no_more_different_than_the_margin():
     wide, narrow = (episodes_to_decide(Pairs(0, 0, 20), margin) for margin in (0.1, 0.02))
+    assert wide is not None
+    assert narrow is not None
     assert 0 < wide < narrow
     assert episodes_to_decide(Pairs(500, 500, 0), 1e-4) is None
 

@@ -234,7 +234,8 @@ def test_resized_cube_is_as_if_built_so() -> None:
     ],
 )
 def test_option_of_a_scene_is_set_below_its_short_form(change: str, options: dict[str, Any]) -> None:
-    config = load_config(find_config("so101_pick_cube", installed_plugins()), overrides=[change])
+    changes = ["simulation.scene=pick_cube", change]
+    config = load_config(find_config("so101_blind", installed_plugins()), overrides=changes)
     assert config.simulation is not None
     assert config.simulation.options.scene == scene("pick_cube", **options)
 

@@ -35,7 +35,7 @@ from ibrobot_core.api import (
     String,
     Vector3,
 )
-from ibrobot_core.app import PanelDescriptor, Session
+from ibrobot_core.app import PanelDescriptor, RunView
 
 
 def gradient(encoding: str) -> Image:
@@ -143,7 +143,7 @@ def test_pages_that_only_watch_see_no_token_in_the_log() -> None:
 
 
 def test_panels_of_plugins_are_shown_and_a_failing_one_harms_nothing() -> None:
-    def fails(session: Session) -> list[list[str]]:
+    def fails(session: RunView) -> list[list[str]]:
         raise ValueError("no servos")
 
     session = make_session()
@@ -191,7 +191,7 @@ def test_objects_of_a_simulated_scene_are_where_the_simulation_has_them() -> Non
     descriptor = HardwareDescriptor("sim", make=make, summary="", scene=lambda options, robot: things)
     config = SimpleNamespace(simulated=True, simulation=SimpleNamespace(type="sim", options=None), robot=None)
     registry = SimpleNamespace(find=lambda kind, name: descriptor)
-    objects: Any = SceneObjects(SimpleNamespace(bus=session.bus, config=config, registry=registry))  # type: ignore[arg-type]
+    objects: Any = SceneObjects(SimpleNamespace(bus=session.bus, config=config, registry=registry))
     assert [(each["name"], each["pos"]) for each in objects.json()] == [("bin", [1, 2, 3]), ("cube", [1, 2, 3])]
     session.bus.publish("/simulation/scene", Float64MultiArray(np.array([9.0, 9.0, 0.5, 0.6, 0.7, 0.0, 1.0, 0.0, 0.0])))
     bin_, cube = objects.json()

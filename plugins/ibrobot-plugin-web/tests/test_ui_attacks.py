@@ -188,7 +188,9 @@ def test_no_request_reaches_files_outside_the_opened_folders(tmp_path: Path, out
         facts |= {**more, "steps": 1, "batch_size": 1, "topic": "/t", "at_s": 0}
         for name in ("episodes", "out", "dataset", "config"):
             for command in ("convert", "train"):
-                values = {"episodes": ["."], "out": "new"} if command == "convert" else {"dataset": ".", "out": "new"}
+                values: dict[str, Any] = (
+                    {"episodes": ["."], "out": "new"} if command == "convert" else {"dataset": ".", "out": "new"}
+                )
                 values[name] = [outside] if name == "episodes" else outside
                 with pytest.raises(RuntimeError, match=r"outside the opened folders|no field|not installed"):
                     await server.post("jobs/start", command=command, values=values)

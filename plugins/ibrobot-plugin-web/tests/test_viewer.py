@@ -22,7 +22,7 @@ from ibrobot_web.options import WebOptions
 from ibrobot_web.viewer import WebViewer
 
 from ibrobot_core.api import Context, Header, IbrobotError, JointState, Message, Viewer
-from ibrobot_core.app import ComponentFailed, ControlState
+from ibrobot_core.app import ComponentFailed, ControlState, Session
 
 OPTIONS = WebOptions(port=0, browser=False, rate_hz=60)
 
@@ -50,7 +50,7 @@ class TestConformance(ViewerSuite):
     @override
     def message(self, ctx: Context, i: int) -> Message:
         session = ctx.session
-        assert session is not None
+        assert isinstance(session, Session)
         now = state(i, ctx.clock.now_ns())
         session.take_state(now)
         return JointState(Header(now.stamp_ns), ctx.robot.joint_names, now.position)

@@ -10,7 +10,7 @@ from ibrobot_testing import SceneSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeScene, FakeWorld
 
 
-class Subject(SceneSuite):
+class Subject(SceneSuite[Any, Any]):
     kind = FakeScene
 
     @override
