@@ -76,6 +76,7 @@ def option(
     more: bool = False,
     names: str = "",
     argument: bool = False,
+    flag: str = "",
 ) -> Any:
     """An attrs field for an options class.
 
@@ -98,6 +99,7 @@ def option(
         more: whether forms show it among further options.
         names: what a text or path names, for forms: `episodes`, `dataset`, `policy`, `robot` or `calibration`.
         argument: whether it is an argument of the command line, and not a flag.
+        flag: its flag on the command line, if that is not made of the key, e.g. `--from`.
     """
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
     metadata: dict[str, Any] = {
@@ -107,7 +109,7 @@ def option(
         **bounds,
     }
     metadata |= {"secret": secret, "plain": plain, "label": label, "more": more, "names": names, "argument": argument}
-    metadata |= {"open": open, "words": dict(choices) if isinstance(choices, Mapping) else {}}
+    metadata |= {"flag": flag, "open": open, "words": dict(choices) if isinstance(choices, Mapping) else {}}
     shown: Any = _hidden if secret else True
 
     def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:

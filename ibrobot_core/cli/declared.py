@@ -88,7 +88,7 @@ def read_options(
 
 def flag_of(name: str, field: attrs.Attribute[Any]) -> str:
     """What the command line calls an option, e.g. `--norm-mode`, or `EPISODES` for an argument."""
-    return name.upper() if field.metadata["argument"] else f"--{name.replace('_', '-')}"
+    return name.upper() if field.metadata["argument"] else field.metadata["flag"] or f"--{name.replace('_', '-')}"
 
 
 def _parameter(name: str, field: attrs.Attribute[Any]) -> Callable[[Any], Any]:

@@ -9,6 +9,8 @@ from ibrobot_core.api import hookimpl
 from ibrobot_core.app import Command, SectionDescriptor, SourceDescriptor
 from ibrobot_data.conversion import EVENTS, ConvertOptions
 from ibrobot_data.options import EpisodesOptions, check_keys
+from ibrobot_data.recording_session import RecordOptions
+from ibrobot_data.recording_session import Session as SessionEvent
 
 if TYPE_CHECKING:
     import click
@@ -36,12 +38,14 @@ def _replay() -> click.Command:
 
 CONVERT = Command("convert", "Make a dataset for training from episodes.", _convert, ConvertOptions, EVENTS)
 
+RECORD = Command("record", "Run a robot and record its episodes.", _record, RecordOptions, (SessionEvent,))
+
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot convert`, `ibrobot record` and `ibrobot replay`."""
     yield CONVERT
-    yield Command("record", "Run a robot and record its episodes.", _record)
+    yield RECORD
     yield Command("replay", "Play a recorded episode on a robot, and compare.", _replay)
 
 

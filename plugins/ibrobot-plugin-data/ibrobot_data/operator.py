@@ -7,9 +7,10 @@ from math import inf
 from typing import override
 
 from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, TeleopDescriptor, ViewerDescriptor, seconds
-from ibrobot_core.app import DiskFull, RunAccess, RunHooks
+from ibrobot_core.app import DiskFull, Event, RunAccess, RunHooks
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.plural import plural
+from ibrobot_data.recording_session import Session as SessionEvent
 
 _MIB = 1 << 20
 _START, _FAILURE, _DISCARD = "tab", "f11", "f12"
@@ -29,6 +30,7 @@ class Operator(RunHooks):
             fails, or the disk has no room for another episode, the run ends.
         continuous: one episode, from the first complete set of messages to the end of the run.
         keys: whether the run has a terminal for the operator's keys.
+        report: gets the state of the session whenever it changes.
 
     Raises:
         NotSupported: with `continuous` if the mode begins and ends episodes itself, or if nothing can begin one.
@@ -36,7 +38,7 @@ class Operator(RunHooks):
 
     def __init__(
         self, run: RunAccess, service: EpisodeService, count: int | None, reset_time_s: float, prompt: str | None, *,
-        auto: bool, keys: bool, continuous: bool = False,
+        auto: bool, keys: bool, continuous: bool = False, report: Callable[[Event], None] | None = None,
     ) -> None:  # fmt: skip
         if service.by_mode and continuous:
             raise NotSupported(f"--continuous: mode {run.mode} begins and ends its episodes itself")
@@ -58,6 +60,8 @@ class Operator(RunHooks):
         self._typed: str | None = None
         """The typed part of a prompt; None while none is asked for."""
         self._complaint = ""
+        self._report = report
+        self._reported: Event | None = None
 
     def _clock_s(self) -> float:
         return seconds(self._run.clock.now_ns())
@@ -65,6 +69,7 @@ class Operator(RunHooks):
     @override
     def step(self) -> None:
         """Begin or end an episode when it is due; called a few times a second."""
+        self._tell()
         while not self._run.operator_events.empty():
             self._press(self._run.operator_events.get())
         if self._service.by_mode:
@@ -158,6 +163,7 @@ class Operator(RunHooks):
     @override
     def summary_rows(self) -> list[tuple[str, str]]:
         """For the summary of the run."""
+        self._tell(ended=True)
         episodes = plural(self._service.saved if self._count is None else self._count, "episode")
         return [("recorded", f"{self._saved()} {episodes} into {self._service.folder}")]
 
@@ -174,6 +180,16 @@ class Operator(RunHooks):
         if pause_s > 0:
             return f"set up the scene again, {pause_s:.0f} s"
         return "waiting: Tab starts" if self._keys and not (self._auto or self._service.by_mode) else "waiting"
+
+    def _tell(self, *, ended: bool = False) -> None:
+        """Report the state of the session, if it has changed."""
+        if self._report is None:
+            return
+        folder, state = str(self._service.folder), "ended" if ended else self._state()
+        event = SessionEvent(folder=folder, saved=self._service.saved, wanted=self._count, state=state)
+        if event != self._reported:
+            self._report(event)
+        self._reported = event
 
     def _saved(self) -> str:
         saved = self._service.saved

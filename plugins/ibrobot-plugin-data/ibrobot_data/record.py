@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from ibrobot_core.app import (
     RobotConfig,
     Runtime,
     check_end,
+    declared,
+    emit,
     find_config,
     installed_plugins,
     load_config,
@@ -22,26 +25,29 @@ from ibrobot_core.app import (
     run_overrides,
     run_robot,
 )
+from ibrobot_data import RECORD
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.operator import Operator
+from ibrobot_data.recording_session import RecordOptions
 
 
 @click.command()
-@run_options()
-@click.option("--dataset", metavar="NAME", help="Folder of the episodes, below the root.")
-@click.option("--root", type=click.Path(path_type=Path), help="Folder of all datasets.")
-@click.option("--prompt", metavar="TEXT", help="Description of the task; asked for if left out.")
-@click.option("--auto", is_flag=True, help="Begin episodes automatically; end them after contract.max_duration_s.")
-@click.option("--continuous", is_flag=True, help="One episode, from the start of the run to its end.")
-@click.option(
-    "--reset-time",
-    type=click.FloatRange(min=0),
-    default=0.0,
-    show_default=True,
-    metavar="S",
-    help="Pause between episodes [s].",
+@run_options(
+    "config",
+    "sim",
+    "lockstep",
+    "seed",
+    "mode",
+    "overrides",
+    "duration",
+    "goals",
+    "viewer",
+    "headless",
+    "dry_run",
+    "as_json",
 )
-def record(config: str | None, dataset: str | None, root: Path | None, **options: Any) -> None:
+@declared(RECORD)
+def record(options: RecordOptions, config: str | None, events: bool, **run: Any) -> None:
     """Run a robot and record its episodes as bags.
 
     CONFIG is a robot YAML as for `ibrobot launch`. If it has no `recording` section, episodes go to episodes/default.
@@ -52,32 +58,30 @@ def record(config: str | None, dataset: str | None, root: Path | None, **options
 
     Exits as `ibrobot launch` does.
     """
-    prompt, auto, reset_time = options.pop("prompt"), options.pop("auto"), options.pop("reset_time")
-    continuous = options.pop("continuous")
-    if continuous and (auto or options["episodes"] is not None or reset_time):
+    if options.continuous and (options.auto or options.episodes is not None or options.reset_time):
         raise click.UsageError("--continuous records one episode: leave --auto, --episodes and --reset-time out")
-    robot = _recorded(config, dataset, root, options)
-    check_end(robot, options)
-    live = sys.stdin.isatty() and sys.stdout.isatty() and not options["headless"]
+    robot = _recorded(config, options.dataset, options.root, run)
+    check_end(robot, {**run, "episodes": options.episodes})
+    live = sys.stdin.isatty() and sys.stdout.isatty() and not run["headless"]
 
     def operator(runtime: Runtime) -> Operator:
         service = runtime.session.episodes
         assert isinstance(service, EpisodeService)
         return Operator(
-            runtime.session, service, options["episodes"], reset_time, prompt,
-            auto=auto, continuous=continuous, keys=live,
+            runtime.session, service, options.episodes, options.reset_time, options.prompt, auto=options.auto,
+            continuous=options.continuous, keys=live, report=partial(emit, RECORD) if events else None,
         )  # fmt: skip
 
     request = LaunchRequest(
-        options["lockstep"], options["seed"], options["duration"], options["episodes"], options["goals"],
-        prompt=prompt or "", by_operator=True,
+        run["lockstep"], run["seed"], run["duration"], options.episodes, run["goals"],
+        prompt=options.prompt or "", by_operator=True,
     )  # fmt: skip
     run_robot(
         robot,
         request,
-        headless=options["headless"],
-        dry_run=options["dry_run"],
-        as_json=options["as_json"],
+        headless=run["headless"],
+        dry_run=run["dry_run"],
+        as_json=run["as_json"],
         make_hooks=operator,
     )
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import DatasetDescriptor, PolicyDescriptor, ReaderDescriptor, hookimpl
 from ibrobot_core.app import Command
+from ibrobot_lerobot.contents import Contents, InfoOptions
 from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions
 from ibrobot_lerobot.training import EVENTS, TrainOptions, check_trainer
 
@@ -86,11 +87,12 @@ def _train() -> click.Command:
     return train
 
 
+INFO = Command("datasets info", "Show what a dataset contains.", _datasets, InfoOptions, (Contents,))
 TRAIN = Command("train", "Train a policy with LeRobot.", _train, TrainOptions, EVENTS, check=check_trainer)
 
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot datasets info` and `ibrobot train`."""
-    yield Command("datasets", "Show LeRobot datasets.", _datasets)
+    yield Command("datasets", "Show LeRobot datasets.", _datasets, commands=(INFO,))
     yield TRAIN

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
-from typing import Any
 
+import attrs
 import click
 from rich.table import Table
 
-from ibrobot_core.app import Screen, echo, wrong_input
+from ibrobot_core.app import Screen, declared, echo, emit, wrong_input
+from ibrobot_lerobot import INFO
+from ibrobot_lerobot.contents import FeatureContents, InfoOptions
 
 
 @click.group()
@@ -19,42 +20,44 @@ def datasets() -> None:
 
 
 @datasets.command()
-@click.argument("dataset", type=click.Path(path_type=Path))
+@declared(INFO)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, with all episodes.")
 @wrong_input()
-def info(dataset: Path, as_json: bool) -> None:
+def info(options: InfoOptions, as_json: bool, events: bool) -> None:
     """Show the counts, features, units and statistics of a DATASET."""
-    from ibrobot_lerobot.dataset_facts import dataset_facts
+    from ibrobot_lerobot.dataset_facts import dataset_contents
 
-    facts = dataset_facts(dataset)
+    found = dataset_contents(options.dataset)
+    if events:
+        emit(INFO, found)
+        return
     if as_json:
-        echo(json.dumps(facts, indent=2))
+        echo(json.dumps(attrs.asdict(found), indent=2))
         return
     console = Screen(width=None if sys.stdout.isatty() else 1000)
     console.print(
-        f"{dataset}: {facts['episodes']} episodes, {facts['frames']} frames at {facts['fps']:g} Hz, "
-        f"{facts['seconds']:.1f} s, {facts['bytes'] / 1e6:.1f} MB",
+        f"{found.path}: {found.episodes} episodes, {found.frames} frames at {found.fps:g} Hz, "
+        f"{found.seconds:.1f} s, {found.bytes / 1e6:.1f} MB",
         soft_wrap=True,
     )
-    for task in facts["tasks"]:
+    for task in found.tasks:
         console.print(f"task: {task or '(empty)'}", soft_wrap=True)
     table = Table(box=None, padding=(0, 1))
     for heading in ("feature", "type", "shape", "unit", "value", "min", "mean", "max", "std"):
         table.add_column(heading, justify="right" if heading in ("min", "mean", "max", "std") else "left")
-    for feature in facts["features"]:
+    for feature in found.features:
         for row in _rows(feature):
             table.add_row(*row)
     console.print(table)
 
 
-def _rows(feature: dict[str, Any]) -> list[tuple[str, ...]]:
+def _rows(feature: FeatureContents) -> list[tuple[str, ...]]:
     """One row for each value of a feature."""
-    stats = feature["stats"]
-    size = len(stats.get("mean", ())) or 1
-    head = (feature["key"], feature["dtype"], "x".join(map(str, feature["shape"])), feature["unit"])
+    head = (feature.key, feature.dtype, "x".join(map(str, feature.shape)), feature.unit)
     rows = []
-    for i in range(size):
-        name = feature["names"][i] if i < len(feature["names"]) else ""
-        numbers = tuple(f"{stats[each][i]:.4g}" if each in stats else "" for each in ("min", "mean", "max", "std"))
-        rows.append((*(head if not i else ("", "", "", "")), str(name), *numbers))
+    for i in range(len(feature.stats.get("mean", ())) or 1):
+        name = feature.names[i] if i < len(feature.names) else ""
+        values = [feature.stats[each][i] if each in feature.stats else None for each in ("min", "mean", "max", "std")]
+        numbers = ["" if value is None else f"{value:.4g}" for value in values]
+        rows.append((*(head if not i else ("", "", "", "")), name, *numbers))
     return rows

@@ -1,4 +1,4 @@
-"""What a dataset contains, as JSON: counts, features with units, statistics, and episodes."""
+"""Reads what a dataset contains: counts, features with units, statistics, and episodes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import numpy as np
 
 from ibrobot_core.api import DatasetError
 from ibrobot_lerobot import layout
+from ibrobot_lerobot.contents import Contents, EpisodeContents, FeatureContents
 
 _UNITS = {"radians": "rad", "degrees": "°", "range_m100_100": "% of the range, -100 to 100"}
 _SHOWN = ("min", "max", "mean", "std", "q01", "q99")
 
 
-def dataset_facts(root: Path) -> dict[str, Any]:
+def dataset_contents(root: Path) -> Contents:
     """What the dataset at `root` contains.
 
     Raises:
@@ -27,32 +28,33 @@ def dataset_facts(root: Path) -> dict[str, Any]:
     info, own = found.info, found.metadata
     norm_mode = str((own.get("conversion") or {}).get("norm_mode", ""))
     try:
-        return {
-            "path": str(root), "robot_type": info.get("robot_type") or "", "fps": info["fps"],
-            "episodes": info["total_episodes"], "frames": info["total_frames"],
-            "seconds": info["total_frames"] / info["fps"], "tasks": found.tasks, "norm_mode": norm_mode,
-            "bytes": sum(file.stat().st_size for file in root.rglob("*") if file.is_file()),
-            "fingerprint": str(own.get("fingerprint", "")),
-            "features": [
+        return Contents(
+            path=str(root), robot_type=info.get("robot_type") or "", fps=float(info["fps"]),
+            episodes=info["total_episodes"], frames=info["total_frames"],
+            seconds=info["total_frames"] / info["fps"], tasks=tuple(found.tasks), norm_mode=norm_mode,
+            bytes=sum(file.stat().st_size for file in root.rglob("*") if file.is_file()),
+            fingerprint=str(own.get("fingerprint", "")),
+            features=tuple(
                 _feature(key, entry, norm_mode, found.stats.get(key) or {})
                 for key, entry in info["features"].items() if key not in layout.COUNTERS
-            ],
-            "list": _episodes(found, own),
-        }  # fmt: skip
+            ),
+            list=_episodes(found, own),
+        )  # fmt: skip
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         raise DatasetError(f"{root}: is not a LeRobot dataset: {error!r}") from error
 
 
-def _feature(key: str, entry: Mapping[str, Any], norm_mode: str, stats: Mapping[str, Any]) -> dict[str, Any]:
+def _feature(key: str, entry: Mapping[str, Any], norm_mode: str, stats: Mapping[str, Any]) -> FeatureContents:
     """A feature with its unit, and statistics of each value or colour."""
-    shape = list(entry["shape"])
     picture = entry["dtype"] in ("video", "image")
     names = entry.get("names") or []
-    values = {name: np.ravel(stats[name]).tolist() for name in _SHOWN if name in stats}
-    return {
-        "key": key, "dtype": entry["dtype"], "shape": shape, "names": list(names) if not picture else [],
-        "unit": _unit(entry, norm_mode, names), "stats": values, "picture": picture,
-    }  # fmt: skip
+    values = {name: np.ravel(stats[name]).astype(float) for name in _SHOWN if name in stats}
+    return FeatureContents(
+        key=key, dtype=entry["dtype"], shape=tuple(entry["shape"]),
+        names=() if picture else tuple(str(name) for name in names), unit=_unit(entry, norm_mode, names),
+        stats={name: tuple(float(x) if np.isfinite(x) else None for x in found) for name, found in values.items()},
+        picture=picture,
+    )  # fmt: skip
 
 
 def _unit(entry: Mapping[str, Any], norm_mode: str, names: Any) -> str:
@@ -63,14 +65,14 @@ def _unit(entry: Mapping[str, Any], norm_mode: str, names: Any) -> str:
     return _UNITS.get(norm_mode, "") if joints else ""
 
 
-def _episodes(found: layout.OnDisk, own: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _episodes(found: layout.OnDisk, own: Mapping[str, Any]) -> tuple[EpisodeContents, ...]:
     recorded = own.get("episodes") or []
     rows = []
     for row in found.episodes():
         number = int(row["episode_index"])
         known = recorded[number] if number < len(recorded) else {}
-        rows.append({
-            "number": number, "frames": row["length"], "seconds": row["length"] / found.info["fps"],
-            "task": "; ".join(row["tasks"]), "source": known.get("source", ""), "outcome": known.get("outcome", ""),
-        })  # fmt: skip
-    return rows
+        rows.append(EpisodeContents(
+            number=number, frames=int(row["length"]), seconds=int(row["length"]) / found.info["fps"],
+            task="; ".join(row["tasks"]), source=known.get("source", ""), outcome=known.get("outcome", ""),
+        ))  # fmt: skip
+    return tuple(rows)

@@ -8,6 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import DecoderDescriptor, ReaderDescriptor, RecorderDescriptor, hookimpl
 from ibrobot_core.app import Command
+from ibrobot_mcap.changes import (
+    Changed,
+    DeleteOptions,
+    InTrash,
+    MarkOptions,
+    RepairOptions,
+    TrashOptions,
+    TrimOptions,
+)
 from ibrobot_mcap.options import McapOptions
 
 if TYPE_CHECKING:
@@ -76,8 +85,19 @@ def _contract() -> click.Command:
     return contract
 
 
+MARK = Command("episodes mark", "Judge episodes.", _commands, MarkOptions, (Changed,))
+TRIM = Command("episodes trim", "Keep a part of an episode.", _commands, TrimOptions, (Changed,))
+DELETE = Command("episodes delete", "Delete episodes.", _commands, DeleteOptions, (Changed,))
+LIST_TRASH = Command(
+    "episodes trash", "List, restore or delete what is in a trash.", _commands, TrashOptions, (Changed, InTrash)
+)
+REPAIR = Command("episodes repair", "Make unfinished episodes whole.", _commands, RepairOptions, (Changed,))
+_CHANGES = (MARK, TRIM, DELETE, LIST_TRASH, REPAIR)
+
+
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot episodes …` and `ibrobot contract init`."""
-    yield Command("episodes", "List, check, repair, trim, plot and export recorded episodes.", _commands)
+    summary = "List, check, repair, trim, plot and export recorded episodes."
+    yield Command("episodes", summary, _commands, commands=_CHANGES)
     yield Command("contract", "Draft a contract for foreign bags.", _contract)

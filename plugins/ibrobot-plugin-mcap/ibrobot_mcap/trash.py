@@ -18,14 +18,13 @@ from pathlib import Path
 import attrs
 
 from ibrobot_core.api import RecorderError, ns, seconds
+from ibrobot_mcap.changes import DELETED, REPLACED, TRIMMED
 from ibrobot_mcap.owning import DELETING, TRIMMING, beside, owning, reading_owned
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
 from ibrobot_mcap.rewrite import Rewritten, rewrite
 
 TRASH = ".trash"
 _NOTE = "undo.json"
-DELETED, TRIMMED, REPLACED = "deleted", "trimmed", "replaced"
-"""What was done: deleted, trimmed, or replaced when a trim was undone."""
 
 
 @attrs.frozen

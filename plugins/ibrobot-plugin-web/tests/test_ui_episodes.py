@@ -14,6 +14,7 @@ import yaml
 from click.testing import CliRunner
 from ibrobot_web.playback import Playback
 from ibrobot_web.ui.context import Ui
+from ibrobot_web.ui.forms import choices_of
 from ibrobot_web.ui.recordings import episodes_of, find_recordings
 from ui_server import UiServer, run_ui
 
@@ -191,7 +192,12 @@ def test_what_is_outside_or_malformed_is_refused(episode: Path, tmp_path: Path) 
         for wrong in ("--help", "", "discarded", None, ["success"]):
             with pytest.raises(RuntimeError, match="outcome"):
                 await server.post("episodes/mark", paths=["."], outcome=wrong)
-        assert await server.get("episodes/list") == {"episodes": [], "complete": True, "trashes": []}
+        assert await server.get("episodes/list") == {
+            "episodes": [],
+            "complete": True,
+            "trashes": [],
+            "outcomes": choices_of("episodes mark", "outcome"),
+        }
 
     run_ui([inside], test)
     assert episode.is_dir()

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 from ibrobot_web.ui.job_runner import IBROBOT
-from ibrobot_web.ui.record import ROUTES
 from ui_server import UiServer, run_ui
 
 ROBOT = """# A pan axis: it turns a camera.
@@ -124,33 +123,26 @@ def test_the_place_of_a_session_counts_episodes_and_the_disk(folder: Path) -> No
     run_ui([folder], test)
 
 
-def test_the_progress_of_a_session_is_read_from_its_status_lines(folder: Path) -> None:
+def test_a_session_is_started_with_the_values_of_its_form(folder: Path) -> None:
     pytest.importorskip("ibrobot_data", reason="needs ibrobot-plugin-data")
 
     async def test(server: UiServer) -> None:
-        for wrong in (0, 1.5, "x", None):
-            with pytest.raises(RuntimeError, match="episodes: "):
-                await server.post("record/start", robot="so101", sim=True, episodes=wrong)
-        asked = {"robot": "arms/pan.yaml", "sim": False, "mode": "nope", "episodes": 3, "prompt": "--pick"}
-        await server.post("record/start", **asked, dataset="a b")
+        form = await server.get("record/form")
+        assert [field["label"] for field in form["fields"]][:3] == ["Task", "Dataset", "Episodes"]
+        for wrong in (0, 1.5, "x"):
+            with pytest.raises(RuntimeError, match="Episodes: "):
+                await server.post("record/start", robot="so101", sim=True, values={"episodes": wrong})
+        with pytest.raises(RuntimeError, match="has no field root"):
+            await server.post("record/start", robot="so101", sim=True, values={"root": "/etc"})
+        with pytest.raises(RuntimeError, match="the prompt has 1001 characters; at most 1000 are allowed"):
+            await server.post("record/start", robot="so101", sim=True, values={"prompt": "x" * 1001})
+        values = {"episodes": 3, "prompt": "--pick", "dataset": "a b"}
+        await server.post("record/start", robot="arms/pan.yaml", sim=False, mode="nope", values=values)
         job, _ = await server.job(lambda job: job["state"] == "failed")
         assert f"--root={folder / 'episodes'} --dataset=a b --prompt=--pick --episodes=3" in job["command"]
+        assert "nope" in job["facts"]["error"]
 
-    assert set(ROUTES) == {"GET /place", "POST /start"}
     run_ui([folder], test)
-    from ibrobot_web.ui.record import read_status
-
-    line = "mode web | episodes 1, successes 1 | recording “a, saved 1 of 2”, 3 s, 17 s left, saved 1 of 4"
-    assert read_status(line) == {
-        "saved": 1,
-        "progress": 0.25,
-        "text": "recording “a, saved 1 of 2”, 3 s, 17 s left · 1 of 4 episodes saved",
-    }
-    assert read_status("recorded   2 of 4 episodes into episodes/pick") == {
-        "saved": 2,
-        "progress": 0.5,
-        "text": "2 of 4 episodes saved",
-    }
 
 
 def test_links_out_of_the_folder_are_not_followed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> None:

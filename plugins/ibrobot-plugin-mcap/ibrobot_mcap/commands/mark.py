@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import click
 
 from ibrobot_core.api import RecorderError
-from ibrobot_core.app import EpisodePath, echo, wrong_input
+from ibrobot_core.app import declared, wrong_input
+from ibrobot_mcap import MARK
+from ibrobot_mcap.changes import Changed, MarkOptions
+from ibrobot_mcap.commands.tell import told
 
 
 @click.command()
-@click.argument("episodes", nargs=-1, required=True, type=EpisodePath())
-@click.argument("outcome", type=click.Choice(("success", "failure", "unknown")))
+@declared(MARK)
 @wrong_input()
-def mark(episodes: tuple[Path, ...], outcome: str) -> None:
+def mark(options: MarkOptions, events: bool) -> None:
     """Set the OUTCOME of EPISODES, e.g. after a repair. The episode records that its outcome was set by hand."""
     from ibrobot_mcap.bag_metadata import set_custom
     from ibrobot_mcap.commands.find_episodes import opened
     from ibrobot_mcap.metadata import MARKED, OUTCOME
     from ibrobot_mcap.owning import owning
 
-    for episode in episodes:
+    for episode in options.episodes:
         with owning(episode, "is being marked"):
             with opened(episode) as reader:
                 whole = episode.is_dir() and reader.finished and not reader.short()
             if not whole:
                 raise RecorderError(f"{episode}: is unfinished, or lacks messages; run `ibrobot episodes repair` first")
-            set_custom(episode, {OUTCOME: outcome, MARKED: "true"})
-        echo(f"{episode}: {outcome}")
+            set_custom(episode, {OUTCOME: options.outcome, MARKED: "true"})
+        told(MARK, Changed(str(episode), options.outcome), events=events)

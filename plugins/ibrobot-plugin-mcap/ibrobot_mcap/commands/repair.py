@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from pathlib import Path
 
 import click
 
 from ibrobot_core.api import EpisodeSummary, RecorderError
-from ibrobot_core.app import EpisodePath, InUse, echo, wrong_input
+from ibrobot_core.app import Failed, InUse, declared, echo, emit, wrong_input
+from ibrobot_mcap import REPAIR
+from ibrobot_mcap.changes import Changed, RepairOptions
+from ibrobot_mcap.commands.tell import told
 
 
 @click.command()
-@click.argument("path", type=EpisodePath())
+@declared(REPAIR)
 @wrong_input()
-def repair(path: Path) -> None:
+def repair(options: RepairOptions, events: bool) -> None:
     """Repair unfinished or incomplete episodes in PATH.
 
     It writes index and metadata.yaml for the readable part. The episode records the missing messages, and `verify`
@@ -26,22 +28,25 @@ def repair(path: Path) -> None:
     from ibrobot_mcap.commands.find_episodes import duration_s, episodes_in
     from ibrobot_mcap.owning import interrupted, owning
 
-    failed = 0
+    path, failed = options.path, 0
     for episode in interrupted(path):
         with suppress(InUse), owning(episode, "is being repaired"):
-            echo(f"{episode}: an interrupted change is finished")
+            told(REPAIR, Changed(str(episode), "an interrupted change is finished"), events=events)
     for episode in episodes_in(path):
         try:
             made = rewrite.repair(episode)
         except (RecorderError, InUse) as error:
             failed += 1
-            echo(f"error: {error}", err=True)
+            if events:
+                emit(REPAIR, Failed(str(error)))
+            else:
+                echo(f"error: {error}", err=True)
             continue
-        if made is None:
-            echo(f"{episode}: is whole")
-        else:
+        what = "is whole"
+        if made is not None:
             count = sum(topic.count for topic in made.summary.topics.values())
-            echo(f"{episode}: repaired, {count} messages, {duration_s(made.summary):.2f} s{_description(made.summary)}")
+            what = f"repaired, {count} messages, {duration_s(made.summary):.2f} s{_description(made.summary)}"
+        told(REPAIR, Changed(str(episode), what), events=events)
     if failed:
         raise SystemExit(1)
 

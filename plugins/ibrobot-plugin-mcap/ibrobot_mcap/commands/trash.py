@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import click
 
 from ibrobot_core.api import RecorderError
-from ibrobot_core.app import Declined, EpisodePath, echo, wrong_input
+from ibrobot_core.app import Declined, declared, echo, emit, wrong_input
+from ibrobot_mcap import LIST_TRASH
+from ibrobot_mcap.changes import Changed, InTrash, TrashOptions
+from ibrobot_mcap.commands.tell import told
 
 
 @click.command("trash")
-@click.argument("path", type=EpisodePath(), default=Path("episodes"))
-@click.option("--restore", metavar="ID", help="Put this one back, as it was.")
-@click.option("--empty", is_flag=True, help="Delete all of them for good, after asking.")
-@click.option("--yes", is_flag=True, help="Do not ask.")
+@declared(LIST_TRASH)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @wrong_input()
-def trash_command(path: Path, restore: str | None, empty: bool, yes: bool, as_json: bool) -> None:
+def trash_command(options: TrashOptions, as_json: bool, events: bool) -> None:
     """List, restore or delete episodes in the trash of PATH.
 
     The trash has deleted episodes and the originals of trimmed ones; newest last.
@@ -29,6 +28,7 @@ def trash_command(path: Path, restore: str | None, empty: bool, yes: bool, as_js
     from ibrobot_mcap.commands.ask import agree
     from ibrobot_mcap.commands.find_episodes import size_of, told_size
 
+    path, restore, empty = options.path, options.restore, options.empty
     if restore is not None and empty:
         raise click.UsageError("give either --restore or --empty")
     if not path.is_dir():
@@ -39,13 +39,16 @@ def trash_command(path: Path, restore: str | None, empty: bool, yes: bool, as_js
         if chosen is None:
             known = ", ".join(each.id for each in found) or "nothing"
             raise RecorderError(f"{path}: its trash has no {restore!r}; it has {known}")
-        echo(f"{trash.restore(chosen)}: restored")
+        told(LIST_TRASH, Changed(str(trash.restore(chosen)), "restored"), events=events)
         return
     sizes = [size_of(each.kept) for each in found]
     if empty:
-        if found and not (yes or agree(f"delete {len(found)} ({told_size(sum(sizes))}) for good?")):
+        if found and not (options.yes or agree(f"delete {len(found)} ({told_size(sum(sizes))}) for good?")):
             raise Declined
-        echo(f"{path}: deleted {len(trash.empty(path))} for good")
+        told(LIST_TRASH, Changed(str(path), f"deleted {len(trash.empty(path))} for good"), events=events)
+    elif events:
+        for each, size in zip(found, sizes, strict=True):
+            emit(LIST_TRASH, InTrash(id=each.id, done=each.done, path=str(each.origin), size_bytes=size))
     elif as_json:
         rows = [
             {"id": each.id, "done": each.done, "path": str(each.origin), "bytes": size}

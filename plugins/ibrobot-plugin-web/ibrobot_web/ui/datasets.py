@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
-from ibrobot_core.app import NoRequest, installed_plugins
+import attrs
+
+from ibrobot_core.app import NoRequest
 from ibrobot_web.ui import episodes
 from ibrobot_web.ui.context import NamesPath, Route, Ui
-from ibrobot_web.ui.recordings import find_recordings, run_command
+from ibrobot_web.ui.forms import run_command
+from ibrobot_web.ui.recordings import find_recordings
 
 
 def listing(ui: Ui, request: NoRequest) -> list[str]:
@@ -18,10 +20,8 @@ def listing(ui: Ui, request: NoRequest) -> list[str]:
 
 def info(ui: Ui, request: NamesPath) -> dict[str, Any]:
     """What a dataset contains."""
-    installed_plugins().command("datasets")  # raises the error that names its package
-    path = ui.folders.find(request.path)
-    found: dict[str, Any] = json.loads(run_command(ui, "datasets", "info", "--json", str(path)))
-    return {**found, "path": ui.folders.name(path)}
+    (found,) = run_command(ui, "datasets info", dataset=request.path)
+    return {**attrs.asdict(found), "path": ui.folders.name(ui.folders.find(request.path))}
 
 
 ROUTES: dict[str, Route[Any]] = {

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import attrs
 
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import NoRequest
 from ibrobot_web.ui.context import Blob, NamesPath, NamesPaths, Route, Ui
-from ibrobot_web.ui.recordings import episodes_of, find_recordings, paths_of, playback, run_command
+from ibrobot_web.ui.forms import choices_of, run_command
+from ibrobot_web.ui.recordings import episodes_of, existing, find_recordings, playback
 
 _LONGEST_S = 1e6
 
@@ -34,7 +35,7 @@ class NamesPicture(NamesTopic):
 class Mark(NamesPaths):
     """How episodes went."""
 
-    outcome: Literal["success", "failure", "unknown"] = option(help="of all of them")
+    outcome: str = option(help="of all of them")
 
 
 @attrs.frozen
@@ -57,16 +58,16 @@ def listing(ui: Ui, request: NoRequest) -> dict[str, Any]:
     found = find_recordings(ui.folders.paths)
     rows = [episodes_of(ui).row(ui, path) for path in found.episodes]
     trashes = [ui.folders.name(path) for path in found.trashes]
-    return {"episodes": rows, "complete": found.complete, "trashes": trashes}
+    outcomes = choices_of("episodes mark", "outcome")
+    return {"episodes": rows, "complete": found.complete, "trashes": trashes, "outcomes": outcomes}
 
 
 def trash(ui: Ui, request: NamesPath) -> list[dict[str, Any]]:
     """What can be undone in a folder, newest first."""
-    folder = ui.folders.find(request.path)
-    rows = json.loads(run_command(ui, "episodes", "trash", str(folder), "--json"))
-    return [
-        {**row, "path": ui.folders.name(Path(row["path"])), "folder": ui.folders.name(folder)} for row in rows[::-1]
-    ]
+    found = run_command(ui, "episodes trash", path=request.path)
+    folder = ui.folders.name(ui.folders.find(request.path))
+    rows = [{**attrs.asdict(each), "what": each.shown().text} for each in found]
+    return [{**row, "path": ui.folders.name(Path(row["path"])), "folder": folder} for row in rows[::-1]]
 
 
 def facts_of(ui: Ui, request: NamesPath) -> dict[str, Any]:
@@ -106,43 +107,40 @@ def objects(ui: Ui, request: NamesPath) -> list[dict[str, Any]]:
     return playback(ui, request.path).objects(ui.folders.find)
 
 
-def mark(ui: Ui, request: Mark) -> str:
+def mark(ui: Ui, request: Mark) -> None:
     """Judge episodes."""
-    return run_command(ui, "episodes", "mark", *paths_of(ui, request.paths), request.outcome)
+    run_command(ui, "episodes mark", episodes=existing(ui, request.paths), outcome=request.outcome)
 
 
-def trim(ui: Ui, request: Trim) -> str:
+def trim(ui: Ui, request: Trim) -> None:
     """Replace an episode by a part of it."""
-    path = ui.folders.find(request.path)
+    episodes_of(ui).forget()
     begin_s, end_s = request.begin_s, request.end_s
-    episodes_of(ui).forget()
-    return run_command(ui, "episodes", "trim", str(path), "--in-place", f"--from={begin_s}", f"--to={end_s}")
+    run_command(ui, "episodes trim", episode=request.path, in_place=True, begin_s=begin_s, end_s=end_s)
 
 
-def delete(ui: Ui, request: NamesPaths) -> str:
+def delete(ui: Ui, request: NamesPaths) -> None:
     """Move episodes to the trash."""
-    paths = paths_of(ui, request.paths)
+    paths = existing(ui, request.paths)
     episodes_of(ui).forget()
-    return run_command(ui, "episodes", "delete", "--to-trash", *paths)
+    run_command(ui, "episodes delete", episodes=paths, to_trash=True)
 
 
-def restore(ui: Ui, request: Restore) -> str:
+def restore(ui: Ui, request: Restore) -> None:
     """Put an original back."""
-    folder = ui.folders.find(request.path)
     episodes_of(ui).forget()
-    return run_command(ui, "episodes", "trash", str(folder), f"--restore={request.id}")
+    run_command(ui, "episodes trash", path=request.path, restore=request.id)
 
 
-def empty(ui: Ui, request: NamesPath) -> str:
+def empty(ui: Ui, request: NamesPath) -> None:
     """Delete what is in a trash for good."""
-    return run_command(ui, "episodes", "trash", str(ui.folders.find(request.path)), "--empty", "--yes")
+    run_command(ui, "episodes trash", path=request.path, empty=True, yes=True)
 
 
-def repair(ui: Ui, request: NamesPath) -> str:
+def repair(ui: Ui, request: NamesPath) -> None:
     """Repair an unfinished episode."""
-    path = ui.folders.find(request.path)
     episodes_of(ui).forget()
-    return run_command(ui, "episodes", "repair", str(path))
+    run_command(ui, "episodes repair", path=request.path)
 
 
 ROUTES: dict[str, Route[Any]] = {

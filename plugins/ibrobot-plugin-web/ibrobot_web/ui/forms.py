@@ -3,25 +3,41 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from collections.abc import Mapping
 from typing import Any, get_args, get_origin
 
 import attrs
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Command, default_of, fields, flag_of, installed_plugins, official_plugins, read_options
+from ibrobot_core.app import (
+    Command,
+    Event,
+    Failed,
+    decode_event,
+    default_of,
+    fields,
+    flag_of,
+    installed_plugins,
+    official_plugins,
+    read_options,
+)
 from ibrobot_web.ui.context import Ui
+from ibrobot_web.ui.job_runner import IBROBOT
 from ibrobot_web.ui.recordings import find_policies, find_recordings
 from ibrobot_web.ui.robots import robot_names, robot_of
 
 _FLAG = re.compile(r"(?<![\w.])--[a-z][a-z-]*(?![\w.])")
 _COMMAND = re.compile(r"`ibrobot ([a-z]+(?: [a-z]+)?)[^`]*`")
+_COMMAND_S = 600.0
+WITH_ROBOT = frozenset({"record"})
+"""Commands that run a robot, with a view of their own in which it is chosen."""
 
 
 def job_commands() -> list[str]:
     """The commands that run by a form: those with events, and those that packages not installed here would add."""
     declared = {name for name, command in installed_plugins().commands.items() if command.events}
-    return sorted(declared.union(*(offers.get("job", ()) for offers in official_plugins().values())))
+    return sorted(declared.union(*(offers.get("job", ()) for offers in official_plugins().values())) - WITH_ROBOT)
 
 
 def title_of(name: str) -> str:
@@ -91,6 +107,39 @@ def in_page_words(text: str, command: Command | None = None) -> str:
     labels = {flag_of(name, field): label_of(name, field) for name, field in options.items()}
     text = _COMMAND.sub(lambda found: f"“{title_of(found[1])}”" if found[1] in declared else found[0], text)
     return _FLAG.sub(lambda found: f"“{labels[found[0]]}”" if found[0] in labels else found[0], text)
+
+
+def run_command(ui: Ui, name: str, **values: Any) -> list[Event]:
+    """Run a command in the first folder with values of its options; return its events.
+
+    Raises:
+        IbrobotError: with its error, if it fails.
+    """
+    command = installed_plugins().command(name)
+    words = [*name.split(), "--events", *arguments(read_form(ui, command, values))]
+    try:
+        done = subprocess.run(
+            [*IBROBOT, *words], cwd=ui.folders.first, stdin=subprocess.DEVNULL, capture_output=True,
+            timeout=_COMMAND_S, start_new_session=True, check=False, text=True, errors="replace",
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise IbrobotError(f"“{title_of(name)}” did not end within {_COMMAND_S:g} s") from None
+    kinds = (*command.events, Failed)
+    events = [event for line in done.stdout.splitlines() if (event := decode_event(line, kinds)) is not None]
+    if errors := [event.error for event in events if isinstance(event, Failed)]:
+        raise IbrobotError(in_page_words("; ".join(errors), command).replace(f"{ui.folders.first}/", ""))
+    if done.returncode:
+        raise IbrobotError(done.stderr.strip().removeprefix("error: ") or f"exit code {done.returncode}")
+    return events
+
+
+def choices_of(name: str, option: str) -> list[list[str]]:
+    """The choices of a command's option, each with its words; none if the command is not installed."""
+    command = installed_plugins().declarations().get(name)
+    if command is None:
+        return []
+    found: list[list[str]] = _field_json(option, fields(command.options)[option])["choices"]
+    return found
 
 
 def _shown(command: Command) -> dict[str, attrs.Attribute[Any]]:

@@ -101,7 +101,8 @@ def event_reader(folders: Folders, command: Command) -> Reader:
             del points[:-_POINTS]
             facts |= {"points": list(points), "axes": list(shown.point)}
         for kind, path in shown.made.items():
-            made.append({"kind": kind, "path": folders.name((folders.first / path).resolve())})
+            thing = {"kind": kind, "path": folders.name((folders.first / path).resolve())}
+            made.extend([thing] * (thing not in made))
             facts["made"] = list(made)
         return facts
 

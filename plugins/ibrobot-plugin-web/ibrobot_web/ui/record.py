@@ -11,16 +11,16 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import installed_plugins
+from ibrobot_core.app import NoRequest, installed_plugins
 from ibrobot_web.ui.context import Route, Ui
+from ibrobot_web.ui.forms import arguments, form_of, read_form
+from ibrobot_web.ui.jobs import event_reader
 from ibrobot_web.ui.robots import RUN_DONE, Launch, read_address, run_arguments
 
+_COMMAND = "record"
+_ROOT = "episodes"
+"""Folder of all datasets that are recorded by the page, in the first folder."""
 _DATASET = re.compile(r"\w[\w .-]*(?:/\w[\w .-]*)*")
-_LONGEST_PROMPT = 500
-_STATUS = re.compile(r"\| (?P<state>[^|]*), saved (?P<saved>\d+) of (?P<count>\d+)$")
-"""The end of a status line of `ibrobot record`."""
-_SUMMARY = re.compile(r"recorded +(?P<saved>\d+) of (?P<count>\d+) episodes? into")
-"""The line of its summary."""
 
 
 @attrs.frozen
@@ -28,22 +28,23 @@ class NamesDataset:
     """A request about a dataset of episodes."""
 
     dataset: str = option("default", help="its name")
-    root: str = option("episodes", help="folder of all datasets")
 
 
 @attrs.frozen(kw_only=True)
 class RecordSession(Launch):
     """What to record."""
 
-    episodes: int = option(ge=1, le=100_000, help="number of episodes")
-    prompt: str = option("", help="the task")
-    dataset: str = option("default", help="name of the dataset")
-    root: str = option("episodes", help="folder of all datasets")
+    values: Mapping[str, Any] = option(help="value of each field of the form")
+
+
+def form(ui: Ui, request: NoRequest) -> dict[str, Any]:
+    """The form of a session, beside the choice of the robot."""
+    return form_of(ui, _COMMAND)
 
 
 def place(ui: Ui, request: NamesDataset) -> dict[str, Any]:
     """Where episodes go, how many the dataset has, how large they are, and the disk's free space."""
-    folder = _folder(ui, request.root, request.dataset)
+    folder = _folder(ui, _ROOT, request.dataset)
     episodes = [path for path in (folder / "episodes").glob("episode_*") if path.is_dir()]
     sizes = [sum(each.stat().st_size for each in path.rglob("*") if each.is_file()) for path in episodes]
     existing = folder
@@ -59,24 +60,24 @@ def place(ui: Ui, request: NamesDataset) -> dict[str, Any]:
 
 def start(ui: Ui, request: RecordSession) -> dict[str, int]:
     """Begin a session: `ibrobot record`, which ends by itself after the last episode."""
-    installed_plugins().command("record")  # raises the error that names its package
-    prompt, count = request.prompt, request.episodes
-    if len(prompt) > _LONGEST_PROMPT:
-        raise IbrobotError(f"the task has {len(prompt)} characters; at most {_LONGEST_PROMPT} are possible")
-    folder = _folder(ui, request.root, request.dataset)
-    root = ui.folders.find(request.root)
-    arguments = [
-        "record",
+    command = installed_plugins().command(_COMMAND)
+    values = dict(request.values)
+    folder = _folder(ui, _ROOT, str(values.pop("dataset", None) or "default"))
+    root = ui.folders.find(_ROOT)
+    options = read_form(ui, command, values)
+    words = [
+        _COMMAND,
+        "--events",
         *run_arguments(ui, request),
         f"--root={root}",
         f"--dataset={folder.relative_to(root)}",
-        f"--prompt={prompt}",
-        f"--episodes={count}",
     ]
-    known = {"dataset": ui.folders.name(folder), "saved": 0, "episodes": count, "progress": 0.0}
+    read_event = event_reader(ui.folders, command)
     job = ui.jobs.start(
-        "record", f"Record {folder.name}", arguments, facts=known, read=read_status, done_codes=RUN_DONE
-    )
+        _COMMAND, f"Record {folder.name}", [*words, *arguments(options)],
+        read=lambda line: found if (found := read_event(line)) is not None else read_address(line),
+        done_codes=RUN_DONE,
+    )  # fmt: skip
     return {"number": job.number}
 
 
@@ -88,19 +89,8 @@ def _folder(ui: Ui, root: str, dataset: str) -> Path:
     return ui.folders.find(str(Path(root) / dataset))
 
 
-def read_status(line: str) -> Mapping[str, Any] | None:
-    """The progress of a session, or the address of its page, from a line of its output."""
-    if (status := _STATUS.search(line)) is not None:
-        saved, count = int(status["saved"]), int(status["count"])
-        return {
-            "saved": saved,
-            "progress": saved / count,
-            "text": f"{status['state']} · {saved} of {count} episodes saved",
-        }
-    if (summary := _SUMMARY.match(line)) is not None:
-        saved, count = int(summary["saved"]), int(summary["count"])
-        return {"saved": saved, "progress": saved / count, "text": f"{saved} of {count} episodes saved"}
-    return read_address(line)
-
-
-ROUTES: dict[str, Route[Any]] = {"GET /place": Route(place, NamesDataset), "POST /start": Route(start, RecordSession)}
+ROUTES: dict[str, Route[Any]] = {
+    "GET /form": Route(form, NoRequest),
+    "GET /place": Route(place, NamesDataset),
+    "POST /start": Route(start, RecordSession),
+}

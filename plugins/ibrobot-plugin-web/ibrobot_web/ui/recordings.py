@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,7 +14,6 @@ from ibrobot_core.api import NS_PER_S, IbrobotError, PolicyDescriptor
 from ibrobot_core.app import installed_plugins
 from ibrobot_web.playback import Playback, problems_of
 from ibrobot_web.ui.context import Ui
-from ibrobot_web.ui.job_runner import IBROBOT
 
 _DEPTH = 6
 """Levels of folders below an opened one in which recordings are looked for."""
@@ -25,7 +23,6 @@ _MOST_POLICIES = 200
 """Policies that are listed."""
 _OPEN = 4
 """Episodes that stay open."""
-_COMMAND_S = 600.0
 _SKIPPED = frozenset({"node_modules", "__pycache__", "site-packages"})
 
 
@@ -162,35 +159,17 @@ def playback(ui: Ui, path: str) -> Playback:
     return episodes_of(ui).opened(ui.folders.find(path))
 
 
-def paths_of(ui: Ui, given: Sequence[str]) -> list[str]:
-    """The paths that a request names, confined to the opened folders.
+def existing(ui: Ui, named: Sequence[str]) -> list[str]:
+    """The paths that a request names, all within the opened folders.
 
     Raises:
         IbrobotError: if one is outside, or does not exist.
     """
-    paths = [ui.folders.find(each) for each in given]
+    paths = [ui.folders.find(each) for each in named]
     for path in paths:
         if not path.exists():
             raise IbrobotError(f"{ui.folders.name(path)}: there is no such file or folder")
     return [str(path) for path in paths]
-
-
-def run_command(ui: Ui, *arguments: str) -> str:
-    """The output of a command of `ibrobot`, which runs in the first folder.
-
-    Raises:
-        IbrobotError: with its error, if it fails.
-    """
-    try:
-        done = subprocess.run(
-            [*IBROBOT, *arguments], cwd=ui.folders.first, stdin=subprocess.DEVNULL, capture_output=True,
-            timeout=_COMMAND_S, start_new_session=True, check=False, text=True,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        raise IbrobotError(f"ibrobot {arguments[0]} did not end within {_COMMAND_S:g} s") from None
-    if done.returncode:
-        raise IbrobotError(done.stderr.strip().removeprefix("error: ") or f"exit code {done.returncode}")
-    return done.stdout
 
 
 def _state_of(path: Path) -> Any:

@@ -87,5 +87,5 @@ function rows({ key, dtype, shape, unit, names, stats, picture }) {
   return Array.from({ length: count }, (_, i) => h("tr", {}, i ? h("td", {}) : h("th", { scope: "row" }, key),
     ...(i ? ["", "", ""] : [dtype, shape.join(" × "), unit]).map((text) => h("td", {}, text)),
     h("td", {}, picture && count === 3 ? colors[i] : names[i] ?? (count > 1 ? String(i) : "")),
-    ...["min", "mean", "max", "std"].map((name) => h("td", {}, stats[name] ? Number(stats[name][i].toPrecision(4)).toString() : ""))));
+    ...["min", "mean", "max", "std"].map((name) => h("td", {}, (stats[name]?.[i] ?? null) === null ? "" : Number(stats[name][i].toPrecision(4)).toString()))));
 }

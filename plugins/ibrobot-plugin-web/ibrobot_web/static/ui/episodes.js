@@ -3,8 +3,6 @@
 import { h, refresh, say, toast } from "../dom.js";
 import { Player } from "./player.js";
 
-const OUTCOMES = ["success", "failure", "unknown"];
-const DONE = { deleted: "deleted", trimmed: "trimmed; this is the original", replaced: "replaced when a trim was undone" };
 
 export class View {
   constructor(ui) {
@@ -47,6 +45,7 @@ export class View {
     const found = await this.ui.attempt(() => this.ui.get("episodes/list"));
     if (!found) return;
     this.rows = found.episodes;
+    this.outcomes = found.outcomes;
     const known = new Set(this.rows.map(({ path }) => path));
     for (const path of this.chosen) if (!known.has(path)) this.chosen.delete(path);
     say(this.note, this.rows.length ? "" : "No episodes in the opened folders. Record some, e.g. in the view Record.");
@@ -108,7 +107,7 @@ export class View {
     if (!paths.length) return [h("p", { class: "note" }, `${rows.length} episode${rows.length === 1 ? "" : "s"}. Choose some to judge or delete them together.`)];
     const off = !this.ui.drives;
     return [h("span", {}, `${paths.length} chosen:`),
-      ...OUTCOMES.map((outcome) => h("button", { disabled: off, onclick: () => this.mark(paths, outcome) }, `Judge ${outcome}`)),
+      ...this.outcomes.map(([outcome, text]) => h("button", { disabled: off, onclick: () => this.mark(paths, outcome) }, `Judge ${text}`)),
       h("button", { class: "danger", disabled: off, onclick: () => this.remove(paths) }, "Delete")];
   }
 
@@ -162,9 +161,9 @@ export class View {
     const whole = h("button", { disabled: off, onclick: () => { cut[0] = 0; cut[1] = facts.duration_s; show(); } }, "Whole");
     show();
     this.controls.replaceChildren(
-      h("div", { class: "row" }, h("span", {}, "Judge:"), OUTCOMES.map((outcome) => h("button", {
+      h("div", { class: "row" }, h("span", {}, "Judge:"), this.outcomes.map(([outcome, text]) => h("button", {
         disabled: off || !facts.finished, "aria-pressed": String(facts.outcome === outcome), onclick: () => this.mark([path], outcome),
-      }, outcome)),
+      }, text)),
       facts.finished ? null : h("button", { class: "primary", disabled: off, onclick: () => this.repair(path) }, "Repair"),
       h("button", { class: "danger", disabled: off, onclick: () => this.remove([path]) }, "Delete")),
       h("div", { class: "row" }, h("span", {}, "Trim:"), begin, end, whole, kept, trim));
@@ -204,11 +203,11 @@ export class View {
     const found = [];
     for (const path of this.trashes) found.push(...await this.ui.attempt(() => this.ui.get("episodes/trash", { path })) ?? []);
     this.trash.hidden = !found.length;
-    refresh(this.trash, [found, this.ui.drives], () => [h("summary", {}, `Trash: ${found.length}, ${size(found.reduce((sum, { bytes }) => sum + bytes, 0))}`),
+    refresh(this.trash, [found, this.ui.drives], () => [h("summary", {}, `Trash: ${found.length}, ${size(found.reduce((sum, each) => sum + each.size_bytes, 0))}`),
       h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Trash" }, h("table", {}, h("thead", {}, h("tr", {},
         ["Episode", "What was done", "Size", ""].map((name) => h("th", { scope: "col" }, name || h("span", { class: "hidden-label" }, "Restore"))))),
-      h("tbody", {}, found.map((each) => h("tr", {}, h("th", { scope: "row" }, each.path), h("td", {}, DONE[each.done] ?? each.done),
-        h("td", {}, size(each.bytes)), h("td", {}, h("button", {
+      h("tbody", {}, found.map((each) => h("tr", {}, h("th", { scope: "row" }, each.path), h("td", {}, each.what),
+        h("td", {}, size(each.size_bytes)), h("td", {}, h("button", {
           disabled: !this.ui.drives, "aria-label": `Restore ${each.path}`, onclick: () => this.restore(each),
         }, "Restore"))))))),
       ...this.trashes.map((path) => h("button", { class: "danger", disabled: !this.ui.drives, onclick: () => this.empty(path) },

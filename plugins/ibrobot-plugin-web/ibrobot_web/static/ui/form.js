@@ -17,6 +17,11 @@ export class Form {
 
   get values() { return Object.fromEntries(this.fields.map(({ name, value }) => [name, value()])); }
 
+  // Enters values by name.
+  enter(values) {
+    for (const field of this.fields) if (field.name in values) field.enter(values[field.name]);
+  }
+
   // Shows the form; values that were entered stay as long as the fields are the same.
   show({ summary, missing, fields, known }, drives) {
     const lacking = fields.filter(({ names, required, open }) => required && !open && known[names]?.length === 0);
@@ -26,7 +31,7 @@ export class Form {
     refresh(this.first, [fields, known], () => {
       const entered = this.values;
       this.fields = fields.map((field) => new Field(field, known[field.names] ?? []));
-      for (const field of this.fields) if (field.name in entered) field.enter(entered[field.name]);
+      this.enter(entered);
       this.others.hidden = !fields.some(({ more }) => more);
       this.more.replaceChildren(...this.fields.filter(({ more }) => more).flatMap(({ elements }) => elements));
       return this.fields.filter(({ more }) => !more).flatMap(({ elements }) => elements);

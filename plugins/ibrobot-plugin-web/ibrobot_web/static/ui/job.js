@@ -4,7 +4,7 @@ import { h, refresh, say } from "../dom.js";
 import { drawPlot } from "../plot.js";
 
 // What a job has made -> the view that shows it.
-const MADE = { dataset: ["datasets", "Open the dataset"], policy: ["policies", "Use it in a robot"], episode: ["episodes", "See the episode"] };
+const MADE = { dataset: ["datasets", "Open the dataset"], policy: ["policies", "Use it in a robot"], episode: ["episodes", "See the episode"], episodes: ["episodes", "See the episodes"] };
 const STATES = { running: "running", done: "done", failed: "failed", cancelled: "ended" };
 
 export class JobCard {
@@ -42,8 +42,8 @@ export class JobCard {
     this.draw();
     const { problems = [], made = [] } = job.facts;
     refresh(this.problems, problems, () => problems.map((problem) => h("div", { class: "problem" }, problem)));
-    refresh(this.made, made, () => made.filter(({ kind }) => kind in MADE).map(({ kind, path }) => (
-      h("a", { class: "button", href: `#${MADE[kind][0]}/${encodeURIComponent(path)}` }, MADE[kind][1]))));
+    refresh(this.made, [made, job.state], () => (job.state === "running" ? [] : made).filter(({ kind }) => kind in MADE).map(({ kind, path }) => (
+      h("a", { class: "button", href: `#${MADE[kind][0]}${kind === "episodes" ? "" : `/${encodeURIComponent(path)}`}` }, MADE[kind][1]))));
     const text = job.lines.join("\n");
     this.details.hidden = !text;
     if (this.output.textContent !== text) {
@@ -68,9 +68,7 @@ export class JobCard {
   }
 
   buttons(job) {
-    if (job.state !== "running") {
-      return job.kind === "record" && job.facts.saved ? [h("a", { class: "button", href: "#episodes" }, "See the episodes")] : [];
-    }
+    if (job.state !== "running") return [];
     const open = job.facts.url
       ? h("a", { class: "button primary", href: job.facts.url, target: "_blank" }, "Open the robot's page") : null;
     const end = h("button", {

@@ -2,6 +2,7 @@
 
 import { h, refresh, say } from "../dom.js";
 import { Chooser } from "./chooser.js";
+import { Form } from "./form.js";
 import { JobCard } from "./job.js";
 
 const GIB = 1 << 30, MIB = 1 << 20;
@@ -14,41 +15,53 @@ export class View {
   }
 
   mount(element) {
-    this.prompt = h("input", { type: "text", id: "record-prompt", placeholder: "pick the cube", maxlength: "500" });
-    this.dataset = h("input", { type: "text", id: "record-dataset", value: "default" });
-    this.dataset.addEventListener("change", () => this.place());
-    this.count = h("input", { type: "number", id: "record-count", min: "1", max: "10000", value: "10" });
-    this.begin = h("button", { class: "primary", disabled: true }, "Start the session");
+    this.form = new Form("Start the session", (values) => this.start(values));
     this.disk = h("p", { class: "note", "aria-live": "polite" });
-    this.chooser.fields.append(h("label", { for: "record-prompt" }, "Task"), this.prompt,
-      h("label", { for: "record-dataset" }, "Dataset"), this.dataset,
-      h("label", { for: "record-count" }, "Episodes"), this.count, h("span", {}), this.disk);
-    this.form = h("form", {}, this.chooser.fields, h("div", { class: "row" }, this.begin));
-    this.form.addEventListener("submit", (event) => { event.preventDefault(); this.start(); });
+    this.form.element.prepend(this.chooser.fields);
+    this.form.others.before(this.disk);
+    this.form.element.addEventListener("change", () => this.place());
     this.sessions = h("div", { class: "columns" },
       h("p", { class: "note" }, "No session yet. In its page, you begin, judge and discard each episode."));
     element.append(h("h2", {}, "Record"), h("div", { class: "columns" },
-      h("section", { class: "card", "aria-label": "Session" }, this.form),
-      h("section", { class: "card", "aria-label": "Check" }, this.chooser.report)),
+      this.form.element, h("section", { class: "card", "aria-label": "Check" }, this.chooser.report)),
     h("h2", {}, "Sessions"), this.sessions);
   }
+
+  async load() {
+    const form = await this.ui.attempt(() => this.ui.get("record/form"));
+    if (!form) return;
+    this.missing = form.missing;
+    this.form.show({ ...form, summary: "" }, this.ui.drives);
+    this.suggest();
+    this.enable();
+    this.place();
+  }
+
+  // The dataset of the robot's YAML, unless one was entered.
+  suggest() {
+    const { dataset } = this.chooser.found ?? {};
+    if (dataset && !this.form.values.dataset) this.form.enter({ dataset });
+  }
+
+  enable() { this.form.button.disabled = !this.chooser.ready || !this.ui.drives || Boolean(this.missing); }
 
   show(shown) {
     if (!shown) return;
     this.chooser.load();
-    this.place();
+    this.load();
     for (const job of this.ui.of("record")) this.job(job);
   }
 
   found(found) {
-    this.begin.disabled = !this.chooser.ready || !this.ui.drives;
-    if (found?.dataset && this.dataset.value === "default") { this.dataset.value = found.dataset; this.place(); }
+    this.enable();
+    this.suggest();
+    if (found) this.place();
   }
 
   // Where episodes go, and for how many the disk has room.
   async place() {
     try {
-      const { folder, episodes, free_bytes: free, episode_bytes: size } = await this.ui.get("record/place", { dataset: this.dataset.value });
+      const { folder, episodes, free_bytes: free, episode_bytes: size } = await this.ui.get("record/place", { dataset: this.form.values.dataset || undefined });
       const room = size ? `, room for some ${Math.floor(free / size)} episodes of ${(size / MIB).toFixed(1)} MiB` : "";
       say(this.disk, `${folder}: ${episodes} episode${episodes === 1 ? "" : "s"} so far · ${(free / GIB).toFixed(1)} GiB of disk left${room}`);
       this.disk.classList.remove("bad");
@@ -58,12 +71,10 @@ export class View {
     }
   }
 
-  async start() {
-    this.begin.disabled = true;
-    await this.ui.attempt(() => this.ui.post("record/start", {
-      ...this.chooser.request, prompt: this.prompt.value, dataset: this.dataset.value, episodes: Number(this.count.value),
-    }));
-    this.begin.disabled = !this.chooser.ready || !this.ui.drives;
+  async start(values) {
+    this.form.button.disabled = true;
+    await this.ui.attempt(() => this.ui.post("record/start", { ...this.chooser.request, values }));
+    this.enable();
   }
 
   job(job) {

@@ -1,0 +1,58 @@
+"""What `ibrobot record` takes beside the options of every run, and the events that it prints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, override
+
+import attrs
+
+from ibrobot_core.api import option
+from ibrobot_core.app import Event, Shown
+from ibrobot_data.prompt import check_prompt
+from ibrobot_data.plural import plural
+
+
+def _check_prompt(instance: object, attribute: object, prompt: str | None) -> None:
+    if prompt is not None:
+        check_prompt(prompt)
+
+
+@attrs.frozen(kw_only=True)
+class RecordOptions:
+    """What is recorded, and where."""
+
+    prompt: str | None = option(
+        None, validator=_check_prompt, label="Task", help="description of the task; asked for if left out"
+    )
+    dataset: str | None = option(None, label="Dataset", help="folder of the episodes, below the root")
+    root: Path | None = option(None, label=None, help="folder of all datasets")
+    episodes: int | None = option(None, ge=1, label="Episodes", help="number of episodes after which it ends")
+    auto: bool = option(
+        False, label="Automatic", more=True,
+        help="begin episodes automatically; end them after contract.max_duration_s",
+    )  # fmt: skip
+    continuous: bool = option(
+        False, label="Without a break", more=True, help="record one episode, from the start of the run to its end"
+    )
+    reset_time: float = option(0.0, ge=0, unit="s", label="Pause", more=True, help="pause between episodes")
+
+
+@attrs.frozen(kw_only=True)
+class Session(Event):
+    """The state of a recording session."""
+
+    folder: str = option(help="folder of the dataset")
+    saved: int = option(help="episodes saved so far")
+    wanted: int | None = option(help="episodes after which it ends; null: it does not end by itself")
+    state: str = option(help="what it does at present")
+
+    @override
+    def shown(self) -> Shown:
+        count = f"{self.saved} {plural(self.saved, 'episode')}"
+        progress = None
+        if self.wanted is not None:
+            count = f"{self.saved} of {self.wanted} {plural(self.wanted, 'episode')}"
+            progress = min(1.0, self.saved / self.wanted)
+        made: dict[str, Any] = {"episodes": self.folder} if self.saved else {}
+        return Shown(f"{self.state} · {count} saved", progress, made=made)

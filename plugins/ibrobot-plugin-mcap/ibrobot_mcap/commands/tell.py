@@ -1,0 +1,14 @@
+"""Tells what a command has done: as an event to a program, or as a line."""
+
+from __future__ import annotations
+
+from ibrobot_core.app import Command, echo, emit
+from ibrobot_mcap.changes import Changed
+
+
+def told(command: Command, change: Changed, *, events: bool) -> None:
+    """Print a change."""
+    if events:
+        emit(command, change)
+    else:
+        echo(change.shown().text)
