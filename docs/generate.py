@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 from api_page import api_page
-from option_pages import config_page, jobs_page, options_page
+from option_pages import config_page, jobs_page, options_page, services_page
 from plugin_index import plugin_page
 
 from ibrobot_core.cli.main import cli
@@ -47,6 +47,7 @@ def write(directory: Path) -> None:
         "cli.md": cli_page,
         "api.md": api_page,
         "jobs.md": jobs_page,
+        "services.md": services_page,
     }
     for name, page in pages.items():
         text = "\n".join(page()) + "\n"

@@ -8,9 +8,10 @@ from collections.abc import Iterable, Iterator
 from typing import Any, get_args
 
 import attrs
+from ibrobot_testing import declared_services
 
 from ibrobot_core.component_config import ComponentConfig
-from ibrobot_core.config.describe import described
+from ibrobot_core.config.describe import described, type_name
 from ibrobot_core.config.schema import SECTIONS
 from ibrobot_core.convert import is_mapping, is_sequence
 from ibrobot_core.options import fields
@@ -77,6 +78,29 @@ def jobs_page() -> Iterator[str]:
         for event in command.events:
             yield f"Event `{event.__name__.lower()}`: {_first_line(event)}\n"
             yield from _table(event, links=False)
+
+
+def services_page() -> Iterator[str]:
+    """Lines of the page on services."""
+    yield "# Services\n"
+    yield "What a run offers to programs, pages and other machines, each while something serves it. A request"
+    yield "is plain data with these keys. `ibrobot service show NAME` prints the same for a running robot, and"
+    yield "[Share topics and services](../how-to/share-topics.md) calls them over the network.\n"
+    for name, service in declared_services().items():
+        yield f"## `{name}`\n"
+        yield f"{service.help}\n"
+        if fields(service.request):
+            yield from _class_tables(service.request)
+        else:
+            yield "It needs no request.\n"
+        if service.alone:
+            yield f"A request without keys is its `{service.alone}`.\n"
+        answer = service.answer
+        if isinstance(answer, type) and attrs.has(answer):
+            yield f"Answer: {_first_line(answer)}\n"
+            yield from _table(answer, links=False)
+        else:
+            yield f"Answer: `{type_name(answer)}`.\n"
 
 
 def _class_lines(path: str, kind: type[Any], shown: set[type]) -> Iterator[str]:

@@ -87,13 +87,21 @@ from ibrobot_core.deadman import HOLD_S as HOLD_S
 from ibrobot_core.control.spline import Spline as Spline
 
 # Topics and services
+from ibrobot_core.config.describe import described as described, type_name as type_name
 from ibrobot_core.bus import Bus as Bus, Subscription as Subscription, Received as Received
 from ibrobot_core.services import (
     Service as Service,
     NoRequest as NoRequest,
     RequestLimits as RequestLimits,
 )
-from ibrobot_core.launch.runtime import SET_MODE as SET_MODE, SetMode as SetMode, ESTOP as ESTOP
+from ibrobot_core.launch.runtime import (
+    SET_MODE as SET_MODE,
+    SetMode as SetMode,
+    RESET as RESET,
+    Reset as Reset,
+    ESTOP as ESTOP,
+)
+from ibrobot_core.launch.sources.policy import TOGGLE_SMOOTHING as TOGGLE_SMOOTHING
 from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
 from ibrobot_core.interfaces.policy import copied_tensors as copied_tensors
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
+import attrs
 import pytest
-from ibrobot_ros2.services import SERVICES, Answer, Call, decode_answer, encode_call
+from ibrobot_ros2.services import DETAILS, SERVICES, Answer, Call, decode_answer, encode_call
 from ibrobot_testing import stand_in
 
 from ibrobot_core.errors import ConfigError, MissingDependency, NotSupported, TransportError
 from ibrobot_core.messages import Bool, String
+from ibrobot_core.options import option
+from ibrobot_core.services import Service
 from ibrobot_core.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -168,6 +171,34 @@ def test_services_answer_other_machines(runs: Runs, network: None):
     runtime.stop()
     with pytest.raises(TransportError):
         ask("/double")
+
+
+@attrs.frozen
+class Fold:
+    """A request."""
+
+    times: int = option(1, ge=1, unit="folds", help="how often")
+
+
+@attrs.frozen
+class Folded:
+    """An answer."""
+
+    thickness: float = option(unit="m", help="of the whole")
+
+
+def test_a_declaration_is_shown_to_other_machines(runs: Runs, network: None):
+    runtime = runs.start("transport={type: network, share: {services: [/paper/]}}", lockstep=False)
+    fold = Service("/paper/fold", Fold, Folded, "Fold paper.", alone="times")
+    runtime.session.bus.serve(fold, lambda request: Folded(request.times * 1e-4))
+    details = ask(DETAILS, "/paper/fold").values
+    assert (details["help"], details["alone"], details["answer"]) == ("Fold paper.", "times", "Folded")
+    (times,), (thickness,) = details["request"], details["answer_keys"]
+    assert (times["name"], times["unit"], times["allowed"], times["help"]) == ("times", "folds", "≥ 1", "how often")
+    assert (thickness["name"], thickness["unit"], thickness["help"]) == ("thickness", "m", "of the whole")
+    assert ask(DETAILS, "/secret").values.startswith("/secret is not shared")
+    assert ask(DETAILS, "/paper/cut").values == "nothing serves /paper/cut at present; served are /paper/fold"
+    runtime.stop()
 
 
 @pytest.mark.parametrize(

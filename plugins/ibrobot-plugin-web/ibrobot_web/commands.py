@@ -10,7 +10,8 @@ from functools import partial
 from typing import Any
 
 from ibrobot_core.api import IbrobotError, PlanningError, seconds
-from ibrobot_core.app import RunView, error_text, raise_thread_priority
+from ibrobot_core.app import RESET, SET_MODE, TOGGLE_SMOOTHING, RunView, error_text, raise_thread_priority
+from ibrobot_core.app import Reset as ResetRun
 from ibrobot_web.messages import (
     BeginEpisode,
     Cancel,
@@ -186,7 +187,7 @@ def _run_times(session: RunView, *times_ms: int) -> list[int]:
 def _reset(session: RunView, sent: Sent[Reset]) -> Any:
     if sent.stops is None:
         raise IbrobotError("this page has seen no state of the robot yet")
-    return session.bus.call("/reset", {"stops": sent.stops})
+    return session.bus.call(RESET, ResetRun(sent.stops))
 
 
 def _joints_of(session: RunView, pose: str) -> dict[str, float]:
@@ -220,11 +221,11 @@ _HANDLERS: Mapping[type[RunCommand], Handler] = {
     Jog: _jog,
     Release: _release,
     Reset: _reset,
-    SetMode: lambda session, sent: session.bus.call("/set_mode", sent.command.mode),
+    SetMode: lambda session, sent: session.bus.call(SET_MODE, {"mode": sent.command.mode}),
     BeginEpisode: lambda session, sent: session.bus.call("/record_episode/start", sent.command.prompt or None),
     EndEpisode: lambda session, sent: session.bus.call("/record_episode/stop", sent.command.outcome),
     DiscardEpisode: lambda session, sent: session.bus.call("/record_episode/discard"),
-    SetSmoothing: lambda session, sent: session.bus.call("/action_dispatcher/toggle_smoothing", sent.command.enabled),
+    SetSmoothing: lambda session, sent: session.bus.call(TOGGLE_SMOOTHING, sent.command.enabled),
     Intervene: lambda session, sent: session.bus.call("/intervene", sent.command.take),
     Preview: _preview,
     GoTo: lambda session, sent: session.bus.call("/planning/go_to", sent.command.goal),

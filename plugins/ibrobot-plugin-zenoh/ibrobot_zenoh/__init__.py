@@ -92,5 +92,5 @@ def _service() -> click.Command:
 def ibrobot_commands() -> Iterable[Command]:
     """Commands for topics, services and certificates."""
     yield Command("topic", "List, show, measure and publish topics shared over the network.", _topic)
-    yield Command("service", "List and call services shared over the network.", _service)
+    yield Command("service", "List, show and call services shared over the network.", _service)
     yield Command("certs", "Make certificates for a server and its robots.", _certs)

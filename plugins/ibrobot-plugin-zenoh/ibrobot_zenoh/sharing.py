@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping
-from typing import override
+from typing import Any, override
 
-from ibrobot_ros2.services import SERVICES, Answer, decode_call, encode_answer, endpoint
+import attrs
+from ibrobot_ros2.services import DETAILS, SERVICES, Answer, decode_call, encode_answer, endpoint
 
 from ibrobot_core.api import NS_PER_S, Handler, IbrobotError, Message, NotSupported, Payload, Transport, did_you_mean
-from ibrobot_core.app import Component, RunView, SessionWorker, Subscription, TransportLink
+from ibrobot_core.app import (
+    Component,
+    RunView,
+    SessionWorker,
+    Subscription,
+    TransportLink,
+    described,
+    type_name,
+)
 from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.ros2 import SharedTopic
 
@@ -152,8 +161,8 @@ class SubscribedTopics(Component):
     @override
     def start(self) -> None:
         transport, bus = _topics(self._link), self._session.bus
-        for topic, type_name in self._topics.items() if isinstance(self._topics, Mapping) else ():
-            bus.expect(topic, type_name)
+        for topic, carried in self._topics.items() if isinstance(self._topics, Mapping) else ():
+            bus.expect(topic, carried)
         for topic in self._topics:
             if not bus.expected(topic):
                 self._session.log.warning(
@@ -188,7 +197,8 @@ class SubscribedTopics(Component):
 class SharedServices(Component):
     """Answers calls of the bus's services from other machines.
 
-    A name that ends with / stands for all services whose names begin with it. `/rosapi/services` lists the services.
+    A name that ends with / stands for all services whose names begin with it. `/rosapi/services` lists the services,
+    and `/rosapi/service_request_details` describes one.
     """
 
     def __init__(self, session: RunView, link: TransportLink, names: tuple[str, ...]) -> None:
@@ -225,17 +235,32 @@ class SharedServices(Component):
             call = decode_call(payload)
             if call.service == SERVICES:
                 return encode_answer(Answer(self._shared()))
-            if not self._is_shared(call.service):
+            name = str(call.request) if call.service == DETAILS else call.service
+            if not self._is_shared(name):
                 raise NotSupported(
-                    f"{call.service} is not shared{did_you_mean(call.service, self._shared(), 'shared')};"
+                    f"{name} is not shared{did_you_mean(name, self._shared(), 'shared')};"
                     " transport.share.services of the robot lists what is"
                 )
-            return encode_answer(Answer(self._session.bus.call(call.service, call.request)))
+            if call.service == DETAILS:
+                return encode_answer(Answer(self._details(name)))
+            return encode_answer(Answer(self._session.bus.call(name, call.request)))
         except IbrobotError as error:
             return encode_answer(Answer(str(error), result=False))
         except Exception:
             self._session.log.exception("a service failed")
             return encode_answer(Answer("the service failed; the robot's log has the cause", result=False))
+
+    def _details(self, name: str) -> dict[str, Any]:
+        """The declaration of a service that is served."""
+        found = self._session.bus.services().get(name)
+        if found is None:
+            raise NotSupported(f"nothing serves {name} at present; served are {', '.join(self._shared())}")
+        keys = {"request": found.request, "answer_keys": found.answer}
+        tables = {
+            name: [attrs.asdict(key) for key in described(kind)] if isinstance(kind, type) and attrs.has(kind) else []
+            for name, kind in keys.items()
+        }
+        return {"help": found.help, "alone": found.alone, "answer": type_name(found.answer), **tables}
 
     def _is_shared(self, service: str) -> bool:
         return any(service == name or (name.endswith("/") and service.startswith(name)) for name in self._names)

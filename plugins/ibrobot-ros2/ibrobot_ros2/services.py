@@ -20,6 +20,9 @@ from ibrobot_ros2.definitions import CodecError
 SERVICES = "/rosapi/services"
 """Service that answers with the names of the services that can be called; rosapi's name."""
 
+DETAILS = "/rosapi/service_request_details"
+"""Service that answers with the declaration of a service, given its name; rosapi's name."""
+
 
 def endpoint(namespace: str = "") -> str:
     """Name under which a transport serves the services of a robot with a namespace."""

@@ -21,7 +21,7 @@ from ibrobot_testing.recorder import RecorderSuite
 from ibrobot_testing.scene import SceneSuite
 from ibrobot_testing.section import SectionSuite, make_session
 from ibrobot_testing.sensor import SensorSuite
-from ibrobot_testing.service import stand_in
+from ibrobot_testing.service import declared_services, stand_in
 from ibrobot_testing.suite import Suite, checks, failed_checks, run_checks
 from ibrobot_testing.teleop import TeleopSuite
 from ibrobot_testing.transport import TransportSuite
@@ -47,6 +47,7 @@ __all__ = [
     "check_descriptor",
     "checks",
     "control_context",
+    "declared_services",
     "failed_checks",
     "host_context",
     "ibrobot_command",

@@ -1,13 +1,14 @@
-"""`ibrobot service list|call`: services that a robot shares over the network."""
+"""`ibrobot service list|show|call`: services that a robot shares over the network."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import click
-from ibrobot_ros2.services import SERVICES, Call, decode_answer, encode_call, endpoint
+from ibrobot_ros2.services import DETAILS, SERVICES, Call, decode_answer, encode_call, endpoint
 
 from ibrobot_core.api import NotSupported
 from ibrobot_core.app import dump_yaml, echo, parse_yaml
@@ -17,7 +18,7 @@ from ibrobot_zenoh.transport import ZenohTransport
 
 @click.group()
 def service() -> None:
-    """List and call services that a robot shares over the network."""
+    """List, show and call services that a robot shares over the network."""
 
 
 def _command(function: Callable[..., None]) -> click.Command:
@@ -44,6 +45,30 @@ def list_(transport: ZenohTransport, namespace: str) -> None:
     """List the shared services."""
     for name in _ask(transport, namespace, Call(SERVICES), 5.0):
         echo(name)
+
+
+@_command
+@click.argument("name", metavar="SERVICE")
+def show(transport: ZenohTransport, namespace: str, name: str) -> None:
+    """Show what SERVICE does, the keys of its request with units, and its answer."""
+    details = _ask(transport, namespace, Call(DETAILS, name), 5.0)
+    echo(f"{name}: {details['help']}")
+    echo("request:" if details["request"] else "request: none")
+    for key in details["request"]:
+        echo(f"  {_key_line(key)}")
+    if details["alone"]:
+        echo(f"A request without keys is the {details['alone']}.")
+    echo(f"answer: {details['answer']}")
+    for key in details["answer_keys"]:
+        echo(f"  {_key_line(key)}")
+
+
+def _key_line(key: Mapping[str, Any]) -> str:
+    """A key of a request or an answer."""
+    unit = f" [{key['unit']}]" if key["unit"] else ""
+    default = "" if key["required"] else f"; by default {json.dumps(key['default'], default=str)}"
+    allowed = f" ({key['allowed']})" if key["allowed"] else ""
+    return f"{key['name']}: {key['type']}{unit}{allowed}{f': {key["help"]}' if key['help'] else ''}{default}"
 
 
 @_command

@@ -1,0 +1,192 @@
+"""What one plugin reads of another: the owner's declaration, and the checks that fail once it has another shape."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import queue
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import attrs
+import ibrobot_web
+import numpy as np
+import pytest
+from ibrobot_testing import declared_services, make_session
+from ibrobot_web import messages
+from ibrobot_web.commands import Commands
+from ibrobot_web.messages import RunCommand, Sent
+
+from ibrobot_core.api import Header, JointTrajectory, JointTrajectoryPoint
+from ibrobot_core.app import Command, Service, fields, installed_plugins
+
+pytestmark = pytest.mark.integration
+PAGE = Path(inspect.getfile(ibrobot_web)).parent
+MOVES: tuple[RunCommand, ...] = (
+    messages.Reset(), messages.SetMode("web"), messages.BeginEpisode("pick"), messages.EndEpisode("failure"),
+    messages.DiscardEpisode(), messages.SetSmoothing(enabled=False), messages.Intervene(take=True),
+    messages.GoTo("home"), messages.Cancel(), messages.Preview(messages.Target(joints={"j0": 0.1})),
+)  # fmt: skip
+"""The commands of a page that call services of the run."""
+
+
+def changed(kind: type[Any], old: str, new: str) -> type[Any]:
+    """A class with another name for one of its fields."""
+    attrs.resolve_types(kind)
+    kept = {field.name: attrs.field(default=field.default, metadata=field.metadata) for field in attrs.fields(kind)}
+    kept[new] = kept.pop(old)
+    made = attrs.make_class(kind.__name__, kept, frozen=True, kw_only=True)
+    made.__annotations__ = {name: attrs.fields_dict(kind)[old if name == new else name].type for name in kept}
+    return attrs.resolve_types(made)
+
+
+# Services: each request of the page fits the owner's declaration, and the page reads fields that the answer has.
+
+
+def check_services(services: Mapping[str, Service[Any, Any]]) -> None:
+    """Send every command of a page to a run with these declarations."""
+    session: Any = make_session()
+    session.control = SimpleNamespace(stops=0, running=True)
+    joint = session.config.robot.joint_names[0]
+    for name, service in services.items():
+        session.bus.unserve(name)
+        session.bus.serve(service, lambda request, kind=service.answer: answer_of(kind, joint))
+    replies: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+    failures: list[Exception] = []
+    commands = Commands(session, lambda: None, replies.put, failures.append)
+    try:
+        for number, command in enumerate(MOVES):
+            commands.take(Sent(number, 0, command))
+        answers = {int(reply["reply"]): reply for reply in (replies.get(timeout=60) for _ in MOVES)}
+    finally:
+        commands.close(10.0)
+    wrong = {type(MOVES[number]).__name__: reply["error"] for number, reply in answers.items() if "error" in reply}
+    assert not wrong
+    assert not failures
+
+
+def answer_of(kind: Any, joint: str) -> Any:
+    """An answer of a declared class."""
+    if not (isinstance(kind, type) and attrs.has(kind)):
+        return None
+    known = {field.name: field for field in attrs.fields(kind)}
+    given: dict[str, Any] = {name: None for name, field in known.items() if field.default is attrs.NOTHING}
+    if "trajectory" in known:
+        point = JointTrajectoryPoint(positions=np.array([0.1]), time_from_start_ns=1_000_000_000)
+        given["trajectory"] = JointTrajectory(header=Header(0, ""), joint_names=(joint,), points=(point,))
+    return kind(**given)
+
+
+def test_the_page_calls_services_as_their_owners_declare_them() -> None:
+    check_services(declared_services())
+
+
+@pytest.mark.parametrize(
+    ("service", "part", "old"),
+    [
+        ("/record_episode/stop", "request", "outcome"),
+        ("/record_episode/start", "request", "prompt"),
+        ("/intervene", "request", "take"),
+        ("/planning/go_to", "request", "goal"),
+        ("/plan_kinematic_path", "request", "goals"),
+        ("/plan_kinematic_path", "answer", "trajectory"),
+    ],
+)
+def test_another_shape_of_a_service_fails(service: str, part: str, old: str) -> None:
+    declared = declared_services()
+    found = declared[service]
+    declared[service] = attrs.evolve(found, **{part: changed(vars_of(found)[part], old, "renamed")})
+    with pytest.raises(AssertionError, match=r"unknown key|no attribute|unexpected"):
+        check_services(declared)
+
+
+def vars_of(found: Any) -> dict[str, Any]:
+    return attrs.asdict(found, recurse=False)
+
+
+# Commands: each option that the page names is declared.
+
+
+def used_options() -> Iterator[tuple[str, str]]:
+    """The commands that the page runs by itself, and the options that it names."""
+    for path in PAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            match node:
+                case ast.Call(func=ast.Name(id="run_command"), args=[_, ast.Constant(value=str(name)), *_]):
+                    yield from ((name, word.arg) for word in node.keywords if word.arg is not None)
+                case ast.Call(
+                    func=ast.Name(id="choices_of"), args=[ast.Constant(value=str(name)), ast.Constant(value=option)]
+                ):
+                    yield name, str(option)
+
+
+def check_options(declared: Mapping[str, Command]) -> None:
+    """Look for options that the page names and no command has."""
+    wrong = [f"{name}: {word}" for name, word in used_options() if word not in fields(declared[name].options)]
+    assert not wrong
+
+
+def test_the_page_names_options_that_their_commands_have() -> None:
+    assert len(set(used_options())) >= 9
+    check_options(installed_plugins().declarations())
+
+
+@pytest.mark.parametrize(
+    ("command", "old"), [("episodes trim", "begin_s"), ("episodes mark", "outcome"), ("datasets info", "dataset")]
+)
+def test_another_name_of_an_option_fails(command: str, old: str) -> None:
+    declared = installed_plugins().declarations()
+    options = changed(declared[command].options, old, "renamed")
+    declared[command] = attrs.evolve(declared[command], options=options)
+    with pytest.raises(AssertionError, match=f"{command}: {old}"):
+        check_options(declared)
+
+
+# Events: what the page's scripts read of the events of others are fields of these.
+
+READ = {
+    ("datasets info", "Contents"): ("datasets.js", r"\bfacts\.(\w+)"),
+    ("episodes trash", "InTrash"): (
+        "episodes.js",
+        r"\beach\.(path|size_bytes|id|done)\b|restore\(\{ \w+, (\w+), (\w+) \}\)",
+    ),
+}
+"""Command and class of its events -> the script that reads them, and how it writes their fields."""
+
+
+def check_events(declared: Mapping[str, Command]) -> None:
+    """Look for fields that a script reads and no event has."""
+    for (command, event), (script, pattern) in READ.items():
+        found = re.findall(pattern, (PAGE / "static/ui" / script).read_text(encoding="utf-8"))
+        read = {name for each in found for name in ([each] if isinstance(each, str) else each) if name}
+        kinds = [kind for kind in declared[command].events if kind.__name__ == event]
+        assert kinds, f"{command} has no event {event}"
+        assert read
+        assert read <= set(fields(kinds[0])), f"{script} reads what {event} does not have"
+
+
+def test_scripts_read_fields_that_events_have() -> None:
+    check_events(installed_plugins().declarations())
+
+
+@pytest.mark.parametrize(
+    ("command", "event", "old"), [("datasets info", "Contents", "fps"), ("episodes trash", "InTrash", "size_bytes")]
+)
+def test_another_name_of_a_field_of_an_event_fails(command: str, event: str, old: str) -> None:
+    declared = installed_plugins().declarations()
+    events = tuple(
+        changed(each, old, "renamed") if each.__name__ == event else each for each in declared[command].events
+    )
+    declared[command] = attrs.evolve(declared[command], events=events)
+    with pytest.raises(AssertionError, match="does not have"):
+        check_events(declared)
+
+
+def test_every_command_and_event_explains_its_fields() -> None:
+    for name, command in installed_plugins().declarations().items():
+        for kind in (command.options, *command.events):
+            bare = [key for key, field in fields(kind).items() if not field.metadata.get("help")]
+            assert not bare, f"{name}: {kind.__name__} has fields without help"
