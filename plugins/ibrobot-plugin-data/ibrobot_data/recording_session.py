@@ -9,8 +9,8 @@ import attrs
 
 from ibrobot_core.api import option
 from ibrobot_core.app import Event, Shown
-from ibrobot_data.prompt import check_prompt
 from ibrobot_data.plural import plural
+from ibrobot_data.prompt import check_prompt
 
 
 def _check_prompt(instance: object, attribute: object, prompt: str | None) -> None:
