@@ -7,6 +7,7 @@ import inspect
 import queue
 import re
 from collections.abc import Iterator, Mapping
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +22,7 @@ from ibrobot_web.commands import Commands
 from ibrobot_web.messages import RunCommand, Sent
 
 from ibrobot_core.api import Header, JointTrajectory, JointTrajectoryPoint
-from ibrobot_core.app import Command, Service, fields, installed_plugins
+from ibrobot_core.app import Command, Service, fields, flag_of, installed_plugins
 
 pytestmark = pytest.mark.integration
 PAGE = Path(inspect.getfile(ibrobot_web)).parent
@@ -183,6 +184,55 @@ def test_another_name_of_a_field_of_an_event_fails(command: str, event: str, old
     declared[command] = attrs.evolve(declared[command], events=events)
     with pytest.raises(AssertionError, match="does not have"):
         check_events(declared)
+
+
+_FLAG = re.compile(r"(?<![\w.])--[a-z][a-z-]*(?![\w.-])")
+TERMINAL = {
+    "--to": "from a dataset to episodes, which no page does",
+    "--episodes": "episodes of a dataset, with --to bag",
+    "--output": "a new episode, where a page replaces the old one",
+    "--yes": "an answer in a terminal",
+}
+"""Flags in errors that a page does not cause, and why."""
+
+
+def flags_in_errors(package: Path) -> Iterator[tuple[str, str]]:
+    """The flags in what a package raises, and where."""
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Raise):
+                texts = [each.value for each in ast.walk(node) if isinstance(each, ast.Constant)]
+                yield from (
+                    (flag, path.name) for text in texts if isinstance(text, str) for flag in _FLAG.findall(text)
+                )
+
+
+def check_flags(declared: Mapping[str, Command]) -> None:
+    """Look for flags in errors that a page cannot replace by the label of an option."""
+    for module in ("ibrobot_data", "ibrobot_lerobot", "ibrobot_mcap", "ibrobot_eval"):
+        package = Path(inspect.getfile(import_module(module))).parent
+        named = {
+            flag_of(name, field)
+            for command in declared.values() if command.events and command.load.__module__ == module
+            for name, field in fields(command.options).items() if field.metadata["label"] is not None
+        }  # fmt: skip
+        found = {
+            (flag, file) for flag, file in flags_in_errors(package) if not file.startswith("replay")
+        }  # no page replays
+        wrong = sorted((flag, file) for flag, file in found if flag not in named | set(TERMINAL))
+        assert not wrong
+
+
+def test_errors_name_options_that_a_page_has_labels_for() -> None:
+    check_flags(installed_plugins().declarations())
+
+
+def test_an_error_that_names_an_option_of_another_name_fails() -> None:
+    declared = installed_plugins().declarations()
+    options = changed(declared["convert"].options, "force_contract", "renamed")
+    declared["convert"] = attrs.evolve(declared["convert"], options=options)
+    with pytest.raises(AssertionError, match="--force-contract"):
+        check_flags(declared)
 
 
 def test_every_command_and_event_explains_its_fields() -> None:

@@ -23,11 +23,16 @@ class RecordOptions:
     """What is recorded, and where."""
 
     prompt: str | None = option(
-        None, validator=_check_prompt, label="Task", help="description of the task; asked for if left out"
+        None,
+        validator=_check_prompt,
+        label="Task",
+        help="description of the task, e.g. pick the cube; keys ask for it if left out",
     )
-    dataset: str | None = option(None, label="Dataset", help="folder of the episodes, below the root")
+    dataset: str | None = option(None, label="Dataset", help="name of the dataset, a folder of episodes below the root")
     root: Path | None = option(None, label=None, help="folder of all datasets")
-    episodes: int | None = option(None, ge=1, label="Episodes", help="number of episodes after which it ends")
+    episodes: int | None = option(
+        None, ge=1, label="Episodes", help="number of episodes after which the session ends; without one, it goes on"
+    )
     auto: bool = option(
         False, label="Automatic", more=True,
         help="begin episodes automatically; end them after contract.max_duration_s",

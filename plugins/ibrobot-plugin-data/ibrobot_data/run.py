@@ -200,7 +200,7 @@ def _check_old(request: ConversionRequest, old: DatasetSummary) -> None:
     if not request.append and known != conversion(request):
         raise DatasetError(_THERE.format(request.out))
     if known is None:
-        raise DatasetError(f"{request.out}: not made by ibrobot convert; convert into another folder")
+        raise DatasetError(f"{request.out}: not made by a conversion of ibrobot; convert into another folder")
     asked = conversion(request)
     known = {"missing": asked["missing"]} | known  # older datasets do not have it
     wrong = [f"{name} {known.get(name)}, now {asked[name]}" for name in asked if known.get(name) != asked[name]]

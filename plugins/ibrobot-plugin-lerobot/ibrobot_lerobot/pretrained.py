@@ -26,7 +26,7 @@ _BACKBONE = re.compile(r"(?P<model>[A-Za-z0-9]+)_Weights\.\w+")
 _TOKENIZER = "tokenizer_name"
 
 
-def check_policy(policy: str, options: Sequence[str], *, download: bool) -> None:
+def check_policy(policy: str, options: Sequence[str], *, download: bool, on_page: bool = False) -> None:
     """Check that a training of this policy type can start on this machine.
 
     Nothing is checked if LeRobot is installed in another environment.
@@ -35,6 +35,7 @@ def check_policy(policy: str, options: Sequence[str], *, download: bool) -> None
         policy: the policy type, e.g. `act`.
         options: further arguments of `lerobot-train`, which may choose other weights.
         download: whether LeRobot may download weights.
+        on_page: whether a page shows the error, which has no field for options of `lerobot-train`.
 
     Raises:
         MissingDependency: for an unknown type, a missing extra, or weights that are not on this machine.
@@ -61,7 +62,7 @@ def check_policy(policy: str, options: Sequence[str], *, download: bool) -> None
         if (wanted := chosen.get(key, source)) and not on_this_machine(wanted):
             raise MissingDependency(
                 f"policy {policy} begins with pretrained weights that are not on this machine: {key} is {wanted}",
-                remedy="--download lets LeRobot fetch them; " + _offline(key, wanted),
+                remedy="--download lets LeRobot fetch them" + ("" if on_page else f"; {_offline(key, wanted)}"),
             )
 
 

@@ -71,7 +71,7 @@ def train(options: TrainOptions, events: bool) -> None:
         newest = _begun(out, chosen)
         if newest is None:
             if policy != SMALL:
-                check_policy(policy, options.lerobot_options, download=options.download)
+                check_policy(policy, options.lerobot_options, download=options.download, on_page=events)
             command = [program, *chosen]
         else:
             kept = [each for each in chosen if each.partition("=")[0] in _WHEN_CONTINUING]

@@ -69,8 +69,8 @@ class TrainOptions:
         help="a policy type of LeRobot, or small_act",
     )  # fmt: skip
     out: Path = option(label="Folder", help="folder for the checkpoints; a training in it is continued")
-    steps: int = option(5000, ge=1, le=100_000_000, label="Steps", help="training steps")
-    batch_size: int = option(32, ge=1, le=1_000_000, label="Frames per step", help="frames per step")
+    steps: int = option(5000, ge=1, le=100_000_000, label="Steps", help="steps of the training")
+    batch_size: int = option(32, ge=1, le=1_000_000, label="Frames per step", help="size of the batches")
     device: str = option(
         AUTO, choices=(AUTO, "cpu", "cuda", "mps"), open=True, validator=_matches(r"[a-z]+(:\d+)?", "cuda:0"),
         label="Device", help="device of torch; auto: a GPU if there is one",

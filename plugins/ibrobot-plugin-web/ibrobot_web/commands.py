@@ -12,6 +12,7 @@ from typing import Any
 from ibrobot_core.api import IbrobotError, PlanningError, seconds
 from ibrobot_core.app import RESET, SET_MODE, TOGGLE_SMOOTHING, RunView, error_text, raise_thread_priority
 from ibrobot_core.app import Reset as ResetRun
+from ibrobot_core.app import SetMode as EnterMode
 from ibrobot_web.messages import (
     BeginEpisode,
     Cancel,
@@ -221,7 +222,7 @@ _HANDLERS: Mapping[type[RunCommand], Handler] = {
     Jog: _jog,
     Release: _release,
     Reset: _reset,
-    SetMode: lambda session, sent: session.bus.call(SET_MODE, {"mode": sent.command.mode}),
+    SetMode: lambda session, sent: session.bus.call(SET_MODE, EnterMode(sent.command.mode)),
     BeginEpisode: lambda session, sent: session.bus.call("/record_episode/start", sent.command.prompt or None),
     EndEpisode: lambda session, sent: session.bus.call("/record_episode/stop", sent.command.outcome),
     DiscardEpisode: lambda session, sent: session.bus.call("/record_episode/discard"),

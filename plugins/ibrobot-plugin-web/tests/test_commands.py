@@ -14,12 +14,12 @@ from ibrobot_web.commands import Commands
 from ibrobot_web.messages import RunCommand, Sent
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Session
+from ibrobot_core.app import Reset, Session, SetMode
 
 _WAIT_S = 60.0
 SERVICES: dict[str, tuple[RunCommand, Any]] = {
-    "/reset": (messages.Reset(), {"stops": 0}),
-    "/set_mode": (messages.SetMode("web"), "web"),
+    "/reset": (messages.Reset(), Reset(0)),
+    "/set_mode": (messages.SetMode("web"), SetMode("web")),
     "/record_episode/start": (messages.BeginEpisode("pick"), "pick"),
     "/record_episode/stop": (messages.EndEpisode("failure"), "failure"),
     "/record_episode/discard": (messages.DiscardEpisode(), None),
@@ -157,7 +157,7 @@ def test_what_was_sent_before_a_stop_and_arrives_after_it_is_refused(rig: Callab
     assert ran == []
     found.send(messages.Reset(), stops=0)
     found.answers(1)
-    assert ran == [{"stops": 0}], "control refuses a reset that has not seen the stop"
+    assert ran == [Reset(0)], "control refuses a reset that has not seen the stop"
     found.send(messages.Reset(), messages.GoTo("home"), stops=1)
     assert all("ok" in each for each in found.answers(2))
     assert ran == [{"stops": 0}, {"stops": 1}, "home"]

@@ -31,6 +31,7 @@ class BrewOptions:
     roast: str = option("dark", choices={"dark": "dark and bitter", "light": "light"}, help="which roast")
     flavour: tuple[str, ...] = option((), choices=("nut", "berry"), help="what it tastes of")
     milk: bool = option(False, label="With milk", more=True, help="whether to add some")
+    machine: tuple[str, ...] = option((), names="robot", more=True, help="which machines")
     grinder: str = option("auto", label=None, help="for experts")
 
 
@@ -63,7 +64,9 @@ def test_a_form_has_all_that_its_owner_declares(ui: Ui) -> None:
     form = form_of(ui, "brew")
     fields = {field["name"]: field for field in form["fields"]}
     assert (form["title"], form["summary"], form["missing"]) == ("Brew", "Brew coffee.", "")
-    assert list(fields) == ["water", "beans", "heat", "cups", "roast", "flavour", "milk"], "not those for terminals"
+    assert list(fields) == ["water", "beans", "heat", "cups", "roast", "flavour", "milk", "machine"], (
+        "not those for terminals"
+    )
     assert fields["heat"] == {
         "name": "heat", "label": "Heat", "help": "how hot", "unit": "degC", "kind": "number", "several": False,
         "required": False, "default": 95.0, "choices": [], "open": False, "min": 0, "max": 100, "more": False,
@@ -72,7 +75,8 @@ def test_a_form_has_all_that_its_owner_declares(ui: Ui) -> None:
     assert fields["roast"]["choices"] == [["dark", "dark and bitter"], ["light", "light"]]
     assert (fields["cups"]["kind"], fields["cups"]["label"]) == ("whole", "Cups")
     assert (fields["flavour"]["several"], fields["milk"]["kind"], fields["milk"]["more"]) == (True, "flag", True)
-    assert form["known"] == {"episodes": []}
+    assert (form["known"]["episodes"], set(form["known"])) == ([], {"episodes", "robot"})
+    assert {"value": "so101", "text": "so101"} in form["known"]["robot"]
 
 
 def test_values_of_a_form_become_arguments_that_give_the_same_options(ui: Ui, tmp_path: Path) -> None:
@@ -101,6 +105,7 @@ def test_empty_fields_leave_the_choice_to_the_command(ui: Ui, tmp_path: Path) ->
     [
         ({}, "^Water: required key is missing$"),
         ({"water": "../x"}, "outside the opened folders"),
+        ({"water": "a", "machine": ["so101", "../x.yaml"]}, "outside the opened folders"),
         ({"water": "a", "heat": 101}, "^Heat: 101.0 is too large, must be at most 100 degC$"),
         ({"water": "a", "grinder": "b"}, "has no field grinder"),
     ],
@@ -147,6 +152,7 @@ def test_an_event_of_another_shape_is_an_error_of_the_job(ui: Ui, line: str, err
     ("text", "shown"),
     [
         ("--milk adds some", "“With milk” adds some"),
+        ("--roast light is milder, --heat 3 is not", "“Roast: light” is milder, “Heat” 3 is not"),
         ("see --policy.path=x, --other and --milk-foam", "see --policy.path=x, --other and --milk-foam"),
         ("run `ibrobot brew --milk` first", "run “Brew” first"),
         ("run `ibrobot paint`", "run `ibrobot paint`"),

@@ -25,7 +25,7 @@ def declared_services() -> dict[str, Service[Any, Any]]:
     names = {module.name for module in iter_modules() if module.name.startswith("ibrobot_")}
     for package in sorted(names - {"ibrobot_testing"}):
         for module in walk_packages(import_module(package).__path__, f"{package}."):
-            spec = module.module_finder.find_spec(module.name, None)  # type: ignore[call-arg]
+            spec = module.module_finder.find_spec(module.name, None)
             assert spec is not None
             assert spec.origin is not None
             if _DECLARES.search(Path(spec.origin).read_text(encoding="utf-8")):

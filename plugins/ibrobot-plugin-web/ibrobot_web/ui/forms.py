@@ -27,7 +27,7 @@ from ibrobot_web.ui.job_runner import IBROBOT
 from ibrobot_web.ui.recordings import find_policies, find_recordings
 from ibrobot_web.ui.robots import robot_names, robot_of
 
-_FLAG = re.compile(r"(?<![\w.])--[a-z][a-z-]*(?![\w.])")
+_FLAG = re.compile(r"(?<![\w.])(?P<flag>--[a-z][a-z-]*)(?![\w.-])(?: (?P<value>[\w-]+))?")
 _COMMAND = re.compile(r"`ibrobot ([a-z]+(?: [a-z]+)?)[^`]*`")
 _COMMAND_S = 600.0
 WITH_ROBOT = frozenset({"record"})
@@ -55,14 +55,18 @@ def form_of(ui: Ui, name: str) -> dict[str, Any]:
     form: dict[str, Any] = {"title": title_of(name), "summary": "", "missing": "", "fields": [], "known": {}}
     try:
         command = installed_plugins().command(name)
-        command.check()
     except IbrobotError as error:
         return {**form, "missing": str(error)}
     shown = _shown(command)
     wanted = {field.metadata["names"] for field in shown.values()}
-    known = {names: found for names, found in _known(ui).items() if names in wanted}
-    found = [_field_json(name, field) for name, field in shown.items()]
-    return {**form, "summary": command.summary, "fields": found, "known": known}
+    form["summary"] = command.summary
+    form["known"] = {names: found for names, found in _known(ui).items() if names in wanted}
+    form["fields"] = [_field_json(name, field) for name, field in shown.items()]
+    try:
+        command.check()
+    except IbrobotError as error:
+        form["missing"] = str(error)
+    return form
 
 
 def read_form(ui: Ui, command: Command, values: Mapping[str, Any]) -> Any:
@@ -101,12 +105,21 @@ def arguments(options: Any) -> list[str]:
 
 
 def in_page_words(text: str, command: Command | None = None) -> str:
-    """A text of a command with labels in place of its flags, e.g. --append, and of commands of a terminal."""
+    """A text of a command with labels in place of its flags, e.g. `--missing skip`, and of commands of a terminal."""
     declared = installed_plugins().declarations()
     options = fields(command.options) if command is not None else {}
-    labels = {flag_of(name, field): label_of(name, field) for name, field in options.items()}
+    known = {flag_of(name, field): (name, field) for name, field in options.items()}
+
+    def labelled(found: re.Match[str]) -> str:
+        if found["flag"] not in known:
+            return found[0]
+        name, field = known[found["flag"]]
+        label, value = label_of(name, field), found["value"] or ""
+        words = field.metadata["words"].get(value)
+        return f"“{label}: {words}”" if words else f"“{label}”{f' {value}' if value else ''}"
+
     text = _COMMAND.sub(lambda found: f"“{title_of(found[1])}”" if found[1] in declared else found[0], text)
-    return _FLAG.sub(lambda found: f"“{labels[found[0]]}”" if found[0] in labels else found[0], text)
+    return _FLAG.sub(labelled, text)
 
 
 def run_command(ui: Ui, name: str, **values: Any) -> list[Event]:

@@ -47,10 +47,17 @@ class Field {
     const described = { id, "aria-describedby": help.id };
     const choices = field.choices.length ? field.choices : known.map(({ value, text }) => [value, text]);
     const closed = choices.length && !field.open && !(field.names === "robot");
+    if (field.several && !choices.length && !field.names) {
+      const input = h("input", { type: "text", placeholder: "several, with commas between them", ...described });
+      this.elements = [h("label", { for: id }, field.label), h("div", {}, input, help)];
+      this.value = () => input.value.split(",").map((text) => text.trim()).filter(Boolean);
+      this.enter = (entered) => { input.value = entered.join(", "); };
+      return;
+    }
     if (field.several) {
       const boxes = choices.map(([value, text]) => {
         const box = h("input", { type: "checkbox", value });
-        box.checked = field.default ? field.default.includes(value) : choices.length === 1;
+        box.checked = field.default?.length ? field.default.includes(value) : choices.length === 1 && field.required;
         return h("label", {}, box, ` ${text}`);
       });
       const group = h("div", { class: "choices", role: "group", "aria-label": field.label, "aria-describedby": help.id },
@@ -86,7 +93,8 @@ class Field {
   }
 }
 
-function sentence({ help, required }) {
+function sentence({ label, help, required }) {
+  if (help.toLowerCase() === label.toLowerCase()) return "";
   const text = help.charAt(0).toUpperCase() + help.slice(1);
   return required ? `${text} (required)` : text;
 }

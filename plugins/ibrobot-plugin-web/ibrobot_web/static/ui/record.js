@@ -17,6 +17,7 @@ export class View {
   mount(element) {
     this.form = new Form("Start the session", (values) => this.start(values));
     this.disk = h("p", { class: "note", "aria-live": "polite" });
+    this.chooser.fields.classList.add("form");
     this.form.element.prepend(this.chooser.fields);
     this.form.others.before(this.disk);
     this.form.element.addEventListener("change", () => this.place());
