@@ -99,7 +99,8 @@ def test_the_page_calls_services_as_their_owners_declare_them() -> None:
 def test_another_shape_of_a_service_fails(service: str, part: str, old: str) -> None:
     declared = declared_services()
     found = declared[service]
-    declared[service] = attrs.evolve(found, **{part: changed(vars_of(found)[part], old, "renamed")})
+    other: Any = {part: changed(vars_of(found)[part], old, "renamed")}
+    declared[service] = attrs.evolve(found, **other)
     with pytest.raises(AssertionError, match=r"unknown key|no attribute|unexpected"):
         check_services(declared)
 

@@ -70,7 +70,7 @@ def _origin_as_given(root: Path, given: Mapping[str, str]) -> Origin:
     if "norm_mode" not in given:
         raise CalibrationError(
             f"{root}: was not made by ibrobot, so it does not state the unit of its joints; "
-            "set it by --norm-mode: radians, degrees or range_m100_100"
+            "give it: radians, degrees or range_m100_100"
         )
     contract = Contract.from_canonical(json.loads(given["contract"]))
     calibrations = json.loads(given.get("calibration", "{}"))

@@ -160,7 +160,7 @@ def test_what_was_sent_before_a_stop_and_arrives_after_it_is_refused(rig: Callab
     assert ran == [Reset(0)], "control refuses a reset that has not seen the stop"
     found.send(messages.Reset(), messages.GoTo("home"), stops=1)
     assert all("ok" in each for each in found.answers(2))
-    assert ran == [{"stops": 0}, {"stops": 1}, "home"]
+    assert ran == [Reset(0), Reset(1), "home"]
 
 
 def test_many_stops_are_one_for_the_run_and_each_is_answered(rig: Callable[..., Rig]) -> None:
