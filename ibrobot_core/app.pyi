@@ -53,6 +53,7 @@ from ibrobot_core.plugins import (
     installed_plugins as installed_plugins,
     example_type as example_type,
     official_plugins as official_plugins,
+    install_command as install_command,
 )
 
 # A run

@@ -45,6 +45,8 @@ def offers() -> dict[str, dict[str, list[str]]]:
                 kinds[RECORDS] = kinds[kind]
         if registry.readers:
             kinds["reader"] = sorted(reader.type for reader in registry.readers)
+        if registry.guides:
+            kinds["guide"] = sorted(guide.name for guide in registry.guides)
         if commands := sorted(name for name, owner in registry.command_packages.items() if owner == package):
             kinds["command"] = commands
         if jobs := [name for name in commands if registry.commands[name].events]:

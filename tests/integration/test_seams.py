@@ -236,6 +236,12 @@ def test_an_error_that_names_an_option_of_another_name_fails() -> None:
         check_flags(declared)
 
 
+def test_the_page_names_no_package() -> None:
+    named = re.compile(r"ibrobot-plugin-|ibrobot\[|pip install|lerobot", re.IGNORECASE)
+    paths = [path for path in PAGE.rglob("*") if path.suffix in (".py", ".js", ".html")]
+    assert [path.name for path in paths if named.search(path.read_text(encoding="utf-8"))] == []
+
+
 def test_every_command_and_event_explains_its_fields() -> None:
     for name, command in installed_plugins().declarations().items():
         for kind in (command.options, *command.events):

@@ -61,7 +61,7 @@ def test_an_arm_is_calibrated_on_the_page(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
 
     async def test(server: UiServer) -> None:
-        guides = {each["name"]: each for each in await server.get("devices/list")}
+        guides = {each["name"]: each for each in (await server.get("devices/list"))["guides"]}
         assert set(guides) >= {"cameras", "ports", "port", "motors", "calibration", "servos"}
         assert [each["name"] for each in guides["calibration"]["questions"]] == ["port", "leader", "name", "zero_at"]
         for wrong, why in (({"zero_at": "noon"}, "is not one of"), ({"leader": "yes"}, "must be a bool")):

@@ -142,7 +142,11 @@ def test_joints_come_in_radians(tmp_path: Path):
             ContractError,
             "was not made by ibrobot, .*give a robot YAML with a matching contract",
         ),
-        ({"contract": provenance()["contract"]}, CalibrationError, "does not state the unit .*; give it: radians, degrees"),
+        (
+            {"contract": provenance()["contract"]},
+            CalibrationError,
+            "does not state the unit .*; give it: radians, degrees",
+        ),
         (provenance(norm_mode="degrees"), CalibrationError, "degrees needs the calibration of joint 'a'"),
         (
             provenance(contract(("a", "c", "b"))),

@@ -10,7 +10,16 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import Child, ComponentFailed, GuideDescriptor, NoRequest, Question, installed_plugins
+from ibrobot_core.app import (
+    Child,
+    ComponentFailed,
+    GuideDescriptor,
+    NoRequest,
+    Question,
+    install_command,
+    installed_plugins,
+    official_plugins,
+)
 from ibrobot_web.ui.context import Blob, Route, Ui
 
 _MODULE = "ibrobot_web.ui.guide_process"
@@ -194,9 +203,9 @@ class GiveAnswer(NamesGuide):
     ok: bool = option(True, help="yes or no; true for what is done")
 
 
-def listing(ui: Ui, request: NoRequest) -> list[dict[str, Any]]:
-    """The guides of all plugins, with their questions."""
-    return [
+def listing(ui: Ui, request: NoRequest) -> dict[str, Any]:
+    """The guides of all plugins, with their questions, and the command that installs others if there are none."""
+    guides = [
         {
             "name": guide.name,
             "title": guide.title,
@@ -205,6 +214,8 @@ def listing(ui: Ui, request: NoRequest) -> list[dict[str, Any]]:
         }
         for guide in installed_plugins().guides
     ]
+    others = [package for package, offers in official_plugins().items() if "guide" in offers]
+    return {"guides": guides, "install": "" if guides else install_command(others)}
 
 
 def start(ui: Ui, request: StartGuide) -> dict[str, int]:

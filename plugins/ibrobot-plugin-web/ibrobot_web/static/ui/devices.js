@@ -31,9 +31,9 @@ export class View {
   }
 
   async load() {
-    const guides = await this.ui.attempt(() => this.ui.get("devices/list"));
+    const { guides, install } = await this.ui.attempt(() => this.ui.get("devices/list")) ?? {};
     if (guides?.length === 0) {
-      this.list.replaceChildren(h("p", { class: "note" }, "No installed plugin has a device to set up. For an SO-101 and cameras: pip install \"ibrobot[so101]\""));
+      this.list.replaceChildren(h("p", { class: "note" }, `No installed plugin has a device to set up. To install those of ibrobot: ${install}`));
     } else if (guides) {
       refresh(this.list, [guides, this.ui.drives], () => guides.map((guide) => this.card(guide)));
     }
