@@ -193,6 +193,8 @@ TERMINAL = {
     "--episodes": "episodes of a dataset, with --to bag",
     "--output": "a new episode, where a page replaces the old one",
     "--yes": "an answer in a terminal",
+    "--open": "blinded trials, which need a terminal",
+    "--reset": "blinded trials, which need a terminal",
 }
 """Flags in errors that a page does not cause, and why."""
 

@@ -50,7 +50,7 @@ def list_(transport: ZenohTransport, namespace: str) -> None:
 @_command
 @click.argument("name", metavar="SERVICE")
 def show(transport: ZenohTransport, namespace: str, name: str) -> None:
-    """Show what SERVICE does, the keys of its request with units, and its answer."""
+    """Show what SERVICE does, its request and its answer."""
     details = _ask(transport, namespace, Call(DETAILS, name), 5.0)
     echo(f"{name}: {details['help']}")
     echo("request:" if details["request"] else "request: none")
