@@ -110,5 +110,5 @@ def test_a_port_that_is_none_is_named(runs: Runs, port: str):
 
 def test_a_port_that_is_taken_is_named(runtime: Runtime, runs: Runs):
     port = url(runtime).split(":")[2].split("/")[0]
-    with pytest.raises(ComponentFailed, match=rf"metrics: port {port} of 127\.0\.0\.1 cannot be had"):
+    with pytest.raises(ComponentFailed, match=rf"metrics: port {port} of 127\.0\.0\.1 is not available"):
         runs.start(f"metrics.port={port}")

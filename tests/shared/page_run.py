@@ -93,9 +93,9 @@ class PageClient:
         async with self._browser.get(address) as answer:
             assert answer.status == 200
         base = self._base = str(answer.url).rstrip("/")
-        self.drive = await self._browser.ws_connect(f"{base}/drive")
-        self.line = await self._browser.ws_connect(f"{base}/stop")
-        self.stream = await self._browser.ws_connect(f"{base}/stream", max_msg_size=0)
+        self.drive = await self._browser.ws_connect(f"{base}/drive", origin=base)
+        self.line = await self._browser.ws_connect(f"{base}/stop", origin=base)
+        self.stream = await self._browser.ws_connect(f"{base}/stream", origin=base, max_msg_size=0)
         # A client answers the server's pings only while it receives.
         self._tasks = [
             asyncio.create_task(self._receive()),
@@ -113,7 +113,7 @@ class PageClient:
 
     def connect(self, path: str) -> Any:
         """A WebSocket of its own."""
-        return self._browser.ws_connect(self._base + path)
+        return self._browser.ws_connect(self._base + path, origin=self._base)
 
     async def _receive(self) -> None:
         async for message in self.stream:

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
-from aiohttp import web
-from ibrobot_web.server.guard import Guard
-from ibrobot_web.server.listening import runner_of
+from ibrobot_http.server import HttpServer
+from ibrobot_web.options import WebOptions
+from ibrobot_web.server.page_guard import page_guard
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
@@ -29,39 +29,35 @@ class UiServer:
     """
 
     def __init__(self, folders: Sequence[Path], port: int = 0) -> None:
-        self.port = port
-        self.guard = Guard(("127.0.0.1",), secure=False)
+        self.guard = page_guard(WebOptions(port=port), any_port="0")
+        self.port = self.guard.listener.port
         opened = Folders(folders)
         options = ("--web", "--set", "viewer.port=0", "--set", "viewer.browser=false")
         self.ui = Ui(opened, Jobs(opened.first), options)
         self.client: aiohttp.ClientSession
         """Signed in as the operator."""
-        self._base = ""
+        self._base = self.guard.listener.url
 
     async def __aenter__(self) -> UiServer:
-        self._runner = runner_of(make_app(self.guard, self.ui), 0.1)
-        await self._runner.setup()
-        await web.TCPSite(self._runner, "127.0.0.1", self.port, reuse_address=True).start()
-        self.port = port = self._runner.addresses[0][1]
-        self.guard.listen_on(port)
-        self._base = f"http://127.0.0.1:{port}"
+        self._server = await HttpServer(self.guard, make_app(self.guard, self.ui), close_s=0.1).__aenter__()
         self.client = self.browser()
         await self.sign_in(self.client)
         return self
 
     async def __aexit__(self, *_: object) -> None:
         await self.client.close()
-        await self._runner.cleanup()
+        await self._server.__aexit__(None, None, None)
         await asyncio.to_thread(self.ui.close)
 
     @property
     def address(self) -> str:
         """The link for operators."""
-        return self._base + self.guard.path("drive")
+        return self.guard.link("drive")
 
     def browser(self) -> aiohttp.ClientSession:
         """A client without a session."""
-        return aiohttp.ClientSession(self._base, cookie_jar=aiohttp.CookieJar(unsafe=True))
+        cookies = aiohttp.CookieJar(unsafe=True)
+        return aiohttp.ClientSession(self._base, cookie_jar=cookies, headers={"Origin": self._base})
 
     async def sign_in(self, browser: aiohttp.ClientSession, role: Any = "drive") -> None:
         """Open a session."""

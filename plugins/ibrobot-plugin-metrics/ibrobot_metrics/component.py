@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import override
 
-from ibrobot_monitoring import Probes, ProbeServer
+from ibrobot_http.probes import Probes, ProbeServer
 from prometheus_client import generate_latest
 
 from ibrobot_core.app import CONTROL, Component, RunView

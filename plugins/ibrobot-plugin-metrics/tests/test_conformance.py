@@ -77,6 +77,6 @@ def test_run_that_is_over_is_unhealthy(session: Session, port: MetricsPort) -> N
 def test_port_that_is_taken_is_named(session: Session, port: MetricsPort) -> None:
     number = int(port.url.split(":")[2].split("/")[0])
     second = MetricsPort(MetricsOptions(port=number), session)
-    with pytest.raises(IbrobotError, match=rf"metrics: port {number} of 127\.0\.0\.1 cannot be had"):
+    with pytest.raises(IbrobotError, match=rf"metrics: port {number} of 127\.0\.0\.1 is not available"):
         second.start()
     second.stop()

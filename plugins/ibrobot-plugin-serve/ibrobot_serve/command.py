@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-from ibrobot_monitoring import ProbeServer
+from ibrobot_http.probes import ProbeServer
 
 from ibrobot_core.api import Context, Policy, RealClock, Robot, Transport, TransportDescriptor
 from ibrobot_core.app import (

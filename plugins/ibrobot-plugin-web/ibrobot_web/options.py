@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-import ipaddress
 from pathlib import Path
 
 import attrs
+from ibrobot_http.addresses import is_loopback
 
 from ibrobot_core.api import documented, option
 
 LEAST_PASSWORD = 12
 """Shortest password of a page on the network [characters]."""
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address is reachable from this machine alone."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 @documented

@@ -10,13 +10,13 @@ from typing import Any
 
 import aiohttp
 import pytest
-from aiohttp import web
+from ibrobot_http.server import HttpServer
 from ibrobot_web.messages import LARGEST_MESSAGE, Jog, Release, RunCommand, Sent, SetMode, clock_ms
+from ibrobot_web.options import WebOptions
 from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import Drive
-from ibrobot_web.server.guard import Guard
-from ibrobot_web.server.listening import runner_of
+from ibrobot_web.server.page_guard import page_guard
 
 Reply = Callable[[Mapping[str, Any]], None]
 
@@ -25,12 +25,12 @@ class Server:
     """A server whose run answers every command with its name."""
 
     def __init__(self, password: str | None = None) -> None:
-        self.guard = Guard(("127.0.0.1", "localhost"), secure=False, password=password)
+        self.guard = page_guard(WebOptions(port=0, password=password), any_port="0")
         self.executed: list[RunCommand] = []
         self.released = self.stopped = 0
         self.broadcast = Broadcast(lambda: None, frozenset({1}))
         self.drive = Drive(self._execute, self._stop, self._release)
-        self.base = ""
+        self.base = self.guard.listener.url
 
     def _execute(self, sent: Sent[RunCommand], answer: Reply) -> None:
         self.executed.append(sent.command)
@@ -47,20 +47,16 @@ class Server:
         async def scene() -> bytes:
             return b"{}"
 
-        self._runner = runner_of(make_app(self.guard, self.broadcast, self.drive, scene), 0.1)
-        await self._runner.setup()
-        site = web.TCPSite(self._runner, "127.0.0.1", 0)
-        await site.start()
-        port = self._runner.addresses[0][1]
-        self.guard.listen_on(port)
-        self.base = f"http://127.0.0.1:{port}"
+        app = make_app(self.guard, self.broadcast, self.drive, scene)
+        self._server = await HttpServer(self.guard, app, close_s=0.1).__aenter__()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self._runner.cleanup()
+        await self._server.__aexit__(None, None, None)
 
     def browser(self) -> aiohttp.ClientSession:
-        return aiohttp.ClientSession(self.base, cookie_jar=aiohttp.CookieJar(unsafe=True))
+        cookies = aiohttp.CookieJar(unsafe=True)
+        return aiohttp.ClientSession(self.base, cookie_jar=cookies, headers={"Origin": self.base})
 
     async def signed_in(self, browser: aiohttp.ClientSession, role: Any = "drive") -> None:
         async with browser.get(self.guard.path(role)) as answer:

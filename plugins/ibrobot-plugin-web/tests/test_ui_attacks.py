@@ -93,8 +93,7 @@ def test_unknown_keys_are_refused_before_anything_runs(tmp_path: Path) -> None:
 def test_requests_that_are_sent_by_half_are_ended_and_what_is_no_http_says_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("ibrobot_web.server.listening.REQUEST_S", 0.2)
-    monkeypatch.setattr("ibrobot_web.ui.server.REQUEST_S", 0.2)
+    monkeypatch.setattr("ibrobot_http.guard.REQUEST_S", 0.2)
     garbage = (
         b"", b"GET / HTTP/1.1\r\nHost: x\r\n", b"G", b"\x16\x03\x01\x00\xa5", b"GET / HTTP/9.9\r\n\r\n",
         b"GET / HTTP/1.1\r\nContent-Length: x\r\n\r\n", b"POST / HTTP/1.1\r\nTransfer-Encoding: y\r\n\r\n",

@@ -6,8 +6,10 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
+from ibrobot_http.certificates import CERTIFICATE, KEY, expiry
+
 from ibrobot_core.api import Check
-from ibrobot_webxr.certificate import CERTIFICATE, KEY, expiry, own_folder
+from ibrobot_webxr.certificate import own_folder
 
 
 def checks(folder: Path | None = None) -> Iterator[Check]:

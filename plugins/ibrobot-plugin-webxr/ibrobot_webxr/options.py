@@ -22,11 +22,6 @@ NONE = "none"
 _HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?)*")
 
 
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches an address."""
-    return host == "localhost" or ipaddress.ip_address(host).is_loopback
-
-
 def _check_host(instance: Any, attribute: attrs.Attribute[Any], value: str) -> None:
     if value == "localhost":
         return

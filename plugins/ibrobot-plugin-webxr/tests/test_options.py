@@ -114,7 +114,7 @@ def test_the_descriptor_fits_its_options():
 
 
 def test_the_page_is_for_this_machine_alone_unless_configured_otherwise():
-    assert server_names(WebxrOptions()) == ("localhost", "127.0.0.1")
+    assert server_names(WebxrOptions()) == ("localhost", "127.0.0.1", "::1")
     assert server_names(WebxrOptions(host="0.0.0.0", names=("robot.lab",)))[0] == "robot.lab"
     assert len(server_names(WebxrOptions(host="0.0.0.0"))) >= 3
     assert server_names(WebxrOptions(host="192.168.1.5"))[0] == "192.168.1.5"

@@ -2,34 +2,32 @@
 
 from __future__ import annotations
 
-import ipaddress
-import os
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from cryptography import x509
-from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import (
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-    load_pem_private_key,
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from cryptography.x509.oid import ExtendedKeyUsageOID
+from ibrobot_http.certificates import (
+    CERTIFICATE,
+    KEY,
+    Issuer,
+    common_name,
+    make_certificate,
+    make_key,
+    write_certificate,
+    write_key,
 )
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ibrobot_core.api import TransportError
 from ibrobot_zenoh.access import read_lines
 from ibrobot_zenoh.identity import Identity, Role, identity_in, subject
 
 CA, CA_KEY = "ca.pem", "ca.key"
-CERTIFICATE, KEY = "certificate.pem", "key.pem"
 ROBOTS = "robots.txt"
 """The list of admitted robots: the authority's own, and a copy in each server's folder."""
-
-_EARLY = timedelta(days=2)
-"""Certificates are valid from a time before their creation, for machines whose clock is behind."""
 
 
 class Authority:
@@ -49,11 +47,13 @@ class Authority:
         certificate, key = folder / CA, folder / CA_KEY
         self.is_new = not certificate.exists() and not key.exists()
         if self.is_new:
-            self._key = ec.generate_private_key(ec.SECP256R1())
-            self._certificate = self._make()
+            self._key = make_key()
+            own = Issuer(common_name("ibrobot authority"), self._key)
+            ends = datetime.now(UTC) + timedelta(days=days)
+            self._certificate = make_certificate(own.name, own.key, own, ends, authority=True)
             folder.mkdir(parents=True, exist_ok=True)
-            _write_key(key, self._key)
-            _write(certificate, self._certificate)
+            write_key(key, self._key)
+            write_certificate(certificate, self._certificate)
             return
         try:
             self._certificate = x509.load_pem_x509_certificate(certificate.read_bytes())
@@ -87,19 +87,14 @@ class Authority:
             folder.mkdir(parents=True)
         except FileExistsError:
             raise TransportError(f"{folder} exists already; nothing is overwritten") from None
-        key = ec.generate_private_key(ec.SECP256R1())
-        names = x509.SubjectAlternativeName([_general_name(host) for host in hosts or (name,)])
+        key = make_key()
         usages = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
-        certificate = (
-            self._builder(subject(Identity(name, Role.SERVER if hosts else Role.ROBOT)), key)
-            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-            .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
-            .add_extension(names, critical=False)
-            .sign(self._key, hashes.SHA256())
-        )
-        _write_key(folder / KEY, key)
-        _write(folder / CERTIFICATE, certificate)
-        _write(folder / CA, self._certificate)
+        owner = subject(Identity(name, Role.SERVER if hosts else Role.ROBOT))
+        issuer = Issuer(self._certificate.subject, self._key)
+        certificate = make_certificate(owner, key, issuer, self.ends, hosts=hosts or (name,), usages=usages)
+        write_key(folder / KEY, key)
+        write_certificate(folder / CERTIFICATE, certificate)
+        write_certificate(folder / CA, self._certificate)
         return folder
 
     def admit(self, robots: Sequence[str]) -> list[Path]:
@@ -119,51 +114,6 @@ class Authority:
             path.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
         return copies
 
-    def _make(self) -> x509.Certificate:
-        usage = {
-            name: name in ("key_cert_sign", "crl_sign")
-            for name in (
-                "digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement",
-                "key_cert_sign", "crl_sign", "encipher_only", "decipher_only",
-            )
-        }  # fmt: skip
-        return (
-            self._builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "ibrobot authority")]), self._key)
-            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-            .add_extension(x509.KeyUsage(**usage), critical=True)
-            .sign(self._key, hashes.SHA256())
-        )
-
-    def _builder(self, name: x509.Name, key: ec.EllipticCurvePrivateKey) -> x509.CertificateBuilder:
-        now = datetime.now(UTC)
-        return (
-            x509.CertificateBuilder()
-            .subject_name(name)
-            .issuer_name(name if key is self._key else self._certificate.subject)
-            .public_key(key.public_key())
-            .serial_number(x509.random_serial_number())
-            .not_valid_before(now - _EARLY)
-            .not_valid_after(now + timedelta(days=self._days) if key is self._key else self.ends)
-        )
-
 
 def _is_server(certificate: Path) -> bool:
     return identity_in(certificate).role is Role.SERVER
-
-
-def _general_name(host: str) -> x509.GeneralName:
-    try:
-        return x509.IPAddress(ipaddress.ip_address(host))
-    except ValueError:
-        return x509.DNSName(host)
-
-
-def _write(path: Path, certificate: x509.Certificate) -> None:
-    with open(path, "xb") as file:
-        file.write(certificate.public_bytes(Encoding.PEM))
-
-
-def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    """Write a key, readable only by its owner from the beginning."""
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-        file.write(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))

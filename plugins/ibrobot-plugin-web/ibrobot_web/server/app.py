@@ -6,39 +6,16 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from aiohttp import web
+from ibrobot_http.files import add_files
+from ibrobot_http.guard import Guard
 
 from ibrobot_web.messages import LARGEST_MESSAGE
 from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import Drive
-from ibrobot_web.server.guard import Guard
 
 STATIC = Path(__file__).parents[1] / "static"
 _HEARTBEAT_S = 5.0
 """Time between pings that find pages which are gone without a word [s]."""
-_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-
-
-class Files:
-    """Serves the files of some folders, each by its name: no path of a request reaches the file system.
-
-    Args:
-        folders: prefix of the URL -> folder.
-    """
-
-    def __init__(self, folders: dict[str, Path]) -> None:
-        self._files: dict[str, Path] = {}
-        for prefix, folder in folders.items():
-            for path in sorted(folder.rglob("*")):
-                if path.suffix in _TYPES:
-                    self._files[f"{prefix}/{path.relative_to(folder).as_posix()}"] = path
-
-    async def serve(self, request: web.Request) -> web.StreamResponse:
-        """Answer with a file."""
-        path = self._files.get(request.path)
-        if path is None:
-            raise web.HTTPNotFound
-        headers = {"Cache-Control": "no-cache"}
-        return web.Response(body=path.read_bytes(), content_type=_TYPES[path.suffix], charset="utf-8", headers=headers)
 
 
 def make_app(
@@ -47,21 +24,17 @@ def make_app(
     """The application.
 
     Args:
-        guard: admits requests.
+        guard: has the roles of sessions.
         broadcast: streams to pages.
         drive: handles commands and emergency stops of pages.
         scene: returns the robot's shapes, as `ibrobot_web.scene` makes them.
     """
-    app = web.Application(middlewares=[guard.middleware], client_max_size=LARGEST_MESSAGE)
-    app.on_response_prepare.append(guard.add_headers)
-    files = Files({"/static": STATIC})
-
-    async def index(request: web.Request) -> web.StreamResponse:
-        return web.Response(text=(STATIC / "index.html").read_text(encoding="utf-8"), content_type="text/html")
+    app = web.Application(client_max_size=LARGEST_MESSAGE)
+    add_files(app, STATIC)
 
     async def session(request: web.Request) -> web.StreamResponse:
-        links = {"watch": guard.path("watch")} if guard.session(request).role == "drive" else {}
-        return web.json_response({"role": guard.session(request).role, "links": links})
+        role = guard.role(request)
+        return web.json_response({"role": role, "links": {"watch": guard.path("watch")} if role == "drive" else {}})
 
     async def shapes(request: web.Request) -> web.StreamResponse:
         return web.Response(body=await scene(), content_type="application/json")
@@ -73,26 +46,24 @@ def make_app(
 
     async def commands(request: web.Request) -> web.StreamResponse:
         socket = await _socket(request)
-        await drive.serve(socket, guard.session(request).role, request.remote or "?")
+        await drive.serve(socket, guard.role(request), request.remote or "?")
         return socket
 
     async def stop_line(request: web.Request) -> web.StreamResponse:
         socket = await _socket(request)
-        await drive.serve_stop(socket, guard.session(request).role)
+        await drive.serve_stop(socket, guard.role(request))
         return socket
 
     async def stop(request: web.Request) -> web.StreamResponse:
-        reply = await drive.stop_now(guard.session(request).role)
+        reply = await drive.stop_now(guard.role(request))
         return web.json_response(dict(reply), status=400 if "error" in reply else 200)
 
-    app.router.add_get("/", index)
     app.router.add_get("/api/session", session)
     app.router.add_get("/api/scene", shapes)
     app.router.add_get("/stream", stream)
     app.router.add_get("/drive", commands)
     app.router.add_get("/stop", stop_line)
     app.router.add_post("/api/stop", stop)
-    app.router.add_get("/static/{path:.*}", files.serve)
     return app
 
 

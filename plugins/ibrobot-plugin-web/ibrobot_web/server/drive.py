@@ -30,7 +30,6 @@ from ibrobot_web.messages import (
     from_page,
     stop_from_page,
 )
-from ibrobot_web.server.guard import Role
 
 _MALFORMED = 20
 """Malformed messages after which a page is disconnected."""
@@ -56,7 +55,7 @@ class Driver:
 
     number: int
     name: str
-    role: Role
+    role: str
     socket: web.WebSocketResponse
     open: int = 0
     malformed: int = 0
@@ -104,7 +103,7 @@ class Drive:
             "pages": len(self._drivers),
         }
 
-    async def serve(self, socket: web.WebSocketResponse, role: Role, name: str) -> None:
+    async def serve(self, socket: web.WebSocketResponse, role: str, name: str) -> None:
         """Handle the commands of a page until it is gone."""
         number = next(self._numbers)
         driver = Driver(number, f"page {number} ({name})", role, socket)
@@ -128,7 +127,7 @@ class Drive:
             await asyncio.gather(sending, return_exceptions=True)
             await socket.close(code=1008 if driver.malformed >= _MALFORMED else 1000)
 
-    async def serve_stop(self, socket: web.WebSocketResponse, role: Role) -> None:
+    async def serve_stop(self, socket: web.WebSocketResponse, role: str) -> None:
         """Pass on the emergency stops of a page until it is gone; each message is one, a number for its reply."""
         replies: asyncio.Queue[Mapping[str, Any]] = asyncio.Queue()
         sending = asyncio.create_task(_send_all(socket, replies))
@@ -149,7 +148,7 @@ class Drive:
             await asyncio.gather(sending, return_exceptions=True)
             await socket.close()
 
-    async def stop_now(self, role: Role) -> Mapping[str, Any]:
+    async def stop_now(self, role: str) -> Mapping[str, Any]:
         """Pass on an emergency stop, and return the run's reply."""
         replied: asyncio.Future[Mapping[str, Any]] = asyncio.get_running_loop().create_future()
         self._stop_run(role, lambda reply: None if replied.done() else replied.set_result(reply))
@@ -158,7 +157,7 @@ class Drive:
         except TimeoutError:
             return {"error": f"the run did not confirm the stop within {_STOP_S:g} s"}
 
-    def _stop_run(self, role: Role, answer: Answer) -> None:
+    def _stop_run(self, role: str, answer: Answer) -> None:
         if role == "drive":
             self._stop(answer)
         else:

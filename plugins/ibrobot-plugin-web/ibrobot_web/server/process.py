@@ -23,22 +23,21 @@ from pathlib import Path
 from typing import Any
 
 import attrs
-from aiohttp import web
+from ibrobot_http.server import HttpServer
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import Channel, Failure, open_parent
 from ibrobot_web.link import ALIVE_S, FIRST_PICTURE, STATUS, receive_frame
 from ibrobot_web.messages import Alive, FromServer, Pages, Release, RunCommand, Sent, StopRun, to_run
+from ibrobot_web.options import WebOptions
 from ibrobot_web.pictures import as_jpeg
 from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import Answer, Drive
-from ibrobot_web.server.guard import Guard
-from ibrobot_web.server.listening import host_names, listen, runner_of, tls_of
+from ibrobot_web.server.page_guard import page_guard
 
 _STREAM_BYTES = 4 << 20
 """Frames that wait to be broadcast [bytes]."""
-_CLOSE_S = 1.0
 _log = logging.getLogger("ibrobot.web")
 
 
@@ -125,6 +124,14 @@ class RunLink:
         self._channel.send(to_run(message))
 
 
+def _options(order: Mapping[str, Any]) -> WebOptions:
+    certificate, key = (Path(order[name]) if order[name] is not None else None for name in ("certificate", "key"))
+    return WebOptions(
+        host=order["host"], port=order["port"], names=tuple(order["names"]), password=order["password"],
+        certificate=certificate, key=key,
+    )  # fmt: skip
+
+
 async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any]) -> None:
     """Serve until the run closes the channel.
 
@@ -133,32 +140,19 @@ async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any
     """
     loop = asyncio.get_running_loop()
     link = RunLink(channel, order)
-    tls = tls_of("viewer: ", order["certificate"], order["key"])
-    names = host_names(order["address"], order["names"])
-    guard = Guard(names, secure=tls is not None, password=order["password"])
-    listening = listen("viewer: ", order["address"], order["port"], "--set viewer.port=0")
-    port = listening.getsockname()[1]
-    guard.listen_on(port)
-    runner = runner_of(make_app(guard, link.broadcast, link.drive, link.scene), _CLOSE_S)
-    await runner.setup()
-    try:
-        site = web.SockSite(runner, listening, ssl_context=tls)
-        await site.start()
+    guard = page_guard(_options(order), of="viewer: ", any_port="--set viewer.port=0")
+    async with HttpServer(guard, make_app(guard, link.broadcast, link.drive, link.scene)):
         loop.add_reader(channel.fileno(), link.receive)
         relaying = asyncio.create_task(link.relay(stream))
         living = asyncio.create_task(link.live())
         scene = asyncio.create_task(link.scene())  # so that the first page does not wait for it
-        base = f"{'https' if tls else 'http'}://{names[0]}:{port}"
-        links = {"url": base + guard.path("drive"), "watch_url": base + guard.path("watch")}
-        channel.send(links)
+        channel.send({"url": guard.link("drive"), "watch_url": guard.link("watch")})
         await link.ended.wait()
         loop.remove_reader(channel.fileno())
         tasks = (relaying, living, scene)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-    finally:
-        await runner.cleanup()
 
 
 def main() -> None:

@@ -12,19 +12,16 @@ import webbrowser
 from pathlib import Path
 
 import click
-from aiohttp import web
+from ibrobot_http.server import HttpServer
 
 from ibrobot_core.app import LogFormatter, echo, end_signals
 from ibrobot_web.desktop import has_desktop
 from ibrobot_web.options import WebOptions
-from ibrobot_web.server.guard import Guard
-from ibrobot_web.server.listening import host_names, listen, runner_of, tls_of
+from ibrobot_web.server.page_guard import page_guard
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.server import make_app
-
-_CLOSE_S = 1.0
 
 
 @click.command()
@@ -73,26 +70,14 @@ def _run_options(options: WebOptions) -> tuple[str, ...]:
 
 async def _serve(options: WebOptions, context: Ui, *, browser: bool) -> None:
     """Serve until a signal."""
-    certificate, key = (str(path) if path is not None else None for path in (options.certificate, options.key))
-    tls = tls_of("", certificate, key)
-    names = host_names(options.host, options.names)
-    guard = Guard(names, secure=tls is not None)
-    listening = listen("", options.host, options.port, "--port 0")
-    port = listening.getsockname()[1]
-    guard.listen_on(port)
-    runner = runner_of(make_app(guard, context), _CLOSE_S)
-    await runner.setup()
-    try:
-        await web.SockSite(runner, listening, ssl_context=tls).start()
-        base = f"{'https' if tls else 'http'}://{names[0]}:{port}"
-        address = base + guard.path("drive")
-        echo(f"page: {address}  (to watch only: {base}{guard.path('watch')})")
+    guard = page_guard(options, any_port="--port 0")
+    async with HttpServer(guard, make_app(guard, context)):
+        address = guard.link("drive")
+        echo(f"page: {address}  (to watch only: {guard.link('watch')})")
         sys.stdout.flush()
         if browser and has_desktop():
             threading.Thread(target=webbrowser.open, args=(address,), name="browser", daemon=True).start()
         await _ended()
-    finally:
-        await runner.cleanup()
 
 
 async def _ended() -> None:

@@ -13,12 +13,12 @@ from typing import Any
 
 import attrs
 from aiohttp import WSMsgType, web
+from ibrobot_http.files import add_files
+from ibrobot_http.guard import Guard
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import ConfigError, error_text
-from ibrobot_web.server.app import STATIC, Files
-from ibrobot_web.server.guard import Guard
-from ibrobot_web.server.listening import REQUEST_S
+from ibrobot_web.server.app import STATIC
 from ibrobot_web.ui.context import Blob, Route, Ui
 from ibrobot_web.ui.forms import job_commands, title_of
 
@@ -46,17 +46,12 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
     """The application.
 
     Args:
-        guard: admits requests.
+        guard: has the roles of sessions.
         ui: what views work with.
     """
-    app = web.Application(middlewares=[guard.middleware, _errors], client_max_size=LARGEST_REQUEST)
+    app = web.Application(middlewares=[_errors], client_max_size=LARGEST_REQUEST)
     app[_UI] = ui
-    app.on_response_prepare.append(guard.add_headers)
-    files = Files({"/static": STATIC})
-    page = (STATIC / "ui.html").read_text(encoding="utf-8")
-
-    async def index(request: web.Request) -> web.StreamResponse:
-        return web.Response(text=page, content_type="text/html")
+    add_files(app, STATIC, "ui.html")
 
     async def session(request: web.Request) -> web.StreamResponse:
         folders = [str(path) for path in ui.folders.paths]
@@ -66,18 +61,16 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
             for name in job_commands()
         ]
         views[-1:-1] = jobs  # before the last one, which shows all of them
-        return web.json_response({"role": guard.session(request).role, "folders": folders, "views": views})
+        return web.json_response({"role": guard.role(request), "folders": folders, "views": views})
 
     async def follow(request: web.Request) -> web.StreamResponse:
         socket = web.WebSocketResponse(heartbeat=_HEARTBEAT_S, max_msg_size=LARGEST_REQUEST, compress=False)
         await socket.prepare(request)
-        await _send_jobs(socket, ui, drives=guard.session(request).role == "drive")
+        await _send_jobs(socket, ui, drives=guard.role(request) == "drive")
         return socket
 
-    app.router.add_get("/", index)
     app.router.add_get("/api/session", session)
     app.router.add_get("/api/jobs", follow)
-    app.router.add_get("/static/{path:.*}", files.serve)
     for name in VIEWS:
         for route, answered in routes_of(name).items():
             method, path = route.split()
@@ -96,7 +89,7 @@ async def _answer(route: Route[Any], guard: Guard, request: web.Request) -> web.
     if request.method == "GET":
         facts = route.read_query(request.query)
     else:
-        if guard.session(request).role != "drive":
+        if guard.role(request) != "drive":
             raise IbrobotError("this link is for watching only")
         facts = route.read(await _body(request))
     answer = await asyncio.to_thread(route.answer, request.app[_UI], facts)
@@ -109,10 +102,7 @@ async def _body(request: web.Request) -> Mapping[str, Any]:
     if request.content_type != "application/json":
         raise IbrobotError("a request must be JSON")
     try:
-        async with asyncio.timeout(REQUEST_S):
-            body = json.loads(await request.read())
-    except TimeoutError:
-        raise web.HTTPRequestTimeout from None
+        body = json.loads(await request.read())
     except (ValueError, RecursionError):
         raise IbrobotError("a request must be JSON") from None
     if not isinstance(body, dict):

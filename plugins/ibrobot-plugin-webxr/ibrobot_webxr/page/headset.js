@@ -1,7 +1,7 @@
 // A WebXR session: controllers and hands of a headset, or a phone that tracks itself.
 
-import { curledClutch, headingOf, pinch } from "/pose.js";
-import { Screens } from "/screens.js";
+import { curledClutch, headingOf, pinch } from "/static/pose.js";
+import { Screens } from "/static/screens.js";
 
 const TRIGGER = 0, SQUEEZE = 1, THUMBSTICK = 3, LOWER = 4, UPPER = 5; // of the WebXR gamepad mapping `xr-standard`
 const PRESSES = { right: { [LOWER]: "start", [UPPER]: "success", [THUMBSTICK]: "failure" }, left: { [LOWER]: "discard", [UPPER]: "intervention", [THUMBSTICK]: "stop" } };

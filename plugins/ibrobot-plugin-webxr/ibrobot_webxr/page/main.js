@@ -1,9 +1,9 @@
 // The page: connects its parts.
 
-import { Connection } from "/connection.js";
-import { Controls } from "/controls.js";
-import { Headset, supportedMode } from "/headset.js";
-import { Phone } from "/phone.js";
+import { Connection } from "/static/connection.js";
+import { Controls } from "/static/controls.js";
+import { Headset, supportedMode } from "/static/headset.js";
+import { Phone } from "/static/phone.js";
 
 const IDLE_MS = 200;
 const REFUSED_MS = 3000; // a socket that does not open for that long needs a remedy

@@ -1,6 +1,6 @@
 // A phone without WebXR: its orientation sensors turn the tool, the sticks on the screen move it.
 
-import { fromDeviceOrientation, headingOf } from "/pose.js";
+import { fromDeviceOrientation, headingOf } from "/static/pose.js";
 
 const WITHOUT_SENSOR = [0, 0, 0, 1];
 const PERIOD_MS = 1000 / 70; // at most once in a frame of 60 Hz

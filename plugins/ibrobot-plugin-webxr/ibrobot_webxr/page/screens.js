@@ -1,6 +1,6 @@
 // Camera images in a headset: rectangles that stand in front of where the operator looked at the start.
 
-import { headingOf } from "/pose.js";
+import { headingOf } from "/static/pose.js";
 
 const DISTANCE_M = 1.2, WIDTH_M = 0.7, GAP_M = 0.05;
 const VERTEX = `#version 300 es

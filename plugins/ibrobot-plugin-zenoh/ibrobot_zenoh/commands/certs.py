@@ -6,10 +6,11 @@ import re
 from pathlib import Path
 
 import click
+from ibrobot_http.certificates import CERTIFICATE, KEY
 
 from ibrobot_core.api import TransportError
 from ibrobot_core.app import echo, wrong_input
-from ibrobot_zenoh.certificates import CA, CERTIFICATE, KEY, ROBOTS, Authority
+from ibrobot_zenoh.certificates import CA, ROBOTS, Authority
 from ibrobot_zenoh.options import check_robot_name
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")

@@ -1,0 +1,88 @@
+"""Where a server listens: its socket, its certificate, and the names under which browsers reach it."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from collections.abc import Sequence
+from pathlib import Path
+
+import attrs
+
+from ibrobot_core.api import IbrobotError
+
+
+@attrs.frozen(eq=False)
+class Listener:
+    """A port that is open, on which a server can begin; clients wait until then."""
+
+    socket: socket.socket
+    names: tuple[str, ...]
+    """Names and addresses under which clients may reach the server; the first is that of `url`."""
+    tls: ssl.SSLContext | None = None
+    """The certificate; None for a server without TLS."""
+    port: int = attrs.field(init=False)
+
+    @port.default
+    def _port(self) -> int:
+        return int(self.socket.getsockname()[1])
+
+    @property
+    def scheme(self) -> str:
+        """`https` or `http`."""
+        return "http" if self.tls is None else "https"
+
+    @property
+    def url(self) -> str:
+        """The address of the server, without a path."""
+        return f"{self.scheme}://{bracketed(self.names[0])}:{self.port}"
+
+
+def bracketed(name: str) -> str:
+    """A name or address as it stands in a URL."""
+    return f"[{name}]" if ":" in name else name
+
+
+def listen(
+    host: str, port: int, names: Sequence[str], *, tls: ssl.SSLContext | None = None, of: str = "", any_port: str = "0"
+) -> Listener:
+    """Open a port.
+
+    Args:
+        host: the address.
+        port: the port; 0 for any free one.
+        names: names and addresses under which clients may reach the server.
+        tls: the certificate.
+        of: begins the error, e.g. `viewer: `.
+        any_port: the option that chooses any free port, for the error.
+
+    Raises:
+        IbrobotError: if the port is not available.
+    """
+    try:
+        opened = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        raise IbrobotError(
+            f"{of}port {port} of {host} is not available: {error.strerror}; choose another, or any free one: {any_port}"
+        ) from None
+    return Listener(opened, tuple(names), tls)
+
+
+def tls_context(certificate: Path, key: Path, *, of: str = "") -> ssl.SSLContext:
+    """The TLS settings of a server with a certificate and its key.
+
+    Args:
+        certificate: the certificate, with the chain of its authority.
+        key: its private key.
+        of: begins the error, e.g. `viewer: `.
+
+    Raises:
+        IbrobotError: if they cannot be used.
+    """
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(certificate, key)
+    except OSError as error:
+        raise IbrobotError(f"{of}certificate {certificate} and key {key} cannot be used: {error}") from None
+    return context
