@@ -8,12 +8,15 @@ import logging
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import override
+from unittest.mock import patch
 
 import attrs
 import numpy as np
 import pytest
 from ibrobot_http.certificates import own_certificate
 from ibrobot_testing import host_context
+from ibrobot_testing.http import HttpSuite, Served
 from ibrobot_webxr.certificate import own_folder
 from ibrobot_webxr.options import WebxrOptions
 from ibrobot_webxr.server import PageServer
@@ -72,6 +75,22 @@ def later(ctx: Context) -> JointReading:
     assert isinstance(ctx.clock, SteppedClock)
     ctx.clock.advance(ns(0.5))
     return measured(ctx)
+
+
+class TestAttacks(HttpSuite):
+    """What every server here withstands, on the routes of the page."""
+
+    @override
+    @contextlib.contextmanager
+    def serve(self, request_s: float) -> Iterator[Served]:
+        with patch("ibrobot_http.guard.REQUEST_S", request_s):
+            page = PageServer(ANY_PORT, RealClock(), None, logging.getLogger("ibrobot.test"))
+            with contextlib.closing(page):
+                url, _, token = page.address.partition("/?")
+                yield Served(
+                    url, ("/", "/certificate.pem", "/static/main.js"), sockets=("/socket",), links=(f"/?{token}",),
+                    other_sites_link=True,
+                )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["main.js", "connection.js", "controls.js", "headset.js", "phone.js", "pose.js",
