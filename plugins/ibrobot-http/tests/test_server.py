@@ -139,6 +139,24 @@ def test_failures_are_logged_and_say_nothing_to_clients(folder: Path, caplog: py
     assert "one over nothing" in caplog.text
 
 
+def test_clients_that_send_garbage_are_no_news(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for tls in (False, True):
+        with small_page(folder, tls=tls) as served:
+            port = int(served.host.rpartition(":")[2])
+            for garbage in (
+                b"",
+                b"\x00" * 100,
+                b"GET / HTTP/9.9\r\n\r\n",
+                b"GET /" + b"a" * 20_000 + b" HTTP/1.1\r\n\r\n",
+            ):
+                with socket.create_connection(("127.0.0.1", port), timeout=30) as client:
+                    client.sendall(garbage)
+                    client.shutdown(socket.SHUT_WR)
+                    with contextlib.suppress(ConnectionError):
+                        client.recv(1000)
+    assert [record for record in caplog.records if record.exc_info or record.levelno >= logging.WARNING] == []
+
+
 def test_each_reason_to_refuse_is_logged_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     with small_page(folder) as served:
         for host in ("a.example", "b.example"):
