@@ -79,6 +79,7 @@ def press(page: Any, label: str, expression: str) -> None:
 
 def record(page: Any, shot: Shot = lambda page, name: None) -> None:
     """Choose the robot, launch a session that records it, jog, and record and judge two episodes."""
+    page.context.set_default_timeout(_WAIT_MS)  # Playwright's 30 s are too short for software that draws beside a run
     page.get_by_role("link", name="Robots").click()
     page.get_by_label("Robot", exact=True).select_option("my_arm.yaml")
     page.get_by_label("Simulation").check()

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 import socket
 from collections.abc import Sequence
+from typing import Any
 
+_LABEL = "[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?"
+_NAME = re.compile(rf"{_LABEL}(\.{_LABEL})*")
 LOCAL = ("127.0.0.1", "localhost", "::1")
 """Names and addresses of this machine that no other machine can use."""
 
@@ -18,6 +22,19 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def check_name(instance: Any, attribute: Any, value: str) -> None:
+    """Check that an option is a host name or an address; a validator of attrs.
+
+    Raises:
+        ValueError: if it is neither.
+    """
+    try:
+        ipaddress.ip_address(value)
+    except ValueError:
+        if not _NAME.fullmatch(value) or re.fullmatch(r"[0-9.]+", value):
+            raise ValueError(f"{value!r} is not a host name or an address, e.g. robot.lab or 192.168.1.5") from None
 
 
 def host_names(host: str, further: Sequence[str] = ()) -> tuple[str, ...]:

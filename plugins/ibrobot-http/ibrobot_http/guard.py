@@ -14,6 +14,7 @@ import secrets
 import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Sequence
+from urllib.parse import parse_qs
 
 from aiohttp import web
 
@@ -26,6 +27,9 @@ _SESSIONS = 100
 """Number of sessions kept; the one unused for the longest time ends first."""
 _TRY_S = 1.0
 """Time between two attempts at the password [s]."""
+_SIGN_IN_BYTES = 4096
+"""Largest form with a password [bytes]."""
+_ROLE = web.RequestKey("role", str)
 _CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self' {sockets}; "
     "base-uri 'none'; form-action {forms}; frame-ancestors 'none'"
@@ -109,7 +113,7 @@ class Guard:
 
     def role(self, request: web.Request) -> str:
         """The role of an admitted request."""
-        return self._sessions[request.cookies[self._cookie]]
+        return request[_ROLE]
 
     @web.middleware
     async def middleware(
@@ -127,6 +131,7 @@ class Guard:
             if key not in self._sessions:
                 return await handler(request) if request.path == STYLE else self._unknown(request)
             self._sessions.move_to_end(key)
+            request[_ROLE] = self._sessions[key]
         await _read(request)
         return await handler(request)
 
@@ -138,12 +143,15 @@ class Guard:
         sockets = f"{'wss' if self._secure else 'ws'}://{host}" if host in self._hosts else ""
         forms = "'none'" if self._password is None else "'self'"
         response.headers["Content-Security-Policy"] = _CSP.format(sockets=sockets, forms=forms)
+        response.headers["Server"] = "ibrobot"  # versions are no client's business
 
     def _foreign(self, request: web.Request) -> str | None:
         """Why a request is not of this server's own pages; None if it may be."""
+        if not request.raw_path.startswith("/"):
+            return "a request must name a path: this server is no proxy"
         hosts = request.headers.getall("Host", [])
         host = hosts[0].lower() if len(hosts) == 1 else ""
-        if (re.sub(r":\d+$", "", host) if self._any_port else host) not in self._hosts:
+        if (re.sub(r":[0-9]+$", "", host) if self._any_port else host) not in self._hosts:
             return "this host name is not served: use the address that the terminal shows"
         origins = request.headers.getall("Origin", [])
         if any(origin.lower() != f"{self.listener.scheme}://{host}" for origin in origins):
@@ -151,9 +159,9 @@ class Guard:
         if not origins and "websocket" in request.headers.get("Upgrade", "").lower():
             return "a WebSocket needs the origin of its page"
         linked = ("same-site", "cross-site") if self._other_sites_link else ("same-site",)
-        site = request.headers.get("Sec-Fetch-Site", "none")
-        if site not in ("same-origin", "none") and not (site in linked and _opens_page(request)):
-            return "requests of other sites are refused"
+        for site in request.headers.getall("Sec-Fetch-Site", []):
+            if site not in ("same-origin", "none") and not (site in linked and _opens_page(request)):
+                return "requests of other sites are refused"
         return None
 
     def _may_redeem(self, role: str) -> bool:
@@ -170,9 +178,12 @@ class Guard:
         if now_s < self._next_try_s:
             return _page("sign in", _LOGIN.format(message="Too many attempts. Try again in a second."), 429)
         self._next_try_s = now_s + _TRY_S
+        if request.content_length is None or request.content_length > _SIGN_IN_BYTES:
+            raise web.HTTPRequestEntityTooLarge(_SIGN_IN_BYTES, request.content_length or 0)
         await _read(request)
-        given = (await request.post()).get("password", "")
-        if isinstance(given, str) and hmac.compare_digest(given.encode(errors="replace"), password.encode()):
+        is_form = request.content_type == "application/x-www-form-urlencoded"
+        form = parse_qs((await request.read()).decode(errors="replace") if is_form else "")
+        if hmac.compare_digest(form.get("password", [""])[0].encode(), password.encode()):
             self._next_try_s = 0.0
             return self._open(next(iter(self._tokens)))
         return _page("sign in", _LOGIN.format(message="Wrong password."), 401)
@@ -210,7 +221,11 @@ class Guard:
 
 
 async def _read(request: web.Request) -> None:
-    """Read the body of a request, which handlers then have at once."""
+    """Read the body of a request, which handlers then have at once.
+
+    Raises:
+        web.HTTPException: if it does not arrive in time, or is no body.
+    """
     if not request.can_read_body:
         return
     try:
@@ -218,6 +233,8 @@ async def _read(request: web.Request) -> None:
             await request.read()
     except TimeoutError:
         raise web.HTTPRequestTimeout from None
+    except (web.RequestPayloadError, ConnectionError):
+        raise web.HTTPBadRequest from None
 
 
 def _page(title: str, content: str, status: int) -> web.StreamResponse:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import ssl
+import stat
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -73,7 +74,7 @@ def tls_context(certificate: Path, key: Path, *, of: str = "") -> ssl.SSLContext
 
     Args:
         certificate: the certificate, with the chain of its authority.
-        key: its private key.
+        key: its private key, which other users of the machine must not be able to use.
         of: begins the error, e.g. `viewer: `.
 
     Raises:
@@ -82,7 +83,10 @@ def tls_context(certificate: Path, key: Path, *, of: str = "") -> ssl.SSLContext
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
-        context.load_cert_chain(certificate, key)
-    except OSError as error:
+        exposed = key.stat().st_mode & stat.S_IRWXO
+        context.load_cert_chain(certificate, key, password=lambda: "")  # instead of a question in the terminal
+    except (OSError, ValueError) as error:
         raise IbrobotError(f"{of}certificate {certificate} and key {key} cannot be used: {error}") from None
+    if exposed:
+        raise IbrobotError(f"{of}every user of this machine may use the key {key}: chmod 600 {key}")
     return context

@@ -63,4 +63,7 @@ class ProbeServer:
 
 
 def _verdict(why_not: str) -> web.StreamResponse:
-    return web.Response(status=503, text=f"{why_not}\n") if why_not else web.Response(text="ok\n")
+    status, text = (503, why_not) if why_not else (200, "ok")
+    return web.Response(
+        status=status, body=f"{text}\n".encode(errors="replace"), content_type="text/plain", charset="utf-8"
+    )

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import socket
 import threading
+import weakref
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from types import TracebackType
 from typing import Any, Self, override
@@ -55,9 +57,11 @@ class HttpServer:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(_quiet_about_clients)
         await self._runner.setup()
+        assert self._runner.server is not None
         tls = self._listener.tls
+        self._door = _Door(self._listener.socket)
         self._server = await loop.create_server(
-            lambda: _Admission(self._runner), sock=self._listener.socket, ssl=tls,
+            self._runner.server, sock=self._door, ssl=tls,
             ssl_handshake_timeout=None if tls is None else guarding.REQUEST_S,
         )  # fmt: skip
         return self
@@ -66,14 +70,11 @@ class HttpServer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         assert self._server is not None
-        assert self._runner.server is not None
+        self._door.most = 0
+        await asyncio.sleep(0)  # asyncio leaks connections whose server closes between their acceptance and transport
         self._server.close()
-        transports = [connection.transport for connection in self._runner.server.connections]
         await self._runner.cleanup()
-        await asyncio.sleep(_CLOSING_S)
-        for transport in transports:
-            if transport is not None:
-                transport.abort()  # browsers keep connections open
+        self._door.end_all()
         await asyncio.sleep(_CLOSING_S)
 
 
@@ -121,22 +122,33 @@ class ServerThread:
                 beside.cancel()
 
 
-class _Admission(asyncio.Protocol):
-    """The beginning of a connection, which ends at once beyond those that are served."""
+class _Door(socket.socket):
+    """A listening socket that accepts `most` connections at a time, and ends further ones at once.
 
-    def __init__(self, runner: web.AppRunner) -> None:
-        self._runner = runner
+    Connections count from their first packet: so do those that never finish their TLS handshake.
+    """
+
+    __slots__ = ("_accepted", "most")
+
+    def __init__(self, opened: socket.socket) -> None:
+        super().__init__(fileno=opened.detach())
+        self.most = _CLIENTS
+        self._accepted: weakref.WeakSet[socket.socket] = weakref.WeakSet()
 
     @override
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        handlers = self._runner.server
-        assert isinstance(transport, asyncio.Transport)
-        if handlers is None or len(handlers.connections) >= _CLIENTS:
-            transport.abort()
-            return
-        handler = handlers()
-        transport.set_protocol(handler)
-        handler.connection_made(transport)
+    def accept(self) -> tuple[socket.socket, Any]:
+        connection, address = super().accept()
+        if sum(each.fileno() >= 0 for each in self._accepted) >= self.most:
+            connection.close()
+            raise ConnectionAbortedError
+        self._accepted.add(connection)
+        return connection, address
+
+    def end_all(self) -> None:
+        """End all connections: browsers keep theirs open, and a handshake may not have ended."""
+        for connection in self._accepted:
+            with contextlib.suppress(OSError):  # it has ended
+                connection.shutdown(socket.SHUT_RDWR)
 
 
 @web.middleware

@@ -80,6 +80,11 @@ def test_health_and_readiness_say_why_not(server: ProbeServer, state: State):
     assert [ask(server, path)[:2] for path in ("/healthz", "/readyz")] == [(503, "the model hangs\n")] * 2
 
 
+def test_reason_that_is_no_text_is_still_a_reason(server: ProbeServer, state: State):
+    state.unhealthy = "no such file: \udcff.yaml"
+    assert ask(server, "/healthz")[:2] == (503, "no such file: ?.yaml\n")
+
+
 @pytest.mark.parametrize("host", ["localhost", "LOCALHOST:9464", "127.0.0.1:1", "[::1]:9464"])
 def test_this_machine_may_be_called_by_its_names(server: ProbeServer, host: str):
     assert ask(server, "/metrics", Host=host)[0] == 200

@@ -15,8 +15,14 @@ from unittest.mock import patch
 import attrs
 import pytest
 from aiohttp import web
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    PrivateFormat,
+    load_pem_private_key,
+)
 from ibrobot_http import server as module
-from ibrobot_http.addresses import LOCAL, host_names, is_loopback
+from ibrobot_http.addresses import LOCAL, check_name, host_names, is_loopback
 from ibrobot_http.certificates import own_certificate
 from ibrobot_http.files import add_files
 from ibrobot_http.guard import Guard
@@ -132,6 +138,56 @@ def test_browsers_shall_insist_on_tls_only_if_the_server_says_so(folder: Path) -
             assert CLIENT.ask(served, "/").headers["Strict-Transport-Security"] == wanted
 
 
+def test_session_that_ends_meanwhile_keeps_its_role_for_the_request(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ibrobot_http.guard._SESSIONS", 1)
+    with small_page(folder) as served:
+        cookie = CLIENT.cookie(served)
+        head = f"POST /api/echo HTTP/1.1\r\nHost: {served.host}\r\nCookie: {cookie}\r\nContent-Length: 1\r\n"
+        with served.connect(30) as client:
+            client.sendall(f"{head}Expect: 100-continue\r\nConnection: close\r\n\r\n".encode())
+            assert b"100 Continue" in client.recv(1000)  # the request is about to be admitted
+            while CLIENT.ask(served, "/", cookie=cookie).status == 200:
+                CLIENT.cookie(served)
+            client.sendall(b"x")
+            assert b'"role": "drive"' in b"".join(iter(lambda: client.recv(1000), b""))
+
+
+def test_key_that_others_may_use_is_refused(folder: Path, tmp_path: Path) -> None:
+    certificate, key = own_certificate(tmp_path, LOCAL)
+    for mode in (0o604, 0o602, 0o601, 0o666):
+        key.chmod(mode)
+        with pytest.raises(IbrobotError, match=rf"^viewer: every user of this machine may use .*: chmod 600 {key}$"):
+            tls_context(certificate, key, of="viewer: ")
+    for mode in (0o600, 0o400, 0o640):
+        key.chmod(mode)
+        tls_context(certificate, key)
+
+
+def test_files_that_are_no_certificate_and_key_are_named(tmp_path: Path) -> None:
+    certificate, key = own_certificate(tmp_path, LOCAL)
+    private = load_pem_private_key(key.read_bytes(), None)
+    locked, empty, other = (
+        tmp_path / "locked.pem",
+        tmp_path / "empty.pem",
+        own_certificate(tmp_path / "other", LOCAL)[1],
+    )
+    locked.write_bytes(private.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret")))
+    empty.touch()
+    for wrong in (locked, empty, other, certificate, tmp_path / "none.pem", tmp_path, Path("a\0b")):
+        with pytest.raises(IbrobotError, match=r"^certificate .*certificate\.pem and key .* cannot be used: "):
+            tls_context(certificate, wrong)
+
+
+def test_names_that_no_browser_sends_are_refused() -> None:
+    for name in ("robot.lab", "ROBOT-2", "192.168.1.5", "::1", "localhost"):
+        check_name(None, None, name)
+    for name in ("", "a\0b", "a\r\nb", "*", "robot.lab.", "robot.lab:80", "https://robot.lab", "1.2.3", "-a", "ä.lab"):
+        with pytest.raises(ValueError, match="is not a host name or an address"):
+            check_name(None, None, name)
+
+
 def test_failures_are_logged_and_say_nothing_to_clients(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     with small_page(folder) as served:
         answer = CLIENT.ask(served, "/fail", cookie=CLIENT.cookie(served))
@@ -154,6 +210,11 @@ def test_clients_that_send_garbage_are_no_news(folder: Path, caplog: pytest.LogC
                     client.shutdown(socket.SHUT_WR)
                     with contextlib.suppress(ConnectionError):
                         client.recv(1000)
+            cookie = CLIENT.cookie(served)
+            head = f"POST /api/echo HTTP/1.1\r\nHost: {served.host}\r\nCookie: {cookie}\r\nContent-Length: 9\r\n"
+            for body in ("\r\n", "Content-Encoding: gzip\r\n\r\nno gzip!!"):
+                with served.connect(30) as client:
+                    client.sendall(f"{head}{body}".encode())
     assert [record for record in caplog.records if record.exc_info or record.levelno >= logging.WARNING] == []
 
 
@@ -230,6 +291,16 @@ def test_crowd_is_turned_away_until_some_leave(folder: Path, monkeypatch: pytest
             with contextlib.suppress(OSError):
                 assert CLIENT.ask(served, "/").status == 401
                 break
+
+
+@pytest.mark.parametrize("tls", [False, True])
+def test_connections_that_begin_while_the_server_ends_are_ended(folder: Path, *, tls: bool) -> None:
+    with contextlib.ExitStack() as clients:
+        with small_page(folder, tls=tls) as served:
+            begun = [clients.enter_context(served.reach(30)) for _ in range(5)]
+        for client in begun:
+            with contextlib.suppress(ConnectionError):
+                assert client.recv(1) == b""
 
 
 def test_port_that_is_taken_is_named() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import attrs
-from ibrobot_http.addresses import is_loopback
+from ibrobot_http.addresses import check_name, is_loopback
 
 from ibrobot_core.api import documented, option
 
@@ -18,9 +18,15 @@ LEAST_PASSWORD = 12
 class WebOptions:
     """Options of the viewer `type: web`."""
 
-    host: str = option("127.0.0.1", help="address of the page; beyond this machine it needs certificate and key")
+    host: str = option(
+        "127.0.0.1", validator=check_name, help="address of the page; beyond this machine it needs certificate and key"
+    )
     port: int = option(8080, ge=0, le=65535, help="port of the page; 0: any free port")
-    names: tuple[str, ...] = option((), help="further host names of this machine in browsers, e.g. robot.local")
+    names: tuple[str, ...] = option(
+        (),
+        validator=attrs.validators.deep_iterable(check_name),
+        help="further host names of this machine in browsers, e.g. robot.local",
+    )
     certificate: Path | None = option(None, help="TLS certificate, with the chain of its authority")
     key: Path | None = option(None, help="private key of the certificate")
     password: str | None = option(

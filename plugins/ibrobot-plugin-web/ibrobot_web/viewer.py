@@ -145,7 +145,10 @@ class WebViewer(Viewer):
         options, robot = self._options, session.config.robot
         paths = {"mjcf": robot.description.mjcf, "urdf": robot.description.urdf}
         return {
-            "address": options.host, "port": options.port, "names": options.names, "password": options.password,
+            "address": options.host,
+            "port": options.port,
+            "names": options.names,
+            "password": options.password,
             "certificate": str(options.certificate) if options.certificate is not None else None,
             "key": str(options.key) if options.key is not None else None,
             "description": {

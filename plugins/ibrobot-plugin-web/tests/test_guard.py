@@ -94,19 +94,29 @@ async def no_scene() -> bytes:
 class TestAttacks(HttpSuite):
     """What every server here withstands, on the routes of the page of a run."""
 
+    password: str | None = None
+
     @override
     @contextlib.contextmanager
     def serve(self, request_s: float) -> Iterator[Served]:
-        with patch("ibrobot_http.guard.REQUEST_S", request_s):
-            guard = page_guard(WebOptions(port=0), any_port="0")
+        with patch("ibrobot_http.guard.REQUEST_S", request_s), patch("ibrobot_http.guard._TRY_S", 0.0):
+            guard = page_guard(WebOptions(port=0, password=self.password), any_port="0")
             broadcast = Broadcast(lambda: None, frozenset())
             drive = Drive(lambda sent, answer: None, lambda answer: answer({"ok": None}), lambda: None)
             server = ServerThread(guard, make_app(guard, broadcast, drive, no_scene), "page", close_s=0.1)
             with contextlib.closing(server):
                 yield Served(
                     guard.listener.url, ("/", "/api/session", "/api/scene", "/static/app.js"), ("/api/stop",),
-                    ("/stream", "/drive", "/stop"), (guard.path("drive"), guard.path("watch")),
+                    ("/stream", "/drive", "/stop"),
+                    tuple(path for path in map(guard.path, ("drive", "watch")) if path != "/"),
+                    password=self.password,
                 )  # fmt: skip
+
+
+class TestAttacksWithPassword(TestAttacks):
+    """The same, where a password takes the place of the link for driving."""
+
+    password = "correct horse battery"
 
 
 def test_a_large_message_ends_the_connection() -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import ipaddress
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import attrs
+from ibrobot_http.addresses import check_name
 
 from ibrobot_core.api import OptionFault, did_you_mean, documented, option
 
@@ -19,7 +19,6 @@ HANDS = ("left", "right")
 """The hands of an operator, as WebXR calls them; on a phone the page asks which arm it drives."""
 NONE = "none"
 """In place of the gripper's group: the robot has none."""
-_HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?)*")
 
 
 def _check_host(instance: Any, attribute: attrs.Attribute[Any], value: str) -> None:
@@ -31,15 +30,6 @@ def _check_host(instance: Any, attribute: attrs.Attribute[Any], value: str) -> N
         raise ValueError(
             f"{value!r} is not an address of this machine: 127.0.0.1 serves this machine alone, 0.0.0.0 the network"
         ) from None
-
-
-def _check_names(instance: Any, attribute: attrs.Attribute[Any], value: tuple[str, ...]) -> None:
-    for name in value:
-        try:
-            ipaddress.ip_address(name)
-        except ValueError:
-            if not _HOST.fullmatch(name) or re.fullmatch(r"[\d.]+", name):
-                raise ValueError(f"{name!r} is not a host name or an address, e.g. robot.lab or 192.168.1.5") from None
 
 
 @documented
@@ -55,7 +45,7 @@ class WebxrOptions:
     port: int = option(8443, ge=0, le=65535, help="port of the page; 0: any free one")
     names: tuple[str, ...] = option(
         (),
-        validator=_check_names,
+        validator=attrs.validators.deep_iterable(check_name),
         help="names and addresses under which browsers reach this machine; empty: its host name and address",
     )
     certificate: Path | None = option(

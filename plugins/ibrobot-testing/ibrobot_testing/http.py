@@ -10,7 +10,7 @@ import ssl
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import ClassVar
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import attrs
 
@@ -37,6 +37,27 @@ _GARBAGE = (
     b"POST / HTTP/1.1\r\nTransfer-Encoding: y\r\n\r\n", b"\x00" * 100, b"GET /" + b"a" * 70_000 + b" HTTP/1.1\r\n\r\n",
     b"GET / HTTP/1.1\r\nHost: " + b"a" * 70_000 + b"\r\n\r\n", b"\xff\xfe\r\n\r\n",
 )  # fmt: skip
+_AMBIGUOUS = (
+    "Content-Length: 6\r\nTransfer-Encoding: chunked", "Content-Length: 6\r\nContent-Length: 0", "Content-Length: 6, 0",
+    "Content-Length: +6", "Content-Length: 6\r\n\tX: a", "Content-Length : 6", "Transfer-Encoding: chunked, identity",
+    "Transfer-Encoding: xchunked", "Transfer-Encoding: chunked\r\nTransfer-Encoding: chunked",
+    "X: a\nContent-Length: 6", "X: a\rContent-Length: 6",
+)  # fmt: skip
+"""Headers by which two readers disagree on where a request ends."""
+_TARGETS = ("http://evil.example/", "https://evil.example{path}", "evil.example:80", "*")
+"""Targets of requests that are no path: those of a proxy, and of the server as a whole."""
+_BROKEN = (("gzip", b"no gzip"), ("deflate", b"\xff\xff"), ("gzip", b""))
+"""Encoding of a body -> what is not encoded so."""
+_CROWD = 260
+"""Connections, which are more than a server should hold."""
+_FORM = "application/x-www-form-urlencoded"
+_NO_PASSWORDS = (
+    (_FORM, b""), (_FORM, b"password="), (_FORM, b"password=x"), (_FORM, b"password=%00"), (_FORM, b"password=\xff%ff"),
+    (_FORM, b"password"), (_FORM, b"&" * 3000), (_FORM, b"password=" + b"a" * 60_000),
+    ("multipart/form-data", b"x"), ("multipart/form-data; boundary=x", b"--x\r\n\r\n--x--"),
+    (f"{_FORM}; charset=none", b"password=x"), ("application/json", b'{"password": true}'),
+)  # fmt: skip
+"""Type -> form that does not have the password."""
 _WEBSOCKET = (
     ("Connection", "Upgrade"),
     ("Upgrade", "websocket"),
@@ -65,15 +86,21 @@ class Served:
     """Whether a link on any other site may open the page."""
     any_port: bool = False
     """Whether clients may name another port."""
+    password: str | None = None
+    """Opens a session by the form of `POST /login`; None if the server has none."""
 
     @property
     def host(self) -> str:
         """Host and port of the address."""
         return urlsplit(self.url).netloc
 
+    def reach(self, patience_s: float) -> socket.socket:
+        """A connection on which nothing was sent."""
+        return socket.create_connection(("127.0.0.1", urlsplit(self.url).port or 0), timeout=patience_s)
+
     def connect(self, patience_s: float) -> socket.socket:
         """A connection, on which TLS is established if the server has it."""
-        plain = socket.create_connection(("127.0.0.1", urlsplit(self.url).port or 0), timeout=patience_s)
+        plain = self.reach(patience_s)
         return plain if self.url.startswith("http:") else _unchecked().wrap_socket(plain)
 
     def requests(self) -> Iterator[tuple[str, str, Headers]]:
@@ -105,7 +132,10 @@ class HttpSuite(Suite[Served]):
         """Serve, and give clients `request_s` to send a request [s]."""
         raise NotImplementedError(f"{type(self).__name__} must define serve(self, request_s)")
 
-    def ask(self, served: Served, path: str, headers: Headers = (), *, method: str = "GET", cookie: str = "") -> Answer:
+    def ask(
+        self, served: Served, path: str, headers: Headers = (), *, method: str = "GET", cookie: str = "",
+        body: bytes = b"",
+    ) -> Answer:  # fmt: skip
         """The answer to a request, which has the header `Host` unless `headers` has one."""
         address, port = "127.0.0.1", urlsplit(served.url).port
         connection = (
@@ -116,10 +146,10 @@ class HttpSuite(Suite[Served]):
         with contextlib.closing(connection):
             connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
             own = () if any(name == "Host" for name, _ in headers) else (("Host", served.host),)
-            length = (("Content-Length", "0"),) if method == "POST" else ()
+            length = (("Content-Length", str(len(body))),) if method == "POST" or body else ()
             for name, value in (*own, *length, *headers, *((("Cookie", cookie),) if cookie else ())):
                 connection.putheader(name, value)
-            connection.endheaders()
+            connection.endheaders(body)
             response = connection.getresponse()
             return Answer(response.status, response.headers, response.read())
 
@@ -163,6 +193,15 @@ class HttpSuite(Suite[Served]):
                 self.refused(served, cookie, [("Host", host)])
             self.refused(served, cookie, [("Host", served.host), ("Host", "evil.example")], (400, 403))
 
+    def test_only_paths_are_served(self) -> None:
+        """The server is no proxy, and no other host in a request line stands beside its own in `Host`."""
+        with self.served() as (served, cookie):
+            for method, path, needed in served.requests():
+                for target in (each.format(path=path) for each in _TARGETS):
+                    answer = self.ask(served, target, needed, method=method, cookie=cookie)
+                    assert answer.status in (400, 403, 404, 405), f"{method} {target} is answered with {answer.status}"
+                    assert "Set-Cookie" not in answer.headers
+
     def test_another_origin_is_refused(self) -> None:
         """Scripts of other sites, and of other servers of this machine, learn and change nothing."""
         with self.served() as (served, cookie):
@@ -175,6 +214,7 @@ class HttpSuite(Suite[Served]):
         with self.served() as (served, cookie):
             for site in ("cross-site", "same-site", "?"):
                 self.refused(served, cookie, [("Sec-Fetch-Site", site)])
+                self.refused(served, cookie, [("Sec-Fetch-Site", "none"), ("Sec-Fetch-Site", site)])
 
     def test_another_site_opens_only_the_page(self) -> None:
         """In a tab, by a link on this machine or, if that is allowed, on any site; never in a frame."""
@@ -190,7 +230,7 @@ class HttpSuite(Suite[Served]):
                         assert self.ask(served, path, headers, cookie=cookie).status == 403, path
 
     def test_nothing_is_served_without_a_session(self) -> None:
-        """Neither without one, nor with one that is made up, nor with a wrong token."""
+        """Neither without one, nor with one that is made up, nor with a wrong token, nor with one in a wrong place."""
         with self.served() as (served, cookie):
             name = cookie.partition("=")[0]
             for wrong in ("", f"{name}=", f"{name}=x", cookie[:-1], f"x{cookie}") if served.links else ():
@@ -202,6 +242,35 @@ class HttpSuite(Suite[Served]):
                 answer = self.ask(served, f"/?token={token}")
                 assert "Set-Cookie" not in answer.headers, token
                 assert not served.links or answer.status == 401, token
+            for count, answer in enumerate(self._misplaced(served, name)):
+                assert answer.status in (401, 403, 404, 405), f"attempt {count} is answered with {answer.status}"
+                assert "Set-Cookie" not in answer.headers
+
+    def _misplaced(self, served: Served, cookie: str) -> Iterator[Answer]:
+        """Answers to requests that have their token elsewhere than in a link."""
+        path = served.reads[-1]
+        for link in served.links:
+            query, token = link[2:], link.partition("=")[2]
+            yield self.ask(served, path, [("Authorization", f"Bearer {token}")])
+            yield self.ask(served, path, [("X-Token", token)], cookie=f"token={token}; {cookie}={token}")
+            for target in (f"{path}?{query}", f"/;{query}", f"/%2f?{query}", f"/?token=x&{query}", f"/?Token={token}"):
+                yield self.ask(served, target)
+            yield self.ask(served, link, method="POST")
+            yield self.ask(served, "/", [("Content-Type", _FORM)], method="POST", body=query.encode())
+
+    def test_only_the_password_signs_in(self) -> None:
+        """Forms without it, and what is no form, are refused, and break nothing."""
+        with self.served() as (served, _):
+            if served.password is None:
+                return
+            for kind, body in _NO_PASSWORDS:
+                answer = self.ask(served, "/login", [("Content-Type", kind)], method="POST", body=body)
+                assert answer.status in (400, 401, 413), f"{kind} {body[:40]!r} is answered with {answer.status}"
+                assert "Set-Cookie" not in answer.headers
+            right = f"password={quote(served.password)}".encode()
+            for kind, status in (("text/plain", 401), (_FORM, 303)):
+                answer = self.ask(served, "/login", [("Content-Type", kind)], method="POST", body=right)
+                assert answer.status == status, kind
 
     def test_link_leads_to_a_session_and_leaves_the_address(self) -> None:
         """Scripts cannot read the cookie, other sites cannot use it, and other ports have another one."""
@@ -233,6 +302,7 @@ class HttpSuite(Suite[Served]):
                 for name, parts in _HEADERS.items():
                     assert all(part in answer.headers.get(name, "") for part in parts), f"{name} of {answer.status}"
                 assert "unsafe" not in answer.headers["Content-Security-Policy"]
+                assert "/" not in answer.headers.get("Server", ""), "the version of the server"
 
     def test_no_path_leads_to_other_files(self) -> None:
         """Only the files of the page are served."""
@@ -283,6 +353,26 @@ class HttpSuite(Suite[Served]):
                     assert b" 200 " not in client.recv(100)
             assert self.ask(served, served.reads[0], cookie=cookie).status < 500
 
+    def test_ambiguous_requests_are_refused(self) -> None:
+        """A request whose end is not certain could carry a second one past whoever stands in front."""
+        with self.served() as (served, cookie):
+            path = served.writes[0] if served.writes else served.reads[0]
+            for headers in _AMBIGUOUS:
+                head = f"POST {path} HTTP/1.1\r\nHost: {served.host}\r\nCookie: {cookie}\r\n{headers}\r\n"
+                with served.connect(self.patience_s) as client, contextlib.suppress(OSError):
+                    client.sendall(f"{head}Content-Type: application/json\r\n\r\n0\r\n\r\nG".encode())
+                    status = client.recv(100).split(b" ")[1:2]
+                    assert status in ([], [b"400"], [b"413"], [b"501"]), f"{headers!r} is answered with {status}"
+
+    def test_broken_bodies_are_the_client_s_fault(self) -> None:
+        """A body that is not encoded as its header says is no failure of the server."""
+        with self.served() as (served, cookie):
+            for method, path, needed in served.requests():
+                for encoding, body in _BROKEN if path not in served.sockets else ():
+                    headers = (*needed, ("Content-Encoding", encoding))
+                    status = self.ask(served, path, headers, method=method, cookie=cookie, body=body).status
+                    assert status < 500, f"{method} {path} with a body that is no {encoding}"
+
     def test_large_bodies_are_not_read(self) -> None:
         """With their length beforehand or without, for every path."""
         with self.served() as (served, cookie):
@@ -292,6 +382,13 @@ class HttpSuite(Suite[Served]):
                     with served.connect(self.patience_s) as client:
                         client.sendall(f"{head}Content-Type: application/json\r\n\r\n".encode())
                         assert _sent(client, chunked="chunked" in length) < _LARGE / 2, f"{path} {length}"
+
+    def test_crowd_is_turned_away(self) -> None:
+        """Connections are limited, from before any handshake: files that a process may open are, too."""
+        with self.serve(3600.0) as served, contextlib.ExitStack() as stack:
+            crowd = [stack.enter_context(served.reach(self.patience_s)) for _ in range(_CROWD)]
+            ended, _, _ = select.select(crowd, [], [], self.patience_s)
+            assert ended, f"{_CROWD} connections are held"
 
     def test_silent_clients_delay_nobody(self) -> None:
         """Many clients may connect and send nothing."""

@@ -10,12 +10,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer, ThreadingHTTPServer
 from typing import Any, ClassVar, override
+from urllib.parse import quote
 
 import pytest
 from ibrobot_testing import checks, failed_checks
 from ibrobot_testing.http import HttpSuite, Served
 
-TOKEN, KEY = "4dc47a9c9b1e4a0f", "99d3fe0a1c5e4b7d"
+TOKEN, KEY, PASSWORD = "4dc47a9c9b1e4a0f", "99d3fe0a1c5e4b7d", "correct horse"
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; base-uri 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -25,7 +26,7 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-FOREIGN = ("host", "origin", "site", "frame", "socket", "session")
+FOREIGN = ("length", "target", "host", "origin", "site", "frame", "socket", "session")
 """What a request is checked for."""
 
 
@@ -38,7 +39,9 @@ class Handler(BaseHTTPRequestHandler):
     methods: ClassVar[tuple[str, ...]] = ("GET", "POST")
     largest: ClassVar[int] = 1000
     request_s: ClassVar[float]
+    form: ClassVar[str] = "application/x-www-form-urlencoded"
     protocol_version = "HTTP/1.0"
+    server_version, sys_version = "ibrobot", ""
     close_connection = True
 
     def setup(self) -> None:
@@ -60,28 +63,43 @@ class Handler(BaseHTTPRequestHandler):
         return f"127.0.0.1:{self.server.server_address[1]}"
 
     def allowed(self, check: str) -> bool:
-        site = self.headers.get("Sec-Fetch-Site", "none")
+        site = ", ".join(self.headers.get_all("Sec-Fetch-Site", ["none"]))
         opens = site == "same-site" and self.command == "GET" and re.fullmatch(r"/(\?.*)?", self.path)
         document = self.headers.get("Sec-Fetch-Dest") == "document"
-        match check:
-            case "host":
-                return self.headers.get_all("Host") == [self.own]
-            case "origin":
-                return self.headers.get("Origin", f"http://{self.own}") == f"http://{self.own}"
-            case "site":
-                return site in ("none", "same-origin") or bool(opens and "Sec-Fetch-Dest" in self.headers)
-            case "frame":
-                return site in ("none", "same-origin") or document or "Sec-Fetch-Dest" not in self.headers
-            case "socket":
-                return "Upgrade" not in self.headers or "Origin" in self.headers
-        return True
+        own_site = site in ("none", "same-origin")
+        return {
+            "length": self.says_where_it_ends,
+            "target": self.path.startswith("/"),
+            "host": self.headers.get_all("Host") == [self.own],
+            "origin": self.headers.get("Origin", f"http://{self.own}") == f"http://{self.own}",
+            "site": own_site or bool(opens and "Sec-Fetch-Dest" in self.headers),
+            "frame": own_site or document or "Sec-Fetch-Dest" not in self.headers,
+            "socket": "Upgrade" not in self.headers or "Origin" in self.headers,
+            "session": True,
+        }[check]
+
+    def parse_request(self) -> bool:
+        lines = self.rfile.peek().partition(b"\r\n\r\n")[0].split(b"\r\n")
+        lengths = [line for line in lines if line.lower().startswith(b"content-length")]
+        self.says_where_it_ends = (
+            len(lengths) < 2
+            and all(re.fullmatch(rb"[!-9;-~]+:[^\r\n]*", line) for line in lines)
+            and all(re.fullmatch(rb"[^:]+: [0-9]+", line) for line in lengths)
+        )
+        return super().parse_request()
+
+    def has_session(self) -> bool:
+        return self.headers.get("Cookie") == f"s_{self.own.partition(':')[2]}={KEY}"
 
     def answer(self) -> None:
-        if not all(self.allowed(check) for check in self.checked):
-            return self.reply(403)
+        for check in self.checked:
+            if check != "session" and not self.allowed(check):
+                return self.reply(400 if check == "length" else 403)
         if self.command == "GET" and self.path.startswith("/?token="):
             return self.redeem(self.path.partition("=")[2])
-        if "session" in self.checked and self.headers.get("Cookie") != f"s_{self.own.partition(':')[2]}={KEY}":
+        if self.command == "POST" and self.path == "/login":
+            return self.sign_in()
+        if "session" in self.checked and not self.has_session():
             return self.reply(401)
         length = int(self.headers.get("Content-Length", 0))
         if "Transfer-Encoding" in self.headers or length > self.largest:
@@ -91,6 +109,14 @@ class Handler(BaseHTTPRequestHandler):
 
     def read_large(self, length: int) -> None:
         self.reply(413)
+
+    def sign_in(self) -> None:
+        length = int(self.headers.get("Content-Length", 0))
+        if length > self.largest:
+            return self.reply(413)
+        form = self.rfile.read(length)
+        right = self.headers.get("Content-Type") == self.form and form == f"password={quote(PASSWORD)}".encode()
+        return self.redeem(TOKEN if right else "")
 
     def redeem(self, token: str) -> None:
         if token != TOKEN:
@@ -121,14 +147,28 @@ class Handler(BaseHTTPRequestHandler):
 class Server(ThreadingHTTPServer):
     daemon_threads = False
     block_on_close = True
-    request_queue_size = 50
+    request_queue_size = 300
+    most: ClassVar[int] = 30
+
+    def server_activate(self) -> None:
+        self.free = threading.BoundedSemaphore(self.most)
+        super().server_activate()
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        return self.free.acquire(blocking=False)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self.free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         pass
 
 
 class OneAtATime(HTTPServer):
-    request_queue_size = 50
+    request_queue_size = 300
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         pass
@@ -136,7 +176,6 @@ class OneAtATime(HTTPServer):
 
 class Attacks(HttpSuite):
     __test__ = False
-    patience_s = 5.0
     handler: ClassVar[type[Handler]] = Handler
     server: ClassVar[type[HTTPServer]] = Server
 
@@ -149,7 +188,7 @@ class Attacks(HttpSuite):
             thread.start()
             url = f"http://127.0.0.1:{server.server_address[1]}"
             try:
-                yield Served(url, ("/",), ("/change",), ("/socket",), (f"/?token={TOKEN}",))
+                yield Served(url, ("/",), ("/change",), ("/socket",), (f"/?token={TOKEN}",), password=PASSWORD)
             finally:
                 server.shutdown()
                 thread.join()
@@ -168,9 +207,33 @@ class RefusesItsOwnPage(Handler):
         return self.reply(403) if self.path == "/change" else super().route()
 
 
+class IsAProxy(without("target")):
+    def route(self):
+        self.path = self.path if self.path.startswith("/") else "/"
+        super().route()
+
+
 class AnswersImagesOfOtherSites(Handler):
     def allowed(self, check):
         return super().allowed(check) or (check == "site" and "Sec-Fetch-Dest" not in self.headers)
+
+
+class TakesTokensOfHeaders(Handler):
+    def has_session(self):
+        return super().has_session() or TOKEN in self.headers.get("Authorization", "")
+
+
+class TakesAPasswordInAnyForm(Handler):
+    form = "text/plain"
+
+    def sign_in(self):
+        self.headers.replace_header("Content-Type", self.form)
+        super().sign_in()
+
+
+class FailsWithEncodings(Handler):
+    def route(self):
+        return self.reply(500) if "Content-Encoding" in self.headers else super().route()
 
 
 class NamesItsKeyToScripts(Handler):
@@ -218,6 +281,11 @@ WRONG = {
     without("session"): "nothing_is_served_without_a_session",
     without("socket"): "sockets_need_their_page",
     NamesItsKeyToScripts: "link_leads_to_a_session_and_leaves_the_address",
+    IsAProxy: "only_paths_are_served",
+    without("length"): "ambiguous_requests_are_refused",
+    TakesTokensOfHeaders: "nothing_is_served_without_a_session",
+    TakesAPasswordInAnyForm: "only_the_password_signs_in",
+    FailsWithEncodings: "broken_bodies_are_the_client_s_fault",
     ForgetsAHeader: "every_answer_has_the_headers",
     ServesFiles: "no_path_leads_to_other_files",
     TakesPut: "other_methods_are_refused",
@@ -231,7 +299,7 @@ WRONG = {
 def test_catches(wrong, caught_by, tmp_path):
     class Wrong(Attacks):
         handler = wrong
-        patience_s = 1.0
+        patience_s = 1.0 if wrong is Patient else Attacks.patience_s
 
     assert failed_checks(Wrong, tmp_path) == {caught_by}
 
@@ -244,5 +312,16 @@ def test_catches_a_server_that_waits_for_each_client(tmp_path):
     assert "silent_clients_delay_nobody" in failed_checks(Wrong, tmp_path)
 
 
+def test_catches_a_server_that_holds_any_number_of_connections(tmp_path):
+    class Boundless(Server):
+        most = 1000
+
+    class Wrong(Attacks):
+        server = Boundless
+        patience_s = 1.0
+
+    assert failed_checks(Wrong, tmp_path) == {"crowd_is_turned_away"}
+
+
 def test_every_check_catches_something():
-    assert checks(HttpSuite) == {*WRONG.values(), "silent_clients_delay_nobody"}
+    assert checks(HttpSuite) == {*WRONG.values(), "silent_clients_delay_nobody", "crowd_is_turned_away"}
