@@ -354,7 +354,7 @@ class HttpSuite(Suite[Served]):
             assert self.ask(served, served.reads[0], cookie=cookie).status < 500
 
     def test_ambiguous_requests_are_refused(self) -> None:
-        """A request whose end is not certain could carry a second one past whoever stands in front."""
+        """A request whose end is not certain could carry a second one past a proxy."""
         with self.served() as (served, cookie):
             path = served.writes[0] if served.writes else served.reads[0]
             for headers in _AMBIGUOUS:
