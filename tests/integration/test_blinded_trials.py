@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import chdir, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from command_line import run_here
@@ -21,19 +22,48 @@ from command_line import run_here
 from ibrobot_core.config import find_config
 from ibrobot_core.plugins import installed_plugins
 
+if TYPE_CHECKING:
+    from ibrobot_testing.site import Site
+
 pytestmark = pytest.mark.integration
 PATIENCE_S = 240.0
 NAMES = ("careful", "hasty")
+ARM = """
+robot:
+  name: mini
+  joints:
+    - {name: pan, lower: -3.0, upper: 3.0, max_velocity: 3.0, max_acceleration: 40.0}
+    - {name: lift, lower: -3.0, upper: 3.0, max_velocity: 3.0, max_acceleration: 40.0}
+  groups: {arm: [pan, lift]}
+hardware: {type: made_up_arm}
+executors:
+  arm_position: {type: position, group: arm}
+models:
+  one: {type: reaching}
+  two: {type: reaching}
+control_modes:
+  careful: {executors: [arm_position], inference: {model: one}}
+  hasty: {executors: [arm_position], inference: {model: two}}
+default_control_mode: careful
+contract:
+  rate_hz: 30
+  max_duration_s: 3600
+  observations:
+    - {key: observation.state, topic: /joint_states, select: [position.pan, position.lift]}
+  actions:
+    - {executor: arm_position, topic: /arm/commands}
+control: {rate_hz: 100, stop: hold}
+"""
 
 
 class Terminal:
     """`ibrobot eval` with blinded trials at a terminal of its own."""
 
-    def __init__(self, folder: Path, *more: str) -> None:
+    def __init__(self, folder: Path, *words: str) -> None:
         self._master, slave = pty.openpty()
         program = "from ibrobot_core.cli.command import main; main()"
         self.process = subprocess.Popen(
-            [sys.executable, "-c", program, *command(*more)],
+            [sys.executable, "-c", program, *(words or command())],
             cwd=folder, stdin=slave, stdout=slave, stderr=slave, start_new_session=True,
         )  # fmt: skip
         os.close(slave)
@@ -97,9 +127,9 @@ def terminals(folder: Path) -> Iterator[list[Terminal]]:
         each.close()
 
 
-def command(*more: str) -> list[str]:
+def command() -> list[str]:
     modes = [word for name in NAMES for word in ("--mode", name)]
-    return ["eval", "arm.yaml", "--sim", "--trials", *modes, "--episodes", "2", "--out", "blind", *more]
+    return ["eval", "arm.yaml", "--sim", "--trials", *modes, "--episodes", "2", "--out", "blind"]
 
 
 def test_operator_judges_blind_and_goes_on_after_a_crash(folder: Path, terminals: list[Terminal]) -> None:
@@ -162,3 +192,32 @@ def test_operator_judges_blind_and_goes_on_after_a_crash(folder: Path, terminals
 def _analysis(folder: Path) -> subprocess.CompletedProcess[str]:
     with chdir(folder):
         return run_here(*command())
+
+
+def test_keys_judge_a_running_arm_and_ctrl_c_ends_it_in_an_orderly_way(
+    site: Site, tmp_path: Path, terminals: list[Terminal]
+) -> None:
+    site.add("ibrobot-reaching", "reaching_arm.py")
+    (tmp_path / "arm.yaml").write_text(ARM, encoding="utf-8")
+    modes = [word for name in NAMES for word in ("--mode", name)]
+    terminal = Terminal(tmp_path, "eval", "arm.yaml", *modes, "--episodes", "1", "--out", "blind")
+    terminals.append(terminal)
+    terminal.see(r"trial 1 \(start 1 of 1\): set the scene to start 1")
+    terminal.press("\r")
+    terminal.see("running")
+    terminal.press("s")
+    terminal.see("trial 1: success")
+    terminal.see("trial 2")
+    terminal.press("\r")
+    terminal.see("running")
+    os.kill(terminal.process.pid, signal.SIGINT)
+    terminal.see("to be continued")
+    assert terminal.end() == 0
+    (trial,) = [json.loads(each.read_text()) for each in (tmp_path / "blind/trials").glob("*.json")]
+    assert (trial["outcome"], trial["faults"], trial["time_s"] > 0) == ("success", [], True)
+    reader = installed_plugins().open_episode(tmp_path / "blind/episodes/trial_0001")
+    try:
+        assert reader.summary().outcome == "success"
+    finally:
+        reader.close()
+    assert not any(name in terminal.shown for name in NAMES)

@@ -59,7 +59,7 @@ def power(trials: int) -> list[str]:
         found.append(f"{100 * difference:g} points with {100 * chance:.0f} %")
     return [
         f"trials of each policy that find a difference of success rates with a probability of 80 %: {needed}",
-        f"{trials} trials find {', '.join(found)}",
+        f"the number asked for, {trials}, finds {', '.join(found)}",
     ]
 
 

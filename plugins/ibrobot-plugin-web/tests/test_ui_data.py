@@ -11,6 +11,7 @@ import yaml
 from ibrobot_web.model_edit import with_model
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
+from ibrobot_web.ui.forms import read_form
 from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.server import routes_of
 from ui_server import UiServer, run_ui
@@ -175,6 +176,13 @@ def test_conversions_are_confined_and_checked_in_the_words_of_the_form(ui: Ui, w
     with pytest.raises(IbrobotError, match=error):
         start(ui, "convert", **{"episodes": ["."], "out": "new", **wrong})
     assert ui.jobs.all() == []
+
+
+@needs_eval
+def test_form_may_name_several_robots(ui: Ui) -> None:
+    command = installed_plugins().command("eval")
+    found = read_form(ui, command, {"config": ["so101_pick_cube", "so101_blind"], "out": "new"})
+    assert found.config == ("so101_pick_cube", "so101_blind")
 
 
 @needs_eval
