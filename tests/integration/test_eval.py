@@ -151,15 +151,20 @@ def test_interrupted_evaluation_goes_on_with_nothing_twice(start: Any, folder: P
     assert digests(folder / "stopped") == digests(whole)
 
 
-def test_workers_end_with_a_killed_command(start: Any) -> None:
+def test_workers_end_with_a_killed_command_and_write_nothing_more(start: Any, folder: Path) -> None:
     running = start("--out", "orphaned", "--jobs", 1)
     running.await_episode()
     (worker,) = running.children()
-    os.kill(running.process.pid, signal.SIGKILL)
+    os.kill(worker, signal.SIGSTOP)  # at the beginning of its next episode
+    running.process.kill()
+    running.process.wait()
+    results = sorted((folder / "orphaned/results").rglob("*.json"))
+    os.kill(worker, signal.SIGCONT)
     deadline = time.monotonic() + PATIENCE_S
     while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not Path(f"/proc/{worker}").exists()
+    assert sorted((folder / "orphaned/results").rglob("*.json")) == results
 
 
 def test_it_stops_as_soon_as_the_fault_is_certain(folder: Path) -> None:
