@@ -23,7 +23,7 @@ from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import installed_plugins
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-SCENES = ("pick_cube", "push", "stack", "sort", "drawer")
+SCENES = ("pick_cube", "push", "stack", "sort", "drawer", "handover")
 REPEATED = 10
 """Episodes that are run twice."""
 
@@ -31,7 +31,8 @@ REPEATED = 10
 def run(scene: str, episodes: int, seed: int, overrides: list[str]) -> dict[str, Any]:
     """Successes, duration and a digest of all states of the episodes from `seed` on."""
     overrides = [f"simulation.scene={scene}", *overrides]
-    config = load_config(CONFIGS / "so101_scenes.yaml", sim=True, mode=scene, overrides=overrides)
+    name = "bi_so101_handover" if scene == "handover" else "so101_scenes"
+    config = load_config(CONFIGS / f"{name}.yaml", sim=True, mode=scene, overrides=overrides)
     session = Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=seed, episodes=episodes))
     runtime = Runtime(session)
     digest, failed, number, before = hashlib.sha256(), [], 0, 0

@@ -16,8 +16,14 @@ from ibrobot_core.config import find_config
 SIZE = (320, 240)
 TOPIC = "/camera/front/image_raw"
 CAMERA = "{name: front, kind: camera, type: mujoco, width: 320, height: 240, fps: 30, encoding: raw, shadows: true}"
-SCENES = {"pick_cube": ("so101_scenes", 3.3), "push": ("so101_scenes", 3.2), "stack": ("so101_scenes", 3.6),
-          "sort": ("so101_scenes", 6.3), "drawer": ("so101_scenes", 3.6)}  # fmt: skip
+SCENES = {
+    "pick_cube": ("so101_scenes", 3.3),
+    "push": ("so101_scenes", 3.2),
+    "stack": ("so101_scenes", 3.6),
+    "sort": ("so101_scenes", 6.3),
+    "drawer": ("so101_scenes", 3.6),
+    "handover": ("bi_so101_handover", 7.8),
+}
 """Scene -> robot YAML, and when the picture is taken [s]."""
 
 

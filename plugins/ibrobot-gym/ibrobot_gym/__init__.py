@@ -12,6 +12,7 @@ ENVIRONMENTS = {
     "PickCube-v0": ("so101_scenes", "pick_cube", "put the cube into the bin"),
     "Push-v0": ("so101_scenes", "push", "push the block onto the green mark"),
     "Stack-v0": ("so101_scenes", "stack", "put the red cube on the blue one"),
+    "Handover-v0": ("bi_so101_handover", "handover", "hand the bar from the left arm to the right one"),
     "Drawer-v0": ("so101_scenes", "drawer", "open the drawer"),
     "Sort-v0": ("so101_scenes", "sort", "put each cube into the bin of its colour"),
 }

@@ -24,7 +24,7 @@ def scene_objects(options: MujocoOptions, robot: Robot) -> tuple[SceneObject, ..
     free = [name for name, thing in options.objects.items() if thing.mass is not None]
     signals = {name: (OBJECTS_TOPIC, POSE_SIZE * i) for i, name in enumerate(free)}
     signals |= {name: (SCENE_TOPIC, first) for name, first in scene.poses.items()}
-    robots = bodies_of(model, robot)
+    robots = bodies_of(model, robot.joint_names)
     found = []
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])

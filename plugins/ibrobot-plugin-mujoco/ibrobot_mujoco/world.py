@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import attrs
 import mujoco
 
-from ibrobot_core.api import Robot, Vector
+from ibrobot_core.api import Vector
 
 
 @attrs.frozen(eq=False)
@@ -38,8 +40,8 @@ class World:
         return float((velocity @ velocity) ** 0.5)
 
 
-def bodies_of(model: mujoco.MjModel, robot: Robot) -> frozenset[int]:
-    """The bodies of a robot: its links, and what carries them or is fixed to them."""
-    links = [int(model.jnt_bodyid[model.joint(name).id]) for name in robot.joint_names]
+def bodies_of(model: mujoco.MjModel, joints: Iterable[str]) -> frozenset[int]:
+    """The bodies of the arms with these joints: their links, and what carries them or is fixed to them."""
+    links = [int(model.jnt_bodyid[model.joint(name).id]) for name in joints]
     roots = {int(model.body_rootid[link]) for link in links}
     return frozenset(body for body in range(1, model.nbody) if int(model.body_rootid[body]) in roots)

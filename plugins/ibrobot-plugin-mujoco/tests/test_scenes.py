@@ -137,6 +137,39 @@ class TestDrawer(_Suite):
     options: ClassVar = {"drawer_colour": (0.0, 0.3), "drawer_damping": (1.0, 4.0)}
 
 
+class TestHandover(_Suite):
+    type = "handover"
+    options: ClassVar = {"bar_colour": (0.0, 0.5)}
+
+    @override
+    def robot(self) -> Robot:
+        return load_config(find_config("bi_so101_handover", installed_plugins())).robot
+
+
+@pytest.mark.parametrize(
+    ("bar", "jaw", "expected"),
+    [
+        ((0.0, 0.0, 0.0), "right_", True),
+        ((0.0, 0.0, 0.0), "left_", False),
+        ((0.0, 0.0, 0.3), "right_", False),
+    ],
+    ids=["in the right hand", "in the left hand", "in no hand"],
+)
+def test_handover_is_a_bar_in_the_right_hand_alone(bar: tuple[float, float, float], jaw: str, expected: bool) -> None:
+    suite = TestHandover()
+    made = suite.make(suite.context())
+    world = suite.world(made, suite.context())
+    suite.begin(made, world, 0)
+    tip = world.data.site(f"{jaw}gripperframe").xpos + bar
+    put(world, "bar", (tip[0], tip[1] - (0.3 if jaw == "left_" and tip[1] > 0.3 else 0.0), max(tip[2], 0.06)))
+    assert made.success(world) is expected
+
+
+def test_handover_needs_two_arms() -> None:
+    with pytest.raises(HardwareError, match=r"handover needs robot.description.arms left_ and right_, got none"):
+        scene("handover").make(so101())
+
+
 def begun(type_: str, seed: int = 0, **options: Any) -> tuple[World, Scene[mujoco.MjSpec, World]]:
     """A scene at the start of an episode."""
     suite = _Suite()

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import PolicyDescriptor
-from ibrobot_mujoco.experts.options import ExpertOptions, SortExpertOptions, check_one_arm
+from ibrobot_mujoco.experts.options import ExpertOptions, SortExpertOptions, check_one_arm, check_two_arms
 from ibrobot_mujoco.gl import check_asked
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def _expert(
         return ScriptedExpert(kind, name, given, ctx, observed(given))
 
     return PolicyDescriptor(
-        type=name, options=options, make=make, check_options=check_one_arm,
+        type=name, options=options, make=make, check_options=check_two_arms if scene == "handover" else check_one_arm,
         summary=f"{summary}, by inverse kinematics and the scene's ground truth",
     )  # fmt: skip
 
@@ -43,6 +43,7 @@ EXPERTS = (
     ),
     _expert("push", "PushTask", "pushes the block onto the goal", lambda _: 10),
     _expert("stack", "StackTask", "puts the cube on the other one", lambda _: 14),
+    _expert("handover", "HandoverTask", "hands the bar from the left arm to the right one", lambda _: 7),
     _expert("drawer", "DrawerTask", "opens the drawer", lambda _: 6),
     _expert(
         "sort", "SortTask", "puts each cube into the bin of its colour", lambda given: 8 * given.cubes + 6,

@@ -41,3 +41,14 @@ def check_one_arm(options: ExpertOptions, robot: Robot, joints: tuple[str, ...])
     gripper = robot.groups.get("gripper", ())
     if len(gripper) != 1:
         yield OptionFault((), f"the scripted expert needs one joint in robot.groups.gripper, got {list(gripper)}")
+
+
+def check_two_arms(options: ExpertOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+    """Check that the robot has two arms, each with a gripper with one joint."""
+    for name in ("left_gripper", "right_gripper"):
+        gripper = robot.groups.get(name, ())
+        if len(gripper) != 1:
+            yield OptionFault((), f"the scripted expert needs one joint in robot.groups.{name}, got {list(gripper)}")
+    for name in ("left", "right"):
+        if name not in robot.groups:
+            yield OptionFault((), f"the scripted expert needs robot.groups.{name}, the joints of that arm")

@@ -10,6 +10,7 @@ from ibrobot_core.api import SceneConfig, SceneDescriptor
 from ibrobot_mujoco.gl import check_asked
 from ibrobot_mujoco.scenes.options import (
     DrawerOptions,
+    HandoverOptions,
     PickCubeOptions,
     PushOptions,
     SceneOptions,
@@ -42,6 +43,7 @@ SCENES: Mapping[str, SceneDescriptor] = {
         _descriptor("push", "Push", PushOptions, "a block and a goal on the table: push the block onto the goal"),
         _descriptor("stack", "Stack", StackOptions, "two cubes: put the smaller one on the other"),
         _descriptor("drawer", "Drawer", DrawerOptions, "a closed drawer: open it"),
+        _descriptor("handover", "Handover", HandoverOptions, "a bar: hand it from the left arm to the right one"),
         _descriptor("sort", "Sort", SortOptions, "red and blue cubes: put each into the bin of its colour"),
     )
 }

@@ -82,10 +82,10 @@ class PushOptions(SceneOptions):
 
     block_size: Span = _cube_size(0.035)
     block_colour: Span = _colour(0.1, "block")
-    block_distance: Range = _distance((0.17, 0.21), "block")
+    block_distance: Range = _distance((0.19, 0.22), "block")
     block_bearing: Range = _bearing((-0.5, 0.5), "block")
     block_yaw: Range = _yaw("block")
-    goal_distance: Range = _distance((0.25, 0.29), "goal")
+    goal_distance: Range = _distance((0.26, 0.29), "goal")
     goal_bearing: Range = _bearing((-0.5, 0.5), "goal")
     goal_tolerance: float = option(0.02, unit="m", gt=0, le=0.1, help="distance from the goal that counts as reached")
 
@@ -103,6 +103,17 @@ class DrawerOptions(SceneOptions):
     )
     drawer_damping: Span = span(2.0, unit="N s/m", ge=0.0, le=20.0, help="viscous friction of the drawer")
     opened: float = option(0.08, unit="m", gt=0, le=0.11, help="distance that counts as open")
+
+
+@documented
+@attrs.frozen(kw_only=True)
+class HandoverOptions(SceneOptions):
+    """Options of scene `handover`. Positions are in the frame between both arms."""
+
+    bar_colour: Span = _colour(0.45, "bar")
+    bar_x: Range = option((0.17, 0.23), unit="m", validator=ordered, help="x of the bar's middle")
+    bar_y: Range = option((0.03, 0.10), unit="m", validator=ordered, help="y of the bar's middle")
+    bar_yaw: Range = option((-0.4, 0.4), unit="rad", validator=ordered, help="turn of the bar away from y")
 
 
 @documented

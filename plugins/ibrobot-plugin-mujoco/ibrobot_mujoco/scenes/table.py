@@ -73,7 +73,7 @@ class TableScene(Scene[mujoco.MjSpec, World]):
         shift, turn = ends(options.camera_shift), ends(options.camera_turn)
         self._look |= dict(zip(_CAMERA, (shift,) * 3 + (turn,) * 3, strict=True))
         self._distractors = [f"distractor{i + 1}" for i in range(options.distractors)]
-        self._of_robot: frozenset[int] = frozenset()
+        self._of_robot: dict[str, frozenset[int]] = {}
         self._original: _Original | None = None
         placed = self.placed()
         self.factors = (*placed, *self._look, "distractors")
@@ -153,13 +153,14 @@ class TableScene(Scene[mujoco.MjSpec, World]):
     def success(self, world: World) -> bool | None:
         return None
 
-    def touched(self, world: World, body: str) -> bool:
-        """Whether the robot touches a body."""
+    def touched(self, world: World, body: str, arm: str = "") -> bool:
+        """Whether the robot touches a body, or only one of its arms: that with the prefix `arm`."""
         model = world.model
-        self._of_robot = self._of_robot or bodies_of(model, self._robot)
+        if arm not in self._of_robot:
+            self._of_robot[arm] = bodies_of(model, [name for name in self._robot.joint_names if name.startswith(arm)])
         pairs = model.geom_bodyid[world.data.contact.geom]
         others = pairs[(pairs == model.body(body).id).any(axis=1)].ravel()
-        return not self._of_robot.isdisjoint(others.tolist())
+        return not self._of_robot[arm].isdisjoint(others.tolist())
 
     def at_rest(self, world: World, body: str) -> bool:
         """Whether a body is at rest, and the robot does not touch it."""
