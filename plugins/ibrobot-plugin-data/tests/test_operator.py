@@ -149,6 +149,22 @@ def test_the_arm_holds_while_a_prompt_is_typed(record: Record):
     assert source.active
 
 
+def test_a_program_hears_of_the_session_whenever_it_changes(record: Record):
+    heard: list[Any] = []
+    run = record(prompt="pick", count=3, report=heard.append)
+    run.step(3)
+    assert [(each.saved, each.wanted, each.state) for each in heard] == [(0, 3, "waiting: Tab starts")]
+    run.keys("tab")
+    run.step(2)
+    assert heard[-1].state.startswith("recording “pick”")
+    run.keys("tab")
+    run.step(1)
+    assert heard[-1].saved == 1
+    count = len(heard)
+    run.operator.summary_rows()
+    assert [(each.saved, each.state) for each in heard[count:]] == [(1, "ended")]
+
+
 def test_failure_and_discard(record: Record):
     run = record(prompt="pick")
     for end in ("f11", "f12"):

@@ -12,18 +12,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import attrs
 import pytest
 from click.testing import CliRunner
+from ibrobot_lerobot import TRAIN
 from ibrobot_lerobot import merge as merging
 from ibrobot_lerobot import train as training
 from ibrobot_lerobot.commands import datasets
 from ibrobot_lerobot.train import arguments, progress, train
-from ibrobot_lerobot.training import TrainOptions
+from ibrobot_lerobot.training import Begin, Progress, Report, TrainOptions
 from ibrobot_lerobot.training_checkpoints import newest_checkpoint
 from trainer import install
 
 from ibrobot_core.api import DatasetError, Feature, MissingDependency
-from ibrobot_core.app import InUse
+from ibrobot_core.app import InUse, Shown, decode_event
 
 from .conftest import CAMERA, FPS, rows, write
 
@@ -72,6 +74,26 @@ def test_training_reports_its_progress_as_events(dataset: Path, tmp_path: Path):
     run(train, dataset, "--out", tmp_path / "other", "--steps", 10, "--events", "--fail=1", code=7)
 
 
+def test_what_is_shown_of_a_training() -> None:
+    assert Begin(0, 10).shown() == Shown("begins: 10 steps", 0.0)
+    assert Begin(5, 10).shown() == Shown("continues from step 5 of 10 steps", 0.5)
+    step = Progress(step=4, steps=10, loss=0.5, lr=None, seconds=360.0, left_s=120.0)
+    text = "step 4 of 10, loss 0.5, about 2 min left"
+    assert step.shown() == Shown(text, 0.4, point={"step": 4.0, "loss": 0.5})
+    assert attrs.evolve(step, left_s=40.0).shown().text.endswith(", less than a minute left")
+    assert attrs.evolve(step, left_s=None).shown().text == "step 4 of 10, loss 0.5"
+    lost = attrs.evolve(step, loss=None).shown()
+    assert (lost.point, "loss not finite" in lost.text) == ({}, True)
+    assert Report("t/last").shown() == Shown("trained: t/last", 1.0, made={"policy": "t/last"})
+
+
+def test_the_time_left_is_known_after_two_reports(dataset: Path, tmp_path: Path) -> None:
+    lines = run(train, dataset, "--out", tmp_path / "out", "--steps", 10, "--events", "--pause=0.01")
+    steps = [event for line in lines if isinstance(event := decode_event(line, TRAIN.events), Progress)]
+    assert [each.left_s is None for each in steps] == [True, *[False] * 9]
+    assert steps[-1].left_s == 0.0
+
+
 def test_training_saves_a_tenth_of_its_steps_apart(dataset: Path, tmp_path: Path):
     run(train, dataset, "--out", tmp_path / "out", "--steps", 1000)
     saved = sorted(path.name for path in (tmp_path / "out/checkpoints").iterdir())
@@ -103,6 +125,7 @@ def interrupted(
 
 SCRIPT = """
 import sys
+from ibrobot_lerobot import TRAIN
 from ibrobot_lerobot import merge as merging
 from ibrobot_lerobot import train as training
 training.find_trainer = lambda: sys.argv[1]
