@@ -2,6 +2,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from evaluation_statistics import covered, decided_at, reached, significant
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_eval.statistics import (
@@ -194,3 +195,13 @@ def test_sequential_test_needs_about_as_many_episodes_as_a_fixed_one():
     assert mcnemar_power(0.9, 0.6, 47) >= 0.9 > mcnemar_power(0.9, 0.6, 43)
     mean = (1 - decided_by(0.9, 0.6, 500)).sum()
     assert 30 < mean < 47
+
+
+def test_benchmark_finds_what_it_states_with_few_experiments():
+    rng = np.random.default_rng(3)
+    for rate in (0.1, 0.9):
+        assert covered(rate, rng, 400)["clopper_pearson"] >= 0.94
+    wrong, peeked = (
+        sum(map(bool, decided_at(0.5, 0.5, rng, 400, table(150)))) / 400 for table in (reached, significant)
+    )
+    assert wrong <= ALPHA < 0.12 < peeked
