@@ -54,7 +54,7 @@ def listen(
         port: the port; 0 for any free one.
         names: names and addresses under which clients may reach the server.
         tls: the certificate.
-        of: begins the error, e.g. `viewer: `.
+        of: begins the error: the part of the robot YAML, e.g. `viewer:`, and a space.
         any_port: the option that chooses any free port, for the error.
 
     Raises:
@@ -75,7 +75,7 @@ def tls_context(certificate: Path, key: Path, *, of: str = "") -> ssl.SSLContext
     Args:
         certificate: the certificate, with the chain of its authority.
         key: its private key, which other users of the machine must not be able to use.
-        of: begins the error, e.g. `viewer: `.
+        of: begins the error: the part of the robot YAML, e.g. `viewer:`, and a space.
 
     Raises:
         IbrobotError: if they cannot be used.
