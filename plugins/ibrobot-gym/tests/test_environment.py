@@ -11,6 +11,7 @@ import gymnasium
 import ibrobot_gym
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
 from gymnasium.utils.env_checker import check_env
 
 from ibrobot_core.app import LaunchRequest, Runtime, Session, find_config, installed_plugins, load_config
@@ -64,16 +65,18 @@ def test_seed_is_that_of_a_run_in_lockstep() -> None:
 
 def test_equal_seeds_and_actions_give_equal_episodes() -> None:
     with made("Stack-v0") as one, made("Stack-v0") as other:
+        actions = one.action_space
+        assert isinstance(actions, Box)
         for environment, before in ((one, 2), (other, 0)):
             for seed in range(before):
                 environment.reset(seed=seed)
-                environment.step(environment.action_space.low)
+                environment.step(actions.low)
         ways = []
         for environment in (one, other):
             observation, _ = environment.reset(seed=5)
             way = [observation["agent_pos"]]
             for i in range(10):
-                action = np.clip(way[0] + 0.02 * i, environment.action_space.low, environment.action_space.high)
+                action = np.clip(way[0] + 0.02 * i, actions.low, actions.high)
                 way.append(environment.step(action)[0]["agent_pos"])
             ways.append(np.stack(way))
     np.testing.assert_array_equal(ways[0], ways[1])

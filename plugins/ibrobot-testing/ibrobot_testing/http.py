@@ -253,8 +253,10 @@ class HttpSuite(Suite[Served]):
             query, token = link[2:], link.partition("=")[2]
             yield self.ask(served, path, [("Authorization", f"Bearer {token}")])
             yield self.ask(served, path, [("X-Token", token)], cookie=f"token={token}; {cookie}={token}")
-            for target in (f"{path}?{query}", f"/;{query}", f"/%2f?{query}", f"/?token=x&{query}", f"/?Token={token}"):
-                yield self.ask(served, target)
+            elsewhere = (f"{path}?{query}", f"/;{query}", f"/%2f?{query}", f"/?token=x&{query}", f"/?Token={token}")
+            for target in elsewhere:
+                if target != link:
+                    yield self.ask(served, target)
             yield self.ask(served, link, method="POST")
             yield self.ask(served, "/", [("Content-Type", _FORM)], method="POST", body=query.encode())
 

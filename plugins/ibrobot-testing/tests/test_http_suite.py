@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer, ThreadingHTTPServer
+from io import BufferedReader
 from typing import Any, ClassVar, override
 from urllib.parse import quote
 
@@ -60,7 +61,8 @@ class Handler(BaseHTTPRequestHandler):
 
     @property
     def own(self) -> str:
-        return f"127.0.0.1:{self.server.server_address[1]}"
+        assert isinstance(self.server, HTTPServer)
+        return f"127.0.0.1:{self.server.server_port}"
 
     def allowed(self, check: str) -> bool:
         site = ", ".join(self.headers.get_all("Sec-Fetch-Site", ["none"]))
@@ -79,6 +81,7 @@ class Handler(BaseHTTPRequestHandler):
         }[check]
 
     def parse_request(self) -> bool:
+        assert isinstance(self.rfile, BufferedReader)
         lines = self.rfile.peek().partition(b"\r\n\r\n")[0].split(b"\r\n")
         lengths = [line for line in lines if line.lower().startswith(b"content-length")]
         self.says_where_it_ends = (
@@ -207,7 +210,9 @@ class RefusesItsOwnPage(Handler):
         return self.reply(403) if self.path == "/change" else super().route()
 
 
-class IsAProxy(without("target")):
+class IsAProxy(Handler):
+    checked = without("target").checked
+
     def route(self):
         self.path = self.path if self.path.startswith("/") else "/"
         super().route()
