@@ -19,6 +19,12 @@ def test_a_decision_has_a_status_and_a_date(page: Path) -> None:
     assert re.fullmatch(rf"\*\*Status\.\*\* {status}, \d{{4}}-\d\d-\d\d\.", third)
 
 
+def test_each_decision_has_a_number_of_its_own() -> None:
+    numbers = [page.name[:4] for page in DECISIONS]
+    assert numbers == sorted(set(numbers))
+    assert all(page.read_text(encoding="utf-8").startswith(f"# {int(page.name[:4])}. ") for page in DECISIONS)
+
+
 def test_the_workflow_runs_the_first_two_commands_of_the_readme() -> None:
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     first, second = [line.removeprefix("$ ") for line in lines if line.startswith("$ ")][:2]

@@ -36,6 +36,7 @@ class ToggleSmoothing:
 TOGGLE_SMOOTHING = Service(
     "/action_dispatcher/toggle_smoothing", ToggleSmoothing, NoneType, "Blend chunks, or do not.", alone="enabled"
 )
+"""The service `/action_dispatcher/toggle_smoothing`."""
 
 
 class LoadedModel(Component):

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Contract, Frame, HardwareError, Image, SteppedClock, ns
-from ibrobot_core.app import LaunchRequest, Runtime, Session, Subscription, installed_plugins
+from ibrobot_core.app import LaunchRequest, RunAccess, Runtime, Session, Subscription, installed_plugins
 from ibrobot_gym.config import RENDERED, environment_config
 from ibrobot_gym.source import EnvironmentSource
 
@@ -97,7 +97,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return spaces.Dict(found)
 
     def _start(self) -> None:
-        def source(session: Session, mode: Any) -> EnvironmentSource:
+        def source(session: RunAccess, mode: Any) -> EnvironmentSource:
             self._source = EnvironmentSource(session, mode)
             return self._source
 

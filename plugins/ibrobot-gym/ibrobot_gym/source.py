@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import override
 
 from ibrobot_core.api import Contract, Frame, Vector
-from ibrobot_core.app import ControlMode, FrameSampler, Session, SourceWorker
+from ibrobot_core.app import ControlMode, FrameSampler, RunAccess, SourceWorker
 
 
 class EnvironmentSource(SourceWorker):
@@ -13,7 +13,7 @@ class EnvironmentSource(SourceWorker):
 
     autonomous = True
 
-    def __init__(self, session: Session, mode: ControlMode) -> None:
+    def __init__(self, session: RunAccess, mode: ControlMode) -> None:
         super().__init__(session, mode, "actions of an environment")
         self._contract = Contract.from_config(session.config)
         self._sampler: FrameSampler | None = None
