@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -121,12 +122,17 @@ def test_an_episode_is_recorded_with_what_is_to_know_of_it(
     ran, logs = recorded("--lockstep", "--episodes", "2", "--seed", "7")
     assert ran.code == 0, ran.err
     assert len(logs) == 2
-    root = tmp_path / "kept" / "default" / "episodes"
+    root, drawn = tmp_path / "kept" / "default" / "episodes", []
     for number, log in enumerate(logs, 1):
         metadata = json.loads((root / f"episode_{number:06d}" / "metadata.json").read_text())
         assert (metadata["outcome"], metadata["dropped"]) == ("success", {})
         assert metadata["metadata"]["seed"] == str(6 + number)
         assert metadata["metadata"]["mode"] == "model_inference"
+        factors = json.loads(metadata["metadata"]["factors"])
+        assert 0.20 <= math.hypot(factors["cube_x"], factors["cube_y"]) <= 0.27
+        assert factors["light"] == 1.0
+        drawn.append(factors["cube_x"])
         assert len(log.times) == metadata["samples"] > 200
         assert log.times[0] == pytest.approx(0.01)
         assert log.times[1:] - log.times[:-1] == pytest.approx(0.01), "no tick is lost, none is twice"
+    assert len(set(drawn)) == 2, "both episodes have the factors of one"
