@@ -142,6 +142,10 @@ class CommandSource:
     def take_goal(self, event: Mapping[str, Any]) -> None:
         """Handle a change of state of an executor's goal."""
 
+    def described(self) -> Mapping[str, str] | None:
+        """Name and weights of the policy that it runs; None without one."""
+        return None
+
     def help(self) -> str:
         """Instructions for the operator in this mode."""
         return ""

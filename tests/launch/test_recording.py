@@ -249,3 +249,10 @@ def test_recording_says_which_policy_acts_with_which_weights(runs: Runs, monkeyp
     runtime.session.episodes.begin()
     ticks(runtime, 2)
     assert "policy" not in notes.begun[1].metadata
+
+
+def test_first_episode_of_a_simulation_says_which_policy_acts(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runtime = runs.start("recording={type: lines}")
+    notes = Notes(runs.parts.MADE["recording"], monkeypatch)
+    ticks(runtime, 2)
+    assert json.loads(notes.begun[0].metadata["policy"])["model"] == "net"

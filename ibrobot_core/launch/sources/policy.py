@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import NoneType
 from typing import override
 
@@ -138,6 +139,10 @@ class PolicySource(SourceWorker):
             self._send, timeout_s, self._inference.prompt, self._model.units,
         )  # fmt: skip
         self._step_ns = contract.step_ns
+
+    @override
+    def described(self) -> Mapping[str, str]:
+        return self._model.described()
 
     def toggle_smoothing(self, enabled: bool) -> None:
         """Enable or disable the blending of chunks, from the next chunk on."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+from collections.abc import Mapping
 from typing import override
 
 import attrs
@@ -94,6 +95,10 @@ class Corrections(SourceWorker):
         self._commanded_ns = 0
         """How long the operator commanded [ns]."""
         self._changed_ns = 0
+
+    @override
+    def described(self) -> Mapping[str, str]:
+        return self._policy.described()
 
     @override
     def setup(self) -> None:

@@ -116,7 +116,7 @@ class RecordingWorker(SessionWorker):
                 session.config, self._config, topics, owned.path, mode=session.mode,
                 seed=session.request.seed + number - 1, stamp_ns=stamp_ns, lockstep=session.request.lockstep,
                 prompt=prompt, plugins=session.registry.versions(),
-                policy=session.acting.described() if session.acting is not None else None, factors=session.factors,
+                policy=session.command_source.described(), factors=session.factors,
             )  # fmt: skip
         except BaseException:
             owned.close()
