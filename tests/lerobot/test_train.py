@@ -101,11 +101,12 @@ def test_killed_training_continues_to_the_same_number_of_steps(
             assert process.poll() is None
             time.sleep(0.05)
         process.send_signal(number)
-        _, errors = process.communicate()
+        output, _ = process.communicate()
     kept = newest_checkpoint(out) if out.exists() else None
     if number == signal.SIGINT:
         assert kept is not None
-        assert f"interrupted; kept: {kept.folder} (step {kept.step}); the same command continues" in errors
+        said = f"interrupted; kept: {kept.folder} (step {kept.step}); the same training continues from there"
+        assert ended(output.splitlines())[-1] == {"event": "failed", "error": said}
     again = subprocess.run(command, capture_output=True, text=True, check=False)
     assert again.returncode == 0, again.stderr
     events = ended(again.stdout.splitlines())
