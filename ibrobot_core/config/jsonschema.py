@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import attrs
 
-from ibrobot_core.component_config import ComponentConfig, component_of
+from ibrobot_core.component_config import ComponentConfig, SceneConfig, component_of
 from ibrobot_core.config.schema import SECTIONS
 from ibrobot_core.config.show import plain
 from ibrobot_core.convert import is_literal, is_mapping, is_sequence, is_union
@@ -91,7 +91,13 @@ class _Schemas:
         return several
 
     def _of_component(self, kind: type[ComponentConfig]) -> Schema:
-        """The schema of a section with a `type`, which determines its further keys."""
+        """The schema of a section with a `type`, which determines its further keys; a scene may be its type alone."""
+        schema = self._of_typed(kind)
+        if not issubclass(kind, SceneConfig):
+            return schema
+        return {"anyOf": [{"type": "string", "enum": schema["properties"][kind.type_key()]["enum"]}, schema]}
+
+    def _of_typed(self, kind: type[ComponentConfig]) -> Schema:
         offered = [descriptor for descriptor in self.registry.of_kind(kind.plugin_kind) if kind.takes(descriptor)]
         own, key = self.of_fields(fields(kind)), kind.type_key()
         own["properties"][key]["enum"] = [descriptor.type for descriptor in offered]

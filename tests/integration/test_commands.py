@@ -77,6 +77,7 @@ WRONG_FILES = {
     "plan BAD --from rest --goal home": (),
     "service call /a --config BAD": (),
     "service list --config BAD": (),
+    "service show /a --config BAD": (),
     "task check BAD": (),
     "task check pick_cube BAD": (),
     "task run BAD": (),

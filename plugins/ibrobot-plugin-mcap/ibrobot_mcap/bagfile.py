@@ -59,9 +59,13 @@ class BagFile:
         self._writer: Any = Writer(
             cast(IO[Any], self._output), chunk_size=options.chunk_size, compression=_COMPRESSION[options.compression]
         )
-        with _whole_records(self._output):
-            self._writer.start("ros2", LIBRARY)
-            self._add_facts(facts)
+        try:
+            with _whole_records(self._output):
+                self._writer.start("ros2", LIBRARY)
+                self._add_facts(facts)
+        except BaseException:
+            self._output.close()
+            raise
 
     @property
     def size(self) -> int:
