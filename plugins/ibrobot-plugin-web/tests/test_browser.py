@@ -19,7 +19,7 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
     pytest.mark.skipif(("hardware", "mujoco") not in installed_plugins().entries, reason="needs ibrobot-plugin-mujoco"),
 ]
-WAIT_S = 30.0
+WAIT_S = 120.0
 PRESS_S = 2.0
 """Time in which a press is held, or counts as released by a stall of the page [s]."""
 REST_NS = 300_000_000
