@@ -88,7 +88,7 @@ class TestPictures:
             return devices.pop()
 
         monkeypatch.setattr(capture_module.Capture, "_open", open_once)
-        monkeypatch.setattr(camera_module, "find_device", lambda device, name: Device("v4l2", "/dev/video7"))
+        monkeypatch.setattr(camera_module, "find_device", lambda device: Device("v4l2", "/dev/video7"))
         options = OpenCvOptions(device=7, strict=False, reconnect_timeout=0.0)
         camera = camera_module.OpenCvCamera(options, host_context("top", clock=RealClock()))
         camera.open()
