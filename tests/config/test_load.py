@@ -239,7 +239,7 @@ def test_shipped_configs_are_found_by_name(
 def test_an_unknown_config_names_the_known(registry: Registry) -> None:
     with pytest.raises(ConfigError, match=r"^minni: no such file, and no config of this name, did you mean 'mini'\?$"):
         find_config("minni", registry)
-    with pytest.raises(ConfigError, match=r"the configs are: bi_so101, so101.*, mini$"):
+    with pytest.raises(ConfigError, match=r"the configs are: bi_so101, .*so101.*, mini$"):
         find_config("zzzzz", registry)
     with pytest.raises(ConfigError, match=r"^no/where\.yaml: no such file$"):
         find_config("no/where.yaml", registry)

@@ -113,7 +113,8 @@ def run_here(command: Sequence[str], **_: Any) -> subprocess.CompletedProcess[st
     """A command in this process, which is faster."""
     group, *arguments = command[len(IBROBOT) :]
     result = CliRunner().invoke(installed_plugins().commands[group].load(), arguments, catch_exceptions=False)
-    return subprocess.CompletedProcess(command, result.exit_code, result.stdout, result.stderr)
+    errors = result.stderr if result.stderr_bytes is not None else ""  # the oldest click mixes it into stdout
+    return subprocess.CompletedProcess(command, result.exit_code, result.stdout, errors)
 
 
 def test_episodes_are_judged_trimmed_deleted_and_restored(
