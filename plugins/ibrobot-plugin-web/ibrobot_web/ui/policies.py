@@ -75,9 +75,6 @@ def _edited(ui: Ui, request: Change) -> tuple[Path, Path, ModelEdit]:
     """The robot's file, the file to write, and its new text. Files outside the opened folders are copied into them."""
     source = Path(find_config(robot_of(ui, request.robot), installed_plugins())).resolve()
     checkpoint = ui.folders.find(request.checkpoint)
-    type_ = policy_type(checkpoint)
-    if type_ is None:
-        raise IbrobotError(f"{ui.folders.name(checkpoint)}: is not a trained policy of an installed plugin")
     inside = any(source.is_relative_to(folder) for folder in ui.folders.paths)
     target = source if inside else ui.folders.first / f"{source.stem}_trained.yaml"
     given = request.target
@@ -85,6 +82,9 @@ def _edited(ui: Ui, request: Change) -> tuple[Path, Path, ModelEdit]:
         target = ui.folders.find(given)
     if target.suffix not in (".yaml", ".yml"):
         raise IbrobotError(f"{ui.folders.name(target)}: a robot's file must end with .yaml")
+    type_ = policy_type(checkpoint)
+    if type_ is None:
+        raise IbrobotError(f"{ui.folders.name(checkpoint)}: is not a trained policy of an installed plugin")
     text = source.read_text(encoding="utf-8")
     return source, target, with_model(text, str(checkpoint), type_, model=request.model, mode=request.mode)
 
