@@ -178,7 +178,7 @@ class _Signals:
 
     def _stop(self, number: int) -> None:
         session = self._session
-        if session.finished.is_set() and number == signal.SIGINT:
+        if self.came and number == signal.SIGINT:
             if self._keys is not None:
                 self._keys.close()
             os._exit(_INTERRUPTED_TWICE)
