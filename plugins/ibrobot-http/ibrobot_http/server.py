@@ -27,7 +27,7 @@ _CLOSING_S = 0.05
 """Time at the end in which connections close [s]."""
 _log = logging.getLogger("ibrobot.http")
 _quiet = logging.getLogger("ibrobot.http.clients")
-_quiet.setLevel(logging.CRITICAL)  # clients that send what is no HTTP are no news
+_quiet.setLevel(logging.CRITICAL)  # not a fault of the server: clients that send no HTTP
 
 
 class HttpServer:
@@ -180,7 +180,7 @@ async def _contained(
 
 
 def _quiet_about_clients(loop: asyncio.AbstractEventLoop, context: Mapping[str, Any]) -> None:
-    """Connections that clients break, e.g. in the handshake of TLS, are no news; all else is."""
+    """Log everything but connections that clients break, e.g. in the handshake of TLS."""
     if "transport" in context or "protocol" in context:
         _log.debug("%s", context["message"], exc_info=context.get("exception"))
     else:

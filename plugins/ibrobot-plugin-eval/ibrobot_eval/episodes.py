@@ -89,19 +89,8 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str, go_on: Call
     request = LaunchRequest(lockstep=True, seed=seed, episodes=1)
     runtime = Runtime(Session(config, registry, request))
     session = runtime.session
-    runtime.start()
-    acting: Mapping[str, str] = {}
-    try:
-        while going := go_on():
-            if session.acting is not None and not acting:
-                acting = session.acting.described()
-            if runtime.step():
-                break
-    finally:
-        runtime.stop()
-    if not going:
+    if not run_to_end(runtime, go_on):
         return
-    runtime.raise_failure()
     if session.state is None or session.state.success is None:
         raise ComponentFailed(f"{config.source}: the scene has no task, so nothing tells a success from a failure")
     time_s = seconds(session.clock.now_ns() - session.episodes.begun_ns)
@@ -112,7 +101,7 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str, go_on: Call
     happened = {kind: count for kind, count in counts["safety"].items() if count and kind not in NO_INTERVENTION}
     result = Result(
         seed, session.outcome.successes == 1, round(time_s, 6), happened, tuple(session.outcome.faults),
-        json.loads(metadata.get("factors", "{}")) | varied, acting,
+        json.loads(metadata.get("factors", "{}")) | varied, json.loads(metadata.get("policy", "{}")),
     )  # fmt: skip
     shutil.rmtree(place.episode, ignore_errors=True)  # of a run that was killed before it wrote the result
     place.episode.parent.mkdir(parents=True, exist_ok=True)
@@ -123,6 +112,24 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str, go_on: Call
 
 NO_INTERVENTION = ("missing", "estop")
 """Counts of the safety layer that are no interventions: ticks without a request, and emergency stops."""
+
+
+def run_to_end(runtime: Runtime, go_on: Callable[[], bool]) -> bool:
+    """Run in lockstep; return whether it came to its end, and was not given up.
+
+    Raises:
+        IbrobotError: if a component fails.
+    """
+    runtime.start()
+    try:
+        while going := go_on():
+            if runtime.step():
+                break
+    finally:
+        runtime.stop()
+    if going:
+        runtime.raise_failure()
+    return going
 
 
 def _checked(bags: list[Path], outcome: str, faults: list[str]) -> Mapping[str, str]:

@@ -22,7 +22,7 @@ from ibrobot_core.app import (
     installed_plugins,
     load_config,
 )
-from ibrobot_eval.episodes import Result, write
+from ibrobot_eval.episodes import Result, run_to_end, write
 from ibrobot_eval.policies import Policy
 
 _CAMERA = "evaluation_film"
@@ -62,16 +62,8 @@ def film(file: Path, policy: Policy, result: Result, go_on: Callable[[], bool] =
     runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=result.seed, episodes=1)))
     session = runtime.session
     images = session.bus.subscribe(f"/camera/{_CAMERA}/image_raw", _DEPTH)
-    runtime.start()
-    try:
-        while going := go_on():
-            if runtime.step():
-                break
-    finally:
-        runtime.stop()
-    if not going:
+    if not run_to_end(runtime, go_on):
         return
-    runtime.raise_failure()
     time_s = round(seconds(session.clock.now_ns() - session.episodes.begun_ns), 6)
     if (bool(session.outcome.successes), time_s) != (result.success, result.time_s):
         raise ComponentFailed("the episode did not end as before when it was run again for its video")
