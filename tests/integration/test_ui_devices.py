@@ -56,8 +56,6 @@ async def until(server: UiServer, what: str) -> dict[str, Any]:
 def test_an_arm_is_calibrated_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from ibrobot_feetech.emulator import Emulator
 
-    # A busy machine may keep the emulator, a thread of this process, from answering for a while.
-    monkeypatch.setattr("ibrobot_feetech.bus._ADAPTER_S", 3.0)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
 
     async def test(server: UiServer) -> None:
@@ -78,7 +76,7 @@ def test_an_arm_is_calibrated_on_the_page(tmp_path: Path, monkeypatch: pytest.Mo
         hand.moves = True
         async with asyncio.timeout(30):
             while True:
-                ask = (await server.get("devices/state"))["ask"]
+                ask = (await until(server, "to both ends"))["ask"]
                 spans = {int(row[0]): int(row[5]) for row in ask.get("rows", ())}
                 if spans == {servo: high - low for servo, (low, high) in ENDS.items()}:
                     break

@@ -47,14 +47,17 @@ class FeetechBus:
         baud_rate: [baud].
         joints: servo id -> joint, for the messages of errors.
         retries: how often to repeat a failed request before raising an error.
+        patience_s: how much longer than usual to wait for replies, where nothing is waiting for them [s].
     """
 
     def __init__(
-        self, port: str, *, baud_rate: int = 1_000_000, joints: Mapping[int, str] | None = None, retries: int = 2
-    ) -> None:
+        self, port: str, *, baud_rate: int = 1_000_000, joints: Mapping[int, str] | None = None, retries: int = 2,
+        patience_s: float = 0.0,
+    ) -> None:  # fmt: skip
         self.port = SerialPort(port, baud_rate)
         self.joints = dict(joints or {})
         self.retries = retries
+        self.patience_s = patience_s
         self.return_delay_s = RETURN_DELAY_S
         """Delay of every servo before it answers [s]; shorter once the servos are configured."""
         self.counters: Counter[str] = Counter(
@@ -373,7 +376,7 @@ class FeetechBus:
     def timeout(self, sent: int, expected: int, servos: int = 1) -> float:
         """How long to wait for replies [s]: wire time of request and replies, plus the delays on both sides."""
         wire_s = (sent + expected) * _BITS_PER_BYTE / self.port.baud_rate
-        return wire_s + servos * self.return_delay_s + _ADAPTER_S
+        return wire_s + servos * self.return_delay_s + _ADAPTER_S + self.patience_s
 
     def _retried[T](self, act: Callable[[], T]) -> T:
         for attempt in range(self.retries + 1):

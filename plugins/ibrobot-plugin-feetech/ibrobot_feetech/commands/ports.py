@@ -15,6 +15,8 @@ from ibrobot_feetech.usb import ADAPTER_VENDOR, usb_ports
 
 _RETRIES = 5
 """Retries of the commands, which have no deadline."""
+_PATIENCE_S = 0.05
+"""How much longer than a control loop the commands wait for a reply [s]."""
 
 
 def the_port(port: str | None) -> str:
@@ -44,7 +46,10 @@ def port_argument[F: Callable[..., Any]](command: F) -> F:
 
 @contextmanager
 def opened(
-    port: str | None, baud_rate: int = 1_000_000, joints: Mapping[int, str] | None = None
+    port: str | None,
+    baud_rate: int = 1_000_000,
+    joints: Mapping[int, str] | None = None,
+    patience_s: float = _PATIENCE_S,
 ) -> Iterator[FeetechBus]:
     """Open a bus at the given port, or at the only port with an SO-101 adapter.
 
@@ -52,7 +57,7 @@ def opened(
         HardwareError: if it cannot be opened.
     """
     with wrong_input():
-        bus = FeetechBus(the_port(port), baud_rate=baud_rate, joints=joints, retries=_RETRIES)
+        bus = FeetechBus(the_port(port), baud_rate=baud_rate, joints=joints, retries=_RETRIES, patience_s=patience_s)
         bus.open()
     try:
         yield bus

@@ -38,7 +38,7 @@ def scan(port: str | None, baud: tuple[int, ...]) -> None:
     """List the servos that answer: id, model, firmware, baud rate. Exit with 1 if there are none."""
     names = by_servo(joints_of())
     found = table(">id", "joint of an SO-101", "model", "firmware", ">baud")
-    with opened(port, baud[0]) as bus:
+    with opened(port, baud[0], patience_s=0.0) as bus:  # most ids have no servo
         for (servo, rate), model in search(bus, baud).items():
             bus.port.set_baud_rate(rate)
             firmware = ".".join(str(bus.read_faulty(servo, f"firmware_{part}")) for part in ("major", "minor"))
