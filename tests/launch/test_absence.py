@@ -10,7 +10,7 @@ import pytest
 from ibrobot_core.errors import ComponentFailed, MissingDependency
 
 if TYPE_CHECKING:
-    from tests.launch.conftest import Runs
+    from fake_runs import Runs
 
 REMEDY = "no OpenGL; sudo apt-get install libegl1 libopengl0"
 SEER = ("models.seer={type: seeing}", "control_modes.policy.inference.model=seer")

@@ -12,8 +12,9 @@ from ibrobot_core.launch.runtime import RESET, SET_MODE
 from ibrobot_core.messages import RobotStatus
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
+
     from ibrobot_core.launch.runtime import Runtime
-    from tests.launch.conftest import Runs
 
 
 @pytest.fixture

@@ -11,8 +11,9 @@ from ibrobot_core.errors import ComponentFailed, TeleopError
 from ibrobot_core.interfaces import JointReading, TeleopCommand
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
+
     from ibrobot_core.launch.runtime import Runtime
-    from tests.launch.conftest import Runs
 
 TWO = (
     "control_modes.teleop.teleop={arm: left, gripper: right}",

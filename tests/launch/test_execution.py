@@ -12,9 +12,8 @@ from ibrobot_core.errors import ComponentFailed, ConfigError
 from ibrobot_core.messages import DiagnosticArray, RobotStatus
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
     from ibrobot_testing.site import Site
-
-    from tests.launch.conftest import Runs
 
 MODE = "control_modes.policy.inference.execution_mode={}"
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
     from ibrobot_testing.site import Site
-
-    from tests.launch.conftest import Runs
 
 
 @pytest.fixture(autouse=True)

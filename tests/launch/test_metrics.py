@@ -13,10 +13,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from ibrobot_core.errors import ComponentFailed, ConfigError, SensorError
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
     from ibrobot_testing.site import Site
 
     from ibrobot_core.launch.runtime import Runtime
-    from tests.launch.conftest import Runs
 
 
 pytestmark = pytest.mark.integration

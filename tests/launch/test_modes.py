@@ -10,7 +10,7 @@ from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported
 from ibrobot_core.launch.runtime import SET_MODE, Runtime
 
 if TYPE_CHECKING:
-    from tests.launch.conftest import Runs
+    from fake_runs import Runs
 
 
 def seconds(runtime: Runtime, duration: float) -> None:

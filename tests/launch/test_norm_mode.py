@@ -15,7 +15,7 @@ from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.interfaces import Frame
 
 if TYPE_CHECKING:
-    from tests.launch.conftest import Runs
+    from fake_runs import Runs
 
 
 RANGE = (1000, 3000)

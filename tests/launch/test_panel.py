@@ -15,8 +15,9 @@ from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
 from ibrobot_core.screen import Screen
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
+
     from ibrobot_core.launch.runtime import Runtime
-    from tests.launch.conftest import Runs
 
 SIZES = [(80, 24), (40, 24), (40, 12)]
 FAULT = (

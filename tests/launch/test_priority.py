@@ -12,7 +12,7 @@ from ibrobot_core.component import Worker
 from ibrobot_core.launch.perception import SensorWorker
 
 if TYPE_CHECKING:
-    from tests.launch.conftest import Runs
+    from fake_runs import Runs
 
 
 class Patient(Worker):

@@ -17,7 +17,7 @@ from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import DiagnosticArray, DiagnosticStatus, KeyValue
 
 if TYPE_CHECKING:
-    from tests.launch.conftest import Runs
+    from fake_runs import Runs
 
 
 def steps(runtime: Runtime, count: int) -> None:
@@ -51,12 +51,12 @@ def watch(runtime: Runtime, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.mark.parametrize("mode", ["policy", "teleop", "plan", "idle"])
 def test_nothing_stands_in_the_plan_before_what_it_needs(runs: Runs, mode: str):
-    runtime = runs.make("recording={type: lines}", mode=mode)
+    runtime = runs.make(mode=mode)
     begun: set[str] = set()
     for component in runtime.plan.components:
         assert set(component.needs) <= begun, component.name
         begun.add(component.name)
-    assert {"control", "sensor:top", "sensor:side", "recording", "status"} <= begun
+    assert {"control", "sensor:top", "sensor:side", "status"} <= begun
     assert (f"mode:{mode}" in begun) == (mode != "idle")
     assert ("model:net" in begun) == ("episodes" in begun) == (mode == "policy")
 
@@ -77,7 +77,7 @@ def test_the_plan_in_words(runs: Runs):
 
 
 def test_all_start_in_order_and_stop_in_reverse(runs: Runs, monkeypatch: pytest.MonkeyPatch):
-    runtime = runs.make("recording={type: lines}")
+    runtime = runs.make()
     names = [component.name for component in runtime.plan.components]
     happened = watch(runtime, monkeypatch)
     runtime.start()

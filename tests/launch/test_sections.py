@@ -11,10 +11,10 @@ from ibrobot_core.errors import TransportError
 from ibrobot_core.messages import Int32, String
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
     from ibrobot_testing.site import Site
 
     from ibrobot_core.launch.runtime import Runtime
-    from tests.launch.conftest import Runs
 
 
 @pytest.fixture(autouse=True)

@@ -10,9 +10,10 @@ from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.launch.sources.teleop import TeleopSource
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
+
     from ibrobot_core.config.schema import ControlMode
     from ibrobot_core.launch.session import Session
-    from tests.launch.conftest import Runs
 
 
 class Raise(SourceWorker):

@@ -14,7 +14,7 @@ from ibrobot_core.control.link import ControlState
 from ibrobot_core.interfaces import JointReading, TeleopCommand
 
 if TYPE_CHECKING:
-    from tests.launch.conftest import Runs
+    from fake_runs import Runs
 
 
 @pytest.fixture
@@ -111,22 +111,3 @@ def test_a_new_state_wakes_who_waits(runs: Runs) -> None:
     session.take_state(state(1))
     waiting.join(30.0)
     assert [each.tick for each in got] == [1]
-
-
-def test_each_state_says_who_commanded_however_late_the_operator_is(runs: Runs) -> None:
-    """The labels come with the states, not from the thread of the operator's devices."""
-    pytest.importorskip("ibrobot_data")
-    run = runs.start(
-        "control_modes.policy.inference={model: net, intervene: lever}", "contract.max_duration_s=100", seed=13
-    )
-    for _ in range(5):
-        run.step()
-    labels = run.session.bus.subscribe("/commander", 1000)
-    commands = run.session.bus.subscribe("/arm/commands", 1000)
-    labels.drain()  # the latched one
-    control: Any = run.session.control
-    for _ in range(30):
-        control.step()  # control alone
-    assert len(commands.drain()) == 30
-    said: list[Any] = [item.message for item in labels.drain()]
-    assert [message.data for message in said] == ["policy"] * 30

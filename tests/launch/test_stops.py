@@ -19,7 +19,7 @@ from ibrobot_core.run_hooks import RunHooks
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from tests.launch.conftest import Runs
+    from fake_runs import Runs
 
 PATIENCE_S = 30.0
 AFTER = "refused, an emergency stop came after it was requested"

@@ -37,7 +37,7 @@ DESCRIPTORS = {descriptor.type: descriptor for descriptor in ibrobot_engines()}
 @pytest.fixture
 def config(site: Site, tmp_path: Path) -> RobotConfig:
     """A robot with a fake policy that other processes can make as well."""
-    site.add("net-parts", "inference_parts.py")
+    site.add("net-parts", Path(__file__).with_name("inference_parts.py"))
     (tmp_path / "mini.yaml").write_text(ROBOT)
     return load_config(tmp_path / "mini.yaml", sim=True)
 

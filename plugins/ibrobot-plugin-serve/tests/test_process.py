@@ -38,7 +38,7 @@ ROBOT = textwrap.dedent("""\
 
 @pytest.fixture
 def config(site: Site, tmp_path: Path) -> RobotConfig:
-    site.add("net-parts", "inference_parts.py")
+    site.add("net-parts", Path(__file__).with_name("inference_parts.py"))
     (tmp_path / "mini.yaml").write_text(ROBOT)
     return load_config(tmp_path / "mini.yaml", sim=True)
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
+from fake_runs import runs, site
 from ibrobot_zenoh import reasons
 
 from .pair import client, free_endpoint, made, router
+
+__all__ = ["runs", "site"]
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -17,9 +17,8 @@ from ibrobot_core.services import Service
 from ibrobot_core.units import NS_PER_S
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
     from ibrobot_testing.site import Site
-
-    from tests.launch.conftest import Runs
 
 
 @pytest.fixture

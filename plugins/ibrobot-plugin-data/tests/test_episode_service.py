@@ -18,8 +18,9 @@ from ibrobot_core.launch.runtime import ESTOP, RESET
 from ibrobot_core.ownership import Ownership
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
+
     from ibrobot_core.launch.runtime import Runtime
-    from tests.launch.conftest import Runs
 
 RECORDING = "recording={type: lines, root: kept, dataset: pick}"
 

@@ -27,8 +27,9 @@ from ibrobot_core.plugins import Registry
 from ibrobot_core.units import NS_PER_S, ns
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
+
     from ibrobot_core.launch.runtime import Runtime
-    from tests.launch.conftest import Runs
 
 INTERLEAVINGS = int(os.environ.get("IBROBOT_INTERLEAVINGS", "240"))
 PARTS = 8

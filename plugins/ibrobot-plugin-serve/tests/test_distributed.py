@@ -17,10 +17,10 @@ from ibrobot_core.errors import ComponentFailed
 from ibrobot_core.messages import DiagnosticArray
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
     from ibrobot_testing.site import Site
 
     from ibrobot_core.launch.runtime import Runtime
-    from tests.launch.conftest import Runs
 
 pytestmark = pytest.mark.integration
 

@@ -15,11 +15,11 @@ from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
 from ibrobot_core.robot import Vector
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
     from ibrobot_testing.fakes import FakeTeleop
 
     from ibrobot_core.bus import Subscription
     from ibrobot_core.launch.runtime import Runtime
-    from tests.launch.conftest import Runs
 
 POLICY = "control_modes.policy.inference={{model: net, intervene: {}}}"
 SLACK = 1.001

@@ -15,8 +15,9 @@ from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
 from ibrobot_core.messages import String
 
 if TYPE_CHECKING:
+    from fake_runs import Runs
+
     from ibrobot_core.launch.runtime import Runtime
-    from tests.launch.conftest import Runs
 
 
 class Notes:
