@@ -7,18 +7,10 @@ import signal
 import sys
 import threading
 import time
-from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 
 import pytest
 from ibrobot_data import run
-
-
-@pytest.fixture(scope="module")
-def fork_server() -> None:
-    """It lives as long as the interpreter, as does the memory of the first value, so they are not leaks."""
-    multiprocessing.get_context("forkserver").Value("q", 0)
-    forkserver.ensure_running()
 
 
 def _deaf(ready: Connection) -> None:
