@@ -205,15 +205,8 @@ def lerobot(session: nox.Session) -> None:
     session.run(*PYTEST, "-m", "lerobot", *marked("lerobot"), *session.posargs)
 
 
-@nox.session
-def wheels(session: nox.Session) -> None:
-    """Whether everything, with all extras, installs from wheels on each platform; what is installed runs by itself."""
-    projects = [str(folder / "pyproject.toml") for folder in LOCAL.values()]
-    options = ("--quiet", "--all-extras", "-c", "constraints.txt", "--only-binary", ":all:", "--python-version", "3.12")
-    for platform in PLATFORMS:
-        session.run("uv", "pip", "compile", *options, "--python-platform", platform, "-o", os.devnull, *projects)
-    folder = Path(session.create_tmp()).absolute()
-    session.run("uv", "build", "--quiet", "--all-packages", "--wheel", "--out-dir", str(folder / "dist"))
+def check_wheels(session: nox.Session, folder: Path) -> None:
+    """What the wheels in `folder / "dist"` install runs by itself, as the pages say; environments land in `folder`."""
     for page in ("README.md", "plugins/ibrobot-plugin-feetech/README.md"):
         requirement, *commands = installation(page)
         environment = folder / requirement
@@ -229,6 +222,34 @@ def wheels(session: nox.Session) -> None:
     emulated = Path("tests/house/launch_on_emulators.py").absolute()
     with session.chdir(folder):
         session.run("python", str(emulated), str(folder / "ibrobot-plugin-feetech/bin/ibrobot"))
+
+
+@nox.session
+def wheels(session: nox.Session) -> None:
+    """Whether everything, with all extras, installs from wheels on each platform; what is installed runs by itself."""
+    projects = [str(folder / "pyproject.toml") for folder in LOCAL.values()]
+    options = ("--quiet", "--all-extras", "-c", "constraints.txt", "--only-binary", ":all:", "--python-version", "3.12")
+    for platform in PLATFORMS:
+        session.run("uv", "pip", "compile", *options, "--python-platform", platform, "-o", os.devnull, *projects)
+    folder = Path(session.create_tmp()).absolute()
+    session.run("uv", "build", "--quiet", "--all-packages", "--wheel", "--out-dir", str(folder / "dist"))
+    check_wheels(session, folder)
+
+
+@nox.session(default=False)
+def release(session: nox.Session) -> None:
+    """A version from its number to checked wheels: `-- X.Y.Z`. Uploads nothing; CONTRIBUTING.md says what follows."""
+    session.install("towncrier", "twine")
+    session.run("python", "tests/house/set_version.py", *session.posargs)
+    session.run("towncrier", "build", "--yes", "--version", session.posargs[0])
+    folder = Path(session.create_tmp()).absolute()
+    shutil.rmtree(folder / "dist", ignore_errors=True)
+    session.run("uv", "build", "--quiet", "--all-packages", "--out-dir", str(folder / "dist"))
+    session.run("twine", "check", "--strict", *map(str, sorted((folder / "dist").glob("*.*"))))
+    check_wheels(session, folder)
+    session.run("git", "commit", "--quiet", "--all", "-m", f"Version {session.posargs[0]}", external=True)
+    session.run("git", "tag", f"v{session.posargs[0]}", external=True)
+    session.log(f"committed and tagged; the files are in {folder / 'dist'}")
 
 
 @nox.session
