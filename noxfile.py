@@ -245,7 +245,7 @@ def release(session: nox.Session) -> None:
     folder = Path(session.create_tmp()).absolute()
     shutil.rmtree(folder / "dist", ignore_errors=True)
     session.run("uv", "build", "--quiet", "--all-packages", "--out-dir", str(folder / "dist"))
-    session.run("twine", "check", "--strict", *map(str, sorted((folder / "dist").glob("*.*"))))
+    session.run("twine", "check", "--strict", *map(str, sorted((folder / "dist").glob("*-*"))))
     check_wheels(session, folder)
     session.run("git", "commit", "--quiet", "--all", "-m", f"Version {session.posargs[0]}", external=True)
     session.run("git", "tag", f"v{session.posargs[0]}", external=True)
