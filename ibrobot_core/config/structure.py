@@ -277,9 +277,13 @@ class SectionParser:
         return None
 
     def _options(
-        self, key: Key, descriptor: Descriptor[Any], kind: type[ComponentConfig], value: Mapping[str, Any],
+        self,
+        key: Key,
+        descriptor: Descriptor[Any],
+        kind: type[ComponentConfig],
+        value: Mapping[str, Any],
         faults: Faults,
-    ) -> Any:  # fmt: skip
+    ) -> Any:
         own = fields(kind)
         known = {name: field for name, field in fields(descriptor.options).items() if name not in own}
         for name in value:

@@ -13,8 +13,11 @@ _PIN = re.compile(r'"(?P<name>(?:lerobot-env-)?ibrobot[a-z0-9-]*(?:\[[a-z0-9,]*\
 
 def projects() -> list[Path]:
     """The `pyproject.toml` of every distribution, core's first, and those of the examples."""
-    return [ROOT / "pyproject.toml", *sorted((ROOT / "plugins").glob("*/pyproject.toml")),
-            *sorted((ROOT / "tests/examples").glob("*/pyproject.toml"))]  # fmt: skip
+    return [
+        ROOT / "pyproject.toml",
+        *sorted((ROOT / "plugins").glob("*/pyproject.toml")),
+        *sorted((ROOT / "tests/examples").glob("*/pyproject.toml")),
+    ]
 
 
 def version_of(project: Path) -> str:

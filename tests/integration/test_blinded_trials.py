@@ -64,8 +64,12 @@ class Terminal:
         program = "from ibrobot_core.cli.command import main; main()"
         self.process = subprocess.Popen(
             [sys.executable, "-c", program, *(words or command())],
-            cwd=folder, stdin=slave, stdout=slave, stderr=slave, start_new_session=True,
-        )  # fmt: skip
+            cwd=folder,
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            start_new_session=True,
+        )
         os.close(slave)
         self.shown = ""
         self._seen = 0

@@ -76,8 +76,12 @@ class Started:
         program = "from ibrobot_core.cli.command import main; main()"
         self.process = subprocess.Popen(
             [sys.executable, "-c", program, *arguments(*more)],
-            cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        )  # fmt: skip
+            cwd=folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
 
     def await_episode(self) -> str:
         """Wait for the next episode."""

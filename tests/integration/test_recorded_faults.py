@@ -110,10 +110,13 @@ def begin(tmp_path: Path, ibrobot: tuple[str, ...]) -> Iterator[Callable[[int], 
                 servo.set("max_position_limit", 3100)
             joint = "    - {{name: {}, lower: -1.5, upper: 1.5, max_velocity: 3.0, max_acceleration: 40.0}}"
             text = ROBOT.format(
-                joints="\n".join(map(joint.format, JOINTS)), names=", ".join(JOINTS), port=emulator.port,
-                folder=tmp_path, patience=f"lost_replies: {lost}, retries: 200",
+                joints="\n".join(map(joint.format, JOINTS)),
+                names=", ".join(JOINTS),
+                port=emulator.port,
+                folder=tmp_path,
+                patience=f"lost_replies: {lost}, retries: 200",
                 positions=", ".join(f"position.{name}" for name in JOINTS),
-            )  # fmt: skip
+            )
             (tmp_path / "arm.yaml").write_text(text)
             with (tmp_path / "err").open("w") as err:
                 command = [*ibrobot, "launch", str(tmp_path / "arm.yaml"), "--headless"]
@@ -143,9 +146,13 @@ def test_replies_that_fail_for_a_time_are_gaps(begin: Callable[[int], Bench]) ->
     bench.go_on(STATES)
     faults = bench.emulator.faults
     passing: list[dict[str, Any]] = [
-        {"silent": {2}}, {"drop": 1.0}, {"corrupt": 1.0}, {"late": 1.0, "late_s": 0.05}, {"delay_s": 0.05},
+        {"silent": {2}},
+        {"drop": 1.0},
+        {"corrupt": 1.0},
+        {"late": 1.0, "late_s": 0.05},
+        {"delay_s": 0.05},
         {"drop": 0.2, "corrupt": 0.002, "duplicate": 0.2},
-    ]  # fmt: skip
+    ]
     for fault in passing:
         before = {name: getattr(faults, name) for name in fault}
         for name, value in fault.items():

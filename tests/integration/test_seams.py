@@ -216,9 +216,11 @@ def check_flags(declared: Mapping[str, Command]) -> None:
         package = Path(inspect.getfile(import_module(module))).parent
         named = {
             flag_of(name, field)
-            for command in declared.values() if command.events and command.load.__module__ == module
-            for name, field in fields(command.options).items() if field.metadata["label"] is not None
-        }  # fmt: skip
+            for command in declared.values()
+            if command.events and command.load.__module__ == module
+            for name, field in fields(command.options).items()
+            if field.metadata["label"] is not None
+        }
         found = {
             (flag, file) for flag, file in flags_in_errors(package) if not file.startswith("replay")
         }  # no page replays

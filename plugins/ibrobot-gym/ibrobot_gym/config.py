@@ -13,9 +13,13 @@ RENDERED = "gym_render"
 
 
 def environment_config(
-    name: str, scene: str | None, cameras: Sequence[str], size: tuple[int, int], rendered: str | None,
+    name: str,
+    scene: str | None,
+    cameras: Sequence[str],
+    size: tuple[int, int],
+    rendered: str | None,
     overrides: Sequence[str],
-) -> RobotConfig:  # fmt: skip
+) -> RobotConfig:
     """A config with its scene and cameras.
 
     Args:

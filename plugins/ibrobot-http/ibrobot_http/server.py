@@ -48,9 +48,13 @@ class HttpServer:
         app.on_response_prepare.append(guard.add_headers)
         self._listener = guard.listener
         self._runner = web.AppRunner(
-            app, access_log=None, logger=_quiet, keepalive_timeout=guarding.REQUEST_S, lingering_time=_LINGER_S,
+            app,
+            access_log=None,
+            logger=_quiet,
+            keepalive_timeout=guarding.REQUEST_S,
+            lingering_time=_LINGER_S,
             shutdown_timeout=close_s,
-        )  # fmt: skip
+        )
         self._server: asyncio.Server | None = None
 
     async def __aenter__(self) -> Self:
@@ -61,9 +65,11 @@ class HttpServer:
         tls = self._listener.tls
         self._door = _Door(self._listener.socket)
         self._server = await loop.create_server(
-            self._runner.server, sock=self._door, ssl=tls,
+            self._runner.server,
+            sock=self._door,
+            ssl=tls,
             ssl_handshake_timeout=None if tls is None else guarding.REQUEST_S,
-        )  # fmt: skip
+        )
         return self
 
     async def __aexit__(

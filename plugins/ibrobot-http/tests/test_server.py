@@ -75,9 +75,13 @@ def small_page(folder: Path, *, tls: bool = False, **options: Any) -> Iterator[S
     with contextlib.closing(server):
         links = tuple(guard.path(role) for role in ("drive", "watch"))
         yield Served(
-            guard.listener.url, ("/", "/api/role"), ("/api/echo",), ("/socket",), links,
+            guard.listener.url,
+            ("/", "/api/role"),
+            ("/api/echo",),
+            ("/socket",),
+            links,
             other_sites_link=options.get("other_sites_link", False),
-        )  # fmt: skip
+        )
 
 
 class TestPage(HttpSuite):
@@ -317,8 +321,12 @@ def test_names_of_a_server() -> None:
     assert host_names("192.168.1.5") == ("192.168.1.5", name, f"{name}.local", *LOCAL)
     assert host_names("0.0.0.0", ["robot.lab"])[:3] == (name, f"{name}.local", "robot.lab")
     assert [is_loopback(host) for host in ("localhost", "::1", "127.9.9.9", "0.0.0.0", "robot.lab")] == [
-        True, True, True, False, False,
-    ]  # fmt: skip
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_addresses_of_ipv6_stand_in_brackets() -> None:

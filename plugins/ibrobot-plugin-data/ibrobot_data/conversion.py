@@ -44,9 +44,13 @@ class ConvertOptions:
         "all", choices=ONLY, label="Rows", more=True, help="rows to keep; each stretch of them becomes an episode"
     )
     context: float = option(
-        2.0, ge=0, unit="s", label="Around interventions", more=True,
+        2.0,
+        ge=0,
+        unit="s",
+        label="Around interventions",
+        more=True,
         help="time to keep before and after an intervention, if only interventions are kept",
-    )  # fmt: skip
+    )
     missing: str = option(
         "skip",
         choices=MISSING,
@@ -64,9 +68,12 @@ class ConvertOptions:
         False, label="Any robot", more=True, help="merge episodes of different robots, robot types or calibrations"
     )
     config: str | None = option(
-        None, names="robot", label="Robot YAML", more=True,
+        None,
+        names="robot",
+        label="Robot YAML",
+        more=True,
         help="robot YAML, or a YAML with only a contract, for episodes of other programs",
-    )  # fmt: skip
+    )
     force_contract: bool = option(
         False,
         label="Contract of the YAML",
@@ -138,10 +145,13 @@ class Report(Event):
     @override
     def shown(self) -> Shown:
         counts = {
-            "left out": self.failed, "passed over": self.passed_over, "ticks skipped": self.skipped_ticks,
-            "ticks held": self.held_ticks, "messages lost in recording": self.lost_messages,
+            "left out": self.failed,
+            "passed over": self.passed_over,
+            "ticks skipped": self.skipped_ticks,
+            "ticks held": self.held_ticks,
+            "messages lost in recording": self.lost_messages,
             "without a task": self.without_prompt,
-        }  # fmt: skip
+        }
         others = "".join(f", {name} {count}" for name, count in counts.items() if count)
         text = f"{self.episodes} {plural(self.episodes, 'episode')}, {self.frames} frames{others}"
         made = {"dataset": self.out} if self.episodes else {}

@@ -34,9 +34,11 @@ class RecordOptions:
         None, ge=1, label="Episodes", help="number of episodes after which the session ends; without one, it goes on"
     )
     auto: bool = option(
-        False, label="Automatic", more=True,
+        False,
+        label="Automatic",
+        more=True,
         help="begin episodes automatically; end them after contract.max_duration_s",
-    )  # fmt: skip
+    )
     continuous: bool = option(
         False, label="Without a break", more=True, help="record one episode, from the start of the run to its end"
     )

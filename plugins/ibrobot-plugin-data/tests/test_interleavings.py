@@ -296,10 +296,12 @@ def test_after_a_stop_nothing_moves_before_a_reset_that_saw_it(runs: Runs, lever
     for seed in range(part, INTERLEAVINGS, PARTS):
         draw = random.Random(seed)
         run = runs.make(
-            "control_modes.policy.inference={model: net, intervene: lever}", "control_modes.teleop.teleop=lever",
-            f"control.startup={draw.choice(('hold', 'pose up'))}", f"control.stop={draw.choice(('hold', 'pose up'))}",
+            "control_modes.policy.inference={model: net, intervene: lever}",
+            "control_modes.teleop.teleop=lever",
+            f"control.startup={draw.choice(('hold', 'pose up'))}",
+            f"control.stop={draw.choice(('hold', 'pose up'))}",
             mode=draw.choice(MODES),
-        )  # fmt: skip
+        )
         runs.made.clear()
         story = Story(run, draw, seen=seen, consent=run.session.mode == "policy")
         try:

@@ -152,7 +152,10 @@ def opened(request: Request) -> Iterator[Evaluation]:
     registry = installed_plugins()
     identities = {policy.label: identify(policy, registry) for policy in request.policies}
     settings = {
-        "format": _FORMAT, "seed": request.seed, "until_decided": request.until_decided, "margin": request.margin,
+        "format": _FORMAT,
+        "seed": request.seed,
+        "until_decided": request.until_decided,
+        "margin": request.margin,
         "trials": request.trials,
         "vary": list(request.policies[0].vary),
         "policies": {
@@ -160,7 +163,7 @@ def opened(request: Request) -> Iterator[Evaluation]:
             for each in request.policies
         },
         "versions": registry.versions(),
-    }  # fmt: skip
+    }
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         owned = Ownership(out, "is being evaluated")

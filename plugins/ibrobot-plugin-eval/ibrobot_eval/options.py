@@ -29,9 +29,12 @@ class EvalOptions:
     )
     seed: int = option(0, ge=0, label="Seed", more=True, help="seed of the first episode; later ones add 1")
     vary: tuple[str, ...] = option(
-        (), label="Vary", more=True, unit="path=low:high:count",
+        (),
+        label="Vary",
+        more=True,
+        unit="path=low:high:count",
         help="vary a key of the YAML over the episodes, e.g. simulation.scene.light=0.2:1.5:5; repeatable",
-    )  # fmt: skip
+    )
     until_decided: bool = option(False, label="Until decided", help="stop as soon as every pair of policies is decided")
     margin: float = option(
         MARGIN, gt=0, lt=1, label="Margin", more=True, help="a difference of success rates below this counts as none"

@@ -82,11 +82,15 @@ class Report:
             "policies": [attrs.asdict(each) for each in self.summaries],
             "comparisons": [{**attrs.asdict(each), "words": each.words} for each in self.comparisons],
             "episodes": [
-                {"policy": each.policy, **attrs.asdict(each.result), "recording": each.recording,
-                 "command": each.command}
+                {
+                    "policy": each.policy,
+                    **attrs.asdict(each.result),
+                    "recording": each.recording,
+                    "command": each.command,
+                }
                 for each in self.episodes
             ],
-        }  # fmt: skip
+        }
 
     def as_csv(self) -> str:
         """One line for each episode."""

@@ -47,8 +47,11 @@ def test_differences_of_settings_are_named():
     known = {"seed": 0, "policies": {"act": {"document": "1", "files": "2"}, "pi": {}}, "versions": {"a": "1"}}
     now = {"seed": 5, "policies": {"act": {"document": "1", "files": "3"}}, "versions": {"a": "2"}}
     assert list(differences(known, now)) == [
-        "seed 0, now 5", "policies act files changed", "policies pi is missing", "versions a 1, now 2",
-    ]  # fmt: skip
+        "seed 0, now 5",
+        "policies act files changed",
+        "policies pi is missing",
+        "versions a 1, now 2",
+    ]
 
 
 def test_command_repeats_an_episode_with_all_overrides():

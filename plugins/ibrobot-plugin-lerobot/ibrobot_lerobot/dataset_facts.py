@@ -50,11 +50,14 @@ def _feature(key: str, entry: Mapping[str, Any], norm_mode: str, stats: Mapping[
     names = entry.get("names") or []
     values = {name: np.ravel(stats[name]).astype(float) for name in _SHOWN if name in stats}
     return FeatureContents(
-        key=key, dtype=entry["dtype"], shape=tuple(entry["shape"]),
-        names=() if picture else tuple(str(name) for name in names), unit=_unit(entry, norm_mode, names),
+        key=key,
+        dtype=entry["dtype"],
+        shape=tuple(entry["shape"]),
+        names=() if picture else tuple(str(name) for name in names),
+        unit=_unit(entry, norm_mode, names),
         stats={name: tuple(float(x) if np.isfinite(x) else None for x in found) for name, found in values.items()},
         picture=picture,
-    )  # fmt: skip
+    )
 
 
 def _unit(entry: Mapping[str, Any], norm_mode: str, names: Any) -> str:

@@ -65,16 +65,24 @@ class TrainOptions:
     dataset: Path = option(argument=True, names="dataset", label="Dataset", help="dataset to train on")
     lerobot_options: tuple[str, ...] = option((), argument=True, label=None, help="further options, e.g. --seed=1")
     policy: str = option(
-        SMALL, choices=POLICIES, open=True, validator=_matches(r"[A-Za-z]\w*", "act"), label="Policy",
+        SMALL,
+        choices=POLICIES,
+        open=True,
+        validator=_matches(r"[A-Za-z]\w*", "act"),
+        label="Policy",
         help="a policy type of LeRobot, or small_act",
-    )  # fmt: skip
+    )
     out: Path = option(label="Folder", help="folder for the checkpoints; a training in it is continued")
     steps: int = option(5000, ge=1, le=100_000_000, label="Steps", help="steps of the training")
     batch_size: int = option(32, ge=1, le=1_000_000, label="Frames per step", help="size of the batches")
     device: str = option(
-        AUTO, choices=(AUTO, "cpu", "cuda", "mps"), open=True, validator=_matches(r"[a-z]+(:\d+)?", "cuda:0"),
-        label="Device", help="device of torch; auto: a GPU if there is one",
-    )  # fmt: skip
+        AUTO,
+        choices=(AUTO, "cpu", "cuda", "mps"),
+        open=True,
+        validator=_matches(r"[a-z]+(:\d+)?", "cuda:0"),
+        label="Device",
+        help="device of torch; auto: a GPU if there is one",
+    )
     save_every: int | None = option(
         None,
         ge=1,

@@ -106,11 +106,13 @@ class TestAttacks(HttpSuite):
             server = ServerThread(guard, make_app(guard, broadcast, drive, no_scene), "page", close_s=0.1)
             with contextlib.closing(server):
                 yield Served(
-                    guard.listener.url, ("/", "/api/session", "/api/scene", "/static/app.js"), ("/api/stop",),
+                    guard.listener.url,
+                    ("/", "/api/session", "/api/scene", "/static/app.js"),
+                    ("/api/stop",),
                     ("/stream", "/drive", "/stop"),
                     tuple(path for path in map(guard.path, ("drive", "watch")) if path != "/"),
                     password=self.password,
-                )  # fmt: skip
+                )
 
 
 class TestAttacksWithPassword(TestAttacks):

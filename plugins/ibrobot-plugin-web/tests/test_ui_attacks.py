@@ -74,9 +74,12 @@ class TestAttacks(HttpSuite):
             with contextlib.closing(Ui(opened, Jobs(opened.first), ())) as ui:
                 with contextlib.closing(ServerThread(guard, make_app(guard, ui), "ui", close_s=0.1)):
                     yield Served(
-                        guard.listener.url, ("/", "/static/ui.js", "/api/session", *paths("GET")), paths("POST"),
-                        ("/api/jobs",), (guard.path("drive"), guard.path("watch")),
-                    )  # fmt: skip
+                        guard.listener.url,
+                        ("/", "/static/ui.js", "/api/session", *paths("GET")),
+                        paths("POST"),
+                        ("/api/jobs",),
+                        (guard.path("drive"), guard.path("watch")),
+                    )
                 assert ui.jobs.all() == []
 
 

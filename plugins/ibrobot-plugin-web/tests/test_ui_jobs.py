@@ -130,9 +130,13 @@ def test_events_become_facts_in_the_words_of_their_owner(ui: Ui, tmp_path: Path)
     facts = dict(read(encode_event(Poured(cups=1, of=2, spilt=f"{tmp_path}/cup: --milk helps"))) or {})
     facts |= read(encode_event(Poured(cups=2, of=2, pot="pot"))) or {}
     assert facts == {
-        "text": "2 cups", "progress": 1.0, "problems": ["cup: “With milk” helps"], "axes": ["cup", "ml"],
-        "points": [[1, 2.5], [2, 2.5]], "made": [{"kind": "dataset", "path": "pot"}],
-    }  # fmt: skip
+        "text": "2 cups",
+        "progress": 1.0,
+        "problems": ["cup: “With milk” helps"],
+        "axes": ["cup", "ml"],
+        "points": [[1, 2.5], [2, 2.5]],
+        "made": [{"kind": "dataset", "path": "pot"}],
+    }
 
 
 @pytest.mark.parametrize(

@@ -88,13 +88,17 @@ class TestAttacks(HttpSuite):
             with contextlib.closing(page):
                 url, _, token = page.address.partition("/?")
                 yield Served(
-                    url, ("/", "/certificate.pem", "/static/main.js"), sockets=("/socket",), links=(f"/?{token}",),
+                    url,
+                    ("/", "/certificate.pem", "/static/main.js"),
+                    sockets=("/socket",),
+                    links=(f"/?{token}",),
                     other_sites_link=True,
-                )  # fmt: skip
+                )
 
 
-@pytest.mark.parametrize("name", ["main.js", "connection.js", "controls.js", "headset.js", "phone.js", "pose.js",
-                                  "screens.js", "index.html"])  # fmt: skip
+@pytest.mark.parametrize(
+    "name", ["main.js", "connection.js", "controls.js", "headset.js", "phone.js", "pose.js", "screens.js", "index.html"]
+)
 def test_files_of_the_page_name_no_other_host(page: PageServer, browser: Browser, name: str):
     assert browser.get(f"/static/{name}")[0] == 401
     status, text, _ = browser.log_in().get(f"/static/{name}")

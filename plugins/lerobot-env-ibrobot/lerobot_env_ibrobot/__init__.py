@@ -60,6 +60,8 @@ class IbrobotEnv(EnvConfig):
     def gym_kwargs(self) -> dict[str, Any]:
         """Keywords of `RobotEnv`."""
         return {
-            "cameras": tuple(self.cameras), "image_size": (self.image_height, self.image_width),
-            "overrides": tuple(self.overrides), "render_mode": "rgb_array",
-        }  # fmt: skip
+            "cameras": tuple(self.cameras),
+            "image_size": (self.image_height, self.image_width),
+            "overrides": tuple(self.overrides),
+            "render_mode": "rgb_array",
+        }

@@ -32,22 +32,26 @@ def _expert(
         return ScriptedExpert(kind, name, given, ctx, observed(given))
 
     return PolicyDescriptor(
-        type=name, options=options, make=make, check_options=check_two_arms if scene == "handover" else check_one_arm,
+        type=name,
+        options=options,
+        make=make,
+        check_options=check_two_arms if scene == "handover" else check_one_arm,
         summary=f"{summary}, by inverse kinematics and the scene's ground truth",
-    )  # fmt: skip
+    )
 
 
 EXPERTS = (
-    _expert(
-        "pick_cube", "PickTask", "picks the cube and puts it into the bin", lambda _: 10, type_="scripted_pick"
-    ),
+    _expert("pick_cube", "PickTask", "picks the cube and puts it into the bin", lambda _: 10, type_="scripted_pick"),
     _expert("push", "PushTask", "pushes the block onto the goal", lambda _: 10),
     _expert("stack", "StackTask", "puts the cube on the other one", lambda _: 14),
     _expert("handover", "HandoverTask", "hands the bar from the left arm to the right one", lambda _: 7),
     _expert("drawer", "DrawerTask", "opens the drawer", lambda _: 6),
     _expert(
-        "sort", "SortTask", "puts each cube into the bin of its colour", lambda given: 8 * given.cubes + 6,
+        "sort",
+        "SortTask",
+        "puts each cube into the bin of its colour",
+        lambda given: 8 * given.cubes + 6,
         SortExpertOptions,
     ),
-)  # fmt: skip
+)
 """The policies `scripted_pick`, `scripted_push` and so on."""

@@ -69,8 +69,11 @@ class PushTask(Task):
         away = hand.reach(behind + (distance - _APPROACH_M) * forward, tool, at, CLOSED_RAD, GRASP_TURN_RAD)
         up = hand.reach(
             behind + (distance - _APPROACH_M) * forward + self.options.hover_height * UP,
-            tool, away, CLOSED_RAD, HOVER_TURN_RAD,
-        )  # fmt: skip
+            tool,
+            away,
+            CLOSED_RAD,
+            HOVER_TURN_RAD,
+        )
         way.to("hover", above, clear=True, expects=is_at(0, block))
         way.to("descend", here, expects=is_at(0, block))
         for joints in line:

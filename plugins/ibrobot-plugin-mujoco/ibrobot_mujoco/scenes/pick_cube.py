@@ -44,9 +44,11 @@ class PickCube(TableScene):
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
         given, size = self._given, look["cube_size"]
         x, y, _, yaw = self.place(
-            world, CUBE, lambda: polar(rng, given.cube_distance, given.cube_bearing, given.cube_yaw, size),
+            world,
+            CUBE,
+            lambda: polar(rng, given.cube_distance, given.cube_bearing, given.cube_yaw, size),
             f"cube_distance {list(given.cube_distance)} and cube_bearing {list(given.cube_bearing)}",
-        )  # fmt: skip
+        )
         return x, y, yaw
 
     @override

@@ -42,9 +42,13 @@ class Push(TableScene):
         # A mocap body can be placed in each episode, and stands still.
         mark = spec.worldbody.add_body(name=GOAL, mocap=True)
         mark.add_geom(
-            name=GOAL, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[given.goal_tolerance, 0.0005, 0], contype=0,
-            conaffinity=0, rgba=[0.1, 0.55, 0.2, 1],
-        )  # fmt: skip
+            name=GOAL,
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            size=[given.goal_tolerance, 0.0005, 0],
+            contype=0,
+            conaffinity=0,
+            rgba=[0.1, 0.55, 0.2, 1],
+        )
 
     @override
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
@@ -52,9 +56,11 @@ class Push(TableScene):
         distance, bearing = rng.uniform(*given.goal_distance), rng.uniform(*given.goal_bearing)
         goal = distance * math.cos(bearing), distance * math.sin(bearing)
         x, y, _, yaw = self.place(
-            world, BLOCK, lambda: polar(rng, given.block_distance, given.block_bearing, given.block_yaw, size),
+            world,
+            BLOCK,
+            lambda: polar(rng, given.block_distance, given.block_bearing, given.block_yaw, size),
             f"block_distance {list(given.block_distance)} and block_bearing {list(given.block_bearing)}",
-        )  # fmt: skip
+        )
         return x, y, yaw, *goal
 
     @override

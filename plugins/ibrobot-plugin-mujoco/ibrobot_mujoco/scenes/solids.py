@@ -31,9 +31,7 @@ def add_cube(spec: mujoco.MjSpec, name: str, size: float, rgba: Sequence[float] 
     """A cube that moves, with body, free joint and geom of one name."""
     body = spec.worldbody.add_body(name=name, pos=[0.24, 0, size / 2])
     body.add_freejoint(name=name)
-    body.add_geom(
-        name=name, type=_Box, size=[size / 2] * 3, density=DENSITY, condim=4, friction=FRICTION, rgba=rgba
-    )  # fmt: skip
+    body.add_geom(name=name, type=_Box, size=[size / 2] * 3, density=DENSITY, condim=4, friction=FRICTION, rgba=rgba)
 
 
 def add_bin(spec: mujoco.MjSpec, name: str, position: tuple[float, float], rgba: Sequence[float]) -> None:

@@ -40,9 +40,7 @@ class Sort(TableScene):
     def add(self, spec: mujoco.MjSpec) -> None:
         for cube in self.moving:
             add_cube(spec, cube, ends(self._given.cube_size)[0], RED)
-        for name, position, rgba in zip(
-            NAMES, (self._given.red_bin, self._given.blue_bin), (RED, BLUE), strict=True
-        ):  # fmt: skip
+        for name, position, rgba in zip(NAMES, (self._given.red_bin, self._given.blue_bin), (RED, BLUE), strict=True):
             add_bin(spec, f"{name}_bin", position, rgba)
 
     @override
@@ -50,9 +48,11 @@ class Sort(TableScene):
         given, size, factors = self._given, look["cube_size"], []
         for cube, number in zip(self.moving, rng.integers(2, size=given.cubes), strict=True):
             x, y, _, yaw = self.place(
-                world, cube, lambda: polar(rng, given.cube_distance, given.cube_bearing, given.cube_yaw, size),
+                world,
+                cube,
+                lambda: polar(rng, given.cube_distance, given.cube_bearing, given.cube_yaw, size),
                 f"cube_distance {list(given.cube_distance)} and cube_bearing {list(given.cube_bearing)}",
-            )  # fmt: skip
+            )
             factors += [x, y, yaw, float(number)]
         return factors
 

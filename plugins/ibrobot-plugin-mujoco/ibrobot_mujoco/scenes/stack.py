@@ -48,9 +48,11 @@ class Stack(TableScene):
         factors: list[float] = []
         for body, size in ((BASE, look["base_size"]), (CUBE, look["cube_size"])):
             place = self.place(
-                world, body, partial(polar, rng, given.cube_distance, given.cube_bearing, given.cube_yaw, size),
+                world,
+                body,
+                partial(polar, rng, given.cube_distance, given.cube_bearing, given.cube_yaw, size),
                 f"cube_distance {list(given.cube_distance)} and cube_bearing {list(given.cube_bearing)}",
-            )  # fmt: skip
+            )
             factors = [*place[[0, 1, 3]].tolist(), *factors]
         return factors
 

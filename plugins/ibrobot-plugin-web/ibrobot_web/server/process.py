@@ -127,9 +127,13 @@ class RunLink:
 def _options(order: Mapping[str, Any]) -> WebOptions:
     certificate, key = (Path(order[name]) if order[name] is not None else None for name in ("certificate", "key"))
     return WebOptions(
-        host=order["address"], port=order["port"], names=tuple(order["names"]), password=order["password"],
-        certificate=certificate, key=key,
-    )  # fmt: skip
+        host=order["address"],
+        port=order["port"],
+        names=tuple(order["names"]),
+        password=order["password"],
+        certificate=certificate,
+        key=key,
+    )
 
 
 async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any]) -> None:

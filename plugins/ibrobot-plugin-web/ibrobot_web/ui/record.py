@@ -74,10 +74,12 @@ def start(ui: Ui, request: RecordSession) -> dict[str, int]:
     ]
     read_event = event_reader(ui.folders, command)
     job = ui.jobs.start(
-        _COMMAND, f"Record {folder.name}", [*words, *arguments(options)],
+        _COMMAND,
+        f"Record {folder.name}",
+        [*words, *arguments(options)],
         read=lambda line: found if (found := read_event(line)) is not None else read_address(line),
         done_codes=RUN_DONE,
-    )  # fmt: skip
+    )
     return {"number": job.number}
 
 
