@@ -21,6 +21,7 @@ ALLOWED = {
     ("ibrobot-plugin-mujoco/tests/test_model_limits.py", "ibrobot_core.config.models"): (
         "limits as core reads them, against those of MuJoCo"
     ),
+    ("ibrobot-plugin-data/tests/test_interleavings.py", "ibrobot_core.control.link"): "plans beside other requests",
     ("ibrobot-plugin-data/tests/test_conversion_events.py", "ibrobot_core.events"): "a line as a command prints it",
     ("ibrobot-plugin-web/tests/test_ui_jobs.py", "ibrobot_core.events"): "a line as a command prints it",
 }

@@ -36,7 +36,7 @@ from ibrobot_core.api import (
     TopicSummary,
     hookimpl,
 )
-from ibrobot_core.errors import DiskFull
+from ibrobot_core.app import DiskFull
 
 
 def _values(message: Message) -> Any:

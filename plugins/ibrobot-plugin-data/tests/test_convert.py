@@ -13,9 +13,20 @@ import pytest
 from command_line import run_here
 from ibrobot_testing.site import Site
 
-from ibrobot_core.api import EpisodeEnd, EpisodeStart, Feature, Float64MultiArray, Header, JointState, Message, String
-from ibrobot_core.config.schema import Align
-from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
+from ibrobot_core.api import (
+    ActionPart,
+    Contract,
+    EpisodeEnd,
+    EpisodeStart,
+    Feature,
+    Float64MultiArray,
+    Header,
+    JointState,
+    Message,
+    ObservationPart,
+    String,
+)
+from ibrobot_core.app import Align
 
 START_NS = 1_700_000_000_000_000_000
 JOINTS = ("pan", "lift")

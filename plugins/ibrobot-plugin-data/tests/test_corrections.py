@@ -10,16 +10,14 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.errors import RequestError, TeleopError
-from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import EpisodeEnd, EpisodeStart, TeleopError, Vector
+from ibrobot_core.app import RequestError
 
 if TYPE_CHECKING:
     from fake_runs import Runs
     from ibrobot_testing.fakes import FakeTeleop
 
-    from ibrobot_core.bus import Subscription
-    from ibrobot_core.launch.runtime import Runtime
+    from ibrobot_core.app import Runtime, Subscription
 
 POLICY = "control_modes.policy.inference={{model: net, intervene: {}}}"
 SLACK = 1.001

@@ -12,15 +12,13 @@ import yaml
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_service import DISCARD, START, STATUS, STOP, EpisodeService
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import ConfigError, DiskFull, IbrobotError, InUse, NotSupported, RecorderError, RequestError
-from ibrobot_core.launch.runtime import ESTOP, RESET
-from ibrobot_core.ownership import Ownership
+from ibrobot_core.api import Contract, IbrobotError, NotSupported, RecorderError
+from ibrobot_core.app import ESTOP, RESET, ConfigError, DiskFull, InUse, Ownership, RequestError
 
 if TYPE_CHECKING:
     from fake_runs import Runs
 
-    from ibrobot_core.launch.runtime import Runtime
+    from ibrobot_core.app import Runtime
 
 RECORDING = "recording={type: lines, root: kept, dataset: pick}"
 

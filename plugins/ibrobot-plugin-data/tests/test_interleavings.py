@@ -18,18 +18,14 @@ import numpy as np
 import pytest
 from ibrobot_testing.fakes import FakeTeleop
 
-from ibrobot_core.control.link import ControlState, PlanRecord
-from ibrobot_core.deadman import HOLD_S
-from ibrobot_core.descriptors import TeleopDescriptor
-from ibrobot_core.errors import ComponentFailed, IbrobotError
-from ibrobot_core.interfaces import JointReading, TeleopCommand
-from ibrobot_core.plugins import Registry
-from ibrobot_core.units import NS_PER_S, ns
+from ibrobot_core.api import NS_PER_S, IbrobotError, JointReading, TeleopCommand, TeleopDescriptor, ns
+from ibrobot_core.app import HOLD_S, ComponentFailed, ControlState, Registry
+from ibrobot_core.control.link import PlanRecord
 
 if TYPE_CHECKING:
     from fake_runs import Runs
 
-    from ibrobot_core.launch.runtime import Runtime
+    from ibrobot_core.app import Runtime
 
 INTERLEAVINGS = int(os.environ.get("IBROBOT_INTERLEAVINGS", "240"))
 PARTS = 8

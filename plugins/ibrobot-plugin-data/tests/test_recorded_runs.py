@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ibrobot_core.launch.runtime import ESTOP, Runtime
+from ibrobot_core.app import ESTOP, Runtime
 
 if TYPE_CHECKING:
     from fake_runs import Runs

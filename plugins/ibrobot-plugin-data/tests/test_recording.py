@@ -9,15 +9,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from ibrobot_data import recording_worker as recording
 
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import RecorderError
-from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart
-from ibrobot_core.messages import String
+from ibrobot_core.api import Contract, EpisodeEnd, EpisodeStart, RecorderError, String
 
 if TYPE_CHECKING:
     from fake_runs import Runs
 
-    from ibrobot_core.launch.runtime import Runtime
+    from ibrobot_core.app import Runtime
 
 
 class Notes:

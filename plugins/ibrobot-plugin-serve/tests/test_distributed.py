@@ -13,14 +13,14 @@ from ibrobot_serve.service import InferenceService
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakeTransport
 
-from ibrobot_core.errors import ComponentFailed
-from ibrobot_core.messages import DiagnosticArray
+from ibrobot_core.api import DiagnosticArray
+from ibrobot_core.app import ComponentFailed
 
 if TYPE_CHECKING:
     from fake_runs import Runs
     from ibrobot_testing.site import Site
 
-    from ibrobot_core.launch.runtime import Runtime
+    from ibrobot_core.app import Runtime
 
 pytestmark = pytest.mark.integration
 

@@ -10,11 +10,8 @@ import pytest
 from ibrobot_ros2.services import DETAILS, SERVICES, Answer, Call, decode_answer, encode_call
 from ibrobot_testing import stand_in
 
-from ibrobot_core.errors import ConfigError, MissingDependency, NotSupported, TransportError
-from ibrobot_core.messages import Bool, String
-from ibrobot_core.options import option
-from ibrobot_core.services import Service
-from ibrobot_core.units import NS_PER_S
+from ibrobot_core.api import NS_PER_S, Bool, MissingDependency, NotSupported, String, TransportError, option
+from ibrobot_core.app import ConfigError, Service
 
 if TYPE_CHECKING:
     from fake_runs import Runs
