@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from blinded_arm import ARM, NAMES
 from command_line import run_here
 
 from ibrobot_core.config import find_config
@@ -27,33 +28,6 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.integration
 PATIENCE_S = 240.0
-NAMES = ("careful", "hasty")
-ARM = """
-robot:
-  name: mini
-  joints:
-    - {name: pan, lower: -3.0, upper: 3.0, max_velocity: 3.0, max_acceleration: 40.0}
-    - {name: lift, lower: -3.0, upper: 3.0, max_velocity: 3.0, max_acceleration: 40.0}
-  groups: {arm: [pan, lift]}
-hardware: {type: made_up_arm}
-executors:
-  arm_position: {type: position, group: arm}
-models:
-  one: {type: reaching}
-  two: {type: reaching}
-control_modes:
-  careful: {executors: [arm_position], inference: {model: one}}
-  hasty: {executors: [arm_position], inference: {model: two}}
-default_control_mode: careful
-contract:
-  rate_hz: 30
-  max_duration_s: 3600
-  observations:
-    - {key: observation.state, topic: /joint_states, select: [position.pan, position.lift]}
-  actions:
-    - {executor: arm_position, topic: /arm/commands}
-control: {rate_hz: 100, stop: hold}
-"""
 
 
 class Terminal:
@@ -140,7 +114,7 @@ def test_operator_judges_blind_and_goes_on_after_a_crash(folder: Path, terminals
     first = Terminal(folder)
     terminals.append(first)
     first.see("find a difference of success rates")
-    first.see(r"trial 1 \(start 1 of 2\).*Enter begins")
+    first.see(r"trial 1 \(start 1 of 2\).*Enter begin the trial")
     first.judge(1, "s", early="f")
     first.see("trial 1: success")
     first.see(r"trial 2 \(start 1 of 2\)")
@@ -206,7 +180,7 @@ def test_keys_judge_a_running_arm_and_ctrl_c_ends_it_in_an_orderly_way(
     modes = [word for name in NAMES for word in ("--mode", name)]
     terminal = Terminal(tmp_path, "eval", "arm.yaml", *modes, "--episodes", "1", "--out", "blind")
     terminals.append(terminal)
-    terminal.see(r"trial 1 \(start 1 of 1\): set the scene to start 1")
+    terminal.see(r"trial 1 \(start 1 of 1\), set the scene to start 1")
     terminal.press("\r")
     terminal.see("running")
     terminal.press("s")
@@ -219,7 +193,7 @@ def test_keys_judge_a_running_arm_and_ctrl_c_ends_it_in_an_orderly_way(
     assert terminal.end() == 0
     (trial,) = [json.loads(each.read_text()) for each in (tmp_path / "blind/trials").glob("*.json")]
     assert (trial["outcome"], trial["faults"], trial["time_s"] > 0) == ("success", [], True)
-    reader = installed_plugins().open_episode(tmp_path / "blind/episodes/trial_0001")
+    reader = installed_plugins().open_episode(tmp_path / "blind/.sealed/trial_0001")
     try:
         assert reader.summary().outcome == "success"
     finally:

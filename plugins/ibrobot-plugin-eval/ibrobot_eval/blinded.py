@@ -1,9 +1,8 @@
-"""Runs blinded trials with an operator at the terminal, who does not learn which policy acts."""
+"""Runs blinded trials with an operator, who does not learn which policy acts."""
 
 from __future__ import annotations
 
 import logging
-import queue
 import re
 import shlex
 import shutil
@@ -11,43 +10,44 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import override
 
 import attrs
 
-from ibrobot_core.api import IbrobotError, TeleopError, seconds
+from ibrobot_core.api import IbrobotError, seconds
 from ibrobot_core.app import (
-    KeyReader,
+    Choice,
     LaunchRequest,
     LogFormatter,
     Runtime,
     Session,
-    echo,
     end_signals,
     error_line,
     installed_plugins,
 )
+from ibrobot_eval.cameras import StartPictures, cameras_of, live_pictures
 from ibrobot_eval.comparison import Decision
 from ibrobot_eval.episodes import NO_INTERVENTION, SCRATCH, Result
 from ibrobot_eval.evaluation import Request
+from ibrobot_eval.operators import QUIT, Operator, Quit
+from ibrobot_eval.options import EvalOptions
 from ibrobot_eval.policies import Policy
 from ibrobot_eval.report import Episode, Report
 from ibrobot_eval.statistics import decided_by
-from ibrobot_eval.trials import FAILURE, OUTCOMES, SUCCESS, VOID, Order, Trial
+from ibrobot_eval.trials import FAILURE, OUTCOMES, SEALED, SUCCESS, VOID, Order, Trial
 
 NEEDED = {0.1: 770, 0.2: 164, 0.3: 69}
 """Difference -> trials of each policy with which it is found with a probability of 80 %, by `episodes_for`."""
 LOG = "trials.log"
 _POLL_S = 0.05
-_JUDGE = "s success, f failure, v void"
+STARTS = "starts"
+"""Folder of the pictures of the starts."""
 _KEYS = {outcome[0]: outcome for outcome in OUTCOMES}
-
-
-class Quit(Exception):
-    """The operator ends the trials for today."""
+_JUDGE = tuple(Choice(key=key, text=outcome) for key, outcome in _KEYS.items())
+_STOP = Choice(key="esc", text="emergency stop", urgent=True)
 
 
 def power(trials: int) -> list[str]:
@@ -125,37 +125,35 @@ class Blinded:
     Args:
         request: what the user asks for.
         reset: a command that resets the scene before each trial; empty if the operator does it.
+        operator: who judges them.
     """
 
-    def __init__(self, request: Request, reset: str) -> None:
+    def __init__(self, request: Request, reset: Sequence[str], operator: Operator) -> None:
         self._request = request
-        self._reset = shlex.split(reset)
+        self._reset = reset
+        self._operator = operator
         self._policies = {each.label: each for each in request.policies}
         self._blinding = Blinding.of(request.policies)
         self._order = Order(request.out, list(self._policies))
-        self._simulated = request.policies[0].load().simulated
+        self._robot = request.policies[0].load()
 
     def run(self) -> bool:
         """Run trials until there are enough, or until they decide; returns whether that is so.
 
         Raises:
-            TeleopError: without a terminal.
+            IbrobotError: if there is no operator.
             DatasetError: if the order has been opened.
         """
         if self._enough():
             return True
         self._order.check_sealed()
-        if not sys.stdin.isatty():
-            raise TeleopError("blinded trials need a terminal, whose keys begin and judge them")
-        if not self._order.trials:
-            for line in power(self._request.episodes):
-                echo(line)
-        keys = KeyReader()
-        pressed = keys.subscribe()
-        with _blind_log(self._request.out, self._blinding), keys:
+        with self._operator.present(), _blind_log(self._request.out, self._blinding):
+            if not self._order.trials:
+                for line in power(self._request.episodes):
+                    self._operator.say(line)
             try:
                 while not self._enough():
-                    self._trial(keys, pressed)
+                    self._trial()
             except Quit:
                 return False
         return True
@@ -165,7 +163,7 @@ class Blinded:
         results = self._results(self._order.open())
         numbers = {(each.block, each.place): each.number for each in self._order.trials if each.outcome != VOID}
         episodes = [
-            Episode(label, self._result(trial), f"episodes/trial_{numbers[trial.block, trial.place]:04d}", "", "")
+            Episode(label, self._result(trial), f"episodes/{_name(numbers[trial.block, trial.place])}", "", "")
             for label, trials in self._order.outcomes().items()
             for trial in trials
         ]
@@ -189,45 +187,54 @@ class Blinded:
         success = trial.outcome == SUCCESS
         return Result(trial.block, success, trial.time_s, trial.interventions, trial.faults, {}, {})
 
-    def _trial(self, keys: KeyReader, pressed: queue.SimpleQueue[str]) -> None:
+    def _trial(self) -> None:
         """Run the next trial, and keep the operator's judgement."""
         block, place, label = self._order.next()
         number = len(self._order.trials) + 1
-        self._prepare(pressed, number, block)
-        policy = self._policies[label]
+        operator = self._operator
+        starts = StartPictures(self._request.out / STARTS / f"start_{block + 1:04d}", cameras_of(self._robot))
+        self._prepare(number, block, starts)
         try:
-            ran = self._run(policy, number, block, keys, pressed)
+            ran = self._run(self._policies[label], number, block, starts)
         except IbrobotError as error:
-            echo(self._blinding(f"trial {number} did not run: {error_line(error)}"))
-            _ask(pressed, "Enter tries it again, q ends for today", ("enter",))
+            failed = self._blinding(f"trial {number} did not run: {error_line(error)}")
+            operator.ask(failed, (Choice(key="enter", text="try it again"), QUIT))
             return
-        outcome = ran.outcome or _KEYS[_ask(pressed, f"trial {number} has ended: {_JUDGE}", tuple(_KEYS))]
+        outcome = ran.outcome or _KEYS[operator.ask(f"trial {number} has ended", (*_JUDGE, QUIT))]
         reason = ""
         if outcome == VOID:
             while not reason:
-                reason = _typed(pressed, "reason: ")
+                reason = operator.ask(f"trial {number} is void; reason").strip()
         self._order.add(
             Trial(number, block, place, outcome, reason, ran.time_s, ran.interventions, ran.faults, self._order.seal)
         )
-        echo(f"trial {number}: {outcome}")
+        operator.say(f"trial {number}: {outcome}")
 
-    def _prepare(self, pressed: queue.SimpleQueue[str], number: int, block: int) -> None:
+    def _prepare(self, number: int, block: int, starts: StartPictures) -> None:
         """Have the scene reset, and wait for the operator."""
+        operator = self._operator
         if self._reset:
-            echo("resetting the scene …")
+            operator.say("resetting the scene …")
             if failed := _failure_of(self._reset):
-                echo(self._blinding(f"the reset failed: {failed}"))
-        scene = "the simulation resets the scene" if self._simulated else f"set the scene to start {block + 1}"
-        text = (
-            f"trial {number} (start {block + 1} of {self._request.episodes}): {scene}; Enter begins, q ends for today"
-        )
-        _ask(pressed, text, ("enter",))
+                operator.say(self._blinding(f"the reset failed: {failed}"))
+        live = self._request.out / SCRATCH / "live"
+        simulated = self._robot.simulated
+        with ExitStack() as stack:
+            shows = operator.sees and not simulated
+            if shows and (problems := stack.enter_context(live_pictures(self._robot, live))):
+                operator.say(f"without live pictures: {problems}")
+            sights = starts.sights(live)
+            scene = "the simulation resets the scene" if simulated else f"set the scene to start {block + 1}"
+            if any(each.wanted for each in sights) and not simulated:
+                scene += " as in the picture" if len(sights) == 1 else " as in the pictures"
+            text = f"trial {number} (start {block + 1} of {self._request.episodes}), {scene}"
+            operator.ask(text, (Choice(key="enter", text="begin the trial"), QUIT), sights)
 
-    def _run(self, policy: Policy, number: int, block: int, keys: KeyReader, pressed: queue.SimpleQueue[str]) -> _Ran:
+    def _run(self, policy: Policy, number: int, block: int, starts: StartPictures) -> _Ran:
         """Run a policy until the operator judges it, or until its time is over."""
         config = policy.load()
         assert config.recording is not None
-        scratch = self._request.out / SCRATCH / f"trial_{number:04d}"
+        scratch = self._request.out / SCRATCH / _name(number)
         shutil.rmtree(scratch, ignore_errors=True)
         recording = attrs.evolve(config.recording, root=str(scratch), dataset="one")
         config = attrs.evolve(config, recording=recording, viewer=None)
@@ -236,25 +243,28 @@ class Blinded:
         seed = self._request.seed + block
         session = Session(config, installed_plugins(), LaunchRequest(False, seed, duration_s, episodes))
         runtime = Runtime(session)
-        keys.gone = lambda: session.fail("keys", TeleopError("the terminal is gone"))
+        # The picture is that of the trial before which the scene was set to a new start.
+        pictures = starts.taken(session) if all(each.outcome == VOID for each in self._order.of(block)) else None
         judged: list[str] = []
-        with _ended_by_signals(session) as came, _listening(pressed, session, lambda key: _judge(session, judged, key)):
-            echo("starting …")
+        self._operator.say("starting …")
+        with _ended_by_signals(session) as came, _listening(self._operator, session, judged):
             runtime.start()
-            echo(f"running: {_JUDGE}, Esc emergency stop")
+            self._operator.put("running", (*_JUDGE, _STOP))
             try:
                 while not runtime.wait(_POLL_S):
+                    if pictures is not None:
+                        pictures.take()
                     if session.faults:
                         break
                 time_s = seconds(session.clock.now_ns() - session.episodes.begun_ns)
             finally:
                 runtime.stop()
         for line in session.outcome.holding:
-            echo(self._blinding(line))
+            self._operator.say(self._blinding(line))
         if came:
             raise Quit
         runtime.raise_failure()
-        episode = self._request.out / "episodes" / f"trial_{number:04d}"
+        episode = self._request.out / SEALED / _name(number)
         for bag in recording.folder.glob("episodes/*/"):
             shutil.rmtree(episode, ignore_errors=True)  # of a trial that was not judged
             episode.parent.mkdir(parents=True, exist_ok=True)
@@ -263,6 +273,10 @@ class Blinded:
         happened = {kind: count for kind, count in counts.items() if count and kind not in NO_INTERVENTION}
         faults = tuple(map(self._blinding, session.outcome.faults))
         return _Ran(_KEYS[judged[0]] if judged else "", round(time_s, 3), happened, faults)
+
+
+def _name(number: int) -> str:
+    return f"trial_{number:04d}"
 
 
 @attrs.frozen
@@ -276,6 +290,20 @@ class _Ran:
     faults: tuple[str, ...]
 
 
+def reset_of(options: EvalOptions) -> Sequence[str]:
+    """The command that resets the scene; empty without one.
+
+    Raises:
+        PluginError: if no installed plugin performs tasks.
+    """
+    if options.reset_task is None:
+        return shlex.split(options.reset)
+    name = installed_plugins().command("task").name
+    program = (sys.executable, "-c", "from ibrobot_core.cli.command import main; main()")
+    where = ("--sim",) if options.sim else ()
+    return [*program, name, "run", str(options.reset_task), options.config[0], "--headless", *where]
+
+
 def _failure_of(command: Sequence[str]) -> str:
     """Run a command; returns why it failed, empty if it did not."""
     try:
@@ -286,13 +314,15 @@ def _failure_of(command: Sequence[str]) -> str:
     return f"exit code {done.returncode}: {' '.join(last)}" if done.returncode else ""
 
 
-def _judge(session: Session, judged: list[str], key: str) -> None:
-    """Handle a key of a running trial: a judgement ends it."""
+def _judge(session: Session, judged: list[str], key: str) -> bool:
+    """Judge a running trial, which ends it; False if it does not run."""
     with session.changing:  # a simulated episode may end at the same time
-        if key in _KEYS and session.episodes.running:
-            judged.append(key)
-            session.episodes.end({SUCCESS: SUCCESS, FAILURE: FAILURE}.get(_KEYS[key], "unknown"))
-            session.finish()
+        if not session.episodes.running:
+            return False
+        judged.append(key)
+        session.episodes.end({SUCCESS: SUCCESS, FAILURE: FAILURE}.get(_KEYS[key], "unknown"))
+        session.finish()
+        return True
 
 
 @contextmanager
@@ -313,56 +343,30 @@ def _ended_by_signals(session: Session) -> Iterator[list[int]]:
 
 
 @contextmanager
-def _listening(pressed: queue.SimpleQueue[str], session: Session, judge: Callable[[str], None]) -> Iterator[None]:
-    """Stop the robot at Esc, from a thread that waits for nothing else; other keys judge."""
+def _listening(operator: Operator, session: Session, judged: list[str]) -> Iterator[None]:
+    """Stop the robot at Esc, from a thread that waits for nothing else; other answers judge."""
     ended = threading.Event()
 
     def work() -> None:
         while not ended.is_set():
             try:
-                key = pressed.get(timeout=_POLL_S)
-            except queue.Empty:
-                continue
-            if key != "esc":
-                judge(key)
-                continue
-            try:
-                session.emergency_stop()
+                given = operator.answer(_POLL_S)
             except IbrobotError as error:
-                session.log.error("%s", error)
+                session.fail("operator", error)
+                return
+            if given == _STOP.key:
+                try:
+                    session.emergency_stop()
+                except IbrobotError as error:
+                    session.log.error("%s", error)
+                operator.put("stopping", (*_JUDGE, _STOP))
+            elif given is not None and not _judge(session, judged, given):
+                operator.put("running", (*_JUDGE, _STOP))
 
-    thread = threading.Thread(target=work, name="keys of the trial", daemon=True)
+    thread = threading.Thread(target=work, name="answers to the trial", daemon=True)
     thread.start()
     try:
         yield
     finally:
         ended.set()
         thread.join()
-
-
-def _ask(pressed: queue.SimpleQueue[str], text: str, keys: tuple[str, ...]) -> str:
-    """Print a prompt and wait for one of the keys.
-
-    Raises:
-        Quit: if the operator presses q.
-    """
-    while not pressed.empty():  # keys typed before the question do not answer it
-        pressed.get()
-    echo(text)
-    while (key := pressed.get()) not in keys:
-        if key == "q":
-            raise Quit
-    return key
-
-
-def _typed(pressed: queue.SimpleQueue[str], text: str) -> str:
-    """Print a prompt and return the line that the operator types."""
-    echo(text, nl=False)
-    line = ""
-    while (key := pressed.get()) != "enter":
-        if key == "backspace":
-            line = line[:-1]
-        else:
-            line += " " if key == "space" else key if len(key) == 1 else ""
-    echo(line)
-    return line.strip()

@@ -6,17 +6,18 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import click
 
 from ibrobot_core.app import Failed, declared, echo, emit, run_options, wrong_input
 from ibrobot_eval import EVAL
-from ibrobot_eval.blinded import Blinded
+from ibrobot_eval.blinded import Blinded, reset_of
 from ibrobot_eval.episodes import Result, write
 from ibrobot_eval.evaluation import Evaluation, Request, Watch, opened
-from ibrobot_eval.options import Begin, EvalOptions, Progress
+from ibrobot_eval.operators import AtPage, AtTerminal, Operator
+from ibrobot_eval.options import Begin, EvalOptions, Progress, Told
 from ibrobot_eval.options import Report as ReportEvent
 from ibrobot_eval.page import as_page
 from ibrobot_eval.policies import Policy, find_policies
@@ -29,13 +30,9 @@ _KEPT = "interrupted; finished episodes are kept: {} to continue"
 @click.command("eval")
 @declared(EVAL)
 @run_options("overrides")
-@click.option("--trials", is_flag=True, help="Run blinded trials, as on a real arm, with a simulated one.")
-@click.option("--reset", default="", metavar="COMMAND", help="Blinded trials: run this command before each of them.")
-@click.option("--open", "open_", is_flag=True, help="Blinded trials: open the order now; no trial can follow.")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 def evaluate(
-    options: EvalOptions, /, *, overrides: tuple[str, ...], trials: bool, reset: str, open_: bool, as_json: bool,
-    events: bool,
+    options: EvalOptions, /, *, overrides: tuple[str, ...], as_json: bool, events: bool
 ) -> None:  # fmt: skip
     """Count the successes of policies, and compare them.
 
@@ -51,16 +48,8 @@ def evaluate(
     """
     with wrong_input():
         policies = find_policies(options.config, options.mode, options.model, overrides, options.vary, sim=options.sim)
-        if options.until_decided and len(policies) < 2:
-            raise click.UsageError("--until-decided compares policies: give at least two")
-        simulated = {each.load().simulated for each in policies}
-        if len(simulated) > 1:
-            raise click.UsageError("some of the robots are simulated, others are not: add --sim")
-        trials = trials or simulated == {False}
-        if trials and options.vary:
-            raise click.UsageError("--vary is for episodes in simulation, not for blinded trials")
-        if not trials and (reset or open_):
-            raise click.UsageError(f"{'--reset' if reset else '--open'} is for blinded trials; episodes are simulated")
+        trials = _checked(options, policies)
+        reset = reset_of(options)
         request = Request(
             options.out, tuple(policies), options.episodes, options.seed, options.until_decided, options.margin,
             options.jobs or _cores(), trials,
@@ -68,7 +57,7 @@ def evaluate(
         try:
             with opened(request) as evaluation:
                 if trials:
-                    report = _judged(request, reset, open_=open_)
+                    report = _judged(request, reset, AtPage() if events else AtTerminal(), open_=options.open)
                 else:
                     report = _evaluated(request, evaluation, options.videos, events=events, quiet=as_json)
         except KeyboardInterrupt:
@@ -78,9 +67,34 @@ def evaluate(
                 echo(_KEPT.format("run the same command again"), err=True)
             sys.exit(_INTERRUPTED)
     if report is None:
-        echo("to be continued: run the same command again")
+        if events:
+            emit(EVAL, Told(text="to be continued: start the same evaluation again"))
+        else:
+            echo("to be continued: run the same command again")
     else:
         _tell(request, report, events=events, as_json=as_json)
+
+
+def _checked(options: EvalOptions, policies: Sequence[Policy]) -> bool:
+    """Whether the evaluation consists of blinded trials.
+
+    Raises:
+        UsageError: for options that do not fit together.
+    """
+    if options.until_decided and len(policies) < 2:
+        raise click.UsageError("--until-decided compares policies: give at least two")
+    simulated = {each.load().simulated for each in policies}
+    if len(simulated) > 1:
+        raise click.UsageError("some of the robots are simulated, others are not: add --sim")
+    trials = options.trials or simulated == {False}
+    if trials and options.vary:
+        raise click.UsageError("--vary is for episodes in simulation, not for blinded trials")
+    for given, flag in ((options.reset, "--reset"), (options.reset_task, "--reset-task"), (options.open, "--open")):
+        if given and not trials:
+            raise click.UsageError(f"{flag} is for blinded trials; episodes are simulated")
+    if options.reset and options.reset_task:
+        raise click.UsageError("--reset and --reset-task exclude each other")
+    return trials
 
 
 def _tell(request: Request, report: Report, *, events: bool, as_json: bool) -> None:
@@ -115,9 +129,9 @@ def _evaluated(request: Request, evaluation: Evaluation, videos: int, *, events:
     return report
 
 
-def _judged(request: Request, reset: str, *, open_: bool) -> Report | None:
+def _judged(request: Request, reset: Sequence[str], operator: Operator, *, open_: bool) -> Report | None:
     """Run blinded trials, and write the report when there are enough; None if the operator goes on another day."""
-    blinded = Blinded(request, reset)
+    blinded = Blinded(request, reset, operator)
     if not open_ and not blinded.run():
         return None
     report = blinded.report()

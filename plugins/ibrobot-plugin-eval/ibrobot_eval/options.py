@@ -8,7 +8,7 @@ from typing import override
 import attrs
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Event, Shown
+from ibrobot_core.app import Ask, Event, Shown
 
 MARGIN = 0.1
 """By default, a difference below this counts as none."""
@@ -43,6 +43,16 @@ class EvalOptions:
         None, ge=1, label="Episodes at once", more=True, help="episodes in parallel; by default one for each CPU core"
     )
     videos: int = option(20, ge=0, label="Videos", more=True, help="failures of each policy to film for the report")
+    trials: bool = option(
+        False, label="Blinded trials", help="run blinded trials, as on a real arm, with a simulated one"
+    )
+    reset_task: Path | None = option(
+        None, label="Reset task", more=True, help="blinded trials: perform this task before each of them"
+    )
+    reset: str = option("", unit="command", label=None, help="blinded trials: run this command before each of them")
+    open: bool = option(
+        False, label="Open the order", more=True, help="blinded trials: open the order now; no trial can follow"
+    )
     out: Path = option(
         label="Folder", help="folder of results, recordings and report; an evaluation in it is continued"
     )
@@ -80,6 +90,17 @@ class Progress(Event):
 
 
 @attrs.frozen(kw_only=True)
+class Told(Event):
+    """Something that the operator of blinded trials is told."""
+
+    text: str = option(help="the text")
+
+    @override
+    def shown(self) -> Shown:
+        return Shown(self.text)
+
+
+@attrs.frozen(kw_only=True)
 class Report(Event):
     """The result."""
 
@@ -91,4 +112,4 @@ class Report(Event):
         return Shown("; ".join(self.lines), 1.0)
 
 
-EVENTS = (Begin, Progress, Report)
+EVENTS = (Begin, Progress, Ask, Told, Report)

@@ -23,6 +23,8 @@ from ibrobot_eval.episodes import write
 
 ORDER = "order.sealed"
 OPENED = "order_opened.json"
+SEALED = ".sealed"
+"""Folder of the recordings, which say what acted, until the order is opened."""
 SUCCESS, FAILURE, VOID = "success", "failure", "void"
 OUTCOMES = (SUCCESS, FAILURE, VOID)
 
@@ -91,10 +93,14 @@ class Order:
         block = 0
         while all((block, place) in judged for place in range(len(self._labels))):
             block += 1
-        tried = [each.place for each in self.trials if each.block == block]
+        tried = [each.place for each in self.of(block)]
         left = [place for place in range(len(self._labels)) if (block, place) not in judged]
         place = min(left, key=lambda each: (tried.count(each), each))
         return block, place, self._policy(block, place)
+
+    def of(self, block: int) -> list[Trial]:
+        """The trials of a block so far."""
+        return [each for each in self.trials if each.block == block]
 
     @property
     def blocks(self) -> int:
@@ -152,6 +158,10 @@ class Order:
                 )
         else:
             write(file, json.dumps(opened, indent=1) + "\n")
+        for recording in sorted((self._out / SEALED).glob("trial_*")):
+            shown = self._out / "episodes" / recording.name
+            shown.parent.mkdir(exist_ok=True)
+            recording.rename(shown)
         return self.outcomes()
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, override
 
@@ -13,10 +16,10 @@ from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import arguments, form_of, in_page_words, read_form
 from ibrobot_web.ui.job_runner import Jobs
-from ibrobot_web.ui.jobs import event_reader
+from ibrobot_web.ui.jobs import GiveAnswer, NamesSight, answer, event_reader, sight
 
 from ibrobot_core.api import IbrobotError, MissingDependency, option
-from ibrobot_core.app import Command, Event, Registry, Shown, declared
+from ibrobot_core.app import Ask, Command, Event, Registry, Shown, declared
 from ibrobot_core.events import encode_event
 
 
@@ -164,3 +167,87 @@ def test_an_event_of_another_shape_is_an_error_of_the_job(ui: Ui, line: str, err
 )
 def test_errors_have_labels_in_place_of_flags_and_commands(ui: Ui, text: str, shown: str) -> None:
     assert in_page_words(text, BREW) == shown
+
+
+class Asking:
+    """A page's server whose job asks two questions, and says what was answered."""
+
+    PROGRAM = """
+from ibrobot_core.events import Choice, Questions, Sight, encode_event
+questions = Questions()
+for text, choices in (("go on?", [Choice(key="y", text="yes"), Choice(key="n", text="no")]), ("why?", [])):
+    sight = Sight(camera="top", wanted="a.jpg", live="../b.jpg")
+    print(encode_event(questions.next(text, choices, [sight])), flush=True)
+    while (given := questions.answer(0.1)) is None:
+        pass
+    print("answered:", given, flush=True)
+"""
+
+    def __init__(self, folder: Path) -> None:
+        command = Command("brew", "Brew coffee.", lambda: click.Command("brew"), BrewOptions, (Poured, Ask))
+        self.ui = Ui(Folders([folder]), Jobs(folder))
+        self.job = self.ui.jobs.start(
+            "brew", "Brew", ["-c", self.PROGRAM], program=(sys.executable,), asks=True,
+            read=event_reader(self.ui.folders, command),
+        )  # fmt: skip
+        (folder / "a.jpg").write_bytes(b"picture")
+        (folder.parent / "b.jpg").write_bytes(b"secret")
+
+    def until(self, met: Callable[[], bool]) -> None:
+        changed = threading.Event()
+        self.ui.jobs.listeners.add(changed.set)
+        while not met():
+            assert changed.wait(60), self.job.lines
+            changed.clear()
+
+
+@pytest.fixture
+def asking(tmp_path: Path) -> Iterator[Asking]:
+    folder = tmp_path / "opened"
+    folder.mkdir()
+    found = Asking(folder)
+    yield found
+    found.ui.close()
+
+
+def test_a_job_asks_and_is_answered(asking: Asking) -> None:
+    ui, job = asking.ui, asking.job
+    asking.until(lambda: job.facts.get("ask") is not None)
+    assert job.json()["facts"]["ask"] == {
+        "ask": 1, "text": "go on?",
+        "choices": ({"key": "y", "text": "yes", "urgent": False}, {"key": "n", "text": "no", "urgent": False}),
+        "sights": ({"camera": "top", "wanted": "a.jpg", "live": "../b.jpg"},),
+    }  # fmt: skip
+    with pytest.raises(IbrobotError, match="'x' is no answer; the answers are: y, n"):
+        answer(ui, GiveAnswer(number=job.number, ask=1, answer="x"))
+    with pytest.raises(IbrobotError, match="was answered already"):
+        answer(ui, GiveAnswer(number=job.number, ask=2, answer="y"))
+    answer(ui, GiveAnswer(number=job.number, ask=1, answer="y"))
+    with pytest.raises(IbrobotError, match="was answered already"):
+        answer(ui, GiveAnswer(number=job.number, ask=1, answer="n"))
+    asking.until(lambda: (job.facts.get("ask") or {}).get("ask") == 2)
+    answer(ui, GiveAnswer(number=job.number, ask=2, answer='so\nthat, "it" ends'))
+    asking.until(lambda: job.state == "done")
+    assert list(job.lines) == ["answered: y", "answered: so", 'that, "it" ends']
+    assert "ask" not in job.facts
+    with pytest.raises(IbrobotError, match="was answered already"):
+        answer(ui, GiveAnswer(number=job.number, ask=2, answer="late"))
+
+
+def test_pictures_of_questions_are_those_in_the_opened_folders(asking: Asking) -> None:
+    asking.until(lambda: asking.job.facts.get("ask") is not None)
+    ask = {"number": asking.job.number, "ask": 1}
+    assert sight(asking.ui, NamesSight(**ask, sight=0, which="wanted")).content == b"picture"
+    with pytest.raises(IbrobotError, match="outside the opened folders"):
+        sight(asking.ui, NamesSight(**ask, sight=0, which="live"))
+    for wrong in ({**ask, "sight": 1}, {**ask, "ask": 2, "sight": 0}):
+        with pytest.raises(IbrobotError, match="no such picture"):
+            sight(asking.ui, NamesSight(**wrong, which="wanted"))
+
+
+def test_a_job_that_asks_ends_with_the_page_s_server(asking: Asking) -> None:
+    asking.until(lambda: asking.job.facts.get("ask") is not None)
+    assert asking.job.process.stdin is not None
+    asking.job.process.stdin.close()  # as when the server is killed
+    asking.until(lambda: asking.job.state == "failed")
+    assert "nobody can answer: standard input has ended" in asking.job.lines[-1]

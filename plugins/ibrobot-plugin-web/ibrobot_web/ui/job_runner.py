@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import select
@@ -18,6 +19,7 @@ from typing import Any, Literal
 import attrs
 
 from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import Answer
 from ibrobot_web.status import without_tokens
 
 IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.command import main; main()")
@@ -102,6 +104,7 @@ class Jobs:
     def start(
         self, kind: str, title: str, arguments: Sequence[str], *, facts: Mapping[str, Any] | None = None,
         read: Reader | None = None, program: Sequence[str] = IBROBOT, done_codes: tuple[int, ...] = (0,),
+        asks: bool = False,
     ) -> Job:  # fmt: skip
         """Start a job.
 
@@ -113,6 +116,7 @@ class Jobs:
             read: reads facts from each line of its output.
             program: the program; the command `ibrobot` by default.
             done_codes: exit codes of a job that did what it was started for.
+            asks: whether it asks questions, the fact `ask`, and reads the answers.
 
         Raises:
             IbrobotError: if the program cannot be started.
@@ -122,8 +126,9 @@ class Jobs:
                 raise IbrobotError("the page's server is ending")
             try:
                 process = subprocess.Popen(
-                    [*program, *arguments], cwd=self._folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                    stderr=subprocess.STDOUT, start_new_session=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
+                    [*program, *arguments], cwd=self._folder, stdin=subprocess.PIPE if asks else subprocess.DEVNULL,
+                    stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+                    env={**os.environ, "PYTHONUNBUFFERED": "1"},
                 )  # fmt: skip
             except OSError as error:
                 raise IbrobotError(f"{program[0]} cannot be started: {error.strerror}") from None
@@ -166,6 +171,28 @@ class Jobs:
         job.cancelling = True
         self._change(job)
 
+    def answer(self, number: int, answer: Answer) -> None:
+        """Answer what a job asks.
+
+        Raises:
+            IbrobotError: if there is no such job, or it does not ask this any more, or the answer is not possible.
+        """
+        job = self.get(number)
+        with self._lock:
+            asked = job.facts.get("ask")
+            if job.state != "running" or asked is None or asked["ask"] != answer.ask:
+                raise IbrobotError("this question was answered already")
+            keys = [each["key"] for each in asked["choices"]]
+            if keys and answer.answer not in keys:
+                raise IbrobotError(f"{answer.answer[:40]!r} is no answer; the answers are: {', '.join(keys)}")
+            assert job.process.stdin is not None
+            try:
+                os.write(job.process.stdin.fileno(), json.dumps(attrs.asdict(answer)).encode() + b"\n")
+            except BrokenPipeError:
+                raise IbrobotError("the job has ended") from None
+            job.facts["ask"] = None
+        self._change(job)
+
     def close(self) -> None:
         """End all jobs, and wait for them."""
         with self._lock:
@@ -203,6 +230,9 @@ class Jobs:
         output.close()
         code = job.process.wait()
         with self._lock:
+            job.facts.pop("ask", None)
+            if job.process.stdin is not None:
+                job.process.stdin.close()
             job.exit_code, job.ended_s = code, time.time()
             done = code in job.done_codes and "error" not in job.facts
             job.state = "done" if done else "cancelled" if job.cancelling else "failed"

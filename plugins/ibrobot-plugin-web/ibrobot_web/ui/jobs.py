@@ -9,14 +9,22 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import Command, Failed, WireError, decode_event, installed_plugins
-from ibrobot_web.ui.context import Route, Ui
+from ibrobot_core.app import Answer, Ask, Command, Failed, WireError, decode_event, installed_plugins
+from ibrobot_web.ui.context import Blob, Route, Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import arguments, form_of, in_page_words, job_commands, read_form, title_of
 from ibrobot_web.ui.job_runner import Reader
 
 _POINTS = 400
 """Points of a curve that are kept."""
+
+
+_LONGEST_ANSWER = 500
+
+
+def _short(instance: object, attribute: object, text: str) -> None:
+    if len(text) > _LONGEST_ANSWER:
+        raise ValueError(f"at most {_LONGEST_ANSWER} characters")
 
 
 @attrs.frozen
@@ -40,6 +48,23 @@ class FilledForm(NamesCommand):
     values: Mapping[str, Any] = option(help="value of each field")
 
 
+@attrs.frozen(kw_only=True)
+class GiveAnswer(NamesJob):
+    """An answer to what a job asks."""
+
+    ask: int = option(ge=1, help="number of the question")
+    answer: str = option(validator=_short, help="key of the choice, or a text")
+
+
+@attrs.frozen(kw_only=True)
+class NamesSight(NamesJob):
+    """A request for a picture beside a question."""
+
+    ask: int = option(ge=1, help="number of the question")
+    sight: int = option(ge=0, help="number of the camera in the question, from 0")
+    which: str = option(choices=("wanted", "live"), help="which of its pictures")
+
+
 def form(ui: Ui, request: NamesCommand) -> dict[str, Any]:
     """The form of a command."""
     return form_of(ui, request.command)
@@ -54,8 +79,9 @@ def start(ui: Ui, request: FilledForm) -> dict[str, int]:
     what = ", ".join(ui.folders.name(each) for each in _paths(options))
     title = f"{title_of(command.name)} {what}"
     job = ui.jobs.start(
-        command.name, title, [command.name, "--events", *arguments(options)], read=event_reader(ui.folders, command)
-    )
+        command.name, title, [command.name, "--events", *arguments(options)],
+        read=event_reader(ui.folders, command), asks=Ask in command.events,
+    )  # fmt: skip
     return {"number": job.number}
 
 
@@ -89,6 +115,8 @@ def event_reader(folders: Folders, command: Command) -> Reader:
         shown, facts = event.shown(), dict[str, Any]()
         if isinstance(event, Failed):
             facts["error"] = words(event.error)
+        elif isinstance(event, Ask):
+            facts["ask"] = {**attrs.asdict(event), "text": words(event.text)}
         elif shown.text:
             facts["text"] = words(shown.text)
         if shown.progress is not None:
@@ -114,8 +142,27 @@ def cancel(ui: Ui, request: NamesJob) -> None:
     ui.jobs.cancel(request.number)
 
 
+def answer(ui: Ui, request: GiveAnswer) -> None:
+    """Answer what a job asks."""
+    ui.jobs.answer(request.number, Answer(ask=request.ask, answer=request.answer))
+
+
+def sight(ui: Ui, request: NamesSight) -> Blob:
+    """A picture beside the question of a job."""
+    asked = ui.jobs.get(request.number).facts.get("ask")
+    if asked is None or asked["ask"] != request.ask or request.sight >= len(asked["sights"]):
+        raise IbrobotError("no such picture: the question was answered")
+    name = asked["sights"][request.sight][request.which]
+    try:
+        return Blob(ui.folders.find(name).read_bytes(), "image/jpeg")
+    except OSError as error:
+        raise IbrobotError(f"{name}: cannot be read: {error.strerror}") from None
+
+
 ROUTES: dict[str, Route[Any]] = {
     "GET /form": Route(form, NamesCommand),
     "POST /start": Route(start, FilledForm),
     "POST /cancel": Route(cancel, NamesJob),
+    "POST /answer": Route(answer, GiveAnswer),
+    "GET /sight": Route(sight, NamesSight),
 }

@@ -26,11 +26,17 @@ export class View {
 
   async load() {
     const form = await this.ui.attempt(() => this.ui.get("jobs/form", { command: this.command }));
-    if (form) this.form.show(form, this.ui.drives);
+    if (!form) return;
+    this.form.show(form, this.ui.drives);
+    if (!this.loaded) this.form.enter(JSON.parse(localStorage.getItem(this.key) ?? "{}")); // as it was sent last
+    this.loaded = true;
   }
+
+  get key() { return `form ${this.command}`; }
 
   async start(values) {
     this.form.button.disabled = true;
+    localStorage.setItem(this.key, JSON.stringify(values));
     await this.ui.attempt(() => this.ui.post("jobs/start", { command: this.command, values }));
     this.form.button.disabled = !this.ui.drives;
   }

@@ -2,6 +2,7 @@
 
 import { h, refresh, say } from "../dom.js";
 import { drawPlot } from "../plot.js";
+import { Question } from "./question.js";
 
 // What a job has made -> the view that shows it.
 const MADE = { dataset: ["datasets", "Open the dataset"], policy: ["policies", "Use it in a robot"], episode: ["episodes", "See the episode"], episodes: ["episodes", "See the episodes"] };
@@ -18,6 +19,7 @@ export class JobCard {
     this.progress = h("progress", { max: "1", "aria-label": "Progress", hidden: true });
     this.facts = h("p", {});
     this.error = h("div", {});
+    this.question = new Question(ui);
     this.plot = h("canvas", { class: "plot", role: "img", hidden: true });
     new ResizeObserver(() => this.draw()).observe(this.plot);
     this.problems = h("div", {});
@@ -25,7 +27,7 @@ export class JobCard {
     this.output = h("pre", { class: "output", tabindex: "0", "aria-label": "Output" });
     this.details = h("details", { open }, h("summary", {}, "Output"), this.output);
     this.element = h("div", { class: "card job" }, h("div", { class: "row" }, this.title, this.state), this.progress,
-      this.facts, this.error, this.plot, this.problems, this.made, this.controls, this.details);
+      this.facts, this.question.element, this.error, this.plot, this.problems, this.made, this.controls, this.details);
   }
 
   update(job) {
@@ -36,6 +38,7 @@ export class JobCard {
     this.progress.hidden = progress === undefined || job.state !== "running";
     if (progress !== undefined) this.progress.value = progress;
     say(this.facts, job.facts.text ?? "");
+    this.question.update(job);
     refresh(this.error, [job.state, job.exit_code, job.facts.error], () => (job.state === "failed" ? failure(job) : []));
     refresh(this.controls, [job.state, job.cancelling, job.facts.url, this.ui.drives], () => this.buttons(job));
     this.job = job;

@@ -1,0 +1,125 @@
+"""Pictures of the scene for the operator of blinded trials: as it was at a start, and as it is."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+from ibrobot_ros2.jpeg import fits_jpeg, is_jpeg, to_jpeg
+
+from ibrobot_core.api import CompressedImage, IbrobotError, Image, Message, Sensor
+from ibrobot_core.app import LaunchRequest, RobotConfig, Session, Sight, Subscription, installed_plugins
+from ibrobot_eval.episodes import write
+
+_QUALITY = 85
+_PERIOD_S = 0.1
+"""Shortest time between two pictures of a camera."""
+
+
+def cameras_of(config: RobotConfig) -> list[str]:
+    """The names of a robot's cameras."""
+    return [name for name, each in config.peripherals.items() if each.kind == "camera"]
+
+
+def as_jpeg(message: Message) -> bytes | None:
+    """A camera's picture as JPEG; None for what has no colours, e.g. depth."""
+    if isinstance(message, CompressedImage):
+        return message.data.tobytes() if is_jpeg(message) else None
+    if isinstance(message, Image) and fits_jpeg(message):
+        return to_jpeg(message, _QUALITY).data.tobytes()
+    return None
+
+
+class StartPictures:
+    """The pictures of a start: the first ones of a run, one of each camera.
+
+    Args:
+        folder: where they are.
+        cameras: the cameras.
+    """
+
+    def __init__(self, folder: Path, cameras: list[str]) -> None:
+        self._files = {name: folder / f"{name}.jpg" for name in cameras}
+
+    def sights(self, live: Path | None) -> list[Sight]:
+        """What the operator sees of the cameras with a picture of the start, or a live one."""
+        found = []
+        for name, file in self._files.items():
+            wanted = str(file) if file.exists() else ""
+            now = live / file.name if live is not None else None
+            present = str(now) if now is not None and now.exists() else ""
+            if wanted or present:
+                found.append(Sight(camera=name, wanted=wanted, live=present))
+        return found
+
+    def taken(self, session: Session) -> TakenPictures:
+        """Takes them in a run, instead of those that there are."""
+        return TakenPictures(session, self._files)
+
+
+class TakenPictures:
+    """Writes the first picture of each camera in a run."""
+
+    def __init__(self, session: Session, files: dict[str, Path]) -> None:
+        self._todo: dict[Path, Subscription] = {
+            file: session.bus.subscribe(f"/camera/{name}/image_raw", 1) for name, file in files.items()
+        }
+
+    def take(self) -> None:
+        """Write what has come by now."""
+        for file, images in tuple(self._todo.items()):
+            for each in images.drain():
+                if (content := as_jpeg(each.message)) is not None:
+                    write(file, content)
+                    del self._todo[file]
+                    break
+
+
+@contextmanager
+def live_pictures(config: RobotConfig, folder: Path) -> Iterator[str]:
+    """Write the present pictures of the cameras of a robot that does not run, each again and again into one file.
+
+    Yields what went wrong with cameras; empty if nothing did.
+    """
+    session = Session(config, installed_plugins(), LaunchRequest())
+    problems: list[str] = []
+    ended = threading.Event()
+    with ExitStack() as stack:
+        for name in cameras_of(config):
+            file, ready = folder / f"{name}.jpg", threading.Event()
+            file.parent.mkdir(parents=True, exist_ok=True)
+            sensor: Sensor = session.make("sensor", config.peripherals[name], name)
+            thread = threading.Thread(
+                target=_follow, args=(sensor, name, file, ready, ended, problems), name=f"live {name}", daemon=True
+            )
+            thread.start()
+            stack.callback(thread.join)
+            stack.callback(ended.set)
+            ready.wait()
+        yield "; ".join(problems)
+
+
+def _follow(
+    sensor: Sensor, name: str, file: Path, ready: threading.Event, ended: threading.Event, problems: list[str]
+) -> None:
+    """Write the pictures of a camera until the end; `ready` once there is one, or none will come."""
+    staged = file.with_suffix(".new")
+    try:
+        sensor.open()
+        while not ended.is_set():
+            message = sensor.read(1.0)
+            if message is not None and (content := as_jpeg(message)) is not None:
+                staged.write_bytes(content)
+                staged.replace(file)
+            ready.set()
+            ended.wait(_PERIOD_S)
+    except IbrobotError as error:
+        problems.append(f"{name}: {error}")
+    finally:
+        ready.set()
+        sensor.close()
+        for each in (staged, file):
+            with suppress(FileNotFoundError):
+                each.unlink()
