@@ -120,6 +120,11 @@ def ibrobot_guides() -> Iterable[descriptors.GuideDescriptor]:  # type: ignore[e
 
 
 @hookspec
+def ibrobot_reports() -> Iterable[descriptors.ReportDescriptor]:  # type: ignore[empty-body]
+    """Folders with results, which pages list and show."""
+
+
+@hookspec
 def ibrobot_configs() -> Iterable[descriptors.ConfigFile]:  # type: ignore[empty-body]
     """Robot YAMLs that this plugin ships."""
 

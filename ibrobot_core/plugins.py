@@ -52,7 +52,9 @@ KINDS: Mapping[str, str] = {
     "section": "ibrobot_sections",
 }
 """Plugin kind -> its registration hook."""
-_UNTYPED = tuple(f"ibrobot_{objects}" for objects in ("readers", "decoders", "configs", "commands", "panels", "guides"))
+_UNTYPED = tuple(
+    f"ibrobot_{objects}" for objects in ("readers", "decoders", "configs", "commands", "panels", "guides", "reports")
+)
 """Registration hooks for objects that the YAML does not name by `type`."""
 
 OFFICIAL = Path(__file__).with_name("official_plugins.json")
@@ -102,6 +104,7 @@ class Registry:
     readers: list[descriptors.ReaderDescriptor] = attrs.field(factory=list)
     panels: list[descriptors.PanelDescriptor] = attrs.field(factory=list)
     guides: list[descriptors.GuideDescriptor] = attrs.field(factory=list)
+    reports: list[descriptors.ReportDescriptor] = attrs.field(factory=list)
     decoders: list[descriptors.DecoderDescriptor] = attrs.field(factory=list)
     commands: dict[str, descriptors.Command] = attrs.field(factory=dict)
     command_packages: dict[str, str] = attrs.field(factory=dict)
@@ -344,6 +347,7 @@ def _add(registry: Registry, plugin: str, package: str, version: str, load: Call
     registry.configs += offers["ibrobot_configs"]
     registry.panels += offers["ibrobot_panels"]
     registry.guides += offers["ibrobot_guides"]
+    registry.reports += offers["ibrobot_reports"]
     for command in offers["ibrobot_commands"]:
         if command.name in registry.commands:
             reason = f"command {command.name!r} is offered by {registry.command_packages[command.name]} already"

@@ -31,8 +31,8 @@ _SIGN_IN_BYTES = 4096
 """Largest form with a password [bytes]."""
 _ROLE = web.RequestKey("role", str)
 _CSP = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self' {sockets}; "
-    "base-uri 'none'; form-action {forms}; frame-ancestors 'none'"
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; media-src 'self'; "
+    "connect-src 'self' {sockets}; base-uri 'none'; form-action {forms}; frame-ancestors 'none'"
 )
 _HEADERS = {
     "Cache-Control": "no-store",

@@ -244,7 +244,7 @@ class Blinded:
         session = Session(config, installed_plugins(), LaunchRequest(False, seed, duration_s, episodes))
         runtime = Runtime(session)
         # The picture is that of the trial before which the scene was set to a new start.
-        pictures = starts.taken(session) if all(each.outcome == VOID for each in self._order.of(block)) else None
+        pictures = starts.taken(session.bus) if all(each.outcome == VOID for each in self._order.of(block)) else None
         judged: list[str] = []
         self._operator.say("starting …")
         with _ended_by_signals(session) as came, _listening(self._operator, session, judged):

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from ibrobot_ros2.jpeg import fits_jpeg, is_jpeg, to_jpeg
 
-from ibrobot_core.api import CompressedImage, IbrobotError, Image, Message, Sensor
-from ibrobot_core.app import LaunchRequest, RobotConfig, Session, Sight, Subscription, installed_plugins
+from ibrobot_core.api import CompressedImage, IbrobotError, Image, Message, RealClock, Sensor
+from ibrobot_core.app import Bus, RobotConfig, Sight, Subscription, installed_plugins
 from ibrobot_eval.episodes import write
 
 _QUALITY = 85
@@ -54,17 +54,17 @@ class StartPictures:
                 found.append(Sight(camera=name, wanted=wanted, live=present))
         return found
 
-    def taken(self, session: Session) -> TakenPictures:
-        """Takes them in a run, instead of those that there are."""
-        return TakenPictures(session, self._files)
+    def taken(self, bus: Bus) -> TakenPictures:
+        """Takes them in a run, instead of the present ones."""
+        return TakenPictures(bus, self._files)
 
 
 class TakenPictures:
     """Writes the first picture of each camera in a run."""
 
-    def __init__(self, session: Session, files: dict[str, Path]) -> None:
+    def __init__(self, bus: Bus, files: dict[str, Path]) -> None:
         self._todo: dict[Path, Subscription] = {
-            file: session.bus.subscribe(f"/camera/{name}/image_raw", 1) for name, file in files.items()
+            file: bus.subscribe(f"/camera/{name}/image_raw", 1) for name, file in files.items()
         }
 
     def take(self) -> None:
@@ -83,16 +83,17 @@ def live_pictures(config: RobotConfig, folder: Path) -> Iterator[str]:
 
     Yields what went wrong with cameras; empty if nothing did.
     """
-    session = Session(config, installed_plugins(), LaunchRequest())
+    registry, clock = installed_plugins(), RealClock()
     problems: list[str] = []
     ended = threading.Event()
     with ExitStack() as stack:
         for name in cameras_of(config):
             file, ready = folder / f"{name}.jpg", threading.Event()
             file.parent.mkdir(parents=True, exist_ok=True)
-            sensor: Sensor = session.make("sensor", config.peripherals[name], name)
+            peripheral = config.peripherals[name]
+            made = registry.find("sensor", peripheral.type).make(peripheral.options, config.context(name, clock, 0))
             thread = threading.Thread(
-                target=_follow, args=(sensor, name, file, ready, ended, problems), name=f"live {name}", daemon=True
+                target=_follow, args=(made, name, file, ready, ended, problems), name=f"live {name}", daemon=True
             )
             thread.start()
             stack.callback(thread.join)

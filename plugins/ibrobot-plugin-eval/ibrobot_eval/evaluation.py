@@ -16,10 +16,10 @@ from ibrobot_core.app import ComponentFailed, Ownership, installed_plugins
 from ibrobot_eval.comparison import Decision
 from ibrobot_eval.episodes import SCRATCH, Place, Result, write
 from ibrobot_eval.film import can_film
+from ibrobot_eval.options import SETTINGS
 from ibrobot_eval.policies import Identity, Policy, identify
 from ibrobot_eval.processes import Job, run_jobs
 
-SETTINGS = "evaluation.json"
 _FORMAT = 1
 Watch = Callable[[int, int, Policy, Result], None]
 """Receives the number of episodes done, the number of all, and the episode just done."""

@@ -10,6 +10,11 @@ import attrs
 from ibrobot_core.api import option
 from ibrobot_core.app import Ask, Event, Shown
 
+SETTINGS = "evaluation.json"
+"""File in the folder of an evaluation with what it was begun with."""
+REPORT = "report.json"
+KIND = "evaluation"
+"""The kind of report, for pages."""
 MARGIN = 0.1
 """By default, a difference below this counts as none."""
 
@@ -91,7 +96,7 @@ class Progress(Event):
 
 @attrs.frozen(kw_only=True)
 class Told(Event):
-    """Something that the operator of blinded trials is told."""
+    """A message for the operator of blinded trials."""
 
     text: str = option(help="the text")
 
@@ -109,7 +114,7 @@ class Report(Event):
 
     @override
     def shown(self) -> Shown:
-        return Shown("; ".join(self.lines), 1.0)
+        return Shown("; ".join(self.lines), 1.0, made={KIND: self.out})
 
 
 EVENTS = (Begin, Progress, Ask, Told, Report)

@@ -13,6 +13,7 @@ import attrs
 
 from ibrobot_eval.comparison import Comparison, Summary, compare
 from ibrobot_eval.episodes import Place, Result, write
+from ibrobot_eval.options import REPORT
 from ibrobot_eval.policies import Policy
 from ibrobot_eval.statistics import ALPHA, Interval
 
@@ -64,6 +65,24 @@ class Report:
                 episodes.append(Episode(each.label, result, str(place.episode), str(place.video), command))
         return cls.of(results, episodes, margin, until_decided=until_decided)
 
+    @classmethod
+    def read(cls, file: Path) -> Report:
+        """Read a report that `facts` describes.
+
+        Raises:
+            OSError: if the file cannot be read.
+            ValueError, KeyError, TypeError: if it is not such a report.
+        """
+        facts = json.loads(file.read_text(encoding="utf-8"))
+        results: dict[str, list[Result]] = {each["label"]: [] for each in facts["policies"]}
+        episodes = []
+        for each in facts["episodes"]:
+            fields = {field.name: each[field.name] for field in attrs.fields(Result)}
+            result = Result(**fields | {"faults": tuple(fields["faults"])})
+            results[each["policy"]].append(result)
+            episodes.append(Episode(each["policy"], result, each["recording"], each["video"], each["command"]))
+        return cls.of(results, episodes, facts["margin"], until_decided=facts["until_decided"])
+
     @property
     def factors(self) -> list[str]:
         """The names of the factors of the episodes, in the order of the scene."""
@@ -79,6 +98,7 @@ class Report:
         return {
             "margin": self.margin,
             "until_decided": self.until_decided,
+            "lines": self.lines(),
             "policies": [attrs.asdict(each) for each in self.summaries],
             "comparisons": [{**attrs.asdict(each), "words": each.words} for each in self.comparisons],
             "episodes": [
@@ -86,6 +106,7 @@ class Report:
                     "policy": each.policy,
                     **attrs.asdict(each.result),
                     "recording": each.recording,
+                    "video": each.video,
                     "command": each.command,
                 }
                 for each in self.episodes
@@ -193,6 +214,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 def write_report(out: Path, report: Report) -> None:
     """Write the report into the folder of its evaluation."""
-    write(out / "report.json", json.dumps(report.facts(), indent=1) + "\n")
+    write(out / REPORT, json.dumps(report.facts(), indent=1) + "\n")
     write(out / "report.csv", report.as_csv())
     write(out / "report.md", report.as_markdown())

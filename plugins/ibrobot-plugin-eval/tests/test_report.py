@@ -3,14 +3,20 @@ import csv
 import json
 import re
 from fractions import Fraction
+from html import escape
 from xml.etree import ElementTree
 
 import pytest
+from ibrobot_eval.contents import contents_of, lines_of, read_contents
 from ibrobot_eval.episodes import Result
 from ibrobot_eval.film import encode
+from ibrobot_eval.options import REPORT
 from ibrobot_eval.page import as_page
 from ibrobot_eval.plots import Axis
 from ibrobot_eval.report import Report, write_report
+
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import PLOT_CLASSES, Cases, Plots, Table, Text
 
 from .made_results import policy, result
 
@@ -86,6 +92,60 @@ def test_report_of_one_policy_compares_nothing(tmp_path):
     assert "Comparison" not in as_page(tmp_path, report)
     write_report(tmp_path, report)
     assert {each.name for each in tmp_path.iterdir()} == {"report.json", "report.csv", "report.md"}
+
+
+def blocks(out, report, kind):
+    return [each for section in contents_of(out, report) for each in section.blocks if isinstance(each, kind)]
+
+
+def test_written_report_is_read_as_it_was(tmp_path):
+    report = made(HOSTILE)
+    write_report(tmp_path, report)
+    assert Report.read(tmp_path / REPORT) == report
+    assert read_contents(tmp_path) == contents_of(tmp_path, report)
+    assert lines_of(tmp_path) == report.lines()
+
+
+def test_file_shows_what_pages_show(tmp_path):
+    report = made()
+    page = as_page(tmp_path, report)
+    pictures = [picture for plots in blocks(tmp_path, report, Plots) for picture in plots.pictures]
+    assert re.findall(r"<svg.*?</svg>", page, re.DOTALL) == pictures
+    assert len(pictures) == 1 + 1 + 2 + 2 + 2
+    for text in blocks(tmp_path, report, Text):
+        assert escape(text.text) in page
+    assert page.count("<table>") == len(blocks(tmp_path, report, Table)) == 2
+    (cases,) = blocks(tmp_path, report, Cases)
+    assert [each.title for each in cases.cases] == [f"bad, seed {seed}" for seed in range(3, 12)]
+    assert cases.cases[2].text == "joint: <stuck>"
+
+
+def test_plots_have_only_classes_that_pages_colour(tmp_path):
+    pictures = [picture for plots in blocks(tmp_path, made(), Plots) for picture in plots.pictures]
+    assert {name for picture in pictures for name in re.findall(r'class="([^"]*)"', picture)} == set(PLOT_CLASSES)
+
+
+def test_evaluation_without_a_report_can_be_continued(tmp_path):
+    assert lines_of(tmp_path) == ["not finished; the same evaluation, started again, continues it"]
+    with pytest.raises(IbrobotError, match="has no report yet"):
+        read_contents(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"lines": 3}', '{"policies": [{"label": "a"}], "episodes": [1]}'])
+def test_damaged_report_is_an_error_that_names_it(tmp_path, text):
+    (tmp_path / REPORT).write_text(text)
+    for read in (lines_of, read_contents):
+        with pytest.raises(IbrobotError, match=r"report\.json: is no report of an evaluation"):
+            read(tmp_path)
+
+
+def test_wrong_values_in_a_report_are_an_error_that_names_it(tmp_path):
+    write_report(tmp_path, made())
+    facts = json.loads((tmp_path / REPORT).read_text())
+    facts["episodes"][0]["time_s"] = "soon"
+    (tmp_path / REPORT).write_text(json.dumps(facts))
+    with pytest.raises(IbrobotError, match=r"report\.json: is no report of an evaluation"):
+        read_contents(tmp_path)
 
 
 @pytest.mark.parametrize("ends", [(0.0, 1.0), (-0.3, 0.31), (0.0, 480.0), (2.0, 2.0)])

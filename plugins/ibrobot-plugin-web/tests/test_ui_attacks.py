@@ -21,10 +21,10 @@ from ibrobot_web.server.page_guard import page_guard
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
-from ibrobot_web.ui.server import LARGEST_REQUEST, VIEWS, make_app, routes_of
+from ibrobot_web.ui.server import LARGEST_REQUEST, ROUTED, make_app, routes_of
 from ui_server import UiServer, run_ui
 
-FILES = ("episodes", "datasets", "policies")
+FILES = ("episodes", "datasets", "policies", "reports")
 """Views whose requests name files."""
 WRONG: tuple[Any, ...] = (
     {},
@@ -37,7 +37,7 @@ WRONG: tuple[Any, ...] = (
 OUTSIDE = ("..", "../x", "/etc/passwd", "/", "a/../../b", "//etc")
 
 
-def routes(views: Any = VIEWS) -> Iterator[tuple[str, str]]:
+def routes(views: Any = ROUTED) -> Iterator[tuple[str, str]]:
     for view in views:
         for route in routes_of(view):
             method, path = route.split()
@@ -145,7 +145,7 @@ def test_no_request_reaches_files_outside_the_opened_folders(tmp_path: Path, out
     async def test(server: UiServer) -> None:
         facts: dict[str, Any] = dict.fromkeys(("path", "out", "dataset", "robot", "checkpoint", "target"), outside)
         more = {"paths": [outside], "begin_s": 0, "end_s": 1, "id": "x", "outcome": "success", "digest": "x"}
-        facts |= {**more, "steps": 1, "batch_size": 1, "topic": "/t", "at_s": 0}
+        facts |= {**more, "steps": 1, "batch_size": 1, "topic": "/t", "at_s": 0, "kind": "x"}
         for name in ("episodes", "out", "dataset", "config"):
             for command in ("convert", "train"):
                 values: dict[str, Any] = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import attrs
@@ -42,6 +43,14 @@ class Blob:
     content_type: str
 
 
+@attrs.frozen
+class File:
+    """An answer that is a file, of which browsers may ask for parts, e.g. a video."""
+
+    path: Path
+    content_type: str
+
+
 _LIMITS = RequestLimits(values=10_000, text=4_500, depth=3)
 _WHOLE = re.compile(r"-?\d{1,18}")
 
@@ -54,8 +63,8 @@ class Route[Q]:
     """
 
     answer: Callable[[Ui, Q], Any]
-    """Returns what JSON can express, or a `Blob`. It runs in a thread, may block, and raises IbrobotError for what the
-    page is to show."""
+    """Returns what JSON can express, a `Blob` or a `File`. It runs in a thread, may block, and raises IbrobotError for
+    what the page is to show."""
     request: type[Q]
     """Class of the request, with its fields as `option`."""
 

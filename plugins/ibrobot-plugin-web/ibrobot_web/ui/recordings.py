@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +36,15 @@ class Found:
     """Folders that have a trash."""
     complete: bool
     """False if there are too many folders to look into."""
+    reports: Mapping[str, Sequence[Path]]
+    """Kind of report -> the folders of that kind."""
 
 
 def find_recordings(folders: Sequence[Path]) -> Found:
-    """The episodes and datasets in folders. Hidden folders and links are left out."""
-    readers = installed_plugins().readers
+    """The episodes, datasets and reports in folders. Hidden folders and links are left out."""
+    registry = installed_plugins()
+    readers = registry.readers
+    reports: dict[str, dict[Path, None]] = {each.name: {} for each in registry.reports}
     episodes: list[Path] = []
     datasets: list[Path] = []
     trashes: list[Path] = []
@@ -49,6 +53,9 @@ def find_recordings(folders: Sequence[Path]) -> Found:
     def look(folder: Path, depth: int) -> None:
         nonlocal left
         left -= 1
+        for each in registry.reports:
+            if each.reads(folder):
+                reports[each.name][folder] = None
         if any(reader.reads(folder) for reader in readers if not reader.numbered):
             episodes.append(folder)
         elif any(reader.reads(folder) for reader in readers if reader.numbered):
@@ -63,7 +70,7 @@ def find_recordings(folders: Sequence[Path]) -> Found:
     for folder in folders:
         look(folder, _DEPTH)
     once = [tuple(dict.fromkeys(each)) for each in (episodes, datasets, trashes)]
-    return Found(once[0], once[1], once[2], left > 0)
+    return Found(once[0], once[1], once[2], left > 0, {kind: tuple(found) for kind, found in reports.items()})
 
 
 def policy_type(path: Path) -> str | None:

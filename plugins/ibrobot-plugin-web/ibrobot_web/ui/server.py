@@ -17,9 +17,9 @@ from ibrobot_http.files import add_files
 from ibrobot_http.guard import Guard
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import ConfigError, error_text
+from ibrobot_core.app import ConfigError, error_text, installed_plugins
 from ibrobot_web.server.app import STATIC
-from ibrobot_web.ui.context import Blob, Route, Ui
+from ibrobot_web.ui.context import Blob, File, Route, Ui
 from ibrobot_web.ui.forms import job_commands, title_of
 
 VIEWS = {
@@ -32,7 +32,10 @@ VIEWS = {
     "jobs": "Jobs",
 }
 """Name -> title in the navigation. The module `ibrobot_web.ui.NAME` has the view's `ROUTES`; `static/ui/NAME.js` shows
-it. Each command that runs as a job has a view, too, all by `static/ui/command.js`."""
+it. Each command that runs as a job has a view, too, all by `static/ui/command.js`; each kind of report has one, all by
+`static/ui/reports.js`."""
+ROUTED = (*VIEWS, "reports")
+"""The modules with `ROUTES`."""
 LARGEST_REQUEST = 1 << 20
 """Largest body of a request [bytes]."""
 _HEARTBEAT_S = 5.0
@@ -60,7 +63,11 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
             {"name": f"job-{name}", "title": title_of(name), "module": "command", "command": name}
             for name in job_commands()
         ]
-        views[-1:-1] = jobs  # before the last one, which shows all of them
+        reports = [
+            {"name": f"report-{each.name}", "title": each.title, "module": "reports", "report": each.name}
+            for each in installed_plugins().reports
+        ]
+        views[-1:-1] = [*jobs, *reports]  # before the last one, which shows all jobs
         return web.json_response({"role": guard.role(request), "folders": folders, "views": views})
 
     async def follow(request: web.Request) -> web.StreamResponse:
@@ -71,7 +78,7 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
 
     app.router.add_get("/api/session", session)
     app.router.add_get("/api/jobs", follow)
-    for name in VIEWS:
+    for name in ROUTED:
         for route, answered in routes_of(name).items():
             method, path = route.split()
             app.router.add_route(method, f"/api/{name}{path}", functools.partial(_answer, answered, guard))
@@ -95,6 +102,8 @@ async def _answer(route: Route[Any], guard: Guard, request: web.Request) -> web.
     answer = await asyncio.to_thread(route.answer, request.app[_UI], facts)
     if isinstance(answer, Blob):
         return web.Response(body=answer.content, content_type=answer.content_type)
+    if isinstance(answer, File):
+        return web.FileResponse(answer.path, headers={"Content-Type": answer.content_type})
     return web.json_response(answer, dumps=_dumps)
 
 

@@ -45,8 +45,9 @@ export class JobCard {
     this.draw();
     const { problems = [], made = [] } = job.facts;
     refresh(this.problems, problems, () => problems.map((problem) => h("div", { class: "problem" }, problem)));
-    refresh(this.made, [made, job.state], () => (job.state === "running" ? [] : made).filter(({ kind }) => kind in MADE).map(({ kind, path }) => (
-      h("a", { class: "button", href: `#${MADE[kind][0]}${kind === "episodes" ? "" : `/${encodeURIComponent(path)}`}` }, MADE[kind][1]))));
+    const shows = (kind) => MADE[kind] ?? this.ui.session.views.filter(({ report }) => report === kind).map(({ name, title }) => [name, `Open in ${title}`])[0];
+    refresh(this.made, [made, job.state], () => (job.state === "running" ? [] : made).filter(({ kind }) => shows(kind)).map(({ kind, path }) => (
+      h("a", { class: "button", href: `#${shows(kind)[0]}${kind === "episodes" ? "" : `/${encodeURIComponent(path)}`}` }, shows(kind)[1]))));
     const text = job.lines.join("\n");
     this.details.hidden = !text;
     if (this.output.textContent !== text) {

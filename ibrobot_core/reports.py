@@ -1,0 +1,65 @@
+"""Reports as data: what a plugin says of a folder with results. A file and a page can show the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import attrs
+
+PLOT_CLASSES = (
+    "ok", "bad", "bad-fill", "faint", "range", "band", "estimate", "grid", "zero", "margin", "label",
+)  # fmt: skip
+"""Classes of the shapes in plots, which get their colours from what shows them: `ok` and `faint` are fills of what went
+well, `bad` is a stroke and `bad-fill` a fill of what did not, `range` and `estimate` are strokes, `band` is a fill."""
+
+
+@attrs.frozen
+class Text:
+    """A paragraph."""
+
+    text: str
+    role: Literal["plain", "verdict", "note", "title"] = "plain"
+
+
+@attrs.frozen
+class Table:
+    """A table."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@attrs.frozen
+class Plots:
+    """Plots side by side, each an SVG of lines, rects, circles, paths, polygons, polylines, texts and titles."""
+
+    pictures: tuple[str, ...]
+
+
+@attrs.frozen
+class Cases:
+    """Episodes worth a look, e.g. failures."""
+
+    cases: tuple[Case, ...]
+
+
+@attrs.frozen
+class Case:
+    """One of them."""
+
+    title: str
+    text: str
+    episode: Path
+    """Its recording."""
+    video: Path | None = None
+    command: str = ""
+    """The command that repeats it."""
+
+
+@attrs.frozen
+class ReportSection:
+    """A part of a report, with a title."""
+
+    title: str
+    blocks: tuple[Text | Table | Plots | Cases, ...]

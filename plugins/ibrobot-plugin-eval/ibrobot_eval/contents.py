@@ -1,0 +1,137 @@
+"""The contents of the report of an evaluation, which a file and a page show."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from ibrobot_core.api import DatasetError
+from ibrobot_core.app import Case, Cases, Plots, ReportSection, Table, Text
+from ibrobot_eval import plots
+from ibrobot_eval.options import REPORT
+from ibrobot_eval.report import (
+    COMPARISON_HEAD,
+    NOTE,
+    SUMMARY_HEAD,
+    Episode,
+    Report,
+    comparison_row,
+    summary_row,
+)
+
+_AXES = (("_x", "_y"), (".x", ".y"))
+
+
+def lines_of(out: Path) -> Sequence[str]:
+    """The result of an evaluation, as a terminal shows it.
+
+    Raises:
+        DatasetError: if its report is damaged.
+    """
+    file = out / REPORT
+    if not file.exists():
+        return ["not finished; the same evaluation, started again, continues it"]
+    try:
+        return [str(each) for each in json.loads(file.read_text(encoding="utf-8"))["lines"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{file}: is no report of an evaluation: {error}") from None
+
+
+def read_contents(out: Path) -> Sequence[ReportSection]:
+    """The contents of the report in the folder of an evaluation.
+
+    Raises:
+        DatasetError: if there is none, or it is damaged.
+    """
+    file = out / REPORT
+    if not file.exists():
+        raise DatasetError(f"{out}: has no report yet; the same evaluation, started again, continues it")
+    try:
+        return contents_of(out, Report.read(file))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DatasetError(f"{file}: is no report of an evaluation: {error}") from None
+
+
+def contents_of(out: Path, report: Report) -> list[ReportSection]:
+    """The contents of a report; videos are those in the folder of the evaluation."""
+    rates = [(each.label, each.successes, each.episodes) for each in report.summaries]
+    verdicts = (Text(f"{each.words}.", "verdict") for each in report.comparisons)
+    table = Table(SUMMARY_HEAD, tuple(map(summary_row, report.summaries)))
+    found = [ReportSection("Evaluation", (*verdicts, table, Plots((plots.rates(rates),))))]
+    if report.comparisons:
+        found.append(_comparison(report))
+    found.append(_outcomes(report))
+    if panels := list(_panels(report)):
+        note = Text("Dots are successes, crosses failures. Bars are 95 % intervals.", "note")
+        found.append(ReportSection("Where it succeeds and fails", (note, Plots(tuple(panels)))))
+    failures = report.failures
+    cases = Cases(tuple(_case(out, each) for each in failures))
+    found.append(ReportSection(f"Failures ({len(failures)})", (cases if failures else Text("None."),)))
+    return found
+
+
+def _comparison(report: Report) -> ReportSection:
+    """The pairs of policies, and their differences over the episodes."""
+    blocks: list[Text | Table | Plots] = [
+        Table(COMPARISON_HEAD, tuple(map(comparison_row, report.comparisons))),
+        Text(NOTE, "note"),
+    ]
+    for each in report.comparisons:
+        title = f"{each.first} minus {each.second}: difference of success rates [points] over the episodes"
+        blocks += [Text(title, "title"), Plots((plots.course(each.course, each.margin, title),))]
+    note = "The band is the interval that is valid at all times; dashed lines are the margin."
+    return ReportSection("Comparison", (*blocks, Text(note, "note")))
+
+
+def _outcomes(report: Report) -> ReportSection:
+    """Outcomes and times by seed."""
+    by_policy = [(each.label, _episodes(report, each.label)) for each in report.summaries]
+    outcomes = [
+        (label, [(e.result.seed, e.result.success, e.result.time_s) for e in found]) for label, found in by_policy
+    ]
+    times = [
+        (label, [(e.result.seed, e.result.time_s) for e in found if e.result.success]) for label, found in by_policy
+    ]
+    blocks: list[Text | Plots] = [Plots((plots.strips(outcomes),)), Text("Tall marks are failures.", "note")]
+    if any(found for _, found in times):
+        blocks.append(Plots((plots.times(times),)))
+    return ReportSection("Episodes", tuple(blocks))
+
+
+def _episodes(report: Report, label: str) -> list[Episode]:
+    return [each for each in report.episodes if each.policy == label]
+
+
+def _panels(report: Report) -> Iterator[str]:
+    """Plots of the outcomes over what the scene has drawn."""
+    values_of = {name: {each.result.factors.get(name) for each in report.episodes} for name in report.factors}
+    names = [name for name, values in values_of.items() if len(values) > 1]
+    ends = [(x, x.removesuffix(a) + b) for a, b in _AXES for x in names if x.endswith(a)]
+    pairs = [(x, y) for x, y in ends if y in names]
+    for summary in report.summaries:
+        results = [each.result for each in _episodes(report, summary.label)]
+        for x, y in pairs:
+            points = [
+                (each.factors[x], each.factors[y], each.success, f"seed {each.seed}")
+                for each in results
+                if x in each.factors and y in each.factors
+            ]
+            if points:
+                yield plots.map_of(points, (x, y), summary.label)
+    others = [name for name in names if not any(name in pair for pair in pairs)]
+    for name, summary in itertools.product(others, report.summaries):
+        results = [each.result for each in _episodes(report, summary.label)]
+        values = [(each.factors[name], each.success) for each in results if name in each.factors]
+        if len({value for value, _ in values}) > 1:
+            yield plots.by_factor(values, name, summary.label)
+
+
+def _case(out: Path, episode: Episode) -> Case:
+    """A failure: why, its recording, its video if there is one, and the command that repeats it."""
+    result = episode.result
+    ended = "; ".join(result.faults) or f"no success within {result.time_s:.1f} s"
+    video = out / episode.video
+    shown = video if episode.video and video.is_file() else None
+    return Case(f"{episode.policy}, seed {result.seed}", ended, out / episode.recording, shown, episode.command)

@@ -1,0 +1,149 @@
+// View: reports of one kind on folders with results, e.g. evaluations, and the recordings that they name.
+
+import { h, refresh, say, toast } from "../dom.js";
+import { Player } from "./player.js";
+
+const SVG = "http://www.w3.org/2000/svg";
+const SHAPES = new Set(["svg", "g", "title", "text", "line", "rect", "circle", "path", "polygon", "polyline"]);
+const ATTRIBUTES = ["viewBox", "role", "x", "y", "x1", "y1", "x2", "y2", "cx", "cy", "r", "d", "points", "width", "height", "class", "text-anchor"];
+
+export class View {
+  constructor(ui, { name, title, report }) {
+    this.ui = ui;
+    this.name = name;
+    this.title = title;
+    this.kind = report;
+  }
+
+  mount(element) {
+    this.note = h("p", { class: "note", role: "status" });
+    this.list = h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": this.title });
+    this.player = new Player(this.ui, "reports");
+    this.playing = h("section", { class: "card", hidden: true, "aria-label": "Recording" },
+      h("div", { class: "row" }, this.recording = h("h3", {}), h("button", { onclick: () => this.play("") }, "Close")),
+      this.problem = h("div", {}), this.player.element);
+    this.head = h("h2", { tabindex: "-1" });
+    this.body = h("div", {});
+    this.detail = h("section", { class: "card report", hidden: true, "aria-label": "Report" },
+      h("div", { class: "row" }, this.head, h("button", { onclick: () => { location.hash = this.name; } }, "Close")), this.body);
+    element.append(h("section", { class: "card" }, h("h2", {}, this.title), this.note, this.list), this.playing, this.detail);
+  }
+
+  async show(shown, rest) {
+    this.shown = shown;
+    if (!shown) { this.player.pause(); return; }
+    await this.load();
+    await this.open(rest);
+  }
+
+  job(job) {
+    if (!this.shown || job.state === "running" || !(job.facts.made ?? []).some(({ kind }) => kind === this.kind)) return;
+    this.load();
+    if (this.path) this.open(this.path);
+  }
+
+  async load() {
+    const found = await this.ui.attempt(() => this.ui.get("reports/list", { kind: this.kind }));
+    if (!found) return;
+    say(this.note, found.length ? "" : "None in the opened folders.");
+    refresh(this.list, [found, this.path], () => (found.length ? [h("table", {},
+      h("thead", {}, h("tr", {}, ["Folder", "Result", "Changed"].map((name) => h("th", { scope: "col" }, name)))),
+      h("tbody", {}, found.map((each) => this.row(each))))] : []));
+  }
+
+  row({ path, lines, problem, changed_s: at }) {
+    return h("tr", { class: path === this.path ? "current" : "" },
+      h("th", { scope: "row" }, h("a", { href: `#${this.name}/${encodeURIComponent(path)}` }, path)),
+      h("td", { class: problem ? "bad text" : "text" }, problem || lines.map((line) => h("div", {}, line))),
+      h("td", {}, new Date(at * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })));
+  }
+
+  async open(path) {
+    if (path !== this.path) this.play("");
+    this.path = path;
+    this.detail.hidden = !path;
+    for (const row of this.list.querySelectorAll("tr")) row.classList.toggle("current", row.querySelector("a")?.textContent === path);
+    if (!path) return;
+    say(this.head, path);
+    let sections;
+    try {
+      sections = await this.ui.get("reports/show", { kind: this.kind, path });
+    } catch (error) {
+      if (this.path === path) refresh(this.body, error.message, () => [h("div", { class: "problem", role: "alert" }, error.message)]);
+      return;
+    }
+    if (this.path !== path) return; // another one was opened meanwhile
+    refresh(this.body, sections, () => sections.map(({ title, blocks }, i) => (
+      h("section", { "aria-label": title }, i ? h("h3", {}, title) : null, blocks.map((block) => this.block(block))))));
+  }
+
+  block(block) {
+    switch (block.kind) {
+      case "text": return block.role === "title" ? h("h4", {}, block.text) : h("p", { class: block.role }, block.text);
+      case "table": return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Table" }, h("table", {},
+        h("thead", {}, h("tr", {}, block.columns.map((name) => h("th", { scope: "col" }, name)))),
+        h("tbody", {}, block.rows.map((row) => h("tr", {}, row.map((cell, i) => (
+          i ? h("td", { class: cell.length > 40 ? "text" : "" }, cell) : h("th", { scope: "row" }, cell))))))));
+      case "plots": return h("div", { class: block.pictures.length > 1 ? "plotted several" : "plotted" }, block.pictures.map(picture));
+      case "cases": return h("div", { class: "columns cases" }, block.cases.map((each) => this.case(each)));
+      default: return null;
+    }
+  }
+
+  case({ title, text, episode, video, command }) {
+    return h("article", { class: "case" }, h("h4", {}, title),
+      video ? h("video", { src: this.ui.address("reports/video", { path: video }), controls: true, muted: true, preload: "metadata", "aria-label": `Video of ${title}` }) : null,
+      h("p", {}, text),
+      episode ? h("p", {}, h("a", { href: `#episodes/${encodeURIComponent(episode)}` }, episode)) : null,
+      command ? h("code", {}, command) : null,
+      h("div", { class: "row" },
+        episode ? h("button", { "aria-label": `Play the recording of ${title}`, onclick: () => this.play(episode, title) }, "Play the recording") : null,
+        command ? h("button", { "aria-label": `Copy the command of ${title}`, onclick: () => copy(command) }, "Copy the command") : null));
+  }
+
+  async play(path, title = "") {
+    this.playing.hidden = !path;
+    if (!path) { this.player.close(); return; }
+    say(this.recording, title);
+    this.problem.replaceChildren();
+    this.player.element.hidden = false;
+    this.player.posed = undefined;
+    try {
+      await this.player.open(path);
+      this.player.toggle();
+    } catch (error) {
+      this.player.close();
+      this.player.element.hidden = true;
+      this.problem.replaceChildren(h("div", { class: "problem", role: "alert" }, error.message));
+    }
+    this.playing.scrollIntoView({ block: "start" });
+  }
+}
+
+async function copy(text) {
+  try {
+    await navigator.clipboard.writeText(text);
+    toast("The command is copied.");
+  } catch {
+    toast("The browser did not permit to copy; select the command instead.", "error");
+  }
+}
+
+// A plot: shapes and texts of an SVG, and nothing else that it may contain.
+function picture(text) {
+  const made = shape(new DOMParser().parseFromString(text, "image/svg+xml").documentElement);
+  const width = made?.getAttribute("viewBox")?.split(" ")[2];
+  if (width) made.style.maxWidth = `${Number(width)}px`;
+  return made;
+}
+
+function shape(element) {
+  if (!SHAPES.has(element.localName)) return null;
+  const made = document.createElementNS(SVG, element.localName);
+  for (const name of ATTRIBUTES) if (element.hasAttribute(name)) made.setAttribute(name, element.getAttribute(name));
+  for (const child of element.childNodes) {
+    const part = child.nodeType === Node.TEXT_NODE ? child.data : child.nodeType === Node.ELEMENT_NODE ? shape(child) : null;
+    if (part !== null) made.append(part);
+  }
+  return made;
+}

@@ -1,0 +1,107 @@
+"""Views: reports of plugins on folders with results, e.g. evaluations; their recordings are played back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.app import Case, Cases, Plots, ReportDescriptor, ReportSection, Table, Text, installed_plugins
+from ibrobot_web.ui import episodes
+from ibrobot_web.ui.context import File, NamesPath, Route, Ui
+from ibrobot_web.ui.recordings import find_recordings
+
+_VIDEO = ".mp4"
+
+
+@attrs.frozen
+class NamesKind:
+    """A request about a kind of report."""
+
+    kind: str = option(help="its name")
+
+
+@attrs.frozen
+class NamesReport(NamesPath):
+    """A request for a report."""
+
+    kind: str = option(help="name of its kind")
+
+
+def _kind(name: str) -> ReportDescriptor:
+    known = {each.name: each for each in installed_plugins().reports}
+    if name not in known:
+        raise IbrobotError(f"{name[:40]!r} is no kind of report; installed: {', '.join(known) or 'none'}")
+    return known[name]
+
+
+def listing(ui: Ui, request: NamesKind) -> list[dict[str, Any]]:
+    """The folders of a kind in the opened folders, the newest first."""
+    descriptor = _kind(request.kind)
+    found = find_recordings(ui.folders.paths).reports.get(descriptor.name, ())
+    rows = []
+    for folder in found:
+        try:
+            lines, problem = list(descriptor.lines(folder)), ""
+        except IbrobotError as error:
+            lines, problem = [], str(error).replace(f"{ui.folders.first}/", "")
+        path, changed_s = ui.folders.name(folder), folder.stat().st_mtime
+        rows.append({"path": path, "lines": lines, "problem": problem, "changed_s": changed_s})
+    return sorted(rows, key=lambda row: row["changed_s"], reverse=True)
+
+
+def show(ui: Ui, request: NamesReport) -> list[dict[str, Any]]:
+    """A report."""
+    folder = ui.folders.find(request.path)
+    descriptor = _kind(request.kind)
+    if not descriptor.reads(folder):
+        raise IbrobotError(f"{ui.folders.name(folder)}: is not among the {descriptor.title.lower()}")
+    try:
+        return [_section(ui, each) for each in descriptor.make(folder)]
+    except IbrobotError as error:
+        raise IbrobotError(str(error).replace(f"{ui.folders.first}/", "")) from error
+
+
+def _section(ui: Ui, section: ReportSection) -> dict[str, Any]:
+    return {"title": section.title, "blocks": [_block(ui, each) for each in section.blocks]}
+
+
+def _block(ui: Ui, block: Text | Table | Plots | Cases) -> dict[str, Any]:
+    match block:
+        case Text() | Table() | Plots():
+            return {"kind": type(block).__name__.lower(), **attrs.asdict(block)}
+        case Cases(cases):
+            return {"kind": "cases", "cases": [_case(ui, each) for each in cases]}
+
+
+def _case(ui: Ui, case: Case) -> dict[str, Any]:
+    return {
+        "title": case.title, "text": case.text, "command": case.command, "episode": _name(ui, case.episode),
+        "video": _name(ui, case.video) if case.video is not None else "",
+    }  # fmt: skip
+
+
+def _name(ui: Ui, path: Path) -> str:
+    """A path for requests; empty if it is outside the opened folders, or there is nothing."""
+    try:
+        return ui.folders.name(ui.folders.find(str(path))) if path.exists() else ""
+    except IbrobotError:
+        return ""
+
+
+def video(ui: Ui, request: NamesPath) -> File:
+    """A video."""
+    path = ui.folders.find(request.path)
+    if path.suffix != _VIDEO or not path.is_file():
+        raise IbrobotError(f"{ui.folders.name(path)}: there is no such video")
+    return File(path, "video/mp4")
+
+
+ROUTES: dict[str, Route[Any]] = {
+    "GET /list": Route(listing, NamesKind),
+    "GET /show": Route(show, NamesReport),
+    "GET /video": Route(video, NamesPath),
+    **{f"GET /{name}": episodes.ROUTES[f"GET /{name}"] for name in ("open", "series", "picture", "scene", "objects")},
+}
