@@ -182,9 +182,9 @@ def integration(session: nox.Session) -> None:
     session.run(*PYTEST, *TWO, "-m", "integration", *marked("integration"), *session.posargs)
 
 
-@nox.session
+@nox.session(default=False)
 def minimums(session: nox.Session) -> None:
-    """Core's and the plugins' tests with the oldest versions that they allow.
+    """Core's and the plugins' tests with the oldest versions that they allow; not one of `nox` alone: it doubles that.
 
     Every test of code runs, with few examples of Hypothesis: the search for rare ones is that of the other sessions.
     """
