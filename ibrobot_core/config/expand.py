@@ -7,7 +7,7 @@ import re
 from importlib.util import find_spec
 from pathlib import Path
 
-_VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)(?::([^}]*))?\}")
+VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)(?::([^}]*))?\}")
 
 
 def expand(text: str) -> str:
@@ -24,9 +24,9 @@ def expand(text: str) -> str:
             raise ValueError(f"environment variable {name} is not set; set it, or give a default: ${{{name}:value}}")
         return value
 
-    if "${" in _VARIABLE.sub("", text):
+    if "${" in VARIABLE.sub("", text):
         raise ValueError(f"malformed variable in {text!r}; write ${{NAME}} or ${{NAME:default}}")
-    expanded = _VARIABLE.sub(replace, text)
+    expanded = VARIABLE.sub(replace, text)
     return str(Path(expanded).expanduser()) if expanded.startswith("~/") else expanded
 
 
