@@ -56,7 +56,8 @@ EXTRAS = {
 PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-apple-darwin")
 """Where everything must install without a compiler: PCs, robots' own computers (e.g. Jetson), and Macs."""
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
-PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0", "-rfEs")
+# A test that fails runs once more: beside other sessions, processes that tests start may be late. `RERUN` lists it.
+PYTEST = ("pytest", "--config-file=pyproject.toml", "--rootdir=.", "--hypothesis-seed=0", "--reruns=1", "-rfEsR")
 TWO = ("-n", "2", "--dist", "worksteal")
 """Two tests at once: in sessions so long that the others would end before them."""
 UNTYPED = (
