@@ -32,7 +32,7 @@ class Seen:
         self._looks: list[str] = []
         self._answers: list[Any] = []
         self.errors: list[str] = []
-        page.on("response", self._answers.append)
+        page.on("response", lambda answer: self._answers.extend([answer]))
         page.on("websocket", lambda socket: socket.on("framereceived", lambda frame: self._looks.append(str(frame))))
         page.on("pageerror", lambda error: self.errors.append(str(error)))
         page.on("console", lambda line: self._looks.append(line.text))
@@ -67,7 +67,7 @@ def judge(page: Any, number: int, key: str) -> None:
     """Begin a trial and judge it, both by keys."""
     question(page, f"trial {number} (")
     page.keyboard.press("Enter")
-    question(page, "running")
+    question(page, "how does it end")
     page.keyboard.press(key)
 
 
@@ -104,14 +104,14 @@ def first_day(page: Any, seen: Seen, folder: Path) -> None:
     assert page.evaluate("getComputedStyle(document.querySelector('.over')).opacity") == "0.8"
     seen.look()
     page.get_by_role("button", name="Begin the trial").click()
-    question(page, "running")
+    question(page, "how does it end")
     seen.look()
     page.get_by_role("button", name="Void").click()
     page.get_by_label("trial 2 is void; reason").fill("the light went out, s")
     page.keyboard.press("Enter")
     question(page, "trial 3 (start 1 of 2)")
     page.keyboard.press("Enter")
-    question(page, "running")
+    question(page, "how does it end")
     crash(folder)
     page.locator(".job .state.failed").wait_for(timeout=WAIT_MS)
     assert page.locator(".ask:visible").count() == 0, "nobody is asked any more"
@@ -127,11 +127,13 @@ def second_day(page: Any, seen: Seen) -> None:
     seen.look()
     page.get_by_role("link", name="Eval", exact=True).click()
     page.get_by_role("button", name="Begin the trial").click()
-    question(page, "running")
+    question(page, "how does it end")
+    page.keyboard.press("Escape")  # the emergency stop
+    question(page, "trial 4 has ended")
     page.get_by_role("button", name="Failure").click()
     question(page, "trial 5 (start 2 of 2)")
     page.get_by_role("button", name="Begin the trial").click()
-    question(page, "running")
+    question(page, "how does it end")
     seen.look()
 
 
@@ -171,6 +173,7 @@ def check_report(out: Path) -> None:
     trials = [json.loads(each.read_text()) for each in sorted((out / "trials").glob("*.json"))]
     assert [each["outcome"] for each in trials] == ["success", "void", "failure", "failure", "failure"]
     assert trials[1]["reason"] == "the light went out, s"
+    assert [bool(each["faults"]) for each in trials] == [False, False, False, True, False], "one was stopped"
     report = json.loads((out / "report.json").read_text())
     assert sorted((each["label"], each["successes"], each["episodes"]) for each in report["policies"]) in (
         [("careful", 0, 2), ("hasty", 1, 2)],

@@ -47,6 +47,7 @@ STARTS = "starts"
 """Folder of the pictures of the starts."""
 _KEYS = {outcome[0]: outcome for outcome in OUTCOMES}
 _JUDGE = tuple(Choice(key=key, text=outcome) for key, outcome in _KEYS.items())
+_ENDS = "how does it end"
 _STOP = Choice(key="esc", text="emergency stop", urgent=True)
 
 
@@ -249,7 +250,8 @@ class Blinded:
         self._operator.say("starting …")
         with _ended_by_signals(session) as came, _listening(self._operator, session, judged):
             runtime.start()
-            self._operator.put("running", (*_JUDGE, _STOP))
+            self._operator.say(f"trial {number} is running")
+            self._operator.put(_ENDS, (*_JUDGE, _STOP))
             try:
                 while not runtime.wait(_POLL_S):
                     if pictures is not None:
@@ -359,9 +361,9 @@ def _listening(operator: Operator, session: Session, judged: list[str]) -> Itera
                     session.emergency_stop()
                 except IbrobotError as error:
                     session.log.error("%s", error)
-                operator.put("stopping", (*_JUDGE, _STOP))
+                operator.put(_ENDS, (*_JUDGE, _STOP))
             elif given is not None and not _judge(session, judged, given):
-                operator.put("running", (*_JUDGE, _STOP))
+                operator.put(_ENDS, (*_JUDGE, _STOP))
 
     thread = threading.Thread(target=work, name="answers to the trial", daemon=True)
     thread.start()

@@ -36,6 +36,7 @@ export class Question {
     this.live = [];
     const pictures = sights.map((sight, i) => this.sight(sight, i));
     if (this.live.length) this.follow(this.asked);
+    requestAnimationFrame(() => this.reveal());
     return [h("p", { class: "request", role: "alert" }, text),
       pictures.length ? h("div", { class: "sights" }, pictures) : null,
       choices.length ? h("div", { class: "row choices-of" }, choices.map((choice) => h("button", {
@@ -52,6 +53,9 @@ export class Question {
     queueMicrotask(() => input.focus());
     return form;
   }
+
+  // Scrolls so that the whole question is visible; again once its pictures have a size.
+  reveal() { this.element.scrollIntoView({ block: "nearest" }); }
 
   press(key) {
     if (!this.asked || !this.ui.drives || !this.asked.choices.some((choice) => choice.key === key)) return false;
@@ -72,7 +76,7 @@ export class Question {
   sight({ camera, wanted, live }, i) {
     const query = { number: this.job, ask: this.asked.ask, sight: i };
     const title = wanted && live ? `${camera}: the start over the live picture` : wanted ? `${camera}: the start` : camera;
-    const over = wanted ? h("img", { class: live ? "over" : "", src: this.ui.address("jobs/sight", { ...query, which: "wanted" }), alt: `${camera} at the start` }) : null;
+    const over = wanted ? h("img", { class: live ? "over" : "", src: this.ui.address("jobs/sight", { ...query, which: "wanted" }), alt: `${camera} at the start`, onload: () => this.reveal() }) : null;
     const caption = h("figcaption", {}, title);
     const layers = h("div", { class: "layers" });
     if (live) {
@@ -100,7 +104,11 @@ export class Question {
       const response = await fetch(this.ui.address("jobs/sight", query));
       if (!response.ok) throw new Error((await response.json()).error);
       const bitmap = await createImageBitmap(await response.blob());
-      if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) { canvas.width = bitmap.width; canvas.height = bitmap.height; }
+      if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
+        canvas.width = bitmap.width;
+        canvas.height = bitmap.height;
+        this.reveal();
+      }
       canvas.getContext("2d").drawImage(bitmap, 0, 0);
       bitmap.close();
       say(caption, title);

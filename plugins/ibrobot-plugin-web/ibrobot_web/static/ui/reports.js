@@ -92,18 +92,22 @@ export class View {
 
   case({ title, text, episode, video, command }) {
     return h("article", { class: "case" }, h("h4", {}, title),
-      video ? h("video", { src: this.ui.address("reports/video", { path: video }), controls: true, muted: true, preload: "metadata", "aria-label": `Video of ${title}` }) : null,
+      video ? h("video", { src: `${this.ui.address("reports/video", { path: video })}#t=0.01`, controls: true, muted: true, preload: "metadata", "aria-label": `Video of ${title}` }) : null,
       h("p", {}, text),
       episode ? h("p", {}, h("a", { href: `#episodes/${encodeURIComponent(episode)}` }, episode)) : null,
       command ? h("code", {}, command) : null,
       h("div", { class: "row" },
-        episode ? h("button", { "aria-label": `Play the recording of ${title}`, onclick: () => this.play(episode, title) }, "Play the recording") : null,
+        episode ? h("button", { "aria-label": `Play the recording of ${title}`, onclick: (event) => this.play(episode, title, event.target) }, "Play the recording") : null,
         command ? h("button", { "aria-label": `Copy the command of ${title}`, onclick: () => copy(command) }, "Copy the command") : null));
   }
 
-  async play(path, title = "") {
+  // Plays a recording until it is closed, which leads back to where it was opened.
+  async play(path, title = "", from = null) {
     this.playing.hidden = !path;
-    if (!path) { this.player.close(); return; }
+    if (!path) this.player.close();
+    if (!path) this.from?.scrollIntoView({ block: "center" });
+    this.from = from;
+    if (!path) return;
     say(this.recording, title);
     this.problem.replaceChildren();
     this.player.element.hidden = false;
