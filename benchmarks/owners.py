@@ -374,7 +374,7 @@ def length(template: Path, folder: Path, name: str) -> float:
     return time.monotonic() - begin_s
 
 
-def _in_this_process(jobs: Any, limit: int, watch: Callable[..., None]) -> Iterator[Any]:
+def _in_this_process(jobs: Any, pool: Any, watch: Callable[..., None]) -> Iterator[Any]:
     for job in jobs:
         yield convert_episode(job, lambda frames: None)
 
@@ -382,7 +382,7 @@ def _in_this_process(jobs: Any, limit: int, watch: Callable[..., None]) -> Itera
 def run(times: int, kills: int, seed: int, only: str | None = None) -> bool:
     """Run all pairs, and then the kills; prints a line for each, and returns whether nothing was wrong."""
     rng, good = random.Random(seed), True
-    convert_module._run_in_processes = _in_this_process
+    convert_module._run_in_pool = _in_this_process
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         template = folder / "template"

@@ -9,6 +9,7 @@ from ibrobot_core.descriptors import (
     GuideDescriptor as GuideDescriptor,
     ReportDescriptor as ReportDescriptor,
     ConfigFile as ConfigFile,
+    PoolDescriptor as PoolDescriptor,
 )
 
 # The robot YAML
@@ -138,6 +139,16 @@ from ibrobot_core.safe_output import echo as echo, LogFormatter as LogFormatter
 from ibrobot_core.screen import Screen as Screen, styled as styled
 from ibrobot_core.terminal import KeyReader as KeyReader, check_key as check_key
 from ibrobot_core.signals import on_signals as on_signals, end_signals as end_signals
+
+# Jobs
+from ibrobot_core.interfaces.pool import (
+    Job as Job,
+    Done as Done,
+    Pool as Pool,
+    on_option as on_option,
+    shard_option as shard_option,
+    shard_of as shard_of,
+)
 
 # Guides
 from ibrobot_core.interfaces import Guide as Guide, Question as Question

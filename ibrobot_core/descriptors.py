@@ -229,6 +229,20 @@ class SectionDescriptor(Descriptor["Component"]):
 
 
 @attrs.frozen
+class PoolDescriptor(Descriptor["interfaces.Pool"]):
+    """A pool, where jobs run. Its type and its address are those of the option `--on` of commands."""
+
+    make: Callable[[str, int | None], interfaces.Pool] = attrs.field(kw_only=True)  # type: ignore[assignment]
+    """Address and number of jobs at a time -> the pool. The address is what follows `TYPE://`, or empty; the number is
+    None for as many as there is room for. Imports what it needs when it is called.
+
+    Raises:
+        RequestError: e.g. for an address that the pool does not have.
+        ComponentFailed: if its machines cannot be reached.
+    """
+
+
+@attrs.frozen
 class ReaderDescriptor:
     """A readable format of recorded episodes; the first installed one that recognises a path reads it."""
 

@@ -28,7 +28,7 @@ from ibrobot_core.options import did_you_mean
 
 if TYPE_CHECKING:
     from ibrobot_core.config.schema import RobotConfig
-    from ibrobot_core.interfaces import EpisodeReader
+    from ibrobot_core.interfaces import EpisodeReader, Pool
     from ibrobot_core.messages import CompressedImage, Image
 
 ENTRY_POINT_GROUP = "ibrobot"
@@ -50,6 +50,7 @@ KINDS: Mapping[str, str] = {
     "dataset": "ibrobot_datasets",
     "viewer": "ibrobot_viewers",
     "section": "ibrobot_sections",
+    "pool": "ibrobot_pools",
 }
 """Plugin kind -> its registration hook."""
 _UNTYPED = tuple(
@@ -227,6 +228,22 @@ class Registry:
         packages = " or ".join(name for name, offers in official_plugins().items() if "reader" in offers)
         hint = "" if formats else f"; pip install {packages}"
         raise RecorderError(f"{path}: not an episode of a known format; installed: {formats or 'none'}{hint}")
+
+    def pool(self, where: str, jobs: int | None = None) -> Pool:
+        """A new pool, which the caller closes.
+
+        Args:
+            where: type, or `TYPE://ADDRESS`; empty for the default.
+            jobs: number of jobs at a time; None for as many as there is room for.
+
+        Raises:
+            IbrobotError: e.g. if its package is not installed, which the error names, or it cannot be reached.
+        """
+        type_, _, address = (where or self.default("pool")).partition("://")
+        descriptor = self.find("pool", type_)
+        assert isinstance(descriptor, descriptors.PoolDescriptor)
+        descriptor.check()
+        return descriptor.make(address, jobs)
 
     def decode(self, picture: CompressedImage) -> Image:
         """Decode a compressed image.

@@ -32,6 +32,7 @@ from ibrobot_core.interfaces.planner import (
     PositionGoal,
 )
 from ibrobot_core.interfaces.policy import Frame, PictureCodec, Policy, PolicySpec, Tensors
+from ibrobot_core.interfaces.pool import Done, Job, Pool
 from ibrobot_core.interfaces.reader import (
     EpisodeAddress,
     EpisodeReader,

@@ -243,13 +243,13 @@ def test_copies_are_found_before_they_are_encoded(tmp_path: Path, monkeypatch: p
         shutil.copytree(tmp_path / f"bags/{number}", tmp_path / f"bags/{number}_copy")
     record(tmp_path / "bags/3", 3, 0.4)
     converted: list[str] = []
-    real = run_module._run_in_processes
+    real = run_module._run_in_pool
 
     def noted(jobs: Any, *more: Any) -> Any:
         converted.extend(job.source for job in jobs)
         return real(jobs, *more)
 
-    monkeypatch.setattr(run_module, "_run_in_processes", noted)
+    monkeypatch.setattr(run_module, "_run_in_pool", noted)
     found = report(tmp_path / "bags", "--out", tmp_path / "set")
     assert (found["code"], sorted(converted)) == (0, ["1", "2", "3"])
     passed_over = {each["source"]: each["passed_over"] for each in found["reports"]}
@@ -271,13 +271,13 @@ def test_of_copies_whose_outcomes_differ_none_is_converted(bags: Path, tmp_path:
 def test_an_outcome_that_is_marked_during_the_conversion_counts(
     bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = run_module._run_in_processes
+    real = run_module._run_in_pool
 
     def marked(*arguments: Any) -> Any:
         assert episodes("mark", bags / "episodes/episode_000001", "failure").returncode == 0
         return real(*arguments)
 
-    monkeypatch.setattr(run_module, "_run_in_processes", marked)
+    monkeypatch.setattr(run_module, "_run_in_pool", marked)
     found = report(bags, "--out", tmp_path / "set", "--outcome", "success")
     assert (found["code"], found["episodes"]) == (0, 1)
     assert [each["passed_over"] for each in found["reports"]] == ["its outcome is failure", ""]
@@ -390,21 +390,6 @@ def test_the_episodes_of_the_benchmark_differ(tmp_path: Path) -> None:
     assert len(digests) == 2
     found = report(tmp_path / "two", "--out", tmp_path / "set")
     assert (found["code"], found["episodes"], found["passed_over"]) == (0, 2, 0), found["err"]
-
-
-def test_by_default_all_cores_convert(bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    jobs: list[int] = []
-    real = run_module.convert
-
-    def noted(request: Any, *more: Any) -> Any:
-        jobs.append(request.jobs)
-        return real(attrs.evolve(request, jobs=1), *more)
-
-    monkeypatch.setattr(run_module, "convert", noted)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {1, 2, 5}, raising=False)
-    assert convert(bags, "--out", tmp_path / "default").returncode == 0
-    assert convert(bags, "--out", tmp_path / "given", "--jobs", "2").returncode == 0
-    assert jobs == [3, 2]
 
 
 def test_episodes_and_datasets_have_short_names(bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,6 +69,10 @@ def digests(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
+def children(pid: int) -> list[int]:
+    return list(map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()))
+
+
 class Started:
     """An evaluation in a process of its own."""
 
@@ -88,11 +92,9 @@ class Started:
         assert self.process.stderr is not None
         return self.process.stderr.readline()
 
-    def children(self) -> list[int]:
-        """The worker processes."""
-        return [
-            int(pid) for pid in Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
-        ]
+    def workers(self) -> list[int]:
+        """The worker processes, which another process forks."""
+        return [worker for child in children(self.process.pid) for worker in children(child)]
 
     def end(self) -> tuple[int, str, str]:
         out, err = self.process.communicate(timeout=PATIENCE_S)
@@ -133,7 +135,7 @@ def test_printed_command_repeats_an_episode_byte_by_byte(folder: Path, whole: Pa
 def test_episode_of_a_killed_worker_is_run_again(start: Any, folder: Path, whole: Path) -> None:
     running = start("--out", "killed", "--jobs", 1)
     assert "(1 of 6)" in running.await_episode()
-    (worker,) = running.children()
+    (worker,) = running.workers()
     os.kill(worker, signal.SIGKILL)
     code, _, err = running.end()
     assert (code, [f"({n} of 6)" in err for n in range(2, 7)]) == (0, [True] * 5), err
@@ -158,7 +160,7 @@ def test_interrupted_evaluation_goes_on_with_nothing_twice(start: Any, folder: P
 def test_workers_end_with_a_killed_command_and_write_nothing_more(start: Any, folder: Path) -> None:
     running = start("--out", "orphaned", "--jobs", 1)
     running.await_episode()
-    (worker,) = running.children()
+    (worker,) = running.workers()
     os.kill(worker, signal.SIGSTOP)  # at the beginning of its next episode
     running.process.kill()
     running.process.wait()
@@ -169,6 +171,29 @@ def test_workers_end_with_a_killed_command_and_write_nothing_more(start: Any, fo
         time.sleep(0.05)
     assert not Path(f"/proc/{worker}").exists()
     assert sorted((folder / "orphaned/results").rglob("*.json")) == results
+
+
+def test_merged_shards_are_the_whole_evaluation(folder: Path, whole: Path) -> None:
+    for number in (2, 1):
+        done = evaluate(folder, "--out", f"part{number}", "--shard", f"{number}/2", "--jobs", 1)
+        assert done.returncode == 0, done.stderr
+    with chdir(folder):
+        twice = run_here("eval", "merge", "part1", "part2", "part1", "--out", "merged")
+        other = run_here("eval", "merge", "part1", folder, "--out", "merged")
+        (Path("other")).mkdir()
+        settings = json.loads(Path("part2/evaluation.json").read_text())
+        settings["policies"]["faulty"]["contract"] = "another"
+        Path("other/evaluation.json").write_text(json.dumps(settings))
+        contract = run_here("eval", "merge", "part1", "other", "--out", "merged")
+        assert not Path("merged").exists()
+        merged = run_here("eval", "merge", "part2", "part1", "--out", "merged")
+    assert "part1: has scripted, seed 0, as part1 has" in twice.stderr
+    assert "is no evaluation: it has no evaluation.json" in other.stderr
+    assert "other: differs from part1: policies faulty contract changed" in contract.stderr
+    assert (merged.returncode, "scripted  3 of 3 succeeded" in merged.stdout) == (0, True), merged.stderr
+    assert digests(folder / "merged") == digests(whole)
+    refused = evaluate(folder, "--out", "part3", "--shard", "2/1")
+    assert "--shard: '2/1' is no part; give I/N with I from 1 to N, e.g. 2/8" in refused.stderr
 
 
 def test_it_stops_as_soon_as_the_fault_is_certain(folder: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import sys
 import time
@@ -18,7 +17,16 @@ import click
 from click.core import ParameterSource
 
 from ibrobot_core.api import Contract, DatasetDescriptor, DatasetError
-from ibrobot_core.app import Failed, declared, echo, emit, installed_plugins, with_closed_ends, wrong_input
+from ibrobot_core.app import (
+    Failed,
+    declared,
+    echo,
+    emit,
+    installed_plugins,
+    shard_of,
+    with_closed_ends,
+    wrong_input,
+)
 from ibrobot_data import CONVERT, conversion
 from ibrobot_data.conversion import ConvertOptions
 from ibrobot_data.plural import plural
@@ -33,7 +41,8 @@ _Progress = Callable[[int], AbstractContextManager[Any]]
 _MIB = 1 << 20
 _ONLY_TO_BAG = ("numbers",)
 _ONLY_TO_DATASET = (
-    "append", "type_", "force_contract", "any_robot", "missing", "outcome", "success", "jobs", "only", "context",
+    "append", "type_", "force_contract", "any_robot", "missing", "outcome", "success", "jobs", "on", "shard",
+    "only", "context",
 )  # fmt: skip
 _EVENT_S = 0.1
 _MUCH = 0.1
@@ -121,11 +130,12 @@ def _to_dataset(options: ConvertOptions, type_: str | None, overrides: Sequence[
     type_ = type_ or installed_plugins().default("dataset")
     request = ConversionRequest(
         options.out, _options("dataset", type_, overrides), type_, append=options.append, outcomes=options.outcome,
-        jobs=options.jobs or cores(), norm_mode=options.norm_mode, missing=options.missing, prompt=options.prompt,
+        jobs=options.jobs, on=options.on, norm_mode=options.norm_mode, missing=options.missing, prompt=options.prompt,
         success=options.success, only=options.only, context=options.context, any_robot=options.any_robot,
         force_contract=options.force_contract, **_stated(options.config, options.calibration),
     )  # fmt: skip
     found = find_episodes(options.episodes)
+    found = [found[number] for number in shard_of(options.shard, len(found))]
     with progress(len(found)) as watch:
         return run(request, found, watch)
 
@@ -190,11 +200,6 @@ def _overrides(flags: Mapping[str, Any]) -> list[str]:
         elif value:
             found.append(Override.of(f"{flag.opts[0]} {value}", f"{name}={value}"))
     return found
-
-
-def cores() -> int:
-    """Number of CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:

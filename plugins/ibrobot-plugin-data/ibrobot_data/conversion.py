@@ -9,7 +9,7 @@ from typing import Any, override
 import attrs
 
 from ibrobot_core.api import option
-from ibrobot_core.app import NORM_MODES, Event, Shown
+from ibrobot_core.app import NORM_MODES, Event, Shown, on_option, shard_option
 from ibrobot_data.plural import plural
 
 OUTCOMES = {"success": "successful", "failure": "failed", "unknown": "not judged"}
@@ -86,6 +86,8 @@ class ConvertOptions:
     jobs: int | None = option(
         None, ge=1, label="Episodes at once", more=True, help="episodes in parallel; by default one for each CPU core"
     )
+    on: str = on_option()
+    shard: str = shard_option()
 
 
 @attrs.frozen

@@ -13,6 +13,7 @@ from contextlib import ExitStack
 from errno import EDQUOT, ENOSPC
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import attrs
 import numpy as np
@@ -47,6 +48,8 @@ SUCCESS = "next.success"
 INTERVENTION, REWARD, DONE = "intervention", "next.reward", "next.done"
 DATASET = "dataset"
 """The dataset within a unit."""
+MAKING = ".making."
+"""Part of the names of folders of incomplete units."""
 _RECORD = "episode.json"
 _VERSION = 5
 """Version of the unit format; units of an older one are converted again."""
@@ -77,10 +80,9 @@ class Job:
     source: str
     unit: Path
 
-    @property
     def making(self) -> Path:
-        """The unit while it is incomplete."""
-        return self.unit.with_name(f"{self.unit.name}.making")
+        """A new name for the unit while it is incomplete: another process may convert the episode at the same time."""
+        return self.unit.with_name(f"{self.unit.name}{MAKING}{uuid4().hex}")
 
 
 @attrs.frozen
@@ -159,8 +161,7 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
     Raises:
         DiskFull: if the disk of the unit is full.
     """
-    making = job.making
-    shutil.rmtree(making, ignore_errors=True)
+    making = job.making()
     report = EpisodeReport(job.source)
     with ExitStack() as stack:
         return _convert(job, making, report, progress, stack)
@@ -182,9 +183,8 @@ def _convert(
         unit = _write(job, key, reader, summary, report, making, progress)
         if unit is None:
             return attrs.evolve(report, passed_over=_NOTHING[job.request.only])
-        shutil.rmtree(job.unit, ignore_errors=True)
         _sync(making)
-        making.rename(job.unit)
+        _put(making, job.unit, key)
     except (IbrobotError, OSError) as error:
         shutil.rmtree(making, ignore_errors=True)
         stop_if_full(error, job.source)
@@ -193,6 +193,17 @@ def _convert(
         shutil.rmtree(making, ignore_errors=True)
         return attrs.evolve(report, error=unexpected(error))
     return unit.report
+
+
+def _put(making: Path, unit: Path, key: str) -> None:
+    """Make a folder the unit, unless another process has converted the same meanwhile."""
+    try:
+        making.rename(unit)
+    except OSError:
+        there = read_unit(unit)
+        if there is None or there.key != key:
+            raise
+        shutil.rmtree(making)
 
 
 _NOTHING = {"interventions": "no operator commands in it", "policy": "no policy commands in it"}

@@ -28,9 +28,14 @@ def identity(reader: EpisodeReader, summary: EpisodeSummary) -> str:
     Raises:
         RecorderError: when the messages have to be read and cannot be.
     """
+    return identity_by_uuid(summary) or reader.digest()
+
+
+def identity_by_uuid(summary: EpisodeSummary) -> str:
+    """The identity of an episode with a random UUID; empty for another one, whose messages would have to be read."""
     uuid = _random_uuid(summary.metadata)
     if not uuid:
-        return reader.digest()
+        return ""
     counts = {topic: each.count for topic, each in sorted(summary.topics.items())}
     known = json.dumps([uuid, summary.start_ns, summary.end_ns, counts])
     return hashlib.sha256(known.encode()).hexdigest()

@@ -51,8 +51,10 @@ class ConversionRequest:
     """Whether episodes of robots of other names, types or calibrations are merged."""
     append: bool = False
     """Whether to add to a dataset in `out`."""
-    jobs: int = option(1, ge=1)
-    """Episodes converted in parallel, each in its own process."""
+    jobs: int | None = option(1, ge=1)
+    """Episodes converted in parallel, each in its own process; None for as many as the pool has room for."""
+    on: str = ""
+    """The pool; see `Registry.pool`."""
 
 
 def _pairs(lists: Iterable[Iterable[int]]) -> tuple[tuple[int, int], ...]:

@@ -4,30 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import multiprocessing
 import os
 import re
 import shutil
-import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
-from multiprocessing import forkserver
-from multiprocessing.process import BaseProcess
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import attrs
 
 from ibrobot_core.api import Contract, DatasetError, DatasetSummary, EpisodeAddress, IbrobotError, seconds
-from ibrobot_core.app import DiskFull, Ownership, end_signals, installed_plugins, set_malloc
+from ibrobot_core.app import DiskFull, Ownership, Pool, installed_plugins, set_malloc
+from ibrobot_core.app import Job as PoolJob
 from ibrobot_data.commanders import is_labelled
 from ibrobot_data.episode import (
     INTERVENTION,
+    MAKING,
     Job,
     Unit,
     convert_episode,
@@ -37,7 +31,7 @@ from ibrobot_data.episode import (
     unit_key,
     unwanted_outcome,
 )
-from ibrobot_data.identity import KnownEpisodes, identity
+from ibrobot_data.identity import KnownEpisodes, identity, identity_by_uuid
 from ibrobot_data.provenance import conversion, provenance
 from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
 from ibrobot_data.same_robot import Identity
@@ -46,9 +40,6 @@ STAGING = ".staging"
 """Folder within the dataset for converted episodes until the merge."""
 _LOCK = "lock"
 _THERE = "{}: already has a dataset; --append adds to it"
-_POLL_S = 0.2
-_END_S = 5.0
-"""A converting process that takes longer to end after Ctrl-C is killed."""
 _MAP_FROM, _KEEP = 512 << 10, 8 << 20
 """Thresholds of malloc [bytes]: freed images go back to the system, since they would fragment the heap."""
 
@@ -98,10 +89,11 @@ def convert(
     """
     begin = time.monotonic()
     with _staging(request) as (staging, old):
-        request = _with_labels(request, episodes, old)
         if old is not None:
+            request = attrs.evolve(request, labels=INTERVENTION in old.features)
             _check_old(request, old)
         plan = _Plan(request, staging, old, episodes)
+        request = plan.request
         # Without --append nothing may be added, but the same command may have been killed when it had merged.
         if old is not None and not request.append and plan.adds(old):
             raise DatasetError(_THERE.format(request.out))
@@ -117,6 +109,11 @@ def convert(
     size = sum(path.stat().st_size for path in request.out.rglob("*") if path.is_file()) if request.out.exists() else 0
     ordered = tuple(reports[source] for source in plan.sources)
     return Report(request.out, ordered, size, time.monotonic() - begin, plan.resumed)
+
+
+def plan_conversion(request: ConversionRequest, episodes: Sequence[Path]) -> tuple[str, ...]:
+    """The sources of the episodes that a conversion into a new dataset would convert, by their summaries."""
+    return _Plan(request, request.out / STAGING, None, episodes).todo
 
 
 def _merge(
@@ -138,6 +135,12 @@ def clear_staging(staging: Path) -> None:
             path.unlink()
 
 
+def _remove_unfinished(staging: Path) -> None:
+    """Remove what processes that died have left of their units."""
+    for folder in staging.glob(f"*{MAKING}*"):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 @contextmanager
 def _staging(request: ConversionRequest) -> Iterator[tuple[Path, DatasetSummary | None]]:
     """The staging folder, owned by this conversion, and the existing dataset."""
@@ -148,6 +151,7 @@ def _staging(request: ConversionRequest) -> Iterator[tuple[Path, DatasetSummary 
             others = [path for path in out.iterdir() if path != staging]
             if old is None and others and all(path.name == _LOCK for path in staging.iterdir()):
                 raise DatasetError(f"{out} is not empty and has no dataset of writer {request.type!r}")
+            _remove_unfinished(staging)
             yield staging, old
     except OSError as error:
         raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
@@ -176,24 +180,6 @@ def own_staging(out: Path) -> Iterator[None]:
             out.rmdir()
 
 
-def _with_labels(request: ConversionRequest, episodes: Sequence[Path], old: DatasetSummary | None) -> ConversionRequest:
-    """The request, which adds labels if the dataset has them, or if there is none and an episode says who commanded."""
-    if old is not None:
-        return attrs.evolve(request, labels=INTERVENTION in old.features)
-    return attrs.evolve(request, labels=request.labels or any(map(_says_who_commanded, episodes)))
-
-
-def _says_who_commanded(episode: Path) -> bool:
-    try:
-        reader = installed_plugins().open_episode(episode)
-        try:
-            return is_labelled(reader.summary())
-        finally:
-            reader.close()
-    except Exception:  # noqa: BLE001 - the conversion reports it
-        return False
-
-
 def _check_old(request: ConversionRequest, old: DatasetSummary) -> None:
     """Check that the dataset was made with the same settings."""
     known = old.metadata.get("conversion")
@@ -214,7 +200,9 @@ class _Plan:
     def __init__(
         self, request: ConversionRequest, staging: Path, old: DatasetSummary | None, episodes: Sequence[Path]
     ) -> None:
-        self._request = request
+        self.request = request
+        """Adds labels if the dataset has them, or if there is none and an episode says who commanded."""
+        self._staging = staging
         self._reports: dict[str, EpisodeReport] = {}
         self._jobs: dict[str, Job] = {}
         self._expected: dict[str, int] = {}
@@ -224,13 +212,19 @@ class _Plan:
         self._alike: dict[Any, list[Job]] = {}
         """What copies have in common, as far as summaries tell -> episodes that the dataset does not have."""
         self.resumed = 0
-        self.sources: list[str] = []
+        self.sources: dict[str, None] = {}
+        self._identities: dict[str, str] = {}
+        """Source -> identity, where the summary tells it."""
+        self._labelled = False
         known = KnownEpisodes(old.metadata["episodes"] if old is not None else ())
         for path in episodes:
             source = _source(path, self.sources)
-            self.sources.append(source)
+            self.sources[source] = None
             unit = hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:32]
             self._add(Job(request, path, source, staging / unit), known)
+        if old is None and self._labelled:
+            self.request = attrs.evolve(request, labels=True)
+            self._jobs = {source: attrs.evolve(job, request=self.request) for source, job in self._jobs.items()}
         self._find_copies()
 
     def _add(self, job: Job, known: KnownEpisodes) -> None:
@@ -239,6 +233,7 @@ class _Plan:
             reader = installed_plugins().open_episode(job.episode)
             try:
                 summary = reader.summary()
+                self._labelled = self._labelled or is_labelled(summary)
                 there = known.find(source, reader, summary)
             finally:
                 reader.close()
@@ -252,17 +247,23 @@ class _Plan:
         if there:
             self._reports[source] = attrs.evolve(report, passed_over=there)
             return
+        self._identities[source] = identity_by_uuid(summary)
         counts = tuple((topic, each.count) for topic, each in sorted(summary.topics.items()))
         self._alike.setdefault((summary.start_ns, summary.end_ns, counts), []).append(job)
-        if unwanted := unwanted_outcome(summary, self._request):
+        if unwanted := unwanted_outcome(summary, self.request):
             self._reports[source] = attrs.evolve(report, passed_over=unwanted)
         else:
             self._jobs[source] = job
             self._reports[source] = report
             text = summary.metadata.get("contract", "")
             rate = re.search(r'"rate_hz": ([0-9.]+)', text)
-            rate_hz = self._request.contract.rate_hz if self._request.contract else float(rate[1]) if rate else 30.0
+            rate_hz = self.request.contract.rate_hz if self.request.contract else float(rate[1]) if rate else 30.0
             self._expected[source] = round(seconds(summary.end_ns - summary.start_ns) * rate_hz) + 1
+
+    @property
+    def todo(self) -> tuple[str, ...]:
+        """The sources of the episodes to convert."""
+        return tuple(source for source in self._jobs if source not in self._copies)
 
     def adds(self, old: DatasetSummary) -> bool:
         """Whether there are episodes to convert that an earlier run did not have to leave out."""
@@ -275,7 +276,7 @@ class _Plan:
             equal: dict[str, list[Job]] = {}
             for job in alike if len(alike) > 1 else ():
                 with suppress(IbrobotError, OSError):  # its conversion will report it
-                    equal.setdefault(_identity(job.episode), []).append(job)
+                    equal.setdefault(self._identities[job.source] or _identity(job.episode), []).append(job)
             for jobs in equal.values():
                 self._note_copies([job.source for job in jobs])
 
@@ -298,7 +299,7 @@ class _Plan:
 
     def run(self, watch: Watch) -> dict[str, EpisodeReport]:
         """Convert the episodes that are not staged yet; returns source -> report."""
-        self._convert([source for source in self._jobs if source not in self._copies], watch)
+        self._convert(self.todo, watch)
         for source, original in self._copies.items():
             if self._reports[original].error:  # of the copies, the first one that can be converted is kept
                 self._convert([source], watch)
@@ -318,17 +319,19 @@ class _Plan:
             else:
                 shutil.rmtree(job.unit, ignore_errors=True)
                 todo.append(job)
+        if not todo:
+            return
         total = sum(self._expected[job.source] for job in todo)
         try:
-            for report in _run_in_processes(todo, self._request.jobs, lambda done, report: watch(done, total, report)):
-                self._reports[report.source] = report
+            with closing(installed_plugins().pool(self.request.on, self.request.jobs)) as pool:
+                for report in _run_in_pool(todo, pool, lambda done, report: watch(done, total, report)):
+                    self._reports[report.source] = report
         except DiskFull as error:
-            for job in todo:
-                shutil.rmtree(job.making, ignore_errors=True)
+            _remove_unfinished(self._staging)
             kept = len(self.units())
             raise DiskFull(
                 f"stopped at {error}; {kept} of {len(self._jobs)} episodes are converted and kept in "
-                f"{self._request.out / STAGING}: make room, and run the same command again"
+                f"{self.request.out / STAGING}: make room, and run the same command again"
             ) from None
 
 
@@ -340,110 +343,38 @@ def _identity(episode: Path) -> str:
         reader.close()
 
 
-_done: Any = None
-"""Frames done by all processes together; set in each of them."""
-
-
-def _begin_process(done: Any) -> None:
-    global _done  # noqa: PLW0603 - the initializer of a pool can only pass shared memory by a global
-    _done = done
+def _convert_in_pool(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
     set_malloc(_MAP_FROM, _KEEP)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    return convert_episode(job, progress)
 
 
-def _end_with_parent() -> None:
-    """Exit when the parent is killed, so as not to write at the same time as the next run."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _count(frames: int) -> None:
-    with _done.get_lock():
-        _done.value += frames
-
-
-def _convert_in_process(job: Job) -> EpisodeReport:
-    return convert_episode(job, _count)
-
-
-def _run_in_processes(
-    jobs: Sequence[Job], limit: int, watch: Callable[[int, EpisodeReport | None], None]
+def _run_in_pool(
+    jobs: Sequence[Job], pool: Pool, watch: Callable[[int, EpisodeReport | None], None]
 ) -> Iterator[EpisodeReport]:
     """Convert each episode in its own process, which frees the memory that encoders leak."""
-    if not jobs:
-        return
-    context = multiprocessing.get_context("forkserver")
-    # Reader and writer are imported by now. A server that has them too forks processes that start at once.
-    context.set_forkserver_preload([name for name in sys.modules if name.startswith("ibrobot_")])
-    done = context.Value("q", 0)
-    pool = ProcessPoolExecutor(min(limit, len(jobs)), context, _begin_process, (done,), max_tasks_per_child=1)
-    try:
-        with _deferred_signals():
-            forkserver.ensure_running()
-            waiting: set[Future[EpisodeReport]] = {pool.submit(_convert_in_process, job) for job in jobs}
-        while waiting:
-            finished, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
-            watch(done.value, None)
-            for future in finished:
-                report = future.result()
-                watch(done.value, report)
-                yield report
-    except BrokenProcessPool:
-        raise DatasetError(
-            "a converting process was killed, e.g. because memory ran out; finished episodes are kept: "
-            "run the same command again, with fewer --jobs if needed"
-        ) from None
-    except (KeyboardInterrupt, DiskFull):
-        _end_pool(pool)
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    frames = 0
 
+    def count(done: int) -> None:
+        nonlocal frames
+        frames = done
+        watch(done, None)
 
-def _end_pool(pool: ProcessPoolExecutor) -> None:
-    """End a pool, and its processes at once.
-
-    The pool may start another process while one ends, and a terminated one may keep a lock that others wait for. So
-    processes are terminated until the pool has ended.
-    """
-    ending = threading.Thread(target=pool.shutdown, kwargs={"cancel_futures": True}, daemon=True)
-    ending.start()
-    while ending.is_alive():
-        end_processes(multiprocessing.active_children())
-        ending.join(_POLL_S)
-
-
-def end_processes(processes: Sequence[BaseProcess]) -> None:
-    """Terminate processes, and kill those that take longer than `_END_S`."""
-    for process in processes:
-        process.terminate()
-    deadline_s = time.monotonic() + _END_S
-    for process in processes:
-        process.join(max(0.0, deadline_s - time.monotonic()))
-        if process.is_alive():
-            process.kill()
-
-
-@contextmanager
-def _deferred_signals() -> Iterator[None]:
-    """Defer Ctrl-C, SIGTERM and SIGHUP; block Ctrl-C in the processes started here, which would print tracebacks."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # Python delivers signals to the main thread alone
-        return
-    came: list[int] = []
-    # Any thread may receive them.
-    handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in end_signals()}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # child processes inherit it
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-    if came:
-        signal.raise_signal(came[0])
+    work = (PoolJob(_convert_in_pool, job, own_process=True) for job in jobs)
+    with closing(pool.run(work, count)) as finished:
+        for done in finished:
+            if done.error is not None and not isinstance(done.error, DiskFull):
+                raise DatasetError(
+                    f"{done.job.argument.source}: {done.error}, e.g. because memory ran out; finished episodes are "
+                    "kept: run the same command again, with fewer --jobs if needed"
+                )
+            report, job = done.result(), done.job.argument
+            if report.kept and not job.unit.exists():
+                raise DatasetError(
+                    f"{job.unit}: was written, but is not there: episodes and dataset must be in a folder that all "
+                    "machines of the pool share"
+                )
+            watch(frames, report)
+            yield report
 
 
 def _refuse_misfits(
@@ -476,7 +407,7 @@ def _refuse_misfits(
     return refused
 
 
-def _source(path: Path, taken: Sequence[str]) -> str:
+def _source(path: Path, taken: Collection[str]) -> str:
     """A short name of an episode: `DATASET/EPISODE` for ibrobot's own, else its folder or file."""
     path = path.resolve()
     name = f"{path.parent.parent.name}/{path.name}" if path.parent.name == "episodes" else path.name

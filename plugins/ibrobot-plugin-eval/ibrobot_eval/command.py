@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -14,20 +13,21 @@ import click
 from ibrobot_core.app import Failed, declared, echo, emit, run_options, wrong_input
 from ibrobot_eval import EVAL
 from ibrobot_eval.blinded import Blinded, reset_of
-from ibrobot_eval.episodes import Result, write
+from ibrobot_eval.episodes import Result
 from ibrobot_eval.evaluation import Evaluation, Request, Watch, opened
+from ibrobot_eval.merge import WithMerge
 from ibrobot_eval.operators import AtPage, AtTerminal, Operator
 from ibrobot_eval.options import Begin, EvalOptions, Progress, Told
 from ibrobot_eval.options import Report as ReportEvent
-from ibrobot_eval.page import as_page
+from ibrobot_eval.page import write_all
 from ibrobot_eval.policies import Policy, find_policies
-from ibrobot_eval.report import Report, write_report
+from ibrobot_eval.report import Report
 
 _INTERRUPTED = 130
 _KEPT = "interrupted; finished episodes are kept: {} to continue"
 
 
-@click.command("eval")
+@click.command("eval", cls=WithMerge)
 @declared(EVAL)
 @run_options("overrides")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
@@ -51,8 +51,8 @@ def evaluate(
         trials = _checked(options, policies)
         reset = reset_of(options)
         request = Request(
-            options.out, tuple(policies), options.episodes, options.seed, options.until_decided, options.margin,
-            options.jobs or _cores(), trials,
+            options.out, tuple(policies), len(options.seeds), options.seeds[0], options.until_decided, options.margin,
+            options.jobs, options.on, trials,
         )  # fmt: skip
         try:
             with opened(request) as evaluation:
@@ -89,6 +89,10 @@ def _checked(options: EvalOptions, policies: Sequence[Policy]) -> bool:
     trials = options.trials or simulated == {False}
     if trials and options.vary:
         raise click.UsageError("--vary is for episodes in simulation, not for blinded trials")
+    if options.shard and (trials or options.until_decided):
+        raise click.UsageError("--shard has a fixed number of episodes; give neither --until-decided nor --trials")
+    if not options.seeds:
+        raise click.UsageError(f"--shard {options.shard}: {options.episodes} episodes are fewer than its parts")
     for given, flag in ((options.reset, "--reset"), (options.reset_task, "--reset-task"), (options.open, "--open")):
         if given and not trials:
             raise click.UsageError(f"{flag} is for blinded trials; episodes are simulated")
@@ -109,11 +113,6 @@ def _tell(request: Request, report: Report, *, events: bool, as_json: bool) -> N
         echo(f"report: {request.out / 'report.html'}")
 
 
-def _cores() -> int:
-    """Number of CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _evaluated(request: Request, evaluation: Evaluation, videos: int, *, events: bool, quiet: bool) -> Report:
     """Run the episodes that are missing, and write the report."""
     with (_events if events else _lines)(evaluation, quiet) as watch:
@@ -125,7 +124,7 @@ def _evaluated(request: Request, evaluation: Evaluation, videos: int, *, events:
 
     evaluation.film(results, videos, filming)
     report = Report.of_simulation(request.policies, results, request.margin, until_decided=request.until_decided)
-    _write(request, report)
+    write_all(request.out, report)
     return report
 
 
@@ -135,13 +134,8 @@ def _judged(request: Request, reset: Sequence[str], operator: Operator, *, open_
     if not open_ and not blinded.run():
         return None
     report = blinded.report()
-    _write(request, report)
+    write_all(request.out, report)
     return report
-
-
-def _write(request: Request, report: Report) -> None:
-    write_report(request.out, report)
-    write(request.out / "report.html", as_page(request.out, report))
 
 
 @contextmanager

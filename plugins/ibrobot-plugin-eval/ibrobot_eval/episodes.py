@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
+from uuid import uuid4
 
 import attrs
 
@@ -48,7 +49,11 @@ class Place:
     result: Path
     episode: Path
     video: Path
-    scratch: Path
+    unfinished: Path
+
+    def scratch(self) -> Path:
+        """A new folder for the episode until it is complete: another process may run it at the same time."""
+        return self.unfinished.with_name(f"{self.unfinished.name}-{uuid4().hex}")
 
     @classmethod
     def of(cls, out: Path, policy: Policy, seed: int) -> Place:
@@ -63,7 +68,7 @@ class Place:
         )
 
 
-def run_episode(out: Path, policy: Policy, seed: int, document: str, go_on: Callable[[], bool] = lambda: True) -> None:
+def run_episode(out: Path, policy: Policy, seed: int, document: str) -> Result:
     """Run an episode in lockstep, and write recording and result.
 
     Args:
@@ -71,7 +76,6 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str, go_on: Call
         policy: the policy.
         seed: the seed.
         document: hash of the robot YAML with which the evaluation began.
-        go_on: asked at every tick whether to go on; without an answer of True nothing is written.
 
     Raises:
         IbrobotError: e.g. if the policy fails, or the recording is incomplete.
@@ -82,15 +86,14 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str, go_on: Call
         raise ComponentFailed(f"{policy.config}: was changed during the evaluation")
     config = policy.load(seed)
     assert config.recording is not None
-    shutil.rmtree(place.scratch, ignore_errors=True)
+    scratch = place.scratch()
     # The recording does not state where it is, so that equal episodes have equal bytes.
-    recording = attrs.evolve(config.recording, root=str(place.scratch), dataset="one")
+    recording = attrs.evolve(config.recording, root=str(scratch), dataset="one")
     config = attrs.evolve(config, recording=recording, viewer=None)
     request = LaunchRequest(lockstep=True, seed=seed, episodes=1)
     runtime = Runtime(Session(config, registry, request))
     session = runtime.session
-    if not run_to_end(runtime, go_on):
-        return
+    run_to_end(runtime)
     if session.state is None or session.state.success is None:
         raise ComponentFailed(f"{config.source}: the scene has no task, so nothing tells a success from a failure")
     time_s = seconds(session.clock.now_ns() - session.episodes.begun_ns)
@@ -103,33 +106,35 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str, go_on: Call
         seed, session.outcome.successes == 1, round(time_s, 6), happened, tuple(session.outcome.faults),
         json.loads(metadata.get("factors", "{}")) | varied, json.loads(metadata.get("policy", "{}")),
     )  # fmt: skip
-    shutil.rmtree(place.episode, ignore_errors=True)  # of a run that was killed before it wrote the result
     place.episode.parent.mkdir(parents=True, exist_ok=True)
-    bags[0].rename(place.episode)
+    try:
+        bags[0].rename(place.episode)
+    except OSError:
+        if not place.episode.is_dir():
+            raise
+        # It was run before by a process that was killed, or is run twice: the recordings are equal.
     write(place.result, json.dumps(attrs.asdict(result), indent=1) + "\n")
-    shutil.rmtree(place.scratch)
+    shutil.rmtree(scratch)
+    return result
 
 
 NO_INTERVENTION = ("missing", "estop")
 """Counts of the safety layer that are no interventions: ticks without a request, and emergency stops."""
 
 
-def run_to_end(runtime: Runtime, go_on: Callable[[], bool]) -> bool:
-    """Run in lockstep; return whether it came to its end, and was not given up.
+def run_to_end(runtime: Runtime) -> None:
+    """Run in lockstep.
 
     Raises:
         IbrobotError: if a component fails.
     """
     runtime.start()
     try:
-        while going := go_on():
-            if runtime.step():
-                break
+        while not runtime.step():
+            pass
     finally:
         runtime.stop()
-    if going:
-        runtime.raise_failure()
-    return going
+    runtime.raise_failure()
 
 
 def _checked(bags: list[Path], outcome: str, faults: list[str]) -> Mapping[str, str]:
@@ -150,7 +155,7 @@ def _checked(bags: list[Path], outcome: str, faults: list[str]) -> Mapping[str, 
 def write(path: Path, content: str | bytes) -> None:
     """Write a file as a whole or not at all, whatever dies meanwhile."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    unfinished = path.with_name(f".{path.name}.{uuid4().hex}")
     with unfinished.open("wb") as file:
         file.write(content.encode() if isinstance(content, str) else content)
         file.flush()

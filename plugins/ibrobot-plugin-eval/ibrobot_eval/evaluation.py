@@ -12,14 +12,16 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import ComponentFailed, Ownership, installed_plugins
+from ibrobot_core.app import ComponentFailed, Done, Job, Ownership, installed_plugins
 from ibrobot_eval.comparison import Decision
 from ibrobot_eval.episodes import SCRATCH, Place, Result, write
 from ibrobot_eval.film import can_film
+from ibrobot_eval.jobs import EpisodeJob, FilmJob, film_in_pool, run_in_pool
 from ibrobot_eval.options import SETTINGS
 from ibrobot_eval.policies import Identity, Policy, identify
-from ibrobot_eval.processes import Job, run_jobs
 
+ASKED = "asked"
+"""Key of the settings for the policies as the user named them, which may be in other words when it is continued."""
 _FORMAT = 1
 Watch = Callable[[int, int, Policy, Result], None]
 """Receives the number of episodes done, the number of all, and the episode just done."""
@@ -37,7 +39,10 @@ class Request:
     """Seed of the first episode; later ones add 1."""
     until_decided: bool
     margin: float
-    jobs: int
+    jobs: int | None
+    """Number of episodes at a time; None for as many as the pool has room for."""
+    on: str = ""
+    """The pool; see `Registry.pool`."""
     trials: bool = False
     """Whether an operator judges blinded trials; otherwise episodes run in simulation."""
 
@@ -88,17 +93,22 @@ class Evaluation:
         """
         request = self.request
         todo = [
-            Job(str(request.out), policy, seed, self.identities[policy.label].document)
+            EpisodeJob(str(request.out), policy, seed, self.identities[policy.label].document)
             for seed in self._seeds
             for policy in request.policies
             if (policy.label, seed) not in self._results
         ]
         total = len(self._seeds) * len(request.policies)
         self._decision.look(self.results())
-        if self._decision.after is None:
-            with closing(run_jobs(todo, request.jobs)) as done:
-                for job in done:
-                    result = Result.read(Place.of(request.out, job.policy, job.seed).result)
+        if todo and self._decision.after is None:
+            with self._running(run_in_pool, todo) as done:
+                for job, result in done:
+                    file = Place.of(request.out, job.policy, job.seed).result
+                    if not file.exists():
+                        raise DatasetError(
+                            f"{file}: was written, but is not there: --out must be in a folder that all machines of "
+                            "the pool share"
+                        )
                     self._check_policy(job.policy, result)
                     self._results[job.policy.label, job.seed] = result
                     watch(len(self._results), total, job.policy, result)
@@ -113,13 +123,25 @@ class Evaluation:
         for policy in self.request.policies:
             failed = [each.seed for each in results[policy.label] if not each.success][:most]
             if failed and can_film(policy):
-                todo += [Job(str(self.request.out), policy, seed) for seed in failed]
+                todo += [FilmJob(str(self.request.out), policy, seed) for seed in failed]
         todo = [job for job in todo if not Place.of(self.request.out, job.policy, job.seed).video.exists()]
         if todo:
             begin(len(todo))
-        with closing(run_jobs(todo, self.request.jobs)) as done:
-            for _ in done:
-                pass
+            with self._running(film_in_pool, todo) as done:
+                for _ in done:
+                    pass
+
+    @contextmanager
+    def _running[J: (EpisodeJob, FilmJob), R](
+        self, function: Callable[[J, Callable[[int], None]], R], orders: Sequence[J]
+    ) -> Iterator[Iterator[tuple[J, R]]]:
+        """Do jobs in the pool; gives each with its result when it is done."""
+        jobs = (Job(function, order) for order in orders)
+        with (
+            closing(installed_plugins().pool(self.request.on, self.request.jobs)) as pool,
+            closing(pool.run(jobs)) as finished,
+        ):
+            yield map(_result, finished)
 
     def _check_policy(self, policy: Policy, result: Result) -> None:
         """Refuse results of other weights, e.g. those of a training that goes on meanwhile."""
@@ -138,6 +160,17 @@ class Evaluation:
                 place.result.unlink(missing_ok=True)
                 shutil.rmtree(place.episode, ignore_errors=True)
         return {label: results[:decided] for label, results in found.items()}
+
+
+def _result[R](done: Done[R]) -> tuple[Any, R]:
+    """A job that is done, and its result; raise the error if it failed."""
+    job = done.job.argument
+    if done.error is not None:
+        which = f"{job.policy.label}, seed {job.seed}"
+        failed = ComponentFailed(f"{which}: {done.error}; finished episodes are kept")
+        failed.exit_code = done.error.exit_code
+        raise failed
+    return job, done.result()
 
 
 @contextmanager
@@ -163,6 +196,7 @@ def opened(request: Request) -> Iterator[Evaluation]:
             for each in request.policies
         },
         "versions": registry.versions(),
+        ASKED: [attrs.asdict(each) for each in request.policies],
     }
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -188,7 +222,7 @@ def _begin(request: Request, settings: Mapping[str, Any]) -> None:
             known = json.loads(file.read_text(encoding="utf-8"))
         except ValueError as error:
             raise DatasetError(f"{file}: cannot be read: {error}") from None
-        if differing := list(differences(known, settings)):
+        if differing := list(differences(known, {**settings, ASKED: known.get(ASKED)})):
             raise DatasetError(f"{out}: was begun with other settings: {'; '.join(differing)}; choose a new folder")
         done = max((len(list(each.glob("seed_*.json"))) for each in (out / "results").glob("*")), default=0)
         if done > request.episodes and not request.until_decided:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +50,7 @@ def _filmed(policy: Policy, seed: int | None) -> RobotConfig | None:
     return attrs.evolve(config, recording=None, viewer=None)
 
 
-def film(file: Path, policy: Policy, result: Result, go_on: Callable[[], bool] = lambda: True) -> None:
+def film(file: Path, policy: Policy, result: Result) -> None:
     """Run an episode again, and write it as a video.
 
     Raises:
@@ -62,8 +61,7 @@ def film(file: Path, policy: Policy, result: Result, go_on: Callable[[], bool] =
     runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=result.seed, episodes=1)))
     session = runtime.session
     images = session.bus.subscribe(f"/camera/{_CAMERA}/image_raw", _DEPTH)
-    if not run_to_end(runtime, go_on):
-        return
+    run_to_end(runtime)
     time_s = round(seconds(session.clock.now_ns() - session.episodes.begun_ns), 6)
     if (bool(session.outcome.successes), time_s) != (result.success, result.time_s):
         raise ComponentFailed("the episode did not end as before when it was run again for its video")

@@ -8,7 +8,7 @@ from typing import override
 import attrs
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Ask, Event, Shown
+from ibrobot_core.app import Ask, Event, Shown, on_option, shard_of, shard_option
 
 SETTINGS = "evaluation.json"
 """File in the folder of an evaluation with what it was begun with."""
@@ -47,6 +47,8 @@ class EvalOptions:
     jobs: int | None = option(
         None, ge=1, label="Episodes at once", more=True, help="episodes in parallel; by default one for each CPU core"
     )
+    on: str = on_option()
+    shard: str = shard_option()
     videos: int = option(20, ge=0, label="Videos", more=True, help="failures of each policy to film for the report")
     trials: bool = option(
         False, label="Blinded trials", help="run blinded trials, as on a real arm, with a simulated one"
@@ -61,6 +63,12 @@ class EvalOptions:
     out: Path = option(
         label="Folder", help="folder of results, recordings and report; an evaluation in it is continued"
     )
+
+    @property
+    def seeds(self) -> range:
+        """The seeds of the episodes: all, or those of the shard."""
+        part = shard_of(self.shard, self.episodes)
+        return range(self.seed + part.start, self.seed + part.stop)
 
 
 @attrs.frozen(kw_only=True)

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from ibrobot_core.app import Case, Cases, Plots, Table, Text
 from ibrobot_eval.contents import contents_of
+from ibrobot_eval.episodes import write
 from ibrobot_eval.plots import tag
-from ibrobot_eval.report import Report
+from ibrobot_eval.report import Report, write_report
 
 _STYLE = """
 :root { color-scheme: light dark; --bg: #fff; --fg: #1c1e21; --muted: #5a6068; --grid: #e2e5e9; --card: #f5f6f8;
@@ -81,3 +82,9 @@ def _case(out: Path, case: Case) -> str:
     if case.command:
         lines.append(tag("code", escape(case.command)))
     return tag("div", "".join(lines), class_="failure")
+
+
+def write_all(out: Path, report: Report) -> None:
+    """Write a report into the folder of its evaluation, and its page."""
+    write_report(out, report)
+    write(out / "report.html", as_page(out, report))

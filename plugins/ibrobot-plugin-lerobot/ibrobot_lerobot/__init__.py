@@ -94,5 +94,5 @@ TRAIN = Command("train", "Train a policy with LeRobot.", _train, TrainOptions, E
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot datasets info` and `ibrobot train`."""
-    yield Command("datasets", "Show LeRobot datasets.", _datasets, commands=(INFO,))
+    yield Command("datasets", "Show and join LeRobot datasets.", _datasets, commands=(INFO,))
     yield TRAIN

@@ -1,9 +1,10 @@
-"""`ibrobot datasets info`: what a dataset contains."""
+"""`ibrobot datasets info`: what a dataset contains; `ibrobot datasets merge`: joins datasets."""
 
 from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 
 import attrs
 import click
@@ -16,7 +17,7 @@ from ibrobot_lerobot.contents import FeatureContents, InfoOptions
 
 @click.group()
 def datasets() -> None:
-    """Show LeRobot datasets."""
+    """Show and join LeRobot datasets."""
 
 
 @datasets.command()
@@ -49,6 +50,22 @@ def info(options: InfoOptions, as_json: bool, events: bool) -> None:
         for row in _rows(feature):
             table.add_row(*row)
     console.print(table)
+
+
+@datasets.command()
+@click.argument("parts", nargs=-1, required=True, metavar="DATASET...", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder of the whole dataset.")
+@wrong_input()
+def merge(parts: tuple[Path, ...], out: Path) -> None:
+    """Join datasets, e.g. those of `ibrobot convert --shard`.
+
+    They must have the same contract and settings. An episode that two of them have is an error. Nothing is encoded
+    again.
+    """
+    from ibrobot_lerobot.join import join_datasets
+
+    episodes = join_datasets(parts, out)
+    echo(f"{episodes} episodes of {len(parts)} datasets -> {out}")
 
 
 def _rows(feature: FeatureContents) -> list[tuple[str, ...]]:

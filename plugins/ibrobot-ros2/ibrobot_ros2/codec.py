@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 from rosbags.serde import SerdeError
@@ -26,11 +27,15 @@ class Codec:
     """
 
     def __init__(self, definitions: Mapping[str, str] | None = None) -> None:
-        self._types: Typestore = make_typestore() if definitions else standard_types()
         self._definitions = dict(definitions or {})
         self._classes: dict[str, type[Any]] = {}
         self._encoders: dict[str, Convert] = {}
         self._decoders: dict[str, Convert] = {}
+
+    @cached_property
+    def _types(self) -> Typestore:
+        """The types; a store takes too long to make for a bag of which only the summary is read."""
+        return make_typestore() if self._definitions else standard_types()
 
     def encode(self, message: Message) -> memoryview:
         """CDR of a message, little-endian, with its encapsulation header; arrays are copied once.

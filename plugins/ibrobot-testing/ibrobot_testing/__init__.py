@@ -17,6 +17,7 @@ from ibrobot_testing.hardware import HardwareSuite, SimulatedHardwareSuite
 from ibrobot_testing.leaks import LeakCheck
 from ibrobot_testing.planner import PlannerSuite
 from ibrobot_testing.policy import PolicySuite
+from ibrobot_testing.pool import PoolSuite
 from ibrobot_testing.recorder import RecorderSuite
 from ibrobot_testing.scene import SceneSuite
 from ibrobot_testing.section import SectionSuite, make_session
@@ -35,6 +36,7 @@ __all__ = [
     "LeakCheck",
     "PlannerSuite",
     "PolicySuite",
+    "PoolSuite",
     "RecorderSuite",
     "SceneSuite",
     "SectionSuite",

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import click
 
-from ibrobot_core.app import EpisodePath, echo, wrong_input
+from ibrobot_core.app import EpisodePath, Job, echo, installed_plugins, wrong_input
 
 
 @click.command()
 @click.argument("path", type=EpisodePath())
 @click.option("--gap", type=click.FloatRange(min=1), default=5.0, show_default=True, help="Longest pause, in periods.")
+@click.option("--on", default="", metavar="TYPE[://ADDRESS]", help="Pool that checks the episodes, e.g. processes.")
+@click.option("--jobs", type=click.IntRange(min=1), help="Episodes at once; with --on by default one per core.")
 @wrong_input()
-def verify(path: Path, gap: float) -> None:
+def verify(path: Path, gap: float, on: str, jobs: int | None) -> None:
     """Check every message of the episodes in PATH.
 
     Prints problems, and exits with 1 if there are any.
@@ -22,14 +26,13 @@ def verify(path: Path, gap: float) -> None:
     messages, topics of the contract without messages, header stamps that decrease, pauses in a topic longer than --gap
     times its median period, and different contracts within one dataset.
     """
-    from ibrobot_mcap.checks import problems_of
-    from ibrobot_mcap.commands.find_episodes import episodes_in, summary_of
+    from ibrobot_mcap.commands.find_episodes import episodes_in
 
     bad = 0
     contracts: dict[Path, tuple[str, Path]] = {}
-    for episode in episodes_in(path):
-        problems = problems_of(episode, gap)
-        fingerprint = summary_of(episode).metadata.get("fingerprint", "")
+    episodes = episodes_in(path)
+    checks = _in_pool(episodes, gap, on, jobs) if on or jobs else (check((each, gap)) for each in episodes)
+    for episode, (problems, fingerprint) in zip(episodes, checks, strict=True):
         first, where = contracts.setdefault(episode.parent, (fingerprint, episode))
         if fingerprint != first:
             problems.append(f"its contract is {fingerprint[:12]}, that of {where.name} is {first[:12]}")
@@ -37,3 +40,24 @@ def verify(path: Path, gap: float) -> None:
         echo(f"{episode}: {'; '.join(problems) or 'good'}")
     if bad:
         raise SystemExit(1)
+
+
+def check(order: tuple[Path, float], progress: Callable[[int], None] = lambda more: None) -> tuple[list[str], str]:
+    """The problems of an episode, with the longest pause in periods, and the fingerprint of its contract."""
+    from ibrobot_mcap.checks import problems_of
+    from ibrobot_mcap.commands.find_episodes import summary_of
+
+    episode, gap = order
+    return problems_of(episode, gap), summary_of(episode).metadata.get("fingerprint", "")
+
+
+def _in_pool(episodes: Sequence[Path], gap: float, on: str, jobs: int | None) -> Iterator[tuple[list[str], str]]:
+    """The result of `check` for each episode, in their order."""
+    early: dict[Path, tuple[list[str], str]] = {}
+    work = (Job(check, (episode, gap)) for episode in episodes)
+    with closing(installed_plugins().pool(on, jobs)) as pool, closing(pool.run(work)) as finished:
+        for episode in episodes:
+            while episode not in early:
+                done = next(finished)
+                early[done.job.argument[0]] = done.result()
+            yield early.pop(episode)

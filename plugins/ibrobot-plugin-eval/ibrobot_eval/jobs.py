@@ -1,0 +1,53 @@
+"""The jobs of an evaluation, for the processes of a pool: episodes to run, and episodes to film."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import attrs
+
+from ibrobot_eval.episodes import Place, Result, run_episode
+from ibrobot_eval.film import film
+from ibrobot_eval.policies import Policy
+
+
+@attrs.frozen
+class EpisodeJob:
+    """An episode to run."""
+
+    out: str
+    """The folder of the evaluation."""
+    policy: Policy
+    seed: int
+    document: str
+    """Hash of the robot YAML with which the evaluation began."""
+
+
+@attrs.frozen
+class FilmJob:
+    """An episode that has been run, to film."""
+
+    out: str
+    """The folder of the evaluation."""
+    policy: Policy
+    seed: int
+
+
+def run_in_pool(job: EpisodeJob, progress: Callable[[int], None]) -> Result:
+    """Run an episode."""
+    _quiet()
+    return run_episode(Path(job.out), job.policy, job.seed, job.document)
+
+
+def film_in_pool(job: FilmJob, progress: Callable[[int], None]) -> None:
+    """Film an episode."""
+    _quiet()
+    place = Place.of(Path(job.out), job.policy, job.seed)
+    film(place.video, job.policy, Result.read(place.result))
+
+
+def _quiet() -> None:
+    """What a run says of itself is not that of the evaluation."""
+    logging.getLogger("ibrobot").setLevel(logging.ERROR)

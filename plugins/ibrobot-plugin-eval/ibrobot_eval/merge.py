@@ -1,0 +1,140 @@
+"""`ibrobot eval merge`: joins evaluations of the same policies on other seeds, and reports on all episodes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, override
+
+import attrs
+import click
+
+from ibrobot_core.api import DatasetError
+from ibrobot_core.app import Ownership, echo, wrong_input
+from ibrobot_eval.episodes import Place, Result, write
+from ibrobot_eval.evaluation import ASKED, differences
+from ibrobot_eval.options import SETTINGS
+from ibrobot_eval.page import write_all
+from ibrobot_eval.policies import Policy
+from ibrobot_eval.report import Report
+
+
+@attrs.frozen
+class _Part:
+    """An evaluation to merge."""
+
+    folder: Path
+    settings: Mapping[str, Any]
+    policies: tuple[Policy, ...]
+    results: Mapping[str, Mapping[int, Result]]
+    """Label -> seed -> result."""
+
+    @classmethod
+    def of(cls, folder: Path) -> _Part:
+        """Read an evaluation.
+
+        Raises:
+            DatasetError: if the folder has none, or one that cannot be merged.
+        """
+        file = folder / SETTINGS
+        try:
+            settings = json.loads(file.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise DatasetError(f"{folder}: is no evaluation: it has no {SETTINGS}") from None
+        except ValueError as error:
+            raise DatasetError(f"{file}: cannot be read: {error}") from None
+        asked = settings.pop(ASKED, None)
+        if settings.get("trials") or settings.get("until_decided") or asked is None:
+            raise DatasetError(f"{folder}: only simulated episodes of a fixed number can be merged")
+        lists = ("overrides", "vary")
+        policies = tuple(Policy(**each | {name: tuple(each[name]) for name in lists}) for each in asked)
+        results = {
+            policy.label: {
+                result.seed: result
+                for path in sorted(Place.of(folder, policy, 0).result.parent.glob("seed_*.json"))
+                for result in (Result.read(path),)
+            }
+            for policy in policies
+        }
+        return cls(folder, settings, policies, results)
+
+
+def merge_evaluations(folders: Sequence[Path], out: Path) -> Report:
+    """Copy the episodes of evaluations into one, and write its report.
+
+    Raises:
+        DatasetError: if the evaluations differ in more than their seeds, have an episode twice or lack one, or if
+            `out` exists.
+    """
+    parts = sorted(map(_Part.of, folders), key=lambda part: part.settings["seed"])
+    first = parts[0]
+    for part in parts[1:]:
+        wrong = differences(first.settings, {**part.settings, "seed": first.settings["seed"]})
+        if differing := list(wrong):
+            raise DatasetError(f"{part.folder}: differs from {first.folder}: {'; '.join(differing)}")
+    where: dict[tuple[str, int], Path] = {}
+    for part in parts:
+        for label, results in part.results.items():
+            for seed in results:
+                if (label, seed) in where:
+                    raise DatasetError(f"{part.folder}: has {label}, seed {seed}, as {where[label, seed]} has")
+                where[label, seed] = part.folder
+    seeds = sorted({seed for _, seed in where})
+    labels = [policy.label for policy in first.policies]
+    whole = range(first.settings["seed"], seeds[-1] + 1) if seeds else range(0)
+    lacking = [f"{label}, seed {seed}" for seed in whole for label in labels if (label, seed) not in where]
+    if lacking or not seeds:
+        what = f"{', '.join(lacking[:3])}{' and more' if len(lacking) > 3 else ''}" if seeds else "all episodes"
+        raise DatasetError(f"{first.folder}: these parts lack {what}: finish them, or name all of them")
+    if out.exists() and any(out.iterdir()):
+        raise DatasetError(f"{out}: exists already; choose a new folder")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with Ownership(out, "is being evaluated"):
+        for part in parts:
+            for name in ("episodes", "results", "videos"):
+                if (part.folder / name).is_dir():
+                    shutil.copytree(part.folder / name, out / name, dirs_exist_ok=True)
+        asked = [attrs.asdict(policy) for policy in first.policies]
+        write(out / SETTINGS, json.dumps({**first.settings, ASKED: asked}, indent=1) + "\n")
+        joined = {label: [_result(parts, label, seed) for seed in whole] for label in labels}
+        report = Report.of_simulation(first.policies, joined, first.settings["margin"], until_decided=False)
+        write_all(out, report)
+    return report
+
+
+def _result(parts: Sequence[_Part], label: str, seed: int) -> Result:
+    return next(part.results[label][seed] for part in parts if seed in part.results[label])
+
+
+@click.command()
+@click.argument("folders", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder for the whole evaluation.")
+@wrong_input()
+def merge(folders: tuple[Path, ...], out: Path) -> None:
+    """Join evaluations of the same policies on other seeds, e.g. of --shard.
+
+    The parts must agree in all else, and no episode may be in two of them. The result is the evaluation that one
+    command would have made. The command without --shard can continue it.
+    """
+    report = merge_evaluations(folders, out)
+    for line in report.lines():
+        echo(line)
+    echo(f"report: {out / 'report.html'}")
+
+
+class WithMerge(click.Command):
+    """The command `eval`, with `eval merge` below it."""
+
+    @override
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        if args[:1] == ["merge"]:
+            return merge.make_context(f"{info_name} merge", args[1:], parent, **extra)
+        return super().make_context(info_name, args, parent, **extra)
+
+    @override
+    def invoke(self, ctx: click.Context) -> Any:
+        return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)

@@ -1,0 +1,144 @@
+"""The pool passes the suite, and each check of the suite catches something wrong."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from ibrobot_testing import PoolSuite
+
+from ibrobot_core.app import ComponentFailed, Done, Job, Pool, RequestError, installed_plugins
+
+
+def process_pool(jobs: int) -> Pool:
+    """The default pool."""
+    return installed_plugins().pool("", jobs)
+
+
+class TestProcessPool(PoolSuite):
+    def pool(self, jobs):
+        return process_pool(jobs)
+
+
+class Wrong(Pool):
+    """A pool with a fault; the rest is that of this package."""
+
+    def __init__(self, jobs: int) -> None:
+        self.pool = process_pool(jobs)
+
+    def run(self, jobs: Iterable[Job[Any]], watch: Callable[[int], None] = lambda count: None) -> Generator[Done[Any]]:
+        with closing(self.pool.run(self.before(jobs), self.watched(watch))) as running:
+            for done in running:
+                yield from self.after(done)
+
+    def before(self, jobs: Iterable[Job[Any]]) -> Iterable[Job[Any]]:
+        return jobs
+
+    def watched(self, watch: Callable[[int], None]) -> Callable[[int], None]:
+        return watch
+
+    def after(self, done: Done[Any]) -> Iterable[Done[Any]]:
+        return [done]
+
+
+class Twice(Wrong):
+    def after(self, done):
+        return [done, done]
+
+
+class AllAtOnce(Wrong):
+    def before(self, jobs):
+        return list(itertools.islice(jobs, 100))
+
+
+class Unwatched(Wrong):
+    def watched(self, watch):
+        return lambda count: watch(0)
+
+
+class PlainErrors(Wrong):
+    def after(self, done):
+        if done.error is not None:
+            done.error.exit_code = 1
+        return [done]
+
+
+class HidesErrors(Wrong):
+    def after(self, done):
+        return [Done(done.job, done.value)]
+
+
+class GivesUp(Wrong):
+    def after(self, done):
+        return [Done(done.job, None, ComponentFailed("its process was killed"))]
+
+
+class KeepsProcesses(Wrong):
+    def before(self, jobs):
+        return (Job(each.function, each.argument) for each in jobs)
+
+
+class OtherFolder(Wrong):
+    def before(self, jobs):
+        os.chdir("/")
+        return jobs
+
+
+class GoesOn(Wrong):
+    """Closing it leaves its jobs running."""
+
+    left: ClassVar[list[Any]] = []
+
+    def run(self, jobs, watch=lambda count: None):
+        running = self.pool.run(jobs, watch)
+        self.left.append(running)
+        for done in running:  # noqa: UP028 - `yield from` would close it
+            yield done
+
+
+@pytest.mark.parametrize(
+    ("kind", "check"),
+    [
+        (Twice, lambda suite, path: suite.test_each_job_is_done_once(1)),
+        (AllAtOnce, lambda suite, path: suite.test_jobs_begin_in_their_order_when_there_is_room_for_them()),
+        (Unwatched, lambda suite, path: suite.test_progress_of_all_jobs_is_counted()),
+        (PlainErrors, lambda suite, path: suite.test_error_of_a_job_is_its_own()),
+        (HidesErrors, lambda suite, path: suite.test_bug_in_a_job_is_an_error()),
+        (HidesErrors, lambda suite, path: suite.test_job_that_kills_each_process_fails_and_others_do_not()),
+        (GivesUp, lambda suite, path: suite.test_job_whose_process_is_killed_is_run_again(path)),
+        (GoesOn, lambda suite, path: suite.test_closing_ends_the_jobs_that_run(path)),
+    ],
+    ids=lambda value: value.__name__ if isinstance(value, type) else "",
+)
+def test_wrong_pool_fails(kind: Any, check: Any, tmp_path: Path) -> None:
+    class Subject(PoolSuite):
+        patience_s = 2.0
+
+        def pool(self, jobs):
+            return kind(jobs)
+
+    with pytest.raises((AssertionError, ComponentFailed)):
+        check(Subject(), tmp_path)
+    for running in GoesOn.left:
+        running.close()
+    GoesOn.left.clear()
+
+
+@pytest.mark.parametrize("kind", [KeepsProcesses, OtherFolder], ids=lambda kind: kind.__name__)
+def test_wrong_processes_fail(kind: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Subject(PoolSuite):
+        def pool(self, jobs):
+            return kind(jobs)
+
+    with pytest.raises(AssertionError):
+        Subject().test_own_processes_run_one_job_each_in_the_same_folder(tmp_path, monkeypatch)
+
+
+def test_processes_have_no_address() -> None:
+    with pytest.raises(RequestError, match="processes://here: processes run on this machine"):
+        installed_plugins().pool("processes://here")
