@@ -72,5 +72,13 @@ class Transport(ABC):
             TransportError: if closed.
         """
 
+    @abstractmethod
+    def served(self, prefix: str) -> frozenset[str]:
+        """The names that begin with `prefix` and have a server now, e.g. all servers of one model. Does not block.
+
+        Raises:
+            TransportError: if closed.
+        """
+
     def close(self) -> None:
         """End all subscriptions, services and watches; every later call is a TransportError. Safe to call twice."""

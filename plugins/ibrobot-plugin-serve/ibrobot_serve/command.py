@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import sys
 import threading
@@ -34,11 +35,23 @@ from ibrobot_core.app import (
     single_options,
     wrong_input,
 )
+from ibrobot_serve.fleet import LARGEST_CANARY
 from ibrobot_serve.metrics import probes
 from ibrobot_serve.service import InferenceService, ServiceOptions
 
 _PLAIN_PERIOD_S = 10.0
 _PANEL_PERIOD_S = 0.5
+
+
+def _share(ctx: click.Context, param: click.Parameter, value: str) -> float:
+    """The number for a share in percent."""
+    try:
+        share = float(value.removesuffix("%")) / 100
+    except ValueError:
+        share = math.nan
+    if not value.endswith("%") or not 0 <= share <= LARGEST_CANARY:
+        raise click.BadParameter(f"{value!r} is no share from 0% to {LARGEST_CANARY:.0%}, e.g. 10%")
+    return share
 
 
 @click.command()
@@ -86,6 +99,14 @@ _PANEL_PERIOD_S = 0.5
     help="A model that works on one batch for longer hangs: requests fail, and the server restarts.",
 )
 @click.option(
+    "--canary",
+    callback=_share,
+    default="0%",
+    show_default=True,
+    metavar="SHARE",
+    help="Share of all robots that try this server although its weights differ, up to 50%; 0%: none.",
+)
+@click.option(
     "--metrics-port",
     type=click.IntRange(0, 65535),
     metavar="PORT",
@@ -123,7 +144,10 @@ def serve(what: str, **options: Any) -> None:
         stopping = threading.Event()  # from here on; before, either signal ends the process at once
         on_signals(stopping.set)
         transport = make_transport()
-        limits = ServiceOptions(options["batch"], options["queue"], options["patience"] / 1000, options["hang_timeout"])
+        limits = ServiceOptions(
+            options["batch"], options["queue"], options["patience"] / 1000, options["hang_timeout"],
+            canary=options["canary"],
+        )  # fmt: skip
 
         def replace() -> None:
             hung.set()
@@ -133,6 +157,8 @@ def serve(what: str, **options: Any) -> None:
         metrics = None
         try:
             service.start()
+            some = f" for {limits.canary:.0%} of the robots" if limits.canary else ""
+            logging.getLogger("ibrobot").info("server %s of %s%s", service.id, name, some)
             if options["metrics_port"] is not None:
                 metrics = ProbeServer(options["metrics_port"], probes(service))
                 logging.getLogger("ibrobot").info("metrics on %s", metrics.url)

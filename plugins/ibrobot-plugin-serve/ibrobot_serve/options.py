@@ -30,3 +30,4 @@ class DistributedOptions:
         None, ge=1, le=100, help="quality of images sent as JPEG, which is smaller but lossy; null: raw images"
     )
     accept_new_weights: bool = option(False, help=_NEW_WEIGHTS.format("server"))
+    canary: bool = option(True, help="try other weights if a server is started with --canary and draws this robot")

@@ -46,6 +46,12 @@ class Pacing:
         with self._lock:
             self._batches.append((requests, took_ns))
 
+    def robots(self, now_ns: int) -> int:
+        """Number of robots that asked within the last 5 s."""
+        with self._lock:
+            self._forget(now_ns - _WINDOW_NS)
+            return len(self._asked)
+
     def pace_ns(self, now_ns: int) -> int:
         """Time to leave from one request to the next [ns]; 0: no limit."""
         with self._lock:

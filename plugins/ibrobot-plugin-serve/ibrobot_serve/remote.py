@@ -7,10 +7,11 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import Callable, Mapping
-from typing import Any, Self, override
+from collections.abc import Callable, Sequence, Set
+from typing import Self, override
 
 import attrs
+import numpy as np
 
 from ibrobot_core.api import (
     NS_PER_S,
@@ -25,6 +26,7 @@ from ibrobot_core.api import (
     TransportError,
 )
 from ibrobot_core.app import WireError
+from ibrobot_serve.fleet import Choice, Offer, drawn_canary, ranked
 from ibrobot_serve.options import DistributedOptions
 from ibrobot_serve.weights import check_weights
 from ibrobot_serve.wire import (
@@ -36,49 +38,65 @@ from ibrobot_serve.wire import (
     WireLimits,
     WireMessage,
     health_name,
+    offer_name,
+    server_name,
     service_name,
     whole_fingerprint,
 )
 
-_HEALTH_TIMEOUT_S = 2.0
-_HEALTH_SIZE = 1 << 20
+_OFFER_TIMEOUT_S = 0.3
+"""How long a robot that chooses a server waits for an offer [s]."""
+_REASON_TIMEOUT_S = 2.0
 _RETRY_S = 0.2
 _PARALLEL = 8
 """Concurrent requests to a server whose model does not remember them."""
 
 
+@attrs.frozen
+class _Session:
+    """A robot's time with a server. Requests of another session may have other weights."""
+
+    server: str
+    fingerprint: str
+    """Of the policy with the server's weights."""
+
+
+class _OtherServerError(PolicyError):
+    """This server did not answer, but another may."""
+
+
 class RemoteEngine(Engine):
     """The model on a server; the robot's side has no weights.
 
-    While the server is unreachable, requests fail and the arm holds. Once it is back it answers again, because each
-    request contains everything that a server needs. The transport reconnects by itself.
+    A robot stays with the server that it has chosen. It chooses another when that one dies, fails, or takes no robots
+    any more; also at the start of an episode, when another has more room. While no server is reachable, requests fail
+    and the arm holds. Each request contains everything that a server needs. The transport reconnects by itself.
 
     Args:
         policy: the robot's side; its fingerprint must equal that of the server's.
-        transport: the connection to the server; its owner closes it.
-        model: name of the model on the server.
-        robot: this robot's name; a suffix makes it unique among the server's robots.
+        transport: the connection to the servers; its owner closes it.
+        model: name of the model on the servers.
+        robot: this robot's name; a suffix makes it unique among all robots.
         start_timeout_s: how long `start` waits for a server [s].
         codec: encodes camera images as JPEG, for slow links.
         limits: the server's.
-        accept_new_weights: continue, with a warning, if the server restarts with other weights.
+        accept_new_weights: continue, with a warning, if only servers with other weights are left.
+        canary: take part if a server offers other weights to a share of the robots.
     """
 
     def __init__(
         self, policy: Policy, transport: Transport, model: str, robot: str, start_timeout_s: float = 5.0,
         codec: PictureCodec | None = None, limits: WireLimits = WIRE_LIMITS, *, accept_new_weights: bool = False,
+        canary: bool = True,
     ) -> None:  # fmt: skip
         super().__init__("distributed")
         self._policy = policy
-        self._fingerprint = policy.fingerprint()
-        """Includes the server's weights, once they are known."""
         self._accept_new_weights = accept_new_weights
-        self._changed = threading.Event()
-        """Set when an answer came from another policy."""
-        self._looking = threading.Lock()
+        self._takes_canaries = canary
         self._transport = transport
         self._model = model
         self._robot = f"{robot}-{uuid.uuid4().hex[:8]}"
+        self._choice = Choice(self._robot)
         self._start_timeout_s = start_timeout_s
         self.parallel = 1 if policy.spec.stateful else _PARALLEL
         self._encoder, self._decoder = WireEncoder(limits, codec), WireDecoder(limits)
@@ -86,6 +104,15 @@ class RemoteEngine(Engine):
         """Free buffers."""
         self._episode = time.time_ns()
         """Starts at the time, so that a restart with the same certificate does not repeat an episode's number."""
+        self._choosing = threading.Lock()
+        self._session: _Session | None = None
+        self._last_server = ""
+        """The one that answered last, or was to."""
+        self._weights: str | None = None
+        """Hash of the weights of all servers but canaries; None before the first was chosen."""
+        self._reconsider = False
+        """Whether an episode has begun since the server was chosen."""
+        self._log = logging.getLogger("ibrobot.inference")
         self._end_watch: Callable[[], None] | None = None
 
     @classmethod
@@ -108,6 +135,7 @@ class RemoteEngine(Engine):
         return cls(
             model.policy, model.transport, options.server_model or ctx.name, ctx.robot.name,
             start_timeout_s=model.timeout_s, codec=codec, accept_new_weights=options.accept_new_weights,
+            canary=options.canary,
         )  # fmt: skip
 
     @override
@@ -115,49 +143,38 @@ class RemoteEngine(Engine):
         deadline_s = time.monotonic() + self._start_timeout_s
         while True:
             try:
-                health = self._health()
+                self._session_for(frozenset())
                 break
             except TransportError as error:
                 if time.monotonic() >= deadline_s:
                     raise PolicyError(f"no server for model {self._model!r}: {error}") from None
                 time.sleep(_RETRY_S)
-        self._adopt(health)
         self._end_watch = self._transport.watch(service_name(self._model), self._served)
 
     @override
+    def reset(self, seed: int) -> None:
+        super().reset(seed)
+        self._reconsider = True
+
+    @override
     def run(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
-        if self._changed.is_set():
-            self._look_again()
-        fingerprint = self._fingerprint
-        left_ns = deadline_ns - time.monotonic_ns()
-        if left_ns <= 0:
-            raise PolicyError(f"request {request_id} expired before it was sent")
-        message = WireMessage(
-            WireKind.REQUEST, request_id, tensors, self._robot, fingerprint, stamp_ns=time.time_ns(),
-            deadline_ns=left_ns, episode=self._episode, seed=self._seed,
-        )  # fmt: skip
-        buffer = self._buffers.pop()
-        try:
-            frame = self._encoder.encode(message, buffer.allocate)
-            reply = self._transport.request(service_name(self._model), frame, left_ns / NS_PER_S)
-            answer = self._decoder.decode(reply)
-        except (TransportError, WireError) as error:
-            raise PolicyError(str(error)) from None
-        finally:
-            self._buffers.append(buffer)
-        self.stats.pace_ms = answer.pace_ns / 1e6
-        if answer.fingerprint not in ("", fingerprint):
-            self._changed.set()
-        if answer.kind is WireKind.FAILURE:
-            raise PolicyError(f"the server of {self._model}: {answer.text}")
-        if answer.id != request_id or answer.fingerprint != fingerprint:
-            raise PolicyError(
-                f"the server of {self._model} answered request {answer.id} with policy {answer.fingerprint!r}; "
-                f"expected request {request_id} with policy {fingerprint!r}"
-            )
-        self.stats.queue_ms = min(answer.queued_ns / 1e6, answer.latency_ms)
-        self.stats.model_ms = answer.latency_ms - self.stats.queue_ms
-        return answer.tensors
+        tried: set[str] = set()
+        failure: PolicyError | None = None
+        while True:
+            try:
+                session = self._session_for(tried)
+            except (TransportError, ContractError) as error:
+                raise failure or PolicyError(str(error)) from None
+            except PolicyError as error:
+                raise failure or error from None
+            try:
+                return self._ask(session, tensors, request_id, deadline_ns)
+            except _OtherServerError as error:
+                failure = error
+                tried.add(session.server)
+                self._leave(session, str(error))
+                if time.monotonic_ns() >= deadline_ns:
+                    raise
 
     @override
     def close(self) -> None:
@@ -165,55 +182,182 @@ class RemoteEngine(Engine):
         if end is not None:
             end()
 
-    def _look_again(self) -> None:
-        """Check which policy the server has now.
+    def _ask(self, session: _Session, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
+        """The answer of one server.
 
         Raises:
-            PolicyError: when the policy differs, or its weights differ and are not accepted.
+            PolicyError: for a fault of this request.
+            _OtherServerError: for a fault of this server.
         """
-        with self._looking:
-            if not self._changed.is_set():
-                return
-            try:
-                self._adopt(self._health())
-            except (TransportError, ContractError) as error:
-                raise PolicyError(str(error)) from None
-            self._changed.clear()
+        left_ns = deadline_ns - time.monotonic_ns()
+        if left_ns <= 0:
+            raise PolicyError(f"request {request_id} expired before it was sent")
+        message = WireMessage(
+            WireKind.REQUEST, request_id, tensors, self._robot, session.fingerprint, stamp_ns=time.time_ns(),
+            deadline_ns=left_ns, episode=self._episode, seed=self._seed,
+        )  # fmt: skip
+        buffer = self._buffers.pop()
+        try:
+            frame = self._encoder.encode(message, buffer.allocate)
+        except WireError as error:
+            self._buffers.append(buffer)
+            raise PolicyError(str(error)) from None
+        try:
+            name = server_name(self._model, session.server)
+            answer = self._decoder.decode(self._transport.request(name, frame, left_ns / NS_PER_S))
+        except (TransportError, WireError) as error:
+            raise _OtherServerError(str(error)) from None
+        finally:
+            self._buffers.append(buffer)
+        self.stats.pace_ms = answer.pace_ns / 1e6
+        if answer.kind is WireKind.REFUSAL:
+            raise _OtherServerError(f"the server of {self._model}: {answer.text}")
+        if answer.kind is WireKind.FAILURE:
+            raise PolicyError(f"the server of {self._model}: {answer.text}")
+        if answer.id != request_id or answer.fingerprint != session.fingerprint:
+            raise _OtherServerError(
+                f"the server of {self._model} answered request {answer.id} with policy {answer.fingerprint!r}; "
+                f"expected request {request_id} with policy {session.fingerprint!r}"
+            )
+        for tensor, array in answer.tensors.items():
+            if np.isnan(array).any():
+                raise _OtherServerError(f"the server of {self._model} answered with NaN in {tensor!r}")
+        self.stats.queue_ms = min(answer.queued_ns / 1e6, answer.latency_ms)
+        self.stats.model_ms = answer.latency_ms - self.stats.queue_ms
+        return answer.tensors
 
-    def _adopt(self, health: Mapping[str, Any]) -> None:
-        """Use the server's weights, if its policy is the robot's."""
-        weights = str(health.get("weights", ""))[:128]
-        fingerprint = whole_fingerprint(self._policy.fingerprint(), weights)
-        if health.get("fingerprint") != fingerprint:
-            raise ContractError(self._differences(health, fingerprint))
-        check_weights(self.stats.weights, weights, f"the server of {self._model}", accept=self._accept_new_weights)
-        self._fingerprint, self.stats.weights = fingerprint, weights
+    def _leave(self, session: _Session, why: str) -> None:
+        """Choose another server for the next request, if there is one."""
+        with self._choosing:
+            self._choice.avoid(session.server, time.monotonic())
+            if self._session is session:
+                self._session = None
+                self._log.warning("model %s: server %s failed: %s", self._model, session.server, why)
+
+    def _session_for(self, tried: Set[str]) -> _Session:
+        """The present session, or a new one with a server that was not tried.
+
+        Raises:
+            TransportError: if no server can be reached.
+            ContractError: if they have another policy.
+            PolicyError: if they have other weights.
+        """
+        with self._choosing:
+            offered = self._transport.served(offer_name(self._model))
+            session = self._session
+            if session is not None and offer_name(self._model, session.server) not in offered:
+                session = None
+            if session is not None and session.server not in tried:
+                return self._reconsidered(session, offered) if self._reconsider else session
+            groups = self._groups([offer for offer in self._offers(offered) if offer.server not in tried])
+            return self._begin(self._choice.order(groups, time.monotonic())[0])
+
+    def _reconsidered(self, session: _Session, offered: frozenset[str]) -> _Session:
+        """The session of a new episode."""
+        try:
+            offers = self._offers(offered)
+            server = self._choice.reconsider(session.server, self._groups(offers), time.monotonic())
+        except (TransportError, PolicyError, ContractError) as error:
+            self._log.info("model %s: stays at server %s: %s", self._model, session.server, error)
+            return session
+        self._reconsider = False
+        if server == session.server:
+            return session
+        return self._begin(next(offer for offer in offers if offer.server == server))
+
+    def _begin(self, offer: Offer) -> _Session:
+        """A session with a server. If it is not the last one, its model must not remember this robot."""
+        if self._last_server not in ("", offer.server):
+            self._episode += 1
+            self._log.info(
+                "model %s: moves from server %s to %s, weights %s",
+                self._model,
+                self._last_server,
+                offer.server,
+                offer.weights,
+            )
+        if offer.canary:
+            self._log.warning("model %s: this robot tries the canary with weights %s", self._model, offer.weights)
+        self._last_server, self.stats.weights = offer.server, offer.weights
+        self._session = _Session(offer.server, offer.fingerprint)
+        return self._session
+
+    def _offers(self, names: frozenset[str]) -> list[Offer]:
+        """What the servers of these names offer.
+
+        Raises:
+            TransportError: if there are none, or none answers.
+            PolicyError: if none is an ibrobot server.
+        """
+        offers: list[Offer] = []
+        failure: TransportError | PolicyError | None = None
+        for name in sorted(names):
+            try:
+                payload = self._transport.request(name, b"", _OFFER_TIMEOUT_S)
+                offers.append(Offer.read(name.rpartition("/")[2], payload))
+            except (TransportError, PolicyError) as error:
+                failure = error
+        if not offers:
+            if failure is None:  # the transport knows the reason, e.g. that there is no connection
+                self._transport.request(health_name(self._model), b"", _REASON_TIMEOUT_S)
+                failure = TransportError(f"the servers of {self._model} take no robots")
+            raise failure
+        return offers
+
+    def _groups(self, offers: Sequence[Offer]) -> list[list[Offer]]:
+        """The servers that this robot may use, by weights: those of a canary that it is to try, and the others."""
+        if not offers:
+            raise TransportError(f"no other server of {self._model} takes robots")
+        ours = self._policy.fingerprint()
+        same = [offer for offer in offers if offer.fingerprint == whole_fingerprint(ours, offer.weights)]
+        if not same:
+            raise ContractError(self._differences(offers[0], whole_fingerprint(ours, offers[0].weights)))
+        canaries = [offer for offer in same if offer.canary] if self._takes_canaries else []
+        drawn = drawn_canary(canaries, self._robot)
+        trying = [offer for offer in canaries if offer.fingerprint == drawn]
+        others = [offer for offer in same if not offer.canary]
+        try:
+            groups = [trying, self._of_one_weights(others)]
+        except PolicyError:
+            if not trying:
+                raise
+            groups = [trying]
+        if not any(groups):
+            raise PolicyError(f"the only servers of {self._model} are canaries, which this robot does not try")
+        return groups
+
+    def _of_one_weights(self, offers: list[Offer]) -> list[Offer]:
+        """The servers whose weights are this robot's.
+
+        Raises:
+            PolicyError: if none has these, or the robot has none yet and the servers disagree.
+        """
+        known = {offer.weights for offer in offers}
+        if self._weights in known or not known:
+            return [offer for offer in offers if offer.weights == self._weights]
+        chosen = ranked(offers, self._robot)[0].weights
+        if self._weights is not None:
+            check_weights(self._weights, chosen, f"the server of {self._model}", accept=self._accept_new_weights)
+        elif len(known) > 1 and not self._accept_new_weights:
+            raise PolicyError(
+                f"the servers of {self._model} have different weights: {', '.join(sorted(known))}; end those that are "
+                "not wanted, start them with --canary SHARE, or set inference.accept_new_weights: true"
+            )
+        self._weights = chosen
+        return [offer for offer in offers if offer.weights == chosen]
 
     def _served(self, alive: bool) -> None:
         self.stats.restarts += alive and self.stats.requests > 0
         self.stats.alive = alive
 
-    def _health(self) -> Mapping[str, Any]:
-        reply = self._transport.request(health_name(self._model), b"", _HEALTH_TIMEOUT_S)
-        try:
-            health = json.loads(bytes(reply)) if len(reply) <= _HEALTH_SIZE else None
-        except ValueError:
-            health = None
-        if not isinstance(health, dict):
-            raise PolicyError(
-                f"the server of {health_name(self._model)} is not an ibrobot server: {bytes(reply)[:40]!r}…"
-            )
-        return health
-
-    def _differences(self, health: Mapping[str, Any], fingerprint: str) -> str:
+    def _differences(self, offer: Offer, fingerprint: str) -> str:
         """The differences of both policies."""
-        known = health["spec"] if isinstance(health.get("spec"), dict) else {}
         ours = json.loads(json.dumps(attrs.asdict(self._policy.spec)))
         lines = [f"the policy on the server is not the robot's model {self._model!r}:"]
-        for field in known:
-            if known[field] != ours.get(field):
-                lines.append(f"  {field}\n      robot: {ours.get(field)}\n     server: {known[field]}")
-        lines.append(f"  fingerprint\n      robot: {fingerprint}\n     server: {health.get('fingerprint')}")
+        for field, theirs in offer.spec.items():
+            if theirs != ours.get(field):
+                lines.append(f"  {field}\n      robot: {ours.get(field)}\n     server: {theirs}")
+        lines.append(f"  fingerprint\n      robot: {fingerprint}\n     server: {offer.fingerprint}")
         if len(lines) == 2:  # the fingerprint alone
             lines.append(
                 "  equal specs, but files or options differ, e.g. statistics: copy the server's files, without weights"

@@ -8,6 +8,7 @@ import queue
 import threading
 import time
 import traceback
+import uuid
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
 from typing import Any
@@ -27,6 +28,8 @@ from ibrobot_serve.wire import (
     WireLimits,
     WireMessage,
     health_name,
+    offer_name,
+    server_name,
     service_name,
     whole_fingerprint,
 )
@@ -53,6 +56,8 @@ class ServiceOptions:
     """How long an incomplete batch waits for more requests [s]; 0: it takes only requests already waiting."""
     hang_timeout_s: float = 30.0
     """A model that works on one batch for longer counts as hanging [s]."""
+    canary: float = 0.0
+    """Share of all robots that may use this server although its weights differ; 0: as any other server."""
     limits: WireLimits = WIRE_LIMITS
 
 
@@ -82,6 +87,8 @@ class _Outcome:
     outputs: Tensors | None
     error: str = ""
     expired: bool = False
+    refused: bool = False
+    """Whether another server may take the request."""
     queued_ns: int = 0
 
 
@@ -100,6 +107,9 @@ class _Ticket:
     def fail(self, error: str, *, expired: bool = False) -> None:
         self.outcomes.put(_Outcome(None, error, expired))
 
+    def refuse(self, why: str) -> None:
+        self.outcomes.put(_Outcome(None, why, refused=True))
+
     def like(self, other: _Ticket) -> bool:
         """Whether both can be in one batch."""
         theirs = other.message.tensors
@@ -111,6 +121,8 @@ class _Ticket:
 
 class InferenceService:
     """Serves `infer` of a loaded policy under `service_name(model)`, and its statistics under `health_name(model)`.
+
+    Several servers may have one model. Robots choose among their offers, and ask each by its own name.
 
     Args:
         policy: the loaded policy; the caller closes it, after the service.
@@ -128,6 +140,8 @@ class InferenceService:
         self._policy = policy
         self._transport = transport
         self._model = model
+        self.id = uuid.uuid4().hex[:12]
+        """Tells this server from the others of the model; another one after each start."""
         self._options = options or ServiceOptions()
         self._decoder, self._encoder = WireDecoder(self._options.limits, codec), WireEncoder(self._options.limits)
         self._weights = policy.weights()
@@ -151,6 +165,8 @@ class InferenceService:
         self._begun_ns = time.monotonic_ns()
         self._log = logging.getLogger("ibrobot.inference")
         self._ends: list[Callable[[], None]] = []
+        self._withdraw: Callable[[], None] = lambda: None
+        """Ends the offer to robots."""
         self._thread = threading.Thread(target=self._infer_all, name=f"model {model}", daemon=True)
         self._watchdog = threading.Thread(target=self._watch, name=f"watchdog of {model}", daemon=True)
 
@@ -164,12 +180,22 @@ class InferenceService:
         # Each waiting request holds a worker; one more must be left to answer that the queue is full.
         workers = options.queue + options.batch + 1
         self._ends.append(self._transport.serve(health_name(self._model), self._health, workers=1))
-        self._ends.append(self._transport.serve(service_name(self._model), self._answer, workers=workers))
+        for name in (service_name(self._model), server_name(self._model, self.id)):
+            self._ends.append(self._transport.serve(name, self._answer, workers=workers))
+        self._withdraw = self._transport.serve(offer_name(self._model, self.id), self._offer, workers=1)
         self._thread.start()
         self._watchdog.start()
 
     def drain(self, timeout_s: float) -> bool:
-        """Refuse new requests, and wait until all pending ones are answered; returns whether they were, in time [s]."""
+        """Send robots to other servers, and wait until all pending requests are answered.
+
+        Args:
+            timeout_s: how long to wait at most [s].
+
+        Returns:
+            Whether all were answered in time.
+        """
+        self._withdraw()
         with self._idle:
             self._draining = True
             return self._idle.wait_for(lambda: self._pending == 0, timeout_s)
@@ -179,7 +205,7 @@ class InferenceService:
         self._draining = True
         self._closed.set()
         self._queue.end()
-        ends, self._ends = self._ends, []
+        ends, self._ends = [self._withdraw, *self._ends], []
         for end in ends:
             end()
         for thread in (self._thread, self._watchdog):
@@ -201,7 +227,7 @@ class InferenceService:
             robots = {name: counts.summary() for name, counts in self._robots.items()}
             batches = {str(size): count for size, count in sorted(self._batches.items())}
             return {
-                "model": self._model, "state": self.state,
+                "model": self._model, "server": self.id, "canary": self._options.canary, "state": self.state,
                 "fingerprint": self._fingerprint, "weights": self._weights, "spec": attrs.asdict(self._policy.spec),
                 "uptime_s": round((time.monotonic_ns() - self._begun_ns) / NS_PER_S, 1), "waiting": len(self._queue),
                 "malformed": self._malformed, "pace_ms": round(pace_ms, 1), **self._all.summary(),
@@ -210,6 +236,17 @@ class InferenceService:
 
     def _health(self, payload: Payload, sender: str | None) -> Payload:
         return json.dumps(self.statistics()).encode()
+
+    def _offer(self, payload: Payload, sender: str | None) -> Payload:
+        """What a robot has to know to choose among servers."""
+        now_ns = time.monotonic_ns()
+        owned = self._owner is not None and now_ns - self._owner_heard_ns < _LEASE_NS
+        robots = int(owned) if self._policy.spec.stateful else self._pacing.robots(now_ns)
+        offer = {
+            "fingerprint": self._fingerprint, "weights": self._weights, "spec": attrs.asdict(self._policy.spec),
+            "robots": robots, "canary": self._options.canary, "uptime_s": (now_ns - self._begun_ns) / NS_PER_S,
+        }  # fmt: skip
+        return json.dumps(offer).encode()
 
     def _answer(self, payload: Payload, sender: str | None) -> Payload:
         """Called by the transport, once for every request, in several threads."""
@@ -228,7 +265,7 @@ class InferenceService:
             refused = self._refusal(message)
             self._pending += 1
         try:
-            outcome = _Outcome(None, refused) if refused else self._wait_for(message, arrived_ns)
+            outcome = _Outcome(None, refused, refused=True) if refused else self._wait_for(message, arrived_ns)
             return self._reply(message, outcome, arrived_ns)
         finally:
             with self._idle:
@@ -254,7 +291,7 @@ class InferenceService:
         self._pacing.ask(message.robot, arrived_ns)
         replaced = self._queue.put(message.robot, ticket)
         if replaced is ticket:
-            ticket.fail(f"the server is full: {self._options.queue} requests wait")
+            ticket.refuse(f"the server is full: {self._options.queue} requests wait")
         elif replaced is not None:
             replaced.fail(f"not begun: the newer request {message.id} of this robot replaced it")
         try:
@@ -286,7 +323,9 @@ class InferenceService:
                 counts.failed += reply is None
                 counts.expired += outcome.expired
                 counts.latencies_ms.append(latency_ms)
-        return reply if reply is not None else encoded(WireKind.FAILURE, {}, error)
+        if reply is not None:
+            return reply
+        return encoded(WireKind.REFUSAL if outcome.refused else WireKind.FAILURE, {}, error)
 
     def _counts(self, robot: str) -> RobotCounts:
         counts = self._robots.setdefault(robot, RobotCounts())
@@ -323,8 +362,9 @@ class InferenceService:
             if work is None or self.state != "hangs":
                 continue
             self._log.error("%s", self._hang())
+            self._withdraw()
             for ticket in (*work[1], *self._queue.clear()):
-                ticket.fail(self._hang())
+                ticket.refuse(self._hang())
             self._on_hang()
             return
 
@@ -363,7 +403,7 @@ class InferenceService:
         """
         message = ticket.message
         if self._owner is not None and self._owner[0] != message.robot and now_ns - self._owner_heard_ns < _LEASE_NS:
-            ticket.fail(f"this policy remembers its requests, so it serves one robot, now {self._owner[0]!r}")
+            ticket.refuse(f"this policy remembers its requests, so it serves one robot, now {self._owner[0]!r}")
             return False
         try:
             self._policy.check(message.tensors)

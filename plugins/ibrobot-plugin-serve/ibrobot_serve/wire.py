@@ -54,6 +54,16 @@ def health_name(model: str) -> str:
     return f"{service_name(model)}/health"
 
 
+def offer_name(model: str, server: str = "") -> str:
+    """Name under which one of a model's servers takes robots; without `server`, what these names begin with."""
+    return f"{service_name(model)}/offer/{server}"
+
+
+def server_name(model: str, server: str) -> str:
+    """Name of the service of one of a model's servers."""
+    return f"{service_name(model)}/at/{server}"
+
+
 def whole_fingerprint(fingerprint: str, weights: str) -> str:
     """Fingerprint of a policy with its weights. Requests and answers carry it, so that each side notices changes.
 
@@ -73,6 +83,8 @@ class WireKind(enum.IntEnum):
     """Its outputs."""
     FAILURE = 3
     """Why there are none, in `text`."""
+    REFUSAL = 4
+    """Why this server does not take the request, in `text`; another server may."""
 
 
 _KINDS = {kind.value: kind for kind in WireKind}

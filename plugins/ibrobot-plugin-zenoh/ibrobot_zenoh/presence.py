@@ -48,6 +48,11 @@ class Presence:
 
         return end, watch
 
+    def served(self, prefix: str) -> frozenset[str]:
+        """The names with this prefix that have a token."""
+        with self._lock:
+            return frozenset(name for name in self._alive if name.startswith(prefix))
+
     def _take(self, sample: zenoh.Sample) -> None:
         name, _, token = str(sample.key_expr).removeprefix(PREFIX).rpartition("/")
         with self._lock:

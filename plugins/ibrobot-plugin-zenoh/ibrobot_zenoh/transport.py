@@ -196,6 +196,11 @@ class ZenohTransport(TopicTransport):
         return self._keep(*self._presence.watch(name.removeprefix("/"), changed))
 
     @override
+    def served(self, prefix: str) -> frozenset[str]:
+        self._connection.check_open()
+        return self._presence.served(prefix.removeprefix("/"))
+
+    @override
     def publish_message(self, topic: str, message: Message, *, latched: bool = False) -> None:
         self._topics.publish(topic, message, latched=latched)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import ClassVar
 
@@ -297,6 +298,23 @@ class TransportSuite(Suite[Transport]):
                 early.get(timeout=self.short_s)
             last()
 
+    def test_served_names_are_listed(self) -> None:
+        """`served` has the names with a prefix, on both ends, for as long as they have a server."""
+        with self.ends() as (near, far):
+            ends = [far.serve(name, lambda payload, _: payload) for name in ("echo/1", "echo/2", "other")]
+            self.settle(near, far)
+            self.until(lambda: near.served("echo/") == far.served("echo/") == {"echo/1", "echo/2"})
+            assert near.served("echo/2") == {"echo/2"}
+            ends[0]()
+            self.until(lambda: near.served("echo/") == far.served("echo/") == {"echo/2"})
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Wait until `condition` holds."""
+        deadline_s, pause = time.monotonic() + self.wait_s, threading.Event()
+        while not condition():
+            assert time.monotonic() < deadline_s, "it did not happen in time"
+            pause.wait(0.002)
+
     def test_a_server_may_use_the_transport(self) -> None:
         """Callbacks and servers may publish and send requests."""
         with self.ends() as (near, far):
@@ -327,3 +345,5 @@ class TransportSuite(Suite[Transport]):
                 near.request("name", b"", self.short_s)
             with pytest.raises(TransportError):
                 near.watch("name", lambda served: None)
+            with pytest.raises(TransportError):
+                near.served("name")

@@ -182,6 +182,16 @@ class WatchesOnce(FakeTransport):
         return end
 
 
+class ListsTheEnded(FakeTransport):
+    """Names stay, although their servers have ended."""
+
+    known: frozenset[str] = frozenset()
+
+    def served(self, prefix):
+        self.known |= super().served(prefix)
+        return frozenset(name for name in self.known if name.startswith(prefix))
+
+
 class WorksWhileClosed(FakeTransport):
     def _check_open(self):
         pass
@@ -198,6 +208,7 @@ WRONG = {
     KeepsBuffers: "sent_buffers_are_free_again",
     OneWorker: "a_slow_answer_delays_no_other",
     WatchesOnce: "a_watch_tells_who_serves",
+    ListsTheEnded: "served_names_are_listed",
     SharesAnswers: "a_late_answer_is_dropped",
     EmptyForErrors: "a_servers_error_reaches_the_requester",
     EmptyForNobody: "nobody_serves",

@@ -22,6 +22,10 @@ class _Request:
     answer: queue.SimpleQueue[Payload | Exception] = attrs.field(factory=queue.SimpleQueue)
 
 
+class _GoneError(TransportError):
+    """The server died before it answered."""
+
+
 class _Threads[T]:
     """Calls `act` with each item, in at most `count` threads; with one, in the order of arrival."""
 
@@ -56,6 +60,8 @@ class FakeTransport(Transport):
         self._subscribers: dict[str, list[_Threads[bytes]]] = {}
         self._servers: dict[str, _Threads[_Request]] = {}
         self._watchers: dict[str, list[_Threads[bool]]] = {}
+        self._pending: dict[_Request, str] = {}
+        """Requests without an answer yet, and the names of their servers."""
         self._closed = False
 
     @override
@@ -81,6 +87,8 @@ class FakeTransport(Transport):
                 request.answer.put(handler(request.payload, None))
             except Exception as error:  # noqa: BLE001 - the requester receives it
                 request.answer.put(error)
+            finally:
+                self._pending.pop(request, None)
 
         server = _Threads(answer, f"the server of {name}", workers)
         with self._lock:
@@ -107,11 +115,14 @@ class FakeTransport(Transport):
             if server is None:
                 raise TransportError(f"nobody serves {name}")
             request = _Request(bytes(payload))
+            self._pending[request] = name
             server.put(request)
         try:
             result = request.answer.get(timeout=timeout_s)
         except queue.Empty:
             raise TransportError(f"no answer from {name} within {timeout_s} s") from None
+        if isinstance(result, _GoneError):
+            raise result
         if isinstance(result, Exception):
             raise TransportError(f"{name} failed: {type(result).__name__}: {result}") from result
         return result
@@ -132,6 +143,22 @@ class FakeTransport(Transport):
                 self._watchers.setdefault(name, []).append(watcher)
             changed(served)
         return lambda: self._end(self._watchers, name, watcher)
+
+    @override
+    def served(self, prefix: str) -> frozenset[str]:
+        with self._lock:
+            self._check_open()
+            return frozenset(name for name in self._servers if name.startswith(prefix))
+
+    def kill(self, *names: str) -> None:
+        """End the servers of these names as the death of their process would: pending requests fail at once."""
+        with self._lock:
+            for name in names:
+                self._servers.pop(name).end()
+                self._tell(name, False)
+            for request in [request for request, name in self._pending.items() if name in names]:
+                name = self._pending.pop(request)
+                request.answer.put(_GoneError(f"nobody serves {name}, or not any more"))
 
     @override
     def close(self) -> None:
