@@ -298,7 +298,7 @@ class RemoteEngine(Engine):
             except (TransportError, PolicyError) as error:
                 failure = error
         if not offers:
-            if failure is None:  # the transport knows the reason, e.g. that there is no connection
+            if failure is None:  # the transport states the reason, e.g. a missing connection
                 self._transport.request(health_name(self._model), b"", _REASON_TIMEOUT_S)
                 failure = TransportError(f"the servers of {self._model} take no robots")
             raise failure

@@ -141,7 +141,9 @@ class ZenohOptions:
 
     share: Share = option(factory=Share, help="topics and services shared with other machines")
     connect: tuple[str, ...] = option(
-        (), validator=_check_endpoints, help="endpoints to connect to, e.g. tls/gpu.lab:7447; a client uses the first that answers, a peer all"
+        (),
+        validator=_check_endpoints,
+        help="endpoints to connect to, e.g. tls/gpu.lab:7447; a client uses the first that answers, a peer all",
     )
     listen: tuple[str, ...] = option(
         (), validator=_check_endpoints, help="endpoints to listen on, e.g. tcp/127.0.0.1:7447; none by default"

@@ -1,0 +1,130 @@
+"""The files in `deploy/`: valid, and their command lines are those of this version."""
+
+from __future__ import annotations
+
+import configparser
+import copy
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import jsonschema
+import pytest
+import yaml
+from ibrobot_http.probes import Probes, ProbeServer
+from ibrobot_serve.command import serve
+
+DEPLOY = Path(__file__).parents[1] / "deploy"
+SCHEMA = json.loads((Path(__file__).parent / "kubernetes/schema.json").read_text())
+OBJECTS: list[dict[str, Any]] = list(yaml.safe_load_all((DEPLOY / "kubernetes.yaml").read_text()))
+POD = next(each for each in OBJECTS if each["kind"] == "StatefulSet")["spec"]["template"]["spec"]
+CONTAINERFILE = (DEPLOY / "Containerfile").read_text().replace("\\\n", "")
+UNIT = DEPLOY / "ibrobot-serve@.service"
+
+
+def validate(document: dict[str, Any]) -> None:
+    """Check a Kubernetes object against the schema of its kind."""
+    group = {"v1": "core.v1", "apps/v1": "apps.v1", "policy/v1": "policy.v1"}[document["apiVersion"]]
+    schema = {**SCHEMA, "$ref": f"#/$defs/io.k8s.api.{group}.{document['kind']}"}
+    jsonschema.Draft202012Validator(schema).validate(document)  # checking the schema as well takes seconds
+
+
+@pytest.mark.parametrize("document", OBJECTS, ids=lambda document: document["kind"])
+def test_manifest_follows_its_schema(document: dict[str, Any]) -> None:
+    validate(document)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("spec.replicas", "three"),
+        ("spec.template.spec.containers.0.livenessProb", {}),
+        ("spec.template.spec.containers.0.livenessProbe.exec.command", "python"),
+        ("spec.template.spec.terminationGracePeriod", 30),
+    ],
+)
+def test_schema_knows_a_wrong_manifest(path: str, value: Any) -> None:
+    document = copy.deepcopy(next(each for each in OBJECTS if each["kind"] == "StatefulSet"))
+    *parents, last = path.split(".")
+    at: Any = document
+    for key in parents:
+        at = at[int(key) if key.isdecimal() else key]
+    at[last] = value
+    with pytest.raises(jsonschema.ValidationError):
+        validate(document)
+
+
+def containerfile(instruction: str) -> list[str]:
+    """The JSON list of an instruction."""
+    (line,) = [line for line in CONTAINERFILE.splitlines() if line.startswith(instruction)]
+    found: list[str] = json.loads(line.removeprefix(instruction))
+    return found
+
+
+def unit() -> configparser.SectionProxy:
+    """The section `Service`."""
+    parser = configparser.RawConfigParser(strict=False)
+    parser.optionxform = str  # type: ignore[assignment,method-assign]  # as configparser's documentation does
+    parser.read_string(UNIT.read_text().replace("\\\n", ""))
+    return parser["Service"]
+
+
+COMMANDS = {
+    "container": [*containerfile("ENTRYPOINT "), *containerfile("CMD ")],
+    "pod": [*containerfile("ENTRYPOINT "), *POD["containers"][0]["args"]],
+    "unit": shlex.split(unit()["ExecStart"].removeprefix("/usr/bin/env ")),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
+def test_command_line_is_right(command: list[str]) -> None:
+    assert command[:2] == ["ibrobot", "serve"]
+    options = click.Context(serve).invoke(serve.make_context, "serve", command[2:]).params
+    assert options["listen"] == ("tls/0.0.0.0:7447",)
+    assert options["metrics_port"] == 9465
+    assert "lease=0.7" in options["transport_options"]
+
+
+def test_server_has_time_to_drain() -> None:
+    drain_s = serve.make_context("serve", COMMANDS["pod"][2:]).params["drain"]
+    assert POD["terminationGracePeriodSeconds"] > drain_s
+    assert int(unit()["TimeoutStopSec"]) > serve.make_context("serve", COMMANDS["unit"][2:]).params["drain"]
+    assert "STOPSIGNAL SIGTERM" in CONTAINERFILE
+    assert unit()["KillSignal"] == "SIGTERM"
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
+    right, wrong = tmp_path / "ibrobot-serve@pick.service", tmp_path / "wrong@pick.service"
+    right.write_text(UNIT.read_text())
+    wrong.write_text(UNIT.read_text().replace("Restart=always", "Restart=allways"))
+    done = subprocess.run(
+        ["systemd-analyze", "verify", right, wrong], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert "allways" in done.stderr
+    assert "ibrobot-serve@" not in done.stderr, done.stderr
+
+
+@pytest.fixture
+def state() -> Iterator[tuple[int, dict[str, str]]]:
+    """The port of a server's probes, and why they fail."""
+    why = {"unhealthy": "", "unready": ""}
+    server = ProbeServer(0, Probes(lambda: b"", lambda: why["unhealthy"], lambda: why["unready"]))
+    yield int(server.url.rpartition(":")[2].partition("/")[0]), why
+    server.close()
+
+
+@pytest.mark.parametrize(("probe", "fault"), [("readinessProbe", "unready"), ("livenessProbe", "unhealthy")])
+def test_probe_fails_when_the_server_does(state: tuple[int, dict[str, str]], probe: str, fault: str) -> None:
+    port, why = state
+    _, flag, code = POD["containers"][0][probe]["exec"]["command"]
+    command = [sys.executable, flag, code.replace("9465", str(port))]
+    assert subprocess.run(command, capture_output=True, timeout=60, check=False).returncode == 0
+    why[fault] = "the server is stopping"
+    assert subprocess.run(command, capture_output=True, timeout=60, check=False).returncode == 1
