@@ -74,13 +74,13 @@ export class View {
     }
     if (this.path !== path) return; // another one was opened meanwhile
     refresh(this.body, sections, () => sections.map(({ title, blocks }, i) => (
-      h("section", { "aria-label": title }, i ? h("h3", {}, title) : null, blocks.map((block) => this.block(block))))));
+      h("section", { "aria-label": title }, i ? h("h3", {}, title) : null, blocks.map((block) => this.block(block, title))))));
   }
 
-  block(block) {
+  block(block, section) {
     switch (block.kind) {
       case "text": return block.role === "title" ? h("h4", {}, block.text) : h("p", { class: block.role }, block.text);
-      case "table": return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Table" }, h("table", {},
+      case "table": return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `${section}: table` }, h("table", {},
         h("thead", {}, h("tr", {}, block.columns.map((name) => h("th", { scope: "col" }, name)))),
         h("tbody", {}, block.rows.map((row) => h("tr", {}, row.map((cell, i) => (
           i ? h("td", { class: cell.length > 40 ? "text" : "" }, cell) : h("th", { scope: "row" }, cell))))))));
