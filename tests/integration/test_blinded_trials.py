@@ -16,6 +16,7 @@ from contextlib import chdir, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import click
 import pytest
 from blinded_arm import ARM, NAMES
 from command_line import run_here
@@ -199,3 +200,38 @@ def test_keys_judge_a_running_arm_and_ctrl_c_ends_it_in_an_orderly_way(
     finally:
         reader.close()
     assert not any(name in terminal.shown for name in NAMES)
+
+
+def test_reset_task_is_performed_by_the_command_for_tasks() -> None:
+    from ibrobot_eval.blinded import reset_of
+    from ibrobot_eval.options import EvalOptions
+
+    options = EvalOptions(config=("arm.yaml",), out=Path("blind"), reset_task=Path("clear table.yaml"), sim=True)
+    program, _, _, name, verb, *words = reset_of(options)
+    assert (program, name, verb) == (sys.executable, "task", "run")
+    tasks = installed_plugins().command(name).load()
+    assert isinstance(tasks, click.Group)
+    given = tasks.commands[verb].make_context(verb, words).params
+    assert (given["file"], given["config"], given["sim"], given["headless"]) == (
+        "clear table.yaml", "arm.yaml", True, True,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["--sim", "--reset-task", "clear.yaml"], "--reset-task is for blinded trials"),
+        (["--sim", "--trials", "--reset-task", "clear.yaml", "--reset", "true"], "exclude each other"),
+    ],
+)
+def test_options_of_trials_that_do_not_fit_are_errors(folder: Path, words: list[str], error: str) -> None:
+    with chdir(folder):
+        done = run_here("eval", "arm.yaml", "--mode", "careful", "--episodes", "1", "--out", "blind", *words)
+    assert (done.returncode, error in done.stderr) == (2, True), done.stderr
+
+
+def test_trials_without_an_operator_are_an_error(folder: Path) -> None:
+    with chdir(folder):
+        done = run_here(*command(), "--events")
+    assert done.returncode != 0
+    assert "nobody can answer: standard input has ended" in done.stdout
