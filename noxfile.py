@@ -33,13 +33,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 PROJECT = nox.project.load_toml("pyproject.toml")
 FOLDERS = {
-    path.name.removeprefix("ibrobot-").removeprefix("plugin-"): path
-    for path in sorted(Path("plugins").glob("ibrobot-*"))
+    path.name.removeprefix("ibrobot-").removeprefix("plugin-"): path for path in sorted(Path("plugins").glob("*-*"))
 }
-"""Name -> folder, of every plugin and of the libraries that they share."""
+"""Name -> folder, of every plugin, of the libraries that they share, and of what LeRobot discovers."""
 SLOW = ("feetech", "testing", "data", "mcap")
 PLUGINS = sorted(FOLDERS, key=lambda name: (name not in SLOW, name))
 """Those whose tests take longest come first."""
+TESTED = [name for name in PLUGINS if (FOLDERS[name] / "tests").is_dir()]
+"""Those with tests of their own; the others have theirs in tests/lerobot."""
 LOCAL = {
     "ibrobot-core": Path(),
     "ibrobot": Path("plugins/ibrobot"),
@@ -254,7 +255,7 @@ def release(session: nox.Session) -> None:
 
 
 @nox.session
-@nox.parametrize("name", PLUGINS, ids=PLUGINS)
+@nox.parametrize("name", TESTED, ids=TESTED)
 def plugin(session: nox.Session, name: str) -> None:
     """A plugin's tests with that plugin and core alone; those in a browser run in `integration`."""
     install(session, name, groups=("test", "coverage"))
@@ -297,7 +298,7 @@ def types(session: nox.Session) -> None:
     for module in {path.stem for each in shared for path in Path(each).iterdir() if path.suffix in (".py", "")}:
         untyped += [module, f"{module}.*"] if module.isidentifier() else []
     # One run, so that mypy reads everything once. All plugins have a package `tests`: here each has another name.
-    for name in PLUGINS:
+    for name in TESTED:
         (folder / f"{name}_tests").unlink(missing_ok=True)
         (folder / f"{name}_tests").symlink_to((FOLDERS[name] / "tests").absolute())
         untyped.append(f"{name}_tests.*")
@@ -305,12 +306,12 @@ def types(session: nox.Session) -> None:
     config = Path("pyproject.toml").read_text(encoding="utf-8")
     config += f"\n[[tool.mypy.overrides]]\nmodule = {json.dumps(sorted(untyped))}\n{options}"
     (folder / "pyproject.toml").write_text(config, encoding="utf-8")
-    typed = ("ibrobot_core", *(str(FOLDERS[name] / f"ibrobot_{name}") for name in PLUGINS))
+    typed = ("ibrobot_core", *(str(path.parent) for path in sorted(Path("plugins").glob("*/*/py.typed"))))
     tests = (
         "tests",
         "benchmarks",
         *map(str, Path("docs").glob("*.py")),
-        *(str(folder / f"{n}_tests") for n in PLUGINS),
+        *(str(folder / f"{n}_tests") for n in TESTED),
     )
     bases = {"MYPYPATH": ":".join((*shared, *map(str, FOLDERS.values()), str(folder)))}
     given = (f"--config-file={folder / 'pyproject.toml'}", "--explicit-package-bases")

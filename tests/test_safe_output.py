@@ -102,7 +102,7 @@ def test_a_remembered_secret_is_hidden_in_every_form(monkeypatch: pytest.MonkeyP
 
 def sources() -> Iterator[Path]:
     yield from (ROOT / "ibrobot_core").rglob("*.py")
-    for package in (ROOT / "plugins").glob("ibrobot*/ibrobot_*"):
+    for package in (ROOT / "plugins").glob("*/*ibrobot*"):
         yield from package.rglob("*.py")
 
 

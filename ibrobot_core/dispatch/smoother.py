@@ -41,8 +41,8 @@ class TemporalSmoother:
         coeff: `c` in `w_k = exp(-c k)`; positive favours old predictions, negative new ones, 0 is the plain mean.
         enabled: whether chunks blend.
         lead_in: makes the new plan, shape (M, A), continue from the old one, given as its actions at the first two
-            steps of the new plan, shape (2, A), or, after the plan ran dry, as the held last action, shape (1, A).
-            None if the arm does not hold the last action.
+            steps of the new plan, shape (2, A), or, after the plan ran dry, as the held last action, shape (1, A). A
+            plan that begins just where the last one ended continues it. None if the arm does not hold the last action.
         continues: whether a chunk that replaces a running plan is also adjusted by `lead_in` to continue it.
 
     Raises:
@@ -73,6 +73,7 @@ class TemporalSmoother:
         self._set(0, np.empty((0, self.action_size)), np.empty(0, dtype=np.intp))
         self._now_ns: int | None = None
         self._held: Vector | None = None if held is None else held[None]
+        self._ended_ns: int | None = None
 
     def plan(self) -> tuple[int, Vector]:
         """The time of the first action [ns] and the actions, shape (M, A), read-only; `(0, empty)` without a plan."""
@@ -104,6 +105,7 @@ class TemporalSmoother:
         if over >= len(self._positions):
             if len(self._positions):
                 self._held = self._positions[-1:]
+                self._ended_ns = self._start_ns + len(self._positions) * self.step_ns
             self._set(0, self._positions[:0], self._counts[:0])
         elif over > 0:
             self._set(self._start_ns + over * self.step_ns, self._positions[over:], self._counts[over:])
@@ -152,12 +154,14 @@ class TemporalSmoother:
         rest = len(actions) - past
         if rest <= 0:
             return 0
-        plan = actions[past:].copy()
+        plan, first_ns = actions[past:].copy(), start_ns + past * self.step_ns
         if not len(self._positions):
-            plan = self._led(self._held, plan)
+            dry = self._ended_ns is None or first_ns - self._ended_ns > self.step_ns // 2
+            if dry or self._continues:
+                plan = self._led(self._held, plan)
         elif self._continues:
             plan = self._led(self._positions[:2], plan)
-        self._set(start_ns + past * self.step_ns, plan, np.ones(rest, dtype=np.intp))
+        self._set(first_ns, plan, np.ones(rest, dtype=np.intp))
         return rest
 
     def _led(self, before: Vector | None, actions: Vector) -> Vector:

@@ -127,6 +127,25 @@ def test_a_chunk_observed_after_the_end_of_an_untrimmed_plan_starts_at_its_own_t
     np.testing.assert_array_equal(smoother.plan()[1], chunk(2, 5))
 
 
+@pytest.mark.parametrize("length", [1, 10])
+def test_a_chunk_that_begins_where_a_plan_has_just_ended_continues_it(length: int) -> None:
+    smoother = TemporalSmoother(STEP, 3, enabled=False, lead_in=lambda before, actions: np.zeros_like(actions))
+    for k in range(3):
+        begin = T0 + k * length * STEP
+        smoother.trim(begin)
+        smoother.update(chunk(k, length), begin)
+        np.testing.assert_array_equal(smoother.plan()[1], chunk(k, length))
+
+
+def test_a_chunk_that_begins_after_the_arm_was_held_leads_in() -> None:
+    smoother = TemporalSmoother(STEP, 3, enabled=False, lead_in=lambda before, actions: np.zeros_like(actions))
+    smoother.update(chunk(1, 10), T0)
+    begin = T0 + 11 * STEP
+    smoother.trim(begin)
+    smoother.update(chunk(2, 5), begin)
+    np.testing.assert_array_equal(smoother.plan()[1], np.zeros((5, 3)))
+
+
 def test_a_chunk_that_begins_where_the_plan_ends_is_appended() -> None:
     smoother = TemporalSmoother(STEP, 3)
     smoother.update(chunk(1, 10), T0)

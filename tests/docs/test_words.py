@@ -24,7 +24,7 @@ PAGES = sorted(
 CODE = sorted(
     {
         *(ROOT / "ibrobot_core").rglob("*.py"),
-        *(path for package in (ROOT / "plugins").glob("*/ibrobot_*") for path in package.rglob("*.py")),
+        *(path for package in (ROOT / "plugins").glob("*/*ibrobot*") for path in package.rglob("*.py")),
     }
 )
 TESTS = sorted({*(ROOT / "tests").rglob("test_*.py"), *(ROOT / "plugins").glob("*/tests/**/test_*.py"), *CODE})

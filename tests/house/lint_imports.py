@@ -18,8 +18,11 @@ NO_LIBRARIES = ("ibrobot_testing",)
 
 
 def contracts(plugins: Path) -> str:
-    """The contracts for the distributions in a folder, as TOML: `ibrobot-plugin-NAME`, and libraries by other names."""
-    of_plugins = list(packages_of(plugins, "ibrobot-plugin-*"))
+    """The contracts for the distributions in a folder, as TOML.
+
+    Plugins are `ibrobot-plugin-NAME`, and `lerobot-…`, which LeRobot discovers; the others are libraries.
+    """
+    of_plugins = [*packages_of(plugins, "ibrobot-plugin-*"), *packages_of(plugins, "lerobot-*")]
     libraries = [each for each in packages_of(plugins, "*") if each not in (*of_plugins, *NO_LIBRARIES)]
     text = CONTRACTS.read_text(encoding="utf-8")
     for mark, found in (("plugins", of_plugins), ("libraries", libraries)):
@@ -29,7 +32,7 @@ def contracts(plugins: Path) -> str:
 
 def packages_of(plugins: Path, distributions: str) -> Iterator[str]:
     """The packages of some distributions in a folder."""
-    yield from sorted(init.parent.name for init in plugins.glob(f"{distributions}/ibrobot_*/__init__.py"))
+    yield from sorted(init.parent.name for init in plugins.glob(f"{distributions}/*ibrobot*/__init__.py"))
 
 
 def main() -> int:

@@ -41,7 +41,7 @@ def count(package: Path) -> Counter[str]:
 
 def main() -> None:
     """Print a table."""
-    for package in (ROOT / "ibrobot_core", *sorted(ROOT.glob("plugins/*/ibrobot_*"))):
+    for package in (ROOT / "ibrobot_core", *sorted(ROOT.glob("plugins/*/*ibrobot*"))):
         lines = count(package)
         print(f"{lines.total():6} {package.name}")
         if package.name == "ibrobot_core":

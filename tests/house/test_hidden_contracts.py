@@ -55,7 +55,7 @@ def guesses(tree: ast.AST) -> Iterator[str]:
 
 def sources() -> Iterator[Path]:
     yield from (ROOT / "ibrobot_core").rglob("*.py")
-    for package in (ROOT / "plugins").glob("ibrobot*/ibrobot_*"):
+    for package in (ROOT / "plugins").glob("*/*ibrobot*"):
         yield from package.rglob("*.py")
 
 

@@ -10,6 +10,11 @@ from lint_imports import ROOT, contracts
 
 ONE_ANOTHER = "Plugins do not import one another"
 LIBRARIES = "The libraries that plugins share do not import one another"
+PACKAGES = (
+    ("ibrobot-plugin-lamp", "ibrobot_lamp"),
+    ("lerobot-lamp-ibrobot", "lerobot_lamp_ibrobot"),
+    ("ibrobot-light", "ibrobot_light"),
+)
 THROUGH = "Plugins and libraries import core through ibrobot_core.api and ibrobot_core.app alone"
 
 
@@ -21,8 +26,7 @@ def read(plugins: Path) -> tuple[set[str], dict[str, dict[str, Any]]]:
 
 def test_every_package_here_is_covered() -> None:
     roots, by_name = read(ROOT / "plugins")
-    others = {ROOT / "plugins/ibrobot", ROOT / "plugins/lerobot-env-ibrobot"}  # no code; a name for LeRobot
-    distributions = {path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml")} - others
+    distributions = {path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml")} - {ROOT / "plugins/ibrobot"}
     assert len(roots) == len(distributions) + 1, "core too"
     assert set(by_name[THROUGH]["source_modules"]) == roots - {"ibrobot_core"}
     assert {"ibrobot_kinematics", "ibrobot_ros2"} <= set(by_name[LIBRARIES]["modules"])
@@ -30,11 +34,16 @@ def test_every_package_here_is_covered() -> None:
 
 
 def test_new_plugin_and_new_library_are_covered_without_an_edit(tmp_path: Path) -> None:
-    for distribution, package in (("ibrobot-plugin-lamp", "ibrobot_lamp"), ("ibrobot-light", "ibrobot_light")):
+    for distribution, package in PACKAGES:
         (tmp_path / distribution / package).mkdir(parents=True)
         (tmp_path / distribution / package / "__init__.py").touch()
     roots, by_name = read(tmp_path)
-    assert {"ibrobot_lamp", "ibrobot_light"} <= roots
-    assert by_name[ONE_ANOTHER]["modules"] == ["ibrobot_lamp"]
+    assert {package for _, package in PACKAGES} <= roots
+    assert by_name[ONE_ANOTHER]["modules"] == ["ibrobot_lamp", "lerobot_lamp_ibrobot"]
     assert by_name[LIBRARIES]["modules"] == ["ibrobot_light"]
-    assert by_name[THROUGH]["source_modules"] == ["ibrobot_lamp", "ibrobot_light", "ibrobot_testing"]
+    assert by_name[THROUGH]["source_modules"] == [
+        "ibrobot_lamp",
+        "lerobot_lamp_ibrobot",
+        "ibrobot_light",
+        "ibrobot_testing",
+    ]

@@ -119,7 +119,7 @@ def offered() -> Offered:
 def declared() -> dict[str, Service[Any, Any]]:
     """The services that core and the plugins declare, found in their source."""
     found: dict[str, Service[Any, Any]] = {}
-    for package in (ROOT / "ibrobot_core", *ROOT.glob("plugins/*/ibrobot_*")):
+    for package in (ROOT / "ibrobot_core", *ROOT.glob("plugins/*/*ibrobot*")):
         for path in package.rglob("*.py"):
             if " = Service(" in path.read_text(encoding="utf-8"):
                 module = import_module(".".join(path.relative_to(package.parent).with_suffix("").parts))
