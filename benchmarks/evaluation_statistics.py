@@ -5,9 +5,9 @@
 Prints one JSON object: the coverage of the intervals of a success rate and of a difference, at eight rates; the share
 of experiments in which two equal policies are called different, looked at after each of 500 episodes, by the test of
 `ibrobot eval` and by the exact test of McNemar; and for four pairs of policies the mean number of episodes of the
-sequential test beside the number that the exact test of McNemar needs for the same probability of finding the
-difference. Exits with 1 if the exact interval covers less than nominally, or more than 5 % of equal policies are called
-different.
+sequential test, given up after so many that it finds the difference with a probability of 80 or 95 %, beside the number
+that the exact test of McNemar needs for the same probability. Exits with 1 if the exact interval covers less than
+nominally, or more than 5 % of equal policies are called different.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,10 @@ RATES = (0.02, 0.1, 0.25, 0.5, 0.7, 0.9, 0.95, 0.99)
 EPISODES = 50
 LONGEST = 500
 Table = np.ndarray[Any, np.dtype[np.bool_]]
+LONGEST_COMPARED = 2000
+COMPARED = 4000
+"""Experiments with that many episodes."""
+POWERS = (0.8, 0.95)
 POLICIES = ((0.9, 0.6), (0.9, 0.8), (0.6, 0.5), (0.94, 0.6))
 
 
@@ -106,6 +111,24 @@ def needed_by_mcnemar(first: float, second: float, power: float) -> int | None:
     return 5 * high
 
 
+def beside_mcnemar(
+    first: float, second: float, rng: np.random.Generator, experiments: int, sequential: Table
+) -> Iterator[dict[str, Any]]:
+    """Mean number of episodes of the sequential test and number of those of the exact test of McNemar, by power."""
+    decided = np.array(decided_at(first, second, rng, experiments, sequential), dtype=float)
+    decided[decided == 0] = np.inf
+    for power in POWERS:
+        longest = float(np.quantile(decided, power, method="higher"))
+        found = np.isfinite(longest)
+        yield {
+            "rates": [first, second],
+            "power": power,
+            "given_up_after": int(longest) if found else None,
+            "mean_episodes": round(float(np.minimum(decided, longest).mean()), 1) if found else None,
+            "mcnemar_episodes": needed_by_mcnemar(first, second, power),
+        }
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--experiments", type=int, default=20_000)
@@ -119,23 +142,10 @@ def main() -> int:
         for rate in (0.5, 0.7, 0.9)
     }
     with_mcnemar = decided_at(0.5, 0.5, rng, experiments, significant(LONGEST))
-    efficiency = []
-    for first, second in POLICIES:
-        episodes = decided_at(first, second, rng, experiments, sequential)
-        power = sum(n > 0 for n in episodes) / experiments
-        mean = float(np.mean([n or LONGEST for n in episodes]))
-        at_most = min(power, 0.95)  # the fixed test of equal power; beyond 95 % the fixed test would look even worse
-        efficiency.append(
-            {
-                "rates": [first, second],
-                "found_within_500": round(power, 3),
-                "mean_episodes": round(mean, 1),
-                "median_episodes": float(np.median([n or LONGEST for n in episodes])),
-                "mcnemar_power": round(at_most, 3),
-                "mcnemar_episodes": needed_by_mcnemar(first, second, at_most),
-                "mcnemar_episodes_for_80_percent": needed_by_mcnemar(first, second, 0.8),
-            }
-        )
+    compared = reached(LONGEST_COMPARED)
+    efficiency = [
+        row for rates in POLICIES for row in beside_mcnemar(*rates, rng, min(experiments, COMPARED), compared)
+    ]
     report = {
         "experiments": experiments,
         "coverage": coverage,

@@ -19,7 +19,7 @@ _KEYS = {"agent_pos": (OBS_STATE, FeatureType.STATE), "environment_state": (OBS_
 
 @EnvConfig.register_subclass("ibrobot")
 @dataclass
-class IbrobotEnv(EnvConfig):
+class IbrobotEnv(EnvConfig):  # type: ignore[misc]  # LeRobot is not installed where types are checked
     """An environment of `ibrobot_gym`."""
 
     task: str | None = "PickCube-v0"
