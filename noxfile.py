@@ -50,6 +50,7 @@ LOCAL = {
 EXTRAS = {
     "ibrobot-plugin-camera": "[realsense]",
     "ibrobot-plugin-mcap": "[plot]",
+    "ibrobot-plugin-mujoco": "[urdf]",
     "ibrobot-plugin-planning": "[client,obstacles,plot]",
     "ibrobot-plugin-zenoh": "[interop]",
 }

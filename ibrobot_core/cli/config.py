@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, override
 
 import attrs
 import click
@@ -22,10 +22,25 @@ if TYPE_CHECKING:
     from ibrobot_core.config import RobotConfig
     from ibrobot_core.config.schema import HardwareConfig, TeleopConfig
 
+_CONFIG = "config "
 config_options = run_options("config", "sim", "overrides", "mode")
 
 
-@click.group()
+class ConfigGroup(click.Group):
+    """Also has the commands of plugins whose names begin with `config`."""
+
+    @override
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        plugins = (name.removeprefix(_CONFIG) for name in installed_plugins().commands if name.startswith(_CONFIG))
+        return sorted([*super().list_commands(ctx), *plugins])
+
+    @override
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        found = installed_plugins().commands.get(f"{_CONFIG}{cmd_name}")
+        return found.load() if found is not None else super().get_command(ctx, cmd_name)
+
+
+@click.group(cls=ConfigGroup)
 def config() -> None:
     """Check, show and copy robot YAMLs.
 

@@ -34,7 +34,7 @@ class LazyGroup(click.Group):
 
         packages = installed_plugins().command_packages
         own = [name for name, package in packages.items() if package == CORE]
-        return [*own, *sorted(set(packages) - set(own))]
+        return [*own, *sorted(name for name in set(packages) - set(own) if " " not in name)]
 
     @override
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:

