@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 from xml.etree.ElementTree import Element, ElementTree, ParseError, SubElement, fromstring
 
@@ -159,7 +160,8 @@ def _convert(source: Path, target: Path) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of NumPy, for the reader of .dae
-            trimesh.load(str(source), force="mesh").export(str(target))
+            mesh: Any = trimesh.load(str(source), force="mesh")
+            mesh.export(str(target))
     except Exception as error:  # trimesh raises the errors of many readers
         raise HardwareError(f"{source} cannot be converted to STL: {error}") from error
 
