@@ -22,7 +22,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, override
 
 import attrs
@@ -48,7 +48,7 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.client import EngineClient
-from ibrobot_core.interfaces import Frame, Tensors, Transport
+from ibrobot_core.interfaces import Frame, Policy, Tensors, Transport
 from ibrobot_core.messages import Header, JointState
 from ibrobot_core.options import NoOptions
 from ibrobot_core.plugins import installed_plugins
@@ -119,8 +119,11 @@ def serve(endpoint: str, batch: int) -> None:
 class Robot:
     """A dispatcher on its ticks, in a thread."""
 
-    def __init__(self, number: int, network: Transport, watermark: Any) -> None:
-        robot = make_robot()
+    def __init__(
+        self, number: int, network: Transport, watermark: Any, policy: Policy | None = None,
+        send: Callable[[int, int, Vector], None] = lambda *_: None,
+    ) -> None:  # fmt: skip
+        robot = self.robot = make_robot()
         joints = robot.joint_names
         config = RobotConfig(
             robot=robot,
@@ -135,13 +138,13 @@ class Robot:
         )
         self._clock, self._joints = RealClock(), joints
         self._bus = Bus(self._clock)
-        policy = TwentyMilliseconds()
-        self._engine = RemoteEngine(policy, network, "model", f"robot{number}", start_timeout_s=60.0)
-        self._client = EngineClient(policy, self._engine, 5.0)
+        policy = self.policy = policy or TwentyMilliseconds()
+        self.engine = RemoteEngine(policy, network, "model", f"robot{number}", start_timeout_s=60.0)
+        self._client = EngineClient(policy, self.engine, 5.0)
         contract = Contract.from_config(config)
         self._step_ns = contract.step_ns
-        self._dispatcher = Dispatcher(
-            contract, policy.spec, DispatchConfig(watermark), robot, self._bus, self._client, lambda *_: None, 5.0
+        self.dispatcher = Dispatcher(
+            contract, policy.spec, DispatchConfig(watermark), robot, self._bus, self._client, send, 5.0
         )
         self.chunks: list[tuple[float, float]] = []
         """When each came [s], and its latency [ms]."""
@@ -150,17 +153,21 @@ class Robot:
 
     def start(self) -> None:
         """Wait for the server."""
-        self._engine.start()
+        self.engine.start()
+
+    def after_tick(self, now_ns: int) -> None:
+        """What else to do in each tick."""
 
     def run(self, until_s: float) -> None:
-        """Go on until a time."""
-        self._dispatcher.begin(0)
-        next_ns, stats = self._clock.now_ns(), self._dispatcher.stats
-        while time.monotonic() < until_s:
+        """Go on until a time, which may be changed meanwhile."""
+        self.until_s = until_s
+        self.dispatcher.begin(0)
+        next_ns, stats = self._clock.now_ns(), self.dispatcher.stats
+        while time.monotonic() < self.until_s:
             chunk = self._client.poll(max(0.0, (next_ns - self._clock.now_ns()) / 1e9))
             if chunk is not None:
                 before = stats.chunks
-                self._dispatcher.accept(chunk, self._clock.now_ns())
+                self.dispatcher.accept(chunk, self._clock.now_ns())
                 if stats.chunks > before:
                     self.chunks.append((time.monotonic(), stats.latency_ms))
             if (now_ns := self._clock.now_ns()) >= next_ns:
@@ -168,11 +175,12 @@ class Robot:
                 self._bus.publish(
                     "/joint_states", JointState(Header(now_ns), self._joints, np.zeros(len(self._joints)))
                 )
-                self._dispatcher.tick(now_ns)
+                self.dispatcher.tick(now_ns)
                 self.holds += [time.monotonic()] * (stats.holds - holds)
+                self.after_tick(now_ns)
                 next_ns += self._step_ns
         self._client.close()
-        self._engine.close()
+        self.engine.close()
 
 
 def robots(endpoint: str, first: int, count: int, watermark: Any) -> None:
