@@ -98,7 +98,7 @@ class Pool(ABC):
 def on_option() -> Any:
     """The option `on` of a command that runs jobs; see `Registry.pool`."""
     return option(
-        "", label="Runs on", more=True, unit="type[://address]",
+        "", label=None, unit="type[://address]",
         help="where the work is done: a type of pool, with an address if it needs one; by default on this machine",
     )  # fmt: skip
 
