@@ -1,6 +1,6 @@
 """Kinematics of arms: forward and inverse kinematics, Jacobians and servo, from an MJCF.
 
-A name is imported from its module when it is first used, so that plugins describe their options without NumPy.
+Names are imported on first use, so that plugins can describe their options without NumPy.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""Distance of an arm from the objects around it, as the run's world knows them."""
+"""Distance of an arm from the objects of the run's world."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from ibrobot_core.app import Bus, Service
 class Configuration:
     """A request to `/world/clearance`: a configuration of the arm."""
 
-    positions: Mapping[str, float] = option(factory=dict, unit="rad or m", help="of joints; the others are measured")
+    positions: Mapping[str, float] = option(
+        factory=dict, unit="rad or m", help="positions of joints; other joints: the measured position"
+    )
 
 
 CLEARANCE = Service("/world/clearance", Configuration, float, "Distance from the nearest object [m].")
@@ -26,11 +28,11 @@ def world_clearance(bus: Bus | None, joints: Sequence[str]) -> Callable[[Vector]
     """The `clearance` of a `Servo`.
 
     Args:
-        bus: of the run.
+        bus: the bus of the run.
         joints: names of the joints that the servo moves.
 
     Returns:
-        Joint positions -> distance from the nearest object [m], infinite while nobody knows any. None without a bus.
+        Joint positions -> distance from the nearest object [m], infinite without a world. None without a bus.
     """
     if bus is None:
         return None

@@ -19,7 +19,7 @@ _PARALLEL = 1e-4
 """Sine of the angle up to which axes count as parallel; a final step with the exact model corrects the difference."""
 _NO_LENGTH = 1e-9
 _NEARLY_VERTICAL = 0.02
-"""Horizontal part of a direction below which the pan is nearly undetermined and is sampled."""
+"""If the horizontal part of a direction is smaller, it hardly determines the pan, which is then sampled."""
 _PANS = 36
 _TURN = 2 * np.pi
 
@@ -106,7 +106,7 @@ class PanPlanarRoll:
         pan, roll = np.concatenate(self._pans(x, y, roll)), np.tile(roll, 2)
         branch = np.repeat([0, 1], rolls)
         if np.hypot(x, y) < 2 * abs(self.offset) + abs(self.lateral):
-            # So near the pan's axis all pans are possible, within a small range of rolls.
+            # This near the pan's axis, all pans are possible, within a small range of rolls.
             around, side = np.tile(np.arange(_PANS) * (_TURN / _PANS), 2), np.repeat([1, -1], _PANS)
             pan, roll = np.append(pan, around), np.append(roll, self._rolls_at(x, y, around, side, start))
             branch = np.append(branch, np.repeat([2, 3], _PANS))
@@ -185,9 +185,9 @@ class PanPlanarRoll:
         if axis is None:
             return off, np.zeros(len(off))
         ax, ay, az = self.points * (self.frame @ axis)
-        asked = (ax + 1j * ay) * np.exp(-1j * pan)
+        requested = (ax + 1j * ay) * np.exp(-1j * pan)
         tool = self.roll * np.exp(-1j * pitch)
-        chord = np.sqrt((asked.real - tool.real) ** 2 + asked.imag**2 + (az - tool.imag) ** 2)
+        chord = np.sqrt((requested.real - tool.real) ** 2 + requested.imag**2 + (az - tool.imag) ** 2)
         return off, 2 * np.arcsin(np.minimum(chord / 2, 1.0))
 
 

@@ -7,7 +7,7 @@ import math
 from ibrobot_core.api import IbrobotError, Vector
 
 _MANY_DIGITS = 1e4
-"""Lengths from here on are written with an exponent [m]."""
+"""Larger lengths [m] are written with an exponent."""
 
 
 class KinematicsError(IbrobotError):

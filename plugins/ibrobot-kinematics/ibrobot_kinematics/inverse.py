@@ -31,14 +31,14 @@ _BEST = 4
 _LEAST_WEIGHT, _WEIGHT, _GREAT_WEIGHT = 10.0, 100.0, 1e4
 """Weights of position errors [rad/m]: minimum; if searches begin at the position; if position has priority."""
 _APART = 0.5
-"""Searches for the nearest point begin at configurations with a joint that differs by more [rad or m]."""
+"""Searches for the nearest point begin at configurations that differ by more in a joint [rad or m]."""
 _OUT_OF_REACH_M = 0.005
 _BY_POSITION = 8
-"""Where all that was found misses the position by more, this many searches start near the position."""
+"""This many searches start near the position if all results miss it by more than `_OUT_OF_REACH_M`."""
 _SHIFTS = 3
-"""How often to shift the target until its position is met with the nearest orientation."""
+"""How often to shift the target, to meet its position with the nearest orientation."""
 _FAR = 100.0
-"""Targets farther than this many times the reach of the arm are beyond it, whatever the tolerances of a search."""
+"""Targets farther than this many times the arm's reach are replaced by nearer ones for the search."""
 _SAME = 0.02
 """Solutions whose joints all differ by less count as equal [rad or m]."""
 
@@ -133,13 +133,13 @@ def _solutions(
         exact, near_misses = _by_closed_form(model, arm, target, start, every)
         if exact:
             return exact
-    # A wider tolerance is for targets that the arm cannot reach exactly: it lets no search end earlier.
+    # A wider tolerance is for targets that the arm cannot reach exactly: it does not end searches earlier.
     tolerances = position_tolerance, min(rotation_tolerance, ROTATION_TOLERANCE_RAD)
     least = _LEAST_WEIGHT if arm is None else _WEIGHT
     weight = float(np.clip(tolerances[1] / position_tolerance, least, _GREAT_WEIGHT))
     for starts in _rounds(model, target, start, near_misses, every):
         first = search(model, target, starts, position_weight=weight, iterations=_SHORT)
-        found = search(
+        results = search(
             model,
             target,
             first.best(len(starts) if every else _BEST, weight),
@@ -147,11 +147,11 @@ def _solutions(
             iterations=_LONG,
             stop_within=None if every else tolerances,
         )
-        solved = found.joints[found.within(*tolerances)]
+        solved = results.joints[results.within(*tolerances)]
         if len(solved):
             nearest_first = solved[np.argsort(((solved - start) ** 2).sum(axis=1), kind="stable")]
             return _distinct(search(model, target, nearest_first, position_weight=weight, iterations=_POLISHING).joints)
-        near_misses = np.concatenate([near_misses, found.joints])
+        near_misses = np.concatenate([near_misses, results.joints])
     nearest = _nearest(model, target, near_misses)
     tip = model.forward(nearest)
     off, turned = target.missed(tip)
@@ -163,7 +163,7 @@ def _solutions(
 def _nearest_to_far(
     model: KinematicModel, target: Target, start: Vector, position_tolerance: float, rotation_tolerance: float
 ) -> Vector:
-    """Solve for a target far beyond reach: the search takes a nearer one, since the squares would overflow."""
+    """Solve for a target far beyond reach by a nearer one, since squares would overflow."""
     share = _FAR * model.reach / float(np.abs(target.position).max())
     nearer = attrs.evolve(target, position=share * target.position)
     try:
@@ -198,7 +198,7 @@ def _closed_form_for(model: KinematicModel, target: Target) -> PanPlanarRoll | N
 def _by_closed_form(
     model: KinematicModel, arm: PanPlanarRoll, target: Target, start: Vector, every: bool
 ) -> tuple[list[Vector], Vector]:
-    """Exact solutions, one per branch, and the candidates with the smallest errors otherwise, shape (N, J)."""
+    """Exact solutions, one per branch; without any, the candidates with the smallest errors, shape (N, J)."""
     chain = start[model.moving]
     near_misses = []
     for candidates in _samples(arm, target, chain, every):
@@ -213,10 +213,7 @@ def _by_closed_form(
                 # The model deviates slightly from the ideal geometry, within its rounding.
                 solutions = search(model, target, solutions, position_weight=_WEIGHT, iterations=_POLISHING).joints
             return list(solutions), solutions
-        ranks = (
-            np.argsort(np.hypot(weight * candidates.off, candidates.turned), kind="stable")
-            for weight in (_WEIGHT, _GREAT_WEIGHT)
-        )
+        ranks = (_ranked(candidates.off, candidates.turned, weight) for weight in (_WEIGHT, _GREAT_WEIGHT))
         nearest = np.unique(np.concatenate([_first_of_each(candidates.branch, ranked) for ranked in ranks]))
         near_misses.append(candidates.joints[nearest])
     return [], _placed(model, start, np.concatenate(near_misses))
@@ -241,7 +238,7 @@ def _samples(arm: PanPlanarRoll, target: Target, chain: Vector, every: bool) -> 
         yield arm.with_axis(target.position, target.axis, chain)
     elif not every:
         yield arm.at(target.position, None, chain, pitches=24, rolls=1)
-    # With an axis these are only where searches begin.
+    # With an axis, these are only starting points of searches.
     yield arm.at(target.position, target.axis, chain, pitches=60 if target.axis is None else 36, rolls=13)
 
 
@@ -283,6 +280,6 @@ def _nearest(model: KinematicModel, target: Target, near: Vector) -> Vector:
         for _ in range(_SHIFTS):
             near = search(model, target, near, position_weight=_WEIGHT, iterations=_SHORT, shifts=shifts).joints
             shifts += target.position - model.forward(near).position
-    found = search(model, target, near, position_weight=_GREAT_WEIGHT, iterations=iterations)
-    near = np.concatenate([found.joints, begin])
+    results = search(model, target, near, position_weight=_GREAT_WEIGHT, iterations=iterations)
+    near = np.concatenate([results.joints, begin])
     return np.asarray(near[_ranked(*target.missed(model.forward(near)), _GREAT_WEIGHT)[0]])

@@ -43,11 +43,11 @@ class JogArm:
         """Load the model that `move_tool` needs.
 
         Args:
-            remedy: how to do without the model, for the error, e.g. `cartesian: false`.
-            bus: of the run, whose world has the obstacles before which the tool slows down.
+            remedy: the setting that needs no model, for the error, e.g. `cartesian: false`.
+            bus: the bus of the run; the tool slows down near obstacles of its world.
 
         Raises:
-            TeleopError: when the robot has no model of its arm, or one that does not fit.
+            TeleopError: if the robot has no model of its arm, or one that does not fit.
         """
         if self.robot.description.mjcf is None:
             raise TeleopError(f"Cartesian jog needs robot.description.mjcf: set it, or {remedy}")
@@ -82,9 +82,9 @@ class JogArm:
         """Setpoints `dt` [s] after `before` on the straight line to `pose`, both [rad], shape (J,).
 
         Args:
-            before: the setpoints before.
+            before: the last setpoints.
             pose: the target positions.
-            speed: of the joints [rad/s].
+            speed: speed of the joints [rad/s].
             dt: the step [s].
         """
         way = pose - before
@@ -96,7 +96,7 @@ class JogArm:
         """Setpoints `dt` [s] after `before`, both [rad], shape (J,), while the tool moves as with `Servo`.
 
         Args:
-            before: the setpoints before. If they differ from those of the last call, the tool starts there at rest.
+            before: the last setpoints. If they differ from the result of the last call, the tool starts there at rest.
             linear: velocity of the tool in the base frame [m/s], shape (3,).
             turn: angular velocity about the tool's own axes [rad/s], shape (3,). The tool points along z:
                 roll turns about z, pitch about y. The arm holds the heading, about x, as well as it can.
@@ -153,12 +153,11 @@ class VelocityJog:
       robot, so an arm that a person pushes away does not spring back.
     - A joint that reverses starts from the measured position, so the operator does not wait for the lead to shrink.
     - No setpoint is further from the measured position than `Joint.max_lead`. The tool waits before a joint of the arm
-      would be.
+      exceeds it.
 
     Args:
         arm: the robot.
-        follow: how far a joint at rest may be from its setpoint [rad]. More than
-            its sag under load, or the joint creeps.
+        follow: how far a joint at rest may be from its setpoint [rad]; must exceed its sag, or the joint creeps.
     """
 
     def __init__(self, arm: JogArm, follow: float) -> None:

@@ -1,7 +1,6 @@
 """Kinematic models from MJCF files.
 
-MuJoCo reads the file, since defaults, includes, frames and orientations mean what its compiler makes of them; what
-follows is numpy alone.
+MuJoCo reads the file, since its compiler resolves defaults, includes, frames and orientations.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ def robot_model(robot: Robot, joints: Sequence[str] | None = None) -> KinematicM
     """The kinematic model of a robot's tip, within the robot's joint limits.
 
     Args:
-        robot: its description names the MJCF and the tip, a site of it.
-        joints: the joints that may move, in the order of vectors; None: all of the robot's. Others stay at zero. Of a
-            robot with several arms, the joints of one of them; the base frame is then that of the arm.
+        robot: its description has the MJCF and the tip, a site in it.
+        joints: the joints that may move, in the order of vectors; None: all of the robot's. Others stay at zero. If
+            the robot has several arms, the joints of one of them; the base frame is then that of the arm.
 
     Raises:
         KinematicsError: if the description has no MJCF, the MJCF cannot be read or lacks the tip or a joint, or the
@@ -66,8 +65,8 @@ def read_mjcf(
         upper: upper position limits [rad or m], shape (J,); None: those of the MJCF.
 
     Raises:
-        KinematicsError: when the file cannot be read, or lacks the site or a joint, or a joint is neither a hinge nor
-            a slide, or has no limits, or the tip moves with a free or ball joint.
+        KinematicsError: if the file cannot be read or lacks the site or a joint, if a joint is neither a hinge nor a
+            slide or has no limits, or if the tip moves with a free or ball joint.
     """
     model = _compiled(path)
     sites = {model.site(i).name: i for i in range(model.nsite)}
@@ -94,14 +93,14 @@ def read_mjcf(
 
 
 def _compiled(path: Path) -> Any:
-    """The MJCF without its shapes, which take a second to load and move nothing."""
+    """The MJCF without its shapes, which take a second to load and do not matter here."""
     import mujoco
 
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         for element in (*spec.sensors, *spec.pairs, *spec.geoms, *spec.meshes, *spec.materials, *spec.textures):
             spec.delete(element)
-        # Bodies that got their mass from their shapes are left without; kinematics needs none, the compiler does.
+        # Only the compiler needs a mass of each body, which may have come from its shapes.
         spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
         for joint in spec.joints:
             joint.armature = 1.0

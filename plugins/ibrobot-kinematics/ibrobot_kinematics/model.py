@@ -35,7 +35,7 @@ class ChainJoint:
     axis: Vector
     """Unit vector along the joint's axis in its own frame, shape (3,)."""
     reference: float = 0.0
-    """Reference position of the joint [rad or m], at which it causes no displacement."""
+    """Reference position [rad or m], at which the joint causes no displacement."""
     slides: bool = False
     """Whether it is prismatic; revolute otherwise."""
 

@@ -70,7 +70,7 @@ def log(rotation: Vector) -> Vector:
 def between(a: Vector, b: Vector) -> Vector:
     """Rotation vector, shape (3,), of the shortest rotation from one unit vector to another.
 
-    Of all half turns it is any.
+    For opposite vectors, it is any of the half turns.
     """
     normal = cross(a, b)
     sine, cosine = math.hypot(*normal.tolist()), float(a @ b)
@@ -118,7 +118,7 @@ def from_rpy(roll: float, pitch: float, yaw: float) -> Vector:
 
 
 def rpy(rotation: Vector) -> Vector:
-    """Roll, pitch and yaw [rad], shape (3,), of a matrix, shape (3, 3); yaw is 0 where the x axis is vertical."""
+    """Roll, pitch and yaw [rad], shape (3,), of a matrix, shape (3, 3); yaw is 0 if the x axis is vertical."""
     level = np.hypot(rotation[0, 0], rotation[1, 0])
     pitch = np.arctan2(-rotation[2, 0], level)
     if level < _NO_LEVEL:

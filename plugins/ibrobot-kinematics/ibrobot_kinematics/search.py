@@ -15,9 +15,9 @@ from ibrobot_kinematics.target import Target
 _LONGEST_STEP = 0.5
 """Maximum change of a joint per step [rad or m], so that a search stays on its branch."""
 _CONVERGED = 1e-7
-"""A search ends if no joint changes by more than this in a step [rad or m],"""
+"""A search ends if no joint changes by more than this in a step [rad or m]."""
 _NO_GAIN = 1e-9
-"""or if the relative improvement of a step is smaller than this."""
+"""A search ends if the relative improvement of a step is smaller."""
 _DAMPING, _LEAST_DAMPING = 1e-2, 1e-9
 _BOUND_PASSES = 2
 _TABLE_SIZE = 4096
@@ -28,7 +28,7 @@ type Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
 @attrs.frozen(eq=False)
-class Found:
+class Results:
     """Results of searches."""
 
     joints: Vector
@@ -57,7 +57,7 @@ def search(
     iterations: int,
     stop_within: tuple[float, float] | None = None,
     shifts: Vector | None = None,
-) -> Found:
+) -> Results:
     """Search for the configurations nearest to the target from `starts`.
 
     A search minimises `(position_weight * distance)**2 + turn**2`, where the turn is the chord of the angle. It takes
@@ -66,7 +66,7 @@ def search(
 
     Args:
         model: the arm.
-        target: where to bring the tip.
+        target: target of the tip.
         starts: joint positions within the limits [rad or m], shape (N, J).
         position_weight: weight of position errors [rad/m].
         iterations: maximum number of iterations.
@@ -75,10 +75,10 @@ def search(
     """
     moving = model.moving
     lower, upper = model.lower[moving], model.upper[moving]
-    asked = np.tile(target.columns, (len(starts), 1, 1))
+    requested = np.tile(target.columns, (len(starts), 1, 1))
     if shifts is not None:
-        asked[:, 0] += shifts
-    weights = np.full(asked.shape[1], 1.0 if target.rotation is None else np.sqrt(0.5))
+        requested[:, 0] += shifts
+    weights = np.full(requested.shape[1], 1.0 if target.rotation is None else np.sqrt(0.5))
     weights[0] = position_weight
     after = np.triu(np.ones((len(moving), len(moving)), dtype=bool))
 
@@ -86,7 +86,7 @@ def search(
         """The tip, the objective, shape (N,), and half of its first and second derivatives by the joints."""
         tip, linear, axes = model.twists(q)
         columns = target.columns_of(tip)
-        error = weights[:, None] * (columns - asked)
+        error = weights[:, None] * (columns - requested)
         # Derivative of each column by each joint, shape (N, n, K, 3).
         rates = cross(axes[:, :, None], columns[:, None])
         rates[:, :, 0] = linear
@@ -125,7 +125,7 @@ def search(
             if (better & (off <= stop_within[0]) & (turned <= stop_within[1])).any():
                 break
     off, turned = target.missed(model.forward(q))
-    return Found(q, off, turned)
+    return Results(q, off, turned)
 
 
 def _bounded_step(hessian: Vector, gradient: Vector, damping: Vector, lower: Vector, upper: Vector) -> Vector:
@@ -166,7 +166,7 @@ def starts_from_table(
 
     Args:
         model: the arm.
-        target: where to bring the tip.
+        target: target of the tip.
         start: positions of the joints that do not move the tip, shape (J,).
         number: number of configurations, at most the size of the table.
         lever: distance that counts as much as a rotation by one radian [m]; 0 for positions alone.

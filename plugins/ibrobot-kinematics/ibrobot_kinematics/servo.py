@@ -1,6 +1,6 @@
 """Servo: moves the tool along a stream of twists, smoothly and within the limits of the joints.
 
-What any device that jogs a tool uses: keyboards, gamepads, 3D mice, phones, and topics of twists.
+For all devices that jog a tool: keyboards, gamepads, 3D mice, phones, and topics of twists.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from ibrobot_kinematics.quadratic import bounded_minimum
 from ibrobot_kinematics.servo_options import ServoOptions
 
 _LEVER_M = 0.1
-"""Turning the tip by a radian weighs as much as moving it by this [m]."""
+"""Length that corresponds to a turn of one radian [m]."""
 _DAMPING = 1e-7
 _MISSED_SLOW, _MISSED_HALT = 0.25, 0.5
-"""Shares of a twist that the tip may miss before it slows down, and where the reach ends and it stands."""
+"""Shares of a twist that the tip may miss before it slows down, and before it stops, at the edge of its reach."""
 _LOOK_AHEAD_S = 0.05
-"""How far ahead the arm looks to see whether it approaches a singularity or an obstacle, or leaves it."""
+"""How far ahead the arm checks whether it approaches or leaves a singularity or an obstacle."""
 _LEAVING = 0.1
-"""Least share of the speed at which an arm leaves a singularity, however near it is."""
+"""Least share of the speed at which an arm leaves a singularity."""
 _AT_REST = 1e-6
-"""Speed of joints [rad/s or m/s] that counts as none."""
+"""Joint speeds below this [rad/s or m/s] count as rest."""
 _LONGEST_TICK_S = 0.1
-"""A longer gap between steps counts as a stop: what was missed is not made up for."""
+"""A longer gap between steps counts as a stop, and is not caught up."""
 _VELOCITY, _ACCELERATION = 0.95, 0.85
-"""Shares of the limits of joints that are used. The times of the steps jitter a little, and a setpoint beyond a limit
-would lag behind and then overshoot."""
+"""Shares of the joints' limits that are used. The times of the steps jitter, and a setpoint beyond a limit would lag
+behind and then overshoot."""
 _DEFAULTS = ServoOptions()
 
 
 class ServoStatus(IntEnum):
-    """What holds the tool back, by the codes of MoveIt Servo (moveit_servo/status_codes.h, ROS 2 Humble)."""
+    """What limits the tool, with the codes of MoveIt Servo (moveit_servo/status_codes.h, ROS 2 Humble)."""
 
     INVALID = -1
     """The last twist was refused."""
@@ -63,25 +63,24 @@ class _Twist:
 class Servo:
     """Joint positions that follow twists of the tool, tick by tick.
 
-    The tip follows the newest twist as well as the arm can. Where it cannot, e.g. at the edge of the reach, it slows
-    down and stands. Speeds and accelerations of joints stay within their limits, and so do positions; a joint beyond
-    its limit only moves inwards. When no twist comes in time, the arm slows down to a stop. Each tick needs the time;
-    nothing here looks at a clock.
+    The tip follows the newest twist as well as the arm can. If it cannot, e.g. at the edge of its reach, it slows down
+    and stops. Positions, speeds and accelerations of joints stay within their limits; a joint beyond its limit only
+    moves inwards. Without a new twist in time, the arm slows down to a stop. The caller passes the time to each step.
 
     Args:
         model: the arm.
         max_velocity: highest speed of each joint [rad/s or m/s], shape (J,).
         max_acceleration: highest acceleration of each joint [rad/s² or m/s²], shape (J,).
-        options: when it slows down and stops.
-        clearance: joint positions, shape (J,) -> distance to the nearest obstacle [m]; None where nobody knows any.
-        turn_weights: how much turns about the tip's own x, y and z axes count, shape (3,). By default an arm with five
+        options: limits of twists, and when to slow down and stop.
+        clearance: joint positions, shape (J,) -> distance to the nearest obstacle [m]; None without obstacles.
+        turn_weights: weights of turns about the tip's own x, y and z axes, shape (3,). By default an arm with five
             joints, which cannot control all of them, gives way about the tip's x axis: the heading of a tool that
             points along z.
 
     Attributes:
         position: joint positions [rad or m], shape (J,).
         velocity: joint velocities [rad/s or m/s], shape (J,).
-        refused: reason -> how many twists were refused for it.
+        refused: reason -> number of twists refused for it.
     """
 
     def __init__(
@@ -103,7 +102,7 @@ class Servo:
         self._clearance = clearance
         self._max_velocity = _VELOCITY * max_velocity[model.moving]
         self._max_acceleration = _ACCELERATION * max_acceleration[model.moving]
-        # From full speed a joint stops within the margin, unless its acceleration is too low for that.
+        # From full speed, a joint stops within the margin, unless its acceleration is too low.
         braking = self._max_velocity**2 / (2 * options.joint_limit_margin)
         self._braking = np.minimum(braking, self._max_acceleration)
         self._weights = np.concatenate([np.ones(3), _LEVER_M * np.asarray(turn_weights, dtype=float)])
@@ -111,13 +110,13 @@ class Servo:
         self.reset((model.lower + model.upper) / 2)
 
     def reset(self, position: Vector) -> None:
-        """Stand at a position, and forget all twists.
+        """Rest at a position, and drop the twist.
 
         Args:
             position: joint positions [rad or m], shape (J,).
 
         Raises:
-            ValueError: when it is not finite or has another shape.
+            ValueError: if it is not finite or has another shape.
         """
         if np.shape(position) != self._model.lower.shape or not np.isfinite(position).all():
             raise ValueError(
@@ -132,16 +131,16 @@ class Servo:
 
     @property
     def status(self) -> ServoStatus:
-        """What holds the tool back."""
+        """What limits the tool."""
         return ServoStatus.INVALID if self._is_invalid else self._state
 
     @property
     def at_rest(self) -> bool:
-        """Whether no joint moves, and no twist asks for it."""
+        """Whether no joint moves, and there is no twist."""
         return self._twist is None and not np.abs(self.velocity).max() > _AT_REST
 
     def tip(self) -> TipPose:
-        """Where the tip is in the base frame."""
+        """Pose of the tip in the base frame."""
         return self._model.forward(self.position)
 
     def command(self, linear: Vector, angular: Vector, now_ns: int, *, in_tool: bool = False) -> str | None:
@@ -154,7 +153,7 @@ class Servo:
             in_tool: whether both are along the axes of the tip, rather than those of the base frame.
 
         Returns:
-            Why it was refused, and the twist before it stays; None where it was not.
+            Why it was refused, in which case the previous twist stays; None if it was accepted.
         """
         reason = self._fault(np.asarray(linear), np.asarray(angular))
         if reason is not None:
@@ -171,19 +170,19 @@ class Servo:
         self._is_invalid = True
 
     def hold_at(self, position: Vector) -> None:
-        """Stand at a position [rad or m], shape (J,), e.g. where a joint does not follow; the twist stays."""
+        """Rest at a position [rad or m], shape (J,), e.g. if a joint does not follow; the twist stays."""
         self.position = np.array(position, dtype=float)
         self.velocity = np.zeros_like(self.position)
 
     def halt(self) -> None:
-        """Forget the twist: the arm slows down to a stop."""
+        """Drop the twist: the arm slows down to a stop."""
         self._twist = None
 
     def step(self, now_ns: int) -> Vector:
         """Joint positions at a time, shape (J,).
 
         Args:
-            now_ns: the time [ns]; where it does not go on, nothing moves.
+            now_ns: the time [ns]; if it has not advanced, nothing moves.
         """
         last, self._last_ns = self._last_ns, now_ns
         if self._twist is not None and now_ns >= self._twist.until_ns:
@@ -198,10 +197,10 @@ class Servo:
         lowest, highest = self._bounds(dt)
         wanted = np.zeros(len(moving))
         if self._twist is not None:
-            wanted = self._wanted(self._twist, np.minimum(lowest, 0), np.maximum(highest, 0))
+            wanted = self._joint_speeds(self._twist, np.minimum(lowest, 0), np.maximum(highest, 0))
         else:
             self._state = ServoStatus.NO_WARNING
-        # All joints change their speeds in step, so that the tool goes straight from one twist to the next.
+        # Scale the changes of all speeds alike, so that the twist changes in a straight line.
         before = self.velocity[moving]
         change, most = wanted - before, self._max_acceleration * dt
         share = min(1.0, float(np.min(most / np.maximum(np.abs(change), 1e-12))))
@@ -223,20 +222,20 @@ class Servo:
         return None
 
     def _bounds(self, dt: float) -> tuple[Vector, Vector]:
-        """Speeds from which each joint can still stop at its limit; none outwards beyond it."""
+        """Speeds from which each joint can still stop at its limit; beyond it, only inward speeds."""
         moving = self._model.moving
         here, drop = self.position[moving], self._braking * dt
 
         def stoppable(room: Vector) -> Vector:
-            # What is left after this tick at the speed v, room - v dt, suffices to stop from it.
+            # After this tick at speed v, the remaining room - v dt suffices to stop.
             return np.asarray(np.sqrt(drop**2 + 2 * self._braking * np.maximum(room, 0.0)) - drop)
 
         highest = np.minimum(stoppable(self._model.upper[moving] - here), self._max_velocity)
         lowest = -np.minimum(stoppable(here - self._model.lower[moving]), self._max_velocity)
         return lowest, highest
 
-    def _wanted(self, twist: _Twist, lowest: Vector, highest: Vector) -> Vector:
-        """Speeds of the joints that follow a twist, scaled down where need be; and the status."""
+    def _joint_speeds(self, twist: _Twist, lowest: Vector, highest: Vector) -> Vector:
+        """Joint speeds that follow a twist, scaled down if necessary; sets the status."""
         model = self._model
         moving = model.moving
         tip, jacobian = model.forward_and_jacobian(self.position)
@@ -245,17 +244,17 @@ class Servo:
         linear, angular = (tip.rotation @ linear, angular) if twist.in_tool else (linear, to_tip @ angular)
         # Turns are in the frame of the tip, where their weights are.
         rates = self._weights[:, None] * np.vstack([jacobian[:3, moving], to_tip @ jacobian[3:, moving]])
-        asked = self._weights * np.concatenate([linear, angular])
+        requested = self._weights * np.concatenate([linear, angular])
         self._state = ServoStatus.NO_WARNING
-        size = float(np.linalg.norm(asked))
+        size = float(np.linalg.norm(requested))
         if size == 0:
             return np.zeros(len(moving))
-        hessian, gradient = rates.T @ rates + _DAMPING * np.eye(len(moving)), -rates.T @ asked
-        # A tool that would be too fast goes slower, on the same way.
+        hessian, gradient = rates.T @ rates + _DAMPING * np.eye(len(moving)), -rates.T @ requested
+        # A twist that is too fast for a joint is slowed down in the same direction.
         excess = float(np.max(np.abs(np.linalg.solve(hessian, gradient)) / self._max_velocity))
         slower = 1 / max(excess, 1.0)
         wanted = bounded_minimum(hessian, slower * gradient, lowest, highest)
-        missed = float(np.linalg.norm(rates @ wanted - slower * asked)) / (slower * size)
+        missed = float(np.linalg.norm(rates @ wanted - slower * requested)) / (slower * size)
         scale = float(np.clip((_MISSED_HALT - missed) / (_MISSED_HALT - _MISSED_SLOW), 0, 1))
         near_limit = (wanted <= lowest) & (lowest > -self._max_velocity)
         near_limit |= (wanted >= highest) & (highest < self._max_velocity)

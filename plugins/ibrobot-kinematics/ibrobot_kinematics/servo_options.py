@@ -1,4 +1,4 @@
-"""When a tool that follows twists slows down and stops. Nothing here imports NumPy."""
+"""Options of a tool that follows twists. Nothing here imports NumPy."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from ibrobot_core.api import documented, option
 @documented
 @attrs.frozen
 class ServoOptions:
-    """When a tool slows down and stops."""
+    """Limits of twists, and when the tool slows down and stops."""
 
     timeout: float = option(0.1, unit="s", gt=0, le=1, help="how long a twist is valid; then the tool slows to a stop")
-    max_linear: float = option(1.0, unit="m/s", gt=0, help="twists faster than that are refused")
+    max_linear: float = option(1.0, unit="m/s", gt=0, help="faster twists are refused")
     max_angular: float = option(6.0, unit="rad/s", gt=0, help="twists that turn faster are refused")
     lower_singularity_threshold: float = option(
         30.0, gt=1, help="condition number of the Jacobian, at a lever of 0.1 m, from which the tool slows down"

@@ -17,9 +17,9 @@ _ELEMENTS = (
     "group", "group_state", "disable_collisions", "enable_collisions", "disable_default_collisions", "end_effector",
     "virtual_joint", "passive_joint", "link_sphere_approximation", "joint_property",
 )  # fmt: skip
-"""Those of MoveIt."""
+"""The elements that MoveIt knows."""
 _LIKELY = 0.8
-"""Similarity from which an unknown element is taken for a misspelt one."""
+"""Unknown elements more similar to a known one are taken for misspelt."""
 
 
 @attrs.frozen
@@ -49,17 +49,17 @@ class Srdf:
         """A named pose.
 
         Args:
-            name: of the pose.
-            group: its group; None where one group alone has a pose of this name.
+            name: name of the pose.
+            group: its group; None if only one group has a pose of this name.
 
         Raises:
-            KinematicsError: when there is none, or several groups have one.
+            KinematicsError: if there is none, or several groups have one.
         """
-        found = [each for each in self.states if each.name == name and group in (None, each.group)]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            groups = ", ".join(each.group for each in found)
+        states = [each for each in self.states if each.name == name and group in (None, each.group)]
+        if len(states) == 1:
+            return states[0]
+        if states:
+            groups = ", ".join(each.group for each in states)
             raise KinematicsError(f"{self.path}: pose {name!r} exists for several groups: {groups}; name the group")
         known = list(dict.fromkeys(each.name for each in self.states if group in (None, each.group)))
         where = "" if group is None else f" for group {group!r}"
@@ -74,8 +74,7 @@ def read_srdf(path: Path, urdf: Urdf) -> Srdf:
         urdf: the robot's URDF, whose links and joints it names.
 
     Raises:
-        KinematicsError: when it cannot be read, is not an SRDF, or names what the URDF does not have; names file and
-            line.
+        KinematicsError: if it cannot be read, is not an SRDF, or has a name that the URDF lacks; gives file and line.
     """
     try:
         root = read_xml(path, "robot")
@@ -116,7 +115,7 @@ def _known(element: XmlElement, attribute: str, known: Sequence[str], what: str)
 
 @attrs.frozen
 class _Groups:
-    """The groups of a file, by what they consist of: joints, links, chains and other groups."""
+    """The groups of a file, which consist of joints, links, chains and other groups."""
 
     urdf: Urdf
     elements: dict[str, XmlElement]
@@ -131,21 +130,21 @@ class _Groups:
         names = [joint.name for joint in self.urdf.joints]
         match element.tag:
             case "joint":
-                found = [_known(element, "name", names, "joint")]
+                members = [_known(element, "name", names, "joint")]
             case "link":  # the joint that carries it, as in MoveIt
                 link = _known(element, "name", self.urdf.links, "link")
-                found = [self.urdf.carriers[link].name] if link in self.urdf.carriers else []
+                members = [self.urdf.carriers[link].name] if link in self.urdf.carriers else []
             case "chain":
-                found = self._chain(element)
+                members = self._chain(element)
             case "group":
                 inner = _known(element, "name", list(self.elements), "group")
                 if inner in within:
                     raise element.error(f"group {inner!r} contains itself: {' -> '.join((*within, inner))}")
-                found = list(self.joints(inner, within))
+                members = list(self.joints(inner, within))
             case _:
                 _check_tag(element, ("joint", "link", "chain", "group"))
-                found = []
-        return (name for name in found if name in moving)
+                members = []
+        return (name for name in members if name in moving)
 
     def _chain(self, element: XmlElement) -> list[str]:
         base, tip = (_known(element, end, self.urdf.links, "link") for end in ("base_link", "tip_link"))
@@ -180,7 +179,7 @@ def _states(root: XmlElement, urdf: Urdf, groups: Mapping[str, tuple[str, ...]])
 
 
 def _may_touch(root: XmlElement, urdf: Urdf) -> frozenset[tuple[str, str]]:
-    """The disabled pairs, in the file's order of precedence: a pair that is enabled counts against a default."""
+    """The disabled pairs: enabling a pair overrides a default, disabling it overrides both."""
     pairs: set[tuple[str, str]] = set()
     for element in _tagged(root, "disable_default_collisions"):
         link = _known(element, "link", urdf.links, "link")

@@ -1,4 +1,4 @@
-"""URDF files: links, joints, and the tree that they make. Source: http://wiki.ros.org/urdf/XML."""
+"""URDF files: links, joints, and their tree. Source: http://wiki.ros.org/urdf/XML."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ibrobot_core.app import ModelError, XmlElement, read_xml
 from ibrobot_kinematics.errors import KinematicsError
 
 MOVING = ("revolute", "continuous", "prismatic")
-"""Types of joints with one position."""
+"""Types of joints with one degree of freedom."""
 _TYPES = (*MOVING, "fixed", "floating", "planar")
 
 Triple = tuple[float, float, float]
@@ -21,7 +21,7 @@ Triple = tuple[float, float, float]
 
 @attrs.frozen
 class UrdfJoint:
-    """How its child link stands in its parent link."""
+    """A joint between a parent and a child link."""
 
     name: str
     type: str
@@ -35,12 +35,12 @@ class UrdfJoint:
     axis: Triple
     """Axis of the joint in the child's frame, of length 1."""
     line: int
-    """Where it is in the file."""
+    """Its line in the file."""
 
 
 @attrs.frozen(slots=False)
 class Urdf:
-    """A URDF whose links make one tree."""
+    """A URDF whose links form one tree."""
 
     path: Path
     name: str
@@ -49,7 +49,7 @@ class Urdf:
     joints: tuple[UrdfJoint, ...]
     """In file order."""
     root: str
-    """The link that no joint carries."""
+    """The link that is no joint's child."""
 
     @cached_property
     def carriers(self) -> Mapping[str, UrdfJoint]:
@@ -57,21 +57,21 @@ class Urdf:
         return {joint.child: joint for joint in self.joints}
 
     def chain(self, base: str, tip: str) -> tuple[UrdfJoint, ...] | None:
-        """The joints from one link to another further out, fixed ones included; None where it is not further out."""
-        found: list[UrdfJoint] = []
+        """The joints from one link outwards to another, fixed ones included; None if there is no such way."""
+        joints: list[UrdfJoint] = []
         while tip != base:
             if tip not in self.carriers:
                 return None
-            found.append(self.carriers[tip])
-            tip = found[-1].parent
-        return tuple(reversed(found))
+            joints.append(self.carriers[tip])
+            tip = joints[-1].parent
+        return tuple(reversed(joints))
 
 
 def read_urdf(path: Path) -> Urdf:
     """Read a URDF.
 
     Raises:
-        KinematicsError: when it cannot be read, is not a URDF, or its links do not make one tree; names file and line.
+        KinematicsError: if it cannot be read, is not a URDF, or its links form no single tree; gives file and line.
     """
     try:
         root = read_xml(path, "robot")
@@ -103,7 +103,7 @@ def required(element: XmlElement, attribute: str) -> str:
     """An attribute that an element must have.
 
     Raises:
-        ModelError: when it is missing or empty.
+        ModelError: if it is missing or empty.
     """
     value = element.attributes.get(attribute, "").strip()
     if not value:
@@ -150,21 +150,21 @@ def _triple(element: XmlElement, attribute: str) -> Triple:
 
 
 def _tree(path: Path, links: Mapping[str, int], joints: tuple[UrdfJoint, ...]) -> str:
-    """The root of the tree that the links make.
+    """The root of the tree of links.
 
     Args:
         path: the file.
         links: link -> line.
-        joints: of the file.
+        joints: the joints of the file.
 
     Raises:
-        ModelError: when they do not make one tree.
+        ModelError: if they do not form one tree.
     """
     carriers: dict[str, UrdfJoint] = {}
     for joint in joints:
         if (other := carriers.setdefault(joint.child, joint)) is not joint:
             reason = f"joints {other.name!r} (line {other.line}) and {joint.name!r} both carry link {joint.child!r}"
-            raise ModelError(f"{path}:{joint.line}: {reason}; links must make a tree")
+            raise ModelError(f"{path}:{joint.line}: {reason}; links must form a tree")
     roots = [link for link in links if link not in carriers]
     for link, joint in carriers.items():
         seen = [link]
@@ -173,10 +173,10 @@ def _tree(path: Path, links: Mapping[str, int], joints: tuple[UrdfJoint, ...]) -
             if parent == link:
                 loop = " -> ".join(reversed(seen))
                 raise ModelError(
-                    f"{path}:{joint.line}: link {link!r} is its own ancestor: {loop}; links must make a tree"
+                    f"{path}:{joint.line}: link {link!r} is its own ancestor: {loop}; links must form a tree"
                 )
             if len(seen) > len(links):
-                break  # a loop further in, which its own links find
+                break  # a loop of its ancestors, reported for these
     if len(roots) > 1:
         place = f"{path}:{links[roots[1]]}"
         raise ModelError(f"{place}: link {roots[1]!r} is not connected: no joint leads to it from {roots[0]!r}")

@@ -94,13 +94,13 @@ def robot(*joints: tuple[str, str, str], links: str = "abcd") -> str:
         (ARM.replace('rpy="0 0 1"', 'rpy="0 0 nan"'), "robot.urdf:6: rpy is '0 0 nan', must be 3 finite numbers"),
         (ARM.replace('"0 0 2"', '"0 0 0"'), "robot.urdf:6: joint 'pan': its axis has length 0"),
         (robot(("1", "a", "b"), ("2", "c", "b"), ("3", "a", "d")),
-         "robot.urdf:7: joints '1' (line 6) and '2' both carry link 'b'; links must make a tree"),
+         "robot.urdf:7: joints '1' (line 6) and '2' both carry link 'b'; links must form a tree"),
         (robot(("1", "a", "b"), ("2", "b", "d")),
          "robot.urdf:4: link 'c' is not connected: no joint leads to it from 'a'"),
         (robot(("1", "b", "c"), ("2", "c", "d"), ("3", "d", "b")),
-         "robot.urdf:6: link 'c' is its own ancestor: c -> d -> b -> c; links must make a tree"),
+         "robot.urdf:6: link 'c' is its own ancestor: c -> d -> b -> c; links must form a tree"),
         (robot(("1", "a", "a"), links="a"),
-         "robot.urdf:3: link 'a' is its own ancestor: a -> a; links must make a tree"),
+         "robot.urdf:3: link 'a' is its own ancestor: a -> a; links must form a tree"),
     ],
 )  # fmt: skip
 def test_wrong_files_are_named_with_their_line(fault: Callable[[str], str], text: str, message: str) -> None:
