@@ -1,4 +1,4 @@
-"""Where the page is served, and its certificate: the one in the options, or one of this installation's own."""
+"""The page's port and certificate: the configured one, or a self-signed one that this installation keeps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ibrobot_webxr.options import WebxrOptions
 
 
 def own_folder() -> Path:
-    """The folder of this installation's own certificate: `$XDG_CONFIG_HOME/ibrobot/webxr`, or that in `~/.config`."""
+    """The folder of the self-signed certificate: `$XDG_CONFIG_HOME/ibrobot/webxr`, by default in `~/.config`."""
     home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     return home / "ibrobot" / "webxr"
 
@@ -31,8 +31,7 @@ def open_port(options: WebxrOptions) -> Listener:
     """Open the port of the page.
 
     Raises:
-        TeleopError: if the port is not available, the certificate or key cannot be read, or the own ones cannot be
-            written.
+        TeleopError: if the port is not available, or the certificate or key cannot be read or written.
     """
     names = server_names(options)
     try:

@@ -1,4 +1,4 @@
-"""What the server's thread and the devices exchange: poses and buttons one way, reports the other."""
+"""Exchange between the server's thread and the devices: poses and buttons one way, reports the other."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ibrobot_core.api import Clock, OperatorEvent, ns, seconds
 from ibrobot_webxr.messages import HandPose, Hands
 
 _WINDOW_S = 10.0
-"""The least delay of a page is that of the last one to two windows [s], since clocks drift."""
+"""The least delay of a page is taken from the last one or two windows [s], since clocks drift."""
 _MOST = 64
-"""Poses that wait for a device; a device that does not read loses the oldest."""
+"""Most samples queued for a device; the oldest are dropped."""
 _REPORTED_S = 0.5
-"""Age of a device's report from which on no device of the present mode listens to the page [s]."""
+"""Older reports [s] are dropped: their device no longer reads the page."""
 
 
 class Delays:
-    """How much longer than the quickest ones messages of a page take, by the page's clock and ours.
+    """Lateness of a page's messages relative to the fastest one.
 
-    A network that stalls delivers old poses in a burst: they arrive now, but they are late.
+    A stalled network delivers old poses in a burst: they arrive now, but they are late.
     """
 
     def __init__(self) -> None:
@@ -51,7 +51,7 @@ class Sample:
     time_s: float
     """The page's time [s]."""
     made_ns: int
-    """When the pose was made, by our clock, if the least delay of the page counts as none [ns]."""
+    """When the pose was made, by our clock, if the fastest message took no time [ns]."""
 
     def age_s(self, now_ns: int) -> float:
         """The age at a time [s]."""
@@ -66,7 +66,7 @@ class Report:
     engaged: bool
     """Whether the hand moves the robot."""
     text: str
-    """Why it does not, e.g. that the clutch must be released first; empty if there is nothing to say."""
+    """Why it does not, e.g. that the clutch must be released first; may be empty."""
     stamp_s: float
     """When, by the monotonic clock [s]."""
 
@@ -116,7 +116,7 @@ class Exchange:
             self._inboxes.remove(inbox)
 
     def put(self, hands: Hands, late_s: float) -> None:
-        """Pass on the poses of a message that has arrived, `late_s` [s] later than with the least delay."""
+        """Pass on the poses of a message that arrived `late_s` [s] later than the fastest would have."""
         with self._lock:
             made_ns = self._clock.now_ns() - ns(late_s)
             for inbox in self._inboxes:
@@ -148,7 +148,7 @@ class Exchange:
                 self._reports[hand] = Report(device, hand == engaged, text, now_s)
 
     def reports(self) -> Mapping[str, Report]:
-        """Hand -> the report of a device that reads the page at present."""
+        """Hand -> the report of the device that reads it now."""
         oldest_s = time.monotonic() - _REPORTED_S
         with self._lock:
             return {hand: report for hand, report in self._reports.items() if report.stamp_s > oldest_s}

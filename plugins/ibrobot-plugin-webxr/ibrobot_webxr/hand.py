@@ -19,7 +19,7 @@ _REST_S = 0.5
 _DRIFT_S = 1.0
 """Time constant with which the dead zone follows a hand at rest [s]: slow drift of the tracking moves nothing."""
 _LONGEST_S = 0.1
-"""Poses further apart in time than this count as this far apart [s]."""
+"""Longest time step between poses [s]; longer ones are cut to this."""
 _FASTEST = 5.0, 25.0
 """Motion of tracked poses above this [m/s and rad/s] is a jump of the tracking."""
 
@@ -38,7 +38,7 @@ class Rest:
         self.is_rest = True
 
     def update(self, value: Vector, dt: float) -> None:
-        """Take a value `dt` [s] after the one before."""
+        """Take the next value, `dt` [s] after the previous one."""
         if math.dist(value, self._centre) > self._size:
             self._centre, self._within_s, self.is_rest = value, 0.0, False
             return
@@ -66,7 +66,7 @@ class HandMotion:
         self._last = np.zeros(3), np.eye(3)
         """The newest pose, unfiltered."""
         self._origin, self._upright = np.zeros(3), np.eye(3)
-        """Where the hand would be if it had not moved."""
+        """The pose of the hand that means no motion."""
         self._first = np.eye(3)
         self.moved, self.turned = np.zeros(3), np.eye(3)
 
@@ -117,7 +117,7 @@ class HandMotion:
             self.turned = rotation @ self._upright.T
 
     def _start(self, pose: HandPose, time_s: float) -> None:
-        """Take a pose as the present one: it changes neither `moved` nor `turned`."""
+        """Take a pose as the present one, without changing `moved` and `turned`."""
         self._last = position, rotation = self._in_base(pose)
         self._time_s = time_s
         self._filter.restart(position, rotation)

@@ -28,7 +28,7 @@ class CameraImages:
     def __init__(self, bus: Bus, cameras: Sequence[str], log: logging.Logger) -> None:
         self._log = log
         self._damaged: set[str] = set()
-        """Cameras of which a damaged image was logged."""
+        """Cameras whose first damaged image was logged."""
         self._bus = bus
         self._wanted = cameras
         self._subscriptions: dict[str, Subscription] = {}

@@ -1,4 +1,4 @@
-"""Messages of the page, as JSON text. A browser is outside: whatever it sends is checked here.
+"""Messages of the page, as JSON text. Browsers are not trusted: everything they send is checked here.
 
 The frame of a pose is that of WebXR: x to the right, y up, z towards the operator; [m], and quaternions (x, y, z, w).
 """
@@ -74,7 +74,7 @@ class Claim:
 
 @attrs.frozen
 class Shown:
-    """The page has shown the image of a camera, and takes the next."""
+    """The page has shown a camera's image, and can take the next."""
 
     camera: int
 
@@ -159,7 +159,7 @@ def _keys(message: Mapping[str, Any], known: set[str], where: str = "") -> None:
     at = f"{where}: " if where else ""
     if missing := sorted(known - set(message)):
         raise ValueError(f"{at}{missing[0]} is missing")
-    if set(message) - known:  # their names are not repeated: they come from outside
+    if set(message) - known:  # not named: they are untrusted
         raise ValueError(f"{at}unknown keys; must have {', '.join(sorted(known)) or 'none'}")
 
 

@@ -25,7 +25,7 @@ def delay(cutoff_hz: float) -> float:
 
 
 def _share(cutoff_hz: float, dt: float) -> float:
-    """How far a filter moves towards a new value."""
+    """Weight of a new value in a first-order low-pass filter."""
     return 1 / (1 + delay(cutoff_hz) / dt)
 
 
@@ -55,7 +55,7 @@ class PoseFilter:
         self.cutoff_hz = self._least_hz
 
     def update(self, position: Vector, rotation: Vector, dt: float) -> None:
-        """Take a pose, `dt` [s] after the one before; without time between them, nothing changes."""
+        """Take the next pose, `dt` [s] after the previous one; ignored if no time has passed."""
         if dt <= 0:
             return
         moved = np.concatenate([position - self._before[0], LEVER_M * log(rotation @ self._before[1].T)]) / dt

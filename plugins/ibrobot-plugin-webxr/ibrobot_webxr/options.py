@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 HANDS = ("left", "right")
 """The hands of an operator, as WebXR calls them; on a phone the page asks which arm it drives."""
 NONE = "none"
-"""In place of the gripper's group: the robot has none."""
+"""Value of `gripper` for a robot without one."""
 
 
 def _check_host(instance: Any, attribute: attrs.Attribute[Any], value: str) -> None:
@@ -82,7 +82,10 @@ class WebxrOptions:
     dead_angle: float = option(0.005, unit="rad", ge=0, lt=0.2, help="turn of a hand that counts as rest")
     timeout: float = option(0.05, unit="s", ge=0.03, le=0.09, help="silence of the page after which the robot holds")
     follow: float = option(
-        0.1, unit="rad", ge=0, help="how far the robot may be from its last setpoint for the clutch to start there"
+        0.1,
+        unit="rad",
+        ge=0,
+        help="distance from the last setpoint beyond which the clutch starts from the measured position",
     )
 
     def __attrs_post_init__(self) -> None:
@@ -93,7 +96,7 @@ class WebxrOptions:
 
 
 def check_robot(options: WebxrOptions, robot: Robot) -> Iterator[OptionFault]:
-    """The robot has a model and the gripper, and the certificate exists."""
+    """Check that the robot has a model and the gripper, and that the certificate exists."""
     if robot.description.mjcf is None:
         yield OptionFault((), "a hand moves the tool, which needs robot.description.mjcf: set it", "mjcf")
     if options.gripper not in (NONE, *robot.groups):

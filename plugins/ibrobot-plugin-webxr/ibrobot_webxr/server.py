@@ -30,7 +30,7 @@ from ibrobot_webxr.options import HANDS, WebxrOptions
 _STATE_S = 0.1
 """Period of the states sent to pages [s]."""
 _SILENT_S = 1.0
-"""A page that has control and sends nothing for that long loses it [s]."""
+"""A page that sends nothing for this long loses control [s]."""
 _MOST_PAGES = 8
 _MOST_REFUSED = 100
 """Wrong messages after which a page is disconnected."""
@@ -45,13 +45,13 @@ class _Page:
     delays: Delays = attrs.field(factory=Delays)
     heard_s: float = attrs.field(factory=time.monotonic)
     """When its last message came [s]."""
-    shown: dict[str, int] = attrs.field(factory=dict)
+    sent: dict[str, int] = attrs.field(factory=dict)
     """Camera -> number of the newest image sent."""
-    waits: set[str] = attrs.field(factory=set)
-    """Cameras with an image that the page has not shown yet."""
+    unacknowledged: set[str] = attrs.field(factory=set)
+    """Cameras whose last image the page has not acknowledged yet."""
     refused: int = 0
     error: str = ""
-    """The last message that was refused, and why."""
+    """Why its last wrong message was refused."""
 
 
 class PageServer:
@@ -91,7 +91,7 @@ class PageServer:
         app.router.add_get("/certificate.pem", self._certificate, allow_head=False)
         app.router.add_get("/socket", self._socket, allow_head=False)
         app.on_shutdown.append(self._close_pages)
-        self._server = ServerThread(self._guard, app, "webxr page", close_s=0.1, beside=self._tell_for_ever)
+        self._server = ServerThread(self._guard, app, "webxr page", close_s=0.1, beside=self._send_states)
 
     @property
     def address(self) -> str:
@@ -112,7 +112,7 @@ class PageServer:
                 await asyncio.wait_for(page.socket.close(), 0.5)
 
     async def _certificate(self, request: web.Request) -> web.StreamResponse:
-        """What a phone installs to trust the page; a text if that is not here."""
+        """The certificate that a phone installs to trust the page; a hint if an authority issued it."""
         if self._options.certificate is not None:
             return web.Response(text="the certificate of this page is from an authority: install that one, ca.pem\n")
         trusted = (own_folder() / CERTIFICATE).read_bytes()
@@ -133,7 +133,7 @@ class PageServer:
                 if message.type is not WSMsgType.TEXT:
                     self._refuse(page, "not text")
                 else:
-                    await self._take(page, message.data)
+                    await self._handle(page, message.data)
                 if page.refused >= _MOST_REFUSED:
                     break
         finally:
@@ -143,8 +143,8 @@ class PageServer:
             await socket.close()
         return socket
 
-    async def _take(self, page: _Page, text: str) -> None:
-        """Follow a message of a page."""
+    async def _handle(self, page: _Page, text: str) -> None:
+        """Handle a message of a page."""
         page.heard_s = time.monotonic()
         try:
             message = decode(text)
@@ -162,8 +162,8 @@ class PageServer:
             case Hands():
                 if page is self._control:
                     self.exchange.put(message, page.delays.late_s(message.time_s, page.heard_s))
-                # The page measures the round trip by it, and notices a network that is gone. It may have sent this
-                # before it learned that it has lost control.
+                # The page measures the round trip by the echo, and notices a lost network. A page that has just lost
+                # control needs it, too.
                 await page.socket.send_str(f'{{"type":"echo","n":{message.number}}}')
             case Press(event):
                 if page is self._control:
@@ -184,7 +184,7 @@ class PageServer:
         if camera >= len(names):
             self._refuse(page, f"camera: must be below {len(names)}")
             return
-        page.waits.discard(names[camera])
+        page.unacknowledged.discard(names[camera])
 
     def _refuse(self, page: _Page, reason: str) -> None:
         page.refused += 1
@@ -203,27 +203,27 @@ class PageServer:
             self._control = None
             self.exchange.put(Hands(0, 0.0, 0.0, {}), 0.0)
 
-    async def _tell_for_ever(self) -> None:
-        """Send the state to all pages."""
+    async def _send_states(self) -> None:
+        """Send the state to all pages, periodically."""
         while True:
             began_s = time.monotonic()
             await asyncio.sleep(_STATE_S)
             now_s = time.monotonic()
             if self._control is not None:
-                # While this thread pauses, a page that has just opened does not learn that it may send.
+                # A pause of this thread does not count as the page's silence.
                 self._control.heard_s += max(0.0, now_s - began_s - _STATE_S)
                 if now_s - self._control.heard_s > _SILENT_S:
                     self._release(self._control)
             if self._images is not None and not self._pages:
-                self._images.refresh()  # so that a page that opens has no old image
+                self._images.refresh()  # so that a page does not open with an old image
             if self._status is not None and (received := self._status.get()) is not None:
                 assert isinstance(received.message, RobotStatus)
                 self._robot = received.message
-            await asyncio.gather(*(self._tell(page) for page in self._pages if not page.socket.closed))
+            await asyncio.gather(*(self._send_state(page) for page in self._pages if not page.socket.closed))
 
-    async def _tell(self, page: _Page) -> None:
+    async def _send_state(self, page: _Page) -> None:
         with contextlib.suppress(OSError, RuntimeError, asyncio.TimeoutError):
-            # A page that does not read gets no more than its socket holds; its heartbeat ends it.
+            # A page that stops reading must not delay the others; its heartbeat disconnects it.
             await asyncio.wait_for(page.socket.send_str(json.dumps(self._state(page))), _STATE_S)
 
     def _state(self, page: _Page) -> Mapping[str, Any]:
@@ -245,15 +245,15 @@ class PageServer:
         }
 
     async def _send_images(self, page: _Page) -> None:
-        """Send a page each camera's newest image when it has shown the one before."""
+        """Send each camera's newest image, after the page acknowledges the previous one."""
         images = self._images
         while images is not None and not page.socket.closed:
             await asyncio.sleep(1 / self._options.image_rate)
             images.refresh()
             for index, name in enumerate(images.names):
                 number, data = images.newest.get(name, (0, b""))
-                if number > page.shown.get(name, 0) and name not in page.waits:
-                    page.shown[name] = number
-                    page.waits.add(name)
+                if number > page.sent.get(name, 0) and name not in page.unacknowledged:
+                    page.sent[name] = number
+                    page.unacknowledged.add(name)
                     with contextlib.suppress(OSError, RuntimeError):
                         await page.socket.send_bytes(bytes([min(index, 255)]) + data)

@@ -35,31 +35,31 @@ def _key(options: WebxrOptions, ctx: Context) -> tuple[int, str, int]:
 
 
 def open_page(options: WebxrOptions, ctx: Context) -> PageServer:
-    """The page of a device, which is served from its first device on; prints its address and QR code then.
+    """Open the page for a device. The first device starts it, and prints its address and QR code.
 
     Raises:
-        TeleopError: if it cannot be served, or another device with this address has other options of the page.
+        TeleopError: if it cannot be served, or its options differ from those of another device with this address.
     """
     with _lock:
         shared = _open.get(_key(options, ctx))
         if shared is None:
             server = PageServer(options, ctx.clock, ctx.bus, ctx.log)
             shared = _open[_key(options, ctx)] = _Shared(server, options, ctx.name)
-            # Not to the log: the address has the token.
+            # Not logged: the address contains the token.
             echo(f"{ctx.name}: open this page on the phone or headset:\n{qr_code(server.address)}", err=True)
             echo(server.address, err=True)
         for name in _SHARED:
             if attrs.asdict(options)[name] != attrs.asdict(shared.options)[name]:
                 raise TeleopError(
-                    f"{ctx.name}: shares the page on port {options.port} with {shared.device}, so that both need the "
-                    f"same {name}; or give it another port"
+                    f"{ctx.name}: shares the page on port {options.port} with {shared.device}: give both the same "
+                    f"{name}, or different ports"
                 )
         shared.users += 1
         return shared.server
 
 
 def close_page(options: WebxrOptions, ctx: Context) -> None:
-    """Leave the page of a device; the last device closes it."""
+    """Close the page for a device; the last device stops it."""
     with _lock:
         shared = _open[_key(options, ctx)]
         shared.users -= 1

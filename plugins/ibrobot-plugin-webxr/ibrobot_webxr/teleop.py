@@ -29,21 +29,20 @@ from ibrobot_webxr.shared import close_page, open_page
 _LONGEST_STEP_S = 0.1
 """Longest motion of the gripper in one command [s]: after a pause of the host it does not jump."""
 _LATE = 0.6
-"""Share of the timeout from which on the arm slows down, before it holds."""
+"""Share of the timeout after which the arm slows down; after all of it, it holds."""
 _STOP_S = 0.045
-"""Speeds of joints are such that their highest acceleration stops them in this time [s]. Then the arm stands 0.1 s
-after the last pose."""
+"""Joint speeds are limited so that joints can stop within this time [s]: the arm stands 0.1 s after the last pose."""
 _LEAD_M, _LEAD_RAD = 0.1, 0.5
-"""How far the hand may be ahead of a tool that cannot follow. Beyond it the hand slips, so that a hand that returns
-moves the tool soon."""
+"""How far the hand may be ahead of a tool that cannot follow. Beyond it the hand slips, so that the tool
+follows at once when the hand returns."""
 _BRAKING, _TURN_BRAKING = 2.0, 10.0
 """Deceleration of the tool towards the pose of the hand [m/s² and rad/s²]."""
 _ARRIVED = 1e-5, 1e-4
-"""Distance from the pose of the hand at which the tool is there [m and rad]."""
+"""Distance from the pose of the hand that counts as arrived [m and rad]."""
 _TRIGGER = 0.1
-"""Movement of a trigger from which on it moves the gripper."""
+"""The gripper moves once the trigger has moved this far."""
 _FULL = 6
-"""Joints that an arm needs for any pose. One with fewer gives way about the tip's x axis, its heading."""
+"""Joints that an arm needs to reach any pose. With fewer, rotation about the tip's x axis is left free."""
 
 
 class WebxrTeleop(Teleop):
@@ -73,7 +72,7 @@ class WebxrTeleop(Teleop):
         self._engaged: str | None = None
         """The hand that moves the robot."""
         self._setpoint: Vector | None = None
-        """The last setpoints of the own joints [rad], in the order of `_joints`."""
+        """The last setpoints [rad], in the order of `_joints`."""
         self._stamp_ns = 0
 
     @override
@@ -87,7 +86,7 @@ class WebxrTeleop(Teleop):
     @override
     def activate(self, measured: JointReading) -> None:
         if self._page is not None and self._inbox is not None:
-            # Discards what was pressed before. The server sends an emergency stop to control by itself.
+            # Discard what was pressed before. The server itself passes an emergency stop to control.
             self._inbox.drain()
             self._page.exchange.take_events()
         self._restart()
@@ -108,7 +107,7 @@ class WebxrTeleop(Teleop):
             self._engaged = None
         if stop:
             self._clutches = {hand: _Clutch(self._options.timeout) for hand in self._hands}
-        exchange.report(self._hands, self._ctx.name, self._engaged, self._why())
+        exchange.report(self._hands, self._ctx.name, self._engaged, self._hint())
         if self._setpoint is None or stop:
             return TeleopCommand(None, estop=stop, events=events)
         dt = min(max(seconds(measured.stamp_ns - self._stamp_ns), 0.0), _LONGEST_STEP_S)
@@ -141,7 +140,7 @@ class WebxrTeleop(Teleop):
         return f"page for a phone or headset: {where}\nhold the clutch to move; the page has the other controls"
 
     def _take(self, hand: str, sample: Sample, now_ns: int, here: Vector) -> None:
-        """Follow a sample of a hand."""
+        """Process a sample of a hand."""
         clutch = self._clutches[hand]
         presses = clutch.take(sample, now_ns)
         if sample.pose is not None:
@@ -158,7 +157,7 @@ class WebxrTeleop(Teleop):
         assert sample.pose is not None
         count = len(self._tool.joints)
         before = here if self._setpoint is None else self._setpoint
-        # The robot holds its last setpoint, from which it sags a little: starting from there moves nothing.
+        # The robot sags a little from its last setpoint: starting from the setpoint causes no jump.
         moved = np.abs(before[:count] - here[:count]).max(initial=0.0) > self._options.follow
         arm = here[:count] if moved else before[:count]
         gripper = self._gripper.engage(before[count:], here[count:], sample.pose.gripper)
@@ -166,8 +165,8 @@ class WebxrTeleop(Teleop):
         self._setpoint = np.concatenate([arm, gripper])
         self._engaged = hand
 
-    def _why(self) -> str:
-        """What the operator should know."""
+    def _hint(self) -> str:
+        """A hint for the operator; empty if there is nothing to do."""
         if self._engaged is not None:
             return ""
         tracked = [clutch for clutch in self._clutches.values() if not clutch.is_lost]
@@ -193,7 +192,7 @@ class _Clutch:
         self.is_lost = True
 
     def take(self, sample: Sample, now_ns: int) -> bool:
-        """Follow a sample; returns whether the clutch is pressed by it. A hand that is not tracked says nothing."""
+        """Take a sample; returns whether it presses the clutch. Samples without a tracked hand are ignored."""
         if sample.pose is None or sample.age_s(now_ns) > self._timeout_s:
             return False
         if self.sample is not None and (sample.made_ns - self.sample.made_ns) * 1e-9 > self._timeout_s:
@@ -204,7 +203,7 @@ class _Clutch:
         return self.holds(now_ns) and not before
 
     def holds(self, now_ns: int) -> bool:
-        """Whether it is held, by a sample that is new enough."""
+        """Whether a recent sample has it held."""
         self.is_lost = self.sample is None or self.sample.age_s(now_ns) > self._timeout_s
         if self.is_lost:
             self._deadman.disarm(now_ns)
@@ -223,7 +222,7 @@ class _Clutch:
 
 
 class _Tool:
-    """The arm, whose tool goes where the hand has moved it.
+    """The arm: its tool follows the hand.
 
     Args:
         options: speeds and filter.
@@ -242,7 +241,7 @@ class _Tool:
         self._servo: Servo | None = None
         self._is_full = True
         self._origin: TipPose | None = None
-        """Where the tool was when the clutch engaged; it slips where the tool cannot follow."""
+        """Pose of the tool when the clutch engaged, adjusted when the tool cannot follow the hand."""
         self.joints = joints
         self.motion = HandMotion(options)
 
@@ -265,7 +264,7 @@ class _Tool:
         self._servo = Servo(model, max_velocity, max_acceleration)
 
     def engage(self, position: Vector, sample: Sample) -> None:
-        """Stand at positions of the joints [rad], with the hand at a sample."""
+        """Start at positions of the joints [rad], with the hand at a sample."""
         assert self._servo is not None
         assert sample.pose is not None
         self._servo.reset(position)
@@ -333,7 +332,7 @@ class _Gripper:
         self._speed = np.minimum(options.gripper_speed, robot.max_velocity[indices])
         self._setpoint = np.zeros(len(joints))
         self._rest: float | None = None
-        """Trigger when the clutch engaged, until it moves: an object in the gripper stays there."""
+        """Trigger when the clutch engaged, until it moves: the gripper does not drop its object."""
 
     def engage(self, before: Vector, here: Vector, trigger: float | None) -> Vector:
         """Start from the last setpoints, which squeeze an object, or from the measured positions [rad]."""
@@ -365,7 +364,7 @@ def _shortened(vector: Vector, most: float) -> Vector:
 
 
 def _approach(way: Vector, time_s: float, speed: float, braking: float) -> Vector:
-    """Velocity towards a place that is `way` off: exponential when near, and able to brake in time when far."""
+    """Velocity along `way` to its end: exponential when near, and slow enough to brake when far."""
     length = float(np.linalg.norm(way))
     if length == 0:
         return way

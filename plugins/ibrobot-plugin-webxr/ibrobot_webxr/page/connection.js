@@ -1,7 +1,7 @@
 // The WebSocket to the robot: sends poses, and receives states and images. It connects again by itself.
 
 const RETRY_MS = 500;
-const SILENT_MS = 300; // without an answer for that long the network counts as gone
+const SILENT_MS = 300; // without an answer for this long, the network counts as lost
 
 export class Connection {
   constructor({ onState, onImage, onLink }) {
@@ -39,7 +39,7 @@ export class Connection {
       const now = performance.now();
       this.roundTrips = [...this.roundTrips.slice(-59), now - this.sentAt.get(message.n)];
       this.answers = [...this.answers.slice(-59), now];
-      // Answers come in order: one that did not come before this one never will.
+      // Answers arrive in order: earlier ones that are missing are lost.
       for (const n of this.sentAt.keys()) if (n <= message.n) this.sentAt.delete(n);
     } else if (message.type === "state") {
       this.inControl = message.control === "you";
@@ -48,7 +48,7 @@ export class Connection {
   }
 
   send(message) {
-    // What the network does not take now would arrive late: a pose is worth nothing then.
+    // Skip poses while the network is congested: a late pose is worthless.
     if (this.socket.readyState === WebSocket.OPEN && (message.type !== "hands" || this.socket.bufferedAmount < 4096)) {
       this.socket.send(JSON.stringify(message));
       return true;

@@ -49,7 +49,7 @@ export class Headset {
     this.session?.end();
   }
 
-  // Whether the session shows the page's own buttons, as a phone does, and a headset does not.
+  // Whether the session overlays the page's buttons: phones do, headsets do not.
   get isPhone() {
     return this.session?.interactionMode === "screen-space";
   }

@@ -6,12 +6,12 @@ import { Headset, supportedMode } from "/static/headset.js";
 import { Phone } from "/static/phone.js";
 
 const IDLE_MS = 200;
-const REFUSED_MS = 3000; // a socket that does not open for that long needs a remedy
+const REFUSED_MS = 3000; // after failing to connect for this long, the page suggests a remedy
 const $ = (id) => document.getElementById(id);
 const figures = [];
 let state = null;
 let failure = "";
-let refusedSince = performance.now(); // the socket has never been open since then; null once it has
+let refusedSince = performance.now(); // null once the socket has been open
 
 const controls = new Controls(document);
 const connection = new Connection({ onState, onImage, onLink });
@@ -86,7 +86,7 @@ async function run(start) {
   failure = "";
   try {
     await start();
-    connection.send({ type: "claim" }); // a start can last longer than a silent page keeps control
+    connection.send({ type: "claim" }); // a silent page may have lost control during a long start
     $("controls").hidden = Boolean(headset.session) && !headset.isPhone;
     await navigator.wakeLock?.request("screen").catch(() => {});
   } catch (error) {
@@ -120,7 +120,7 @@ supportedMode().then((mode) => {
   }));
 });
 
-// Without poses to send, the page still says that it is there; and that it holds nothing when it is left.
+// An idle page stays in control by empty messages. A page that is left reports that no hand is tracked.
 setInterval(() => {
   if (!headset.session && !phone.running && document.visibilityState === "visible") connection.sendHands({}, 0);
 }, IDLE_MS);

@@ -15,7 +15,7 @@ export class Phone {
     this.last = 0;
   }
 
-  // Called by a tap: iPhones ask for the permission only then.
+  // Call it from a tap: iPhones ask for permission only then.
   async start() {
     const asks = window.DeviceOrientationEvent?.requestPermission;
     if (asks && (await asks.call(window.DeviceOrientationEvent)) !== "granted") throw new Error("the sensors are not permitted");

@@ -40,7 +40,7 @@ export function fromDeviceOrientation(alpha, beta, gamma) {
 
 const STRAIGHT = 1.4, CURLED = 1.2;
 
-// How far the middle finger is bent, as a clutch: `held` until now, and the ratio of tip and knuckle to the wrist.
+// Bending the middle finger holds the clutch, with hysteresis: ratio of the distances of tip and knuckle from the wrist.
 export function curledClutch(held, wrist, knuckle, tip) {
   const ratio = distance(tip, wrist) / Math.max(distance(knuckle, wrist), 1e-3);
   return ratio < (held ? STRAIGHT : CURLED);

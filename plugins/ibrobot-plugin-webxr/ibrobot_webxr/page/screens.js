@@ -1,4 +1,4 @@
-// Camera images in a headset: rectangles that stand in front of where the operator looked at the start.
+// Camera images in a headset: rectangles in the direction in which the operator looked at the start.
 
 import { headingOf } from "/static/pose.js";
 
@@ -17,7 +17,7 @@ void main() { colour = vec4(texture(image, at).rgb, 1.0); }`;
 
 export class Screens {
   constructor() {
-    this.images = new Map(); // camera -> newest ImageBitmap that is no texture yet
+    this.images = new Map(); // camera -> newest ImageBitmap that is not uploaded yet
     this.textures = new Map();
   }
 
@@ -53,7 +53,7 @@ export class Screens {
     gl.bindFramebuffer(gl.FRAMEBUFFER, layer.framebuffer);
     gl.clearColor(0, 0, 0, session.environmentBlendMode === "opaque" ? 1 : 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    if (isPhone) return; // its page has them
+    if (isPhone) return; // the page shows them
     this.upload();
     this.placed ??= viewer.transform;
     gl.useProgram(this.program);
