@@ -40,7 +40,7 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
 
 
 def _subscribed(options: ZenohOptions) -> list[tuple[tuple[str | int, ...], str]]:
-    """The topics of other machines, each with its place in the options."""
+    """The topics of other machines, each with its key in the options."""
     topics = options.share.subscribe
     keys: Iterable[str | int] = topics if isinstance(topics, Mapping) else range(len(topics))
     return [(("share", "subscribe", key), topic) for key, topic in zip(keys, topics, strict=True)]

@@ -22,7 +22,7 @@ from ibrobot_zenoh.ros2 import ADMIN
 SERVICES, SERVED, TOPICS = "ibrobot/service", "ibrobot/served", "ibrobot/topic"
 """Keys are SERVICES/WHO/NAME for requests, SERVED/NAME/ID for tokens of servers, TOPICS/NAME for plain payloads."""
 ANYBODY = "anybody"
-"""Name of a sender without a proved name."""
+"""Name of a sender whose name is not verified."""
 
 _ALL = [
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
@@ -49,7 +49,7 @@ class Peers:
 def restrict(config: zenoh.Config, options: ZenohOptions) -> bool:
     """Add the access list to Zenoh's settings; returns whether the key of a request proves its sender.
 
-    It does not if names are not verified, or if the user's own settings have an access list.
+    It does not if names are not verified, or if the user's settings have their own access list.
 
     Raises:
         TransportError: if a file is missing or invalid, or a certificate has the wrong role.
@@ -82,7 +82,7 @@ def _by_certificate(tls: Tls, own: Identity) -> Peers:
 
 
 def _users(path: Path) -> tuple[str, ...]:
-    """The names in a users file, which must not be empty, because Zenoh then admits everyone."""
+    """The names in a users file. It must not be empty: Zenoh would admit everyone."""
     listed = []
     for number, line in enumerate(read_lines(path), 1):
         name, _, password = line.partition(":")
@@ -149,7 +149,7 @@ def _allow(flows: Sequence[str], messages: Iterable[str], keys: Sequence[str]) -
 
 
 def _hear(domain: int) -> list[dict[str, Any]]:
-    """Rules for receiving: every robot sees the servers, and the topics that others share."""
+    """Rules for receiving: every robot sees the servers and all shared topics."""
     # Wildcards do not match parts that begin with @, such as @adv of latched topics.
     shared = [f"{domain}/**", f"{domain}/**/@adv/**", f"{ADMIN}/{domain}/**"]
     return [
@@ -170,13 +170,13 @@ def _hear(domain: int) -> list[dict[str, Any]]:
 
 def _own(name: str, domain: int) -> list[dict[str, Any]]:
     """Rules for the keys below a robot's own name."""
-    topics, kept = f"{domain}/{name}/**", f"{domain}/{name}/**/@adv/**"
+    topics, latched = f"{domain}/{name}/**", f"{domain}/{name}/**/@adv/**"
     return [
         _allow(("ingress",), ["query"], [f"{SERVICES}/{name}/**"]),
         _allow(("egress",), ["reply"], [f"{SERVICES}/{name}/**"]),
-        _allow(("ingress",), ["put", "delete", "reply"], [topics, kept, f"{TOPICS}/{name}/**"]),
-        _allow(("ingress",), ["declare_queryable", "liveliness_token"], [kept]),
-        _allow(("egress",), ["query"], [topics, kept]),
+        _allow(("ingress",), ["put", "delete", "reply"], [topics, latched, f"{TOPICS}/{name}/**"]),
+        _allow(("ingress",), ["declare_queryable", "liveliness_token"], [latched]),
+        _allow(("egress",), ["query"], [topics, latched]),
         _allow(
             ("ingress",),
             ["liveliness_token"],

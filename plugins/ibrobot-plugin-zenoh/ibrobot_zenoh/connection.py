@@ -26,10 +26,10 @@ _BATCHES, _RECEIVED_AT_ONCE = 16, 256 << 10
 """Number of 64 kB buffers of a large message in front of the socket, and the size of a read [bytes].
 
 With Zenoh's defaults, two and 64 kB, its threads wake one another for every piece of a camera image, which takes a
-quarter of a request's time.
+quarter of the time of a request.
 """
 _ACCEPT_MS, _ACCEPTED = 3000, 4000
-"""How long a new connection may take to say who it is [ms], and how many may do so at a time."""
+"""How long a new connection may take to authenticate [ms], and how many may do so at once."""
 _CLOSE_WAIT_S = 1.0
 """How long `close` waits for an attempt to connect, which cannot be interrupted [s]."""
 _ASK_WHY_S = 2.0
@@ -38,7 +38,7 @@ _FIRST_WAIT_S = 0.3
 """How long the constructor of a client waits for a peer to answer, so that it is usable at once [s]."""
 
 _LARGEST_KEPT, _KEPT_BYTES = 32 << 20, 256 << 20
-"""Freed memory for glibc to keep [bytes], because mapping it for each large message costs more than the copies."""
+"""Freed memory for glibc to keep [bytes]: mapping it for each large message costs more than the copies."""
 
 
 class Declared(Protocol):
@@ -119,10 +119,10 @@ def open_connections() -> list[Connection]:
 
 @cache
 def _close_at_the_end() -> None:
-    """Register a handler, once, that closes open sessions when the main thread ends, so that the process ends.
+    """Start a thread, once, that closes open sessions when the main thread ends, so that the process ends.
 
-    The interpreter waits for Zenoh's callback threads, which wait for the end of their session, and for this thread: a
-    daemon would be killed while it closes one, which aborts the process.
+    Otherwise the interpreter waits for ever for Zenoh's callback threads, which wait for the end of their session. The
+    thread is no daemon: killed while it closes a session, it would abort the process.
     """
 
     def close_all() -> None:
@@ -134,7 +134,7 @@ def _close_at_the_end() -> None:
 
 
 class Connection:
-    """A Zenoh session. A peer or router has it at once; a client keeps trying until the other side answers.
+    """A Zenoh session. A peer or router opens it at once; a client keeps trying until the other side answers.
 
     After that, Zenoh itself reconnects and restores declarations.
 

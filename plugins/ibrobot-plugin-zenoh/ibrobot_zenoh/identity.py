@@ -18,9 +18,9 @@ class Role(Enum):
     """Role of a machine in its certificate."""
 
     SERVER = "server"
-    """Others may connect to it; it answers requests."""
+    """Answers requests; others may connect to it."""
     ROBOT = "robot"
-    """It only connects: it asks servers, and publishes in its own name."""
+    """Only connects: it asks servers, and publishes in its own name."""
 
 
 @attrs.frozen
@@ -69,9 +69,9 @@ def identity_in(certificate: Path) -> Identity:
     Raises:
         TransportError: if the certificate has no role.
     """
-    found = x509.load_pem_x509_certificate(certificate.read_bytes()).subject
-    names = found.get_attributes_for_oid(NameOID.COMMON_NAME)
-    roles = found.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
+    owner = x509.load_pem_x509_certificate(certificate.read_bytes()).subject
+    names = owner.get_attributes_for_oid(NameOID.COMMON_NAME)
+    roles = owner.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
     if len(names) != 1 or len(roles) != 1 or roles[0].value not in {role.value for role in Role}:
         raise TransportError(
             f"{certificate}: has no role (server or robot), so the permissions of its machine are unknown; replace the "

@@ -41,7 +41,7 @@ def check_robot_name(name: str) -> None:
 
 
 def is_local(endpoint: str) -> bool:
-    """Whether only this machine can reach an endpoint to listen on."""
+    """Whether only this machine can reach an endpoint."""
     protocol, _, address = endpoint.partition("/")
     if protocol == "unixsock-stream":
         return True
@@ -59,11 +59,11 @@ def server_options(endpoints: Sequence[str]) -> dict[str, Any]:
 
 def _check_endpoints(instance: object, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
     for endpoint in value:
-        found = _ENDPOINT.fullmatch(endpoint)
-        if found is None:
+        match = _ENDPOINT.fullmatch(endpoint)
+        if match is None:
             raise ValueError(f"{endpoint!r} is not an endpoint; use PROTOCOL/HOST:PORT, e.g. tcp/127.0.0.1:7447")
-        port = found["address"].rpartition(":")[2].partition("#")[0]
-        if found["protocol"] != "unixsock-stream" and not port.isdecimal():
+        port = match["address"].rpartition(":")[2].partition("#")[0]
+        if match["protocol"] != "unixsock-stream" and not port.isdecimal():
             raise ValueError(f"{endpoint!r} has no port; use PROTOCOL/HOST:PORT, e.g. {endpoint}:7447")
 
 
@@ -78,12 +78,12 @@ class Tls:
     robots: Path | None = option(None, help="to listen: a file of admitted robots, one name per line")
 
 
-def _check_name(what: str, name: str, given: tuple[str, ...]) -> None:
+def _check_name(what: str, name: str, names: tuple[str, ...]) -> None:
     if not name.startswith("/"):
         raise ValueError(f"{name!r} is not a full {what}, did you mean '/{name}'?")
     if not _NAME.fullmatch(name):
         raise ValueError(f"{name!r} is not a {what}: it has letters, digits and _ between slashes, and no wildcards")
-    if given.count(name) > 1:
+    if names.count(name) > 1:
         raise ValueError(f"{name} is listed twice")
 
 
@@ -115,18 +115,18 @@ class Share:
     """Topics and services shared with other machines."""
 
     publish: tuple[str, ...] = option(
-        (), validator=_check_topics, help="topics of this robot for others, e.g. /joint_states"
+        (), validator=_check_topics, help="topics of this robot to send, e.g. /joint_states"
     )
     subscribe: tuple[str, ...] | Mapping[str, str] = option(
         (),
         validator=_check_subscribed,
-        help="topics of other machines for this robot's bus, e.g. [/force_torque]; {/lamp: std_msgs/msg/Bool} states "
-        "the type of a topic that nothing else in this file states",
+        help="topics of other machines to receive, e.g. [/force_torque]; {/lamp: std_msgs/msg/Bool} declares the type "
+        "of a topic that nothing else in this file declares",
     )
     services: tuple[str, ...] = option(
         (),
         validator=_check_services,
-        help="services of this robot that others may call, e.g. /planning/go_to; /world/ stands for all that begin so",
+        help="services of this robot that others may call, e.g. /planning/go_to; /world/ means all that begin with it",
     )
 
     def __attrs_post_init__(self) -> None:

@@ -10,7 +10,7 @@ from ibrobot_zenoh.connection import Connection, open_connections
 
 
 def peer_rows(session: RunView) -> list[tuple[str, ...]]:
-    """One row for each peer; for a connection without peers, one with where it listens or why it has none."""
+    """One row for each peer. A connection without peers has one row, with its addresses or why it is not connected."""
     return [row for connection in open_connections() for row in _rows(connection)]
 
 

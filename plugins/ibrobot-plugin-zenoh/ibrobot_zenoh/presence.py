@@ -27,14 +27,14 @@ class Presence:
         )
 
     def watch(self, name: str, changed: Callable[[bool], object]) -> tuple[Callable[[], None], Workers[bool]]:
-        """Returns a function that ends the watch, and the thread that calls `changed`; see `Transport.watch`."""
-        turn = threading.Lock()  # held until the present state is delivered, which must come first
+        """See `Transport.watch`; returns a function that ends the watch, and the thread that calls `changed`."""
+        turn = threading.Lock()  # the present state must be delivered before any change
 
-        def tell(served: bool) -> None:
+        def notify(served: bool) -> None:
             with turn:
                 changed(served)
 
-        watch = Workers(tell, f"a watch of {name}")
+        watch = Workers(notify, f"a watch of {name}")
         with turn:
             with self._lock:
                 served = bool(self._alive.get(name))

@@ -84,7 +84,7 @@ def type_of_key(key: str) -> str:
 
 
 def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
-    """The attachment of a message: its number from 1, time of sending [ns], and the publisher's id, 16 bytes."""
+    """The attachment of a message: its number from 1, time of sending [ns], and the publisher's id (16 bytes)."""
     return _ATTACHMENT.pack(sequence, stamp_ns, len(gid), gid)
 
 
@@ -123,5 +123,5 @@ def topics_of_tokens(tokens: Iterable[str]) -> list[SharedTopic]:
                 counts[parts[9].replace("%", "/"), ros_type(parts[10]), parts[5]] += 1
             except TransportError:
                 continue
-    found = sorted({(name, type_name) for name, type_name, _ in counts})
-    return [SharedTopic(name, kind, counts[name, kind, "MP"], counts[name, kind, "MS"]) for name, kind in found]
+    topics = sorted({(name, type_name) for name, type_name, _ in counts})
+    return [SharedTopic(name, kind, counts[name, kind, "MP"], counts[name, kind, "MS"]) for name, kind in topics]

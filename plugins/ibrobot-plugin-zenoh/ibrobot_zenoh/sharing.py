@@ -26,11 +26,11 @@ _DEPTH = 10
 """Queue size of a topic for the network; when it is full, the bus drops and counts the oldest message."""
 
 _MOST_BYTES = 1 << 20
-"""Size of a call of a service, at most [bytes]."""
+"""Largest request to a service [bytes]."""
 _URGENT_BYTES = 1000
-"""Size of a call of an urgent service, at most [bytes]."""
+"""Largest request to an urgent service [bytes]."""
 _SILENT_NS = 5 * NS_PER_S
-"""A topic without a message for this long after the start is reported once [ns]."""
+"""A topic without a message for this long after the start is reported, once [ns]."""
 
 
 class TopicTransport(Transport):
@@ -61,9 +61,9 @@ class TopicTransport(Transport):
     def serve_with_urgent(
         self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool], largest: int
     ) -> Callable[[], None]:
-        """Like `serve`; urgent requests have a queue and threads of their own, which no other request delays.
+        """Like `serve`; urgent requests have their own queue and threads, so that no other request delays them.
 
-        Requests of more than `largest` bytes are refused at once, so that a flood of them fills no memory.
+        Requests of more than `largest` bytes are refused at once, so that they cannot fill the memory.
         """
 
     @property
@@ -110,20 +110,20 @@ class PublishedTopic(SessionWorker):
         super().__init__(session, f"share:{topic}", "to other machines", (link.name,))
         self._link = link
         self._topic = topic
-        self._waiting: Subscription | None = None
-        self._told = False
+        self._subscription: Subscription | None = None
+        self._reported = False
         self._silent_from_ns: int | None = None
 
     @override
     def setup(self) -> None:
         self._transport = _topics(self._link)
         self._silent_from_ns = self.session.clock.now_ns()
-        self._waiting = self.session.bus.subscribe(self._topic, _DEPTH)
+        self._subscription = self.session.bus.subscribe(self._topic, _DEPTH)
 
     @override
     def work(self, timeout_s: float) -> None:
-        assert self._waiting is not None
-        received = self._waiting.get(timeout_s)
+        assert self._subscription is not None
+        received = self._subscription.get(timeout_s)
         if received is not None:
             self._silent_from_ns = None
         elif self._silent_from_ns is not None and self.session.clock.now_ns() - self._silent_from_ns > _SILENT_NS:
@@ -132,20 +132,20 @@ class PublishedTopic(SessionWorker):
             self.session.log.warning("%s is not shared: it has no publisher so far%s", self._topic, known)
         while received is not None:
             self._send(received.message)
-            received = self._waiting.get()
+            received = self._subscription.get()
 
     def _send(self, message: Message) -> None:
         try:
             self._transport.publish_message(self._topic, message, latched=self._topic in self.session.bus.latched())
         except IbrobotError as error:
-            if not self._told:
-                self._told = True
+            if not self._reported:
+                self._reported = True
                 self.session.log.warning("%s is not shared: %s", self._topic, error)
 
     @override
     def teardown(self) -> None:
-        if self._waiting is not None:
-            self._waiting.close()
+        if self._subscription is not None:
+            self._subscription.close()
 
 
 class SubscribedTopics(Component):
@@ -166,8 +166,8 @@ class SubscribedTopics(Component):
         for topic in self._topics:
             if not bus.expected(topic):
                 self._session.log.warning(
-                    "transport.share.subscribe: nothing states the type of %s so far, so its first message does; "
-                    "{%s: TYPE} states it",
+                    "transport.share.subscribe: nothing declares the type of %s, so its first message will; "
+                    "{%s: TYPE} declares it",
                     topic,
                     topic,
                 )
@@ -197,7 +197,7 @@ class SubscribedTopics(Component):
 class SharedServices(Component):
     """Answers calls of the bus's services from other machines.
 
-    A name that ends with / stands for all services whose names begin with it. `/rosapi/services` lists the services,
+    A name that ends with / means all services whose names begin with it. `/rosapi/services` lists the services,
     and `/rosapi/service_request_details` describes one.
     """
 
@@ -221,14 +221,14 @@ class SharedServices(Component):
             end()
 
     def _is_urgent(self, payload: Payload) -> bool:
-        """Whether a request is for an urgent service; reads short ones only, as it delays all others."""
+        """Whether a request is for an urgent service. It delays all other requests, so only short ones are read."""
         if len(payload) > _URGENT_BYTES:
             return False
         try:
-            found = self._session.bus.services().get(decode_call(payload).service)
+            service = self._session.bus.services().get(decode_call(payload).service)
         except IbrobotError:
             return False
-        return found is not None and found.urgent
+        return service is not None and service.urgent
 
     def _answer(self, payload: Payload, sender: str | None) -> bytes:
         try:
@@ -251,20 +251,20 @@ class SharedServices(Component):
             return encode_answer(Answer("the service failed; the robot's log has the cause", result=False))
 
     def _details(self, name: str) -> dict[str, Any]:
-        """The declaration of a service that is served."""
-        found = self._session.bus.services().get(name)
-        if found is None:
+        """The declaration of a service, as JSON values."""
+        service = self._session.bus.services().get(name)
+        if service is None:
             raise NotSupported(f"nothing serves {name} at present; served are {', '.join(self._shared())}")
-        keys = {"request": found.request, "answer_keys": found.answer}
+        keys = {"request": service.request, "answer_keys": service.answer}
         tables = {
             name: [attrs.asdict(key) for key in described(kind)] if isinstance(kind, type) and attrs.has(kind) else []
             for name, kind in keys.items()
         }
-        return {"help": found.help, "alone": found.alone, "answer": type_name(found.answer), **tables}
+        return {"help": service.help, "alone": service.alone, "answer": type_name(service.answer), **tables}
 
     def _is_shared(self, service: str) -> bool:
         return any(service == name or (name.endswith("/") and service.startswith(name)) for name in self._names)
 
     def _shared(self) -> list[str]:
-        """The shared services that something serves at present."""
+        """The shared services that are served at present."""
         return [name for name in self._session.bus.services() if self._is_shared(name)]

@@ -25,7 +25,7 @@ DEPTH = 100
 """Queue size of a subscriber; when it is full, the oldest message is dropped."""
 _AGAIN_S = 0.02
 _LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
-"""Types of large messages, which smaller ones may overtake."""
+"""Types of large messages; smaller ones may overtake them."""
 
 
 class _Group:
@@ -161,7 +161,7 @@ class Topics:
             return publisher
 
     def subscribe(self, topic: str, callback: Callable[[Message], object]) -> tuple[Callable[[], None], Workers[Any]]:
-        """Returns a function that unsubscribes, and the thread that calls `callback`; see `TopicTransport`."""
+        """See `TopicTransport`; returns a function that unsubscribes, and the thread that calls `callback`."""
         name = absolute(topic, self.namespace)
         warn_once = _Once(self._log)
 
@@ -189,12 +189,12 @@ class Topics:
     def shared(self, timeout_s: float) -> list[SharedTopic]:
         """See `TopicTransport.shared_topics`."""
         deadline = time.monotonic() + timeout_s
-        found, before = self._tokens(timeout_s), None
+        tokens, before = self._tokens(timeout_s), None
         # The first answer after connecting may arrive before the other side has sent all its tokens.
-        while found != before and time.monotonic() + _AGAIN_S < deadline:
+        while tokens != before and time.monotonic() + _AGAIN_S < deadline:
             time.sleep(_AGAIN_S)
-            found, before = self._tokens(timeout_s), found
-        return topics_of_tokens(found)
+            tokens, before = self._tokens(timeout_s), tokens
+        return topics_of_tokens(tokens)
 
     def _tokens(self, timeout_s: float) -> set[str]:
         replies = self.connection.session().liveliness().get(f"{ADMIN}/{self.options.domain}/**", timeout=timeout_s)

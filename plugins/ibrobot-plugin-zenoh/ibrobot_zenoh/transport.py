@@ -45,7 +45,7 @@ def _key(prefix: str, name: str) -> zenoh.KeyExpr:
 
 
 def _sendable(payload: Payload) -> bytes | bytearray:
-    """A payload in a type that Zenoh accepts, which excludes views."""
+    """A payload in a type that Zenoh accepts: it takes no views."""
     if not isinstance(payload, memoryview):
         return payload
     whole = payload.obj
@@ -82,7 +82,7 @@ class ZenohTransport(TopicTransport):
         key = _key(TOPICS, topic)
         session = self._connection.open_session
         if session is not None:  # without a session there are no subscribers
-            # This may wait for the link but never for a subscriber, because subscribers have queues.
+            # May wait for the link, but never for a subscriber, as these have queues.
             try:
                 session.put(key, _sendable(payload), congestion_control=zenoh.CongestionControl.BLOCK)
             except zenoh.ZError as error:
@@ -123,14 +123,14 @@ class ZenohTransport(TopicTransport):
                     request = query.payload
                     reply = handler(request.to_bytes() if request is not None else b"", self._sender(query))
                     self._check_size(len(reply), name)
-                except Exception as error:  # noqa: BLE001 - it is the requester's to see
+                except Exception as error:  # noqa: BLE001 - passed to the requester
                     query.reply_err(f"{type(error).__name__}: {error}", encoding=_FAILED)
                 else:
                     query.reply(query.key_expr, _sendable(reply), express=True)
 
         server = Workers(answer, f"the server of {name}", workers, REQUESTS_WAITING)
 
-        # Its queue is long, as a request that waits long in it is followed by as many like it.
+        # A long queue: urgent requests must not be dropped.
         urgent = Workers(answer, f"the urgent requests of {name}", _URGENT_WORKERS, URGENT_WAITING)
 
         def take(query: zenoh.Query) -> None:
@@ -140,11 +140,11 @@ class ZenohTransport(TopicTransport):
                 with query:
                     query.reply_err(f"a request of {size} bytes, at most {largest} are read", encoding=_FAILED)
                 return
-            first = is_urgent(payload.to_bytes() if payload is not None else b"")
-            turned_away = (urgent if first else server).put(query)
-            if turned_away is not None:
-                with turned_away:
-                    turned_away.reply_err("it is overloaded, or about to end", encoding=_FAILED)
+            workers = urgent if is_urgent(payload.to_bytes() if payload is not None else b"") else server
+            rejected = workers.put(query)
+            if rejected is not None:
+                with rejected:
+                    rejected.reply_err("it is overloaded, or about to end", encoding=_FAILED)
 
         with self._lock:
             if name in self._served:
@@ -223,7 +223,7 @@ class ZenohTransport(TopicTransport):
         return self._connection.why_not
 
     def is_heard(self, topic: str, type_name: str, timeout_s: float) -> bool:
-        """Whether a topic and type has a subscriber; waits for one up to `timeout_s` [s]."""
+        """Whether a topic of a type has a subscriber; waits up to `timeout_s` [s] for one."""
         return self._topics.is_heard(topic, type_name, timeout_s)
 
     @override
@@ -252,12 +252,10 @@ class ZenohTransport(TopicTransport):
         return end
 
     def _sender(self, query: zenoh.Query) -> str | None:
-        """The sender of a request, which the access list allows to use only keys of its own name."""
-        return (
-            str(query.key_expr).removeprefix(f"{SERVICES}/").partition("/")[0]
-            if self._connection.knows_who_asks
-            else None
-        )
+        """The sender of a request, from its key: the access list permits only keys of the own name."""
+        if not self._connection.knows_who_asks:
+            return None
+        return str(query.key_expr).removeprefix(f"{SERVICES}/").partition("/")[0]
 
     def _check_size(self, size: int, name: str) -> None:
         if size > self._largest:

@@ -47,14 +47,14 @@ class Workers[T]:
             if self._ended:
                 return item
             full = self._depth is not None and len(self._waiting) >= self._depth
-            gave_way = self._waiting.popleft() if full else None
+            dropped = self._waiting.popleft() if full else None
             self._waiting.append(item)
             if len(self._waiting) > self._idle and len(self._threads) < self._count:
                 thread = threading.Thread(target=self._run, name=self._name, daemon=True)
                 self._threads.append(thread)
                 thread.start()
             self._arrived.notify()
-        return gave_way
+        return dropped
 
     def end(self) -> None:
         """Stop processing. Waits briefly for running items, unless called from one of them."""
@@ -78,6 +78,6 @@ class Workers[T]:
                 item = self._waiting.popleft()
             try:
                 self._work(item)
-            except Exception:  # noqa: BLE001 - contained: one item's fault must not reach the others
+            except Exception:  # noqa: BLE001 - one item's fault must not affect the others
                 _log.exception("%s failed", self._name)
             del item  # it may hold memory, or a caller may wait for its end

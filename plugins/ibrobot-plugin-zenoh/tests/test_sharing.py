@@ -111,7 +111,7 @@ def test_a_wrong_first_message_keeps_no_right_one_out(runs: Runs, network: None,
     made().callbacks["/lamp"](Bool(True))
     assert [item.message for item in seen.drain()] == [Bool(True)]
     assert "from another machine: topic /lamp carries std_msgs/msg/Bool, not std_msgs/msg/String" in caplog.text
-    assert "nothing states the type" not in caplog.text
+    assert "nothing declares the type" not in caplog.text
     runtime.stop()
 
 
@@ -124,7 +124,7 @@ def test_the_contract_states_types_before_anything_is_published(runs: Runs):
 
 def test_a_topic_of_unknown_type_is_named(runs: Runs, network: None, caplog: pytest.LogCaptureFixture):
     runtime = runs.start("transport={type: network, share: {subscribe: [/lamp]}}", lockstep=False)
-    assert "nothing states the type of /lamp so far, so its first message does; {/lamp: TYPE} states it" in caplog.text
+    assert "nothing declares the type of /lamp, so its first message will; {/lamp: TYPE} declares it" in caplog.text
     runtime.stop()
 
 

@@ -1,1 +1,1 @@
-"""The commands `ibrobot topic …` and `ibrobot certs`."""
+"""The commands `ibrobot topic …`, `ibrobot service …` and `ibrobot certs`."""

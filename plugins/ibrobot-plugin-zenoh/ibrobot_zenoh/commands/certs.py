@@ -62,16 +62,16 @@ def certs(out_dir: Path, servers: tuple[str, ...], robots: tuple[str, ...], days
     endpoint = f'"tls/[{server}]:{_PORT}"' if ":" in server else f"tls/{server}:{_PORT}"
     for name, folder in zip(machines, made, strict=True):
         if name in hosts:
-            _tell(folder, "mode: router", f"listen: [tls/0.0.0.0:{_PORT}]", files={**_FILES, "robots": ROBOTS})
+            _print_yaml(folder, "mode: router", f"listen: [tls/0.0.0.0:{_PORT}]", files={**_FILES, "robots": ROBOTS})
         else:
-            _tell(folder, f"connect: [{endpoint}]", files=_FILES)
+            _print_yaml(folder, f"connect: [{endpoint}]", files=_FILES)
     for path in lists:
         if robots and path.parent.name not in hosts:
             echo(f"\n# {path.parent.name}: copy {path} there again and restart it to admit the robot")
 
 
-def _tell(folder: Path, *lines: str, files: dict[str, str]) -> None:
-    """Print the YAML of a machine."""
+def _print_yaml(folder: Path, *lines: str, files: dict[str, str]) -> None:
+    """Print a machine's YAML."""
     echo(f"\n# {folder.name}: copy {folder}/ there, beside its YAML, which says:\ntransport:\n  type: zenoh")
     for line in lines:
         echo(f"  {line}")

@@ -17,7 +17,7 @@ from ibrobot_zenoh.transport import ZenohTransport
 _CONNECT_S = 3.0
 """How long a command waits for the other side [s]."""
 _EVERYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
-"""Addresses to reach, from this machine, a server that listens on all addresses."""
+"""All addresses to listen on -> the one to reach such a server from this machine."""
 
 
 def network_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -49,11 +49,11 @@ def options_from(config: str | None, endpoints: tuple[str, ...], domain: int | N
             raise click.UsageError(f"--endpoint: {reason}") from None
     from ibrobot_core.app import find_config, installed_plugins, load_config
 
-    found = load_config(find_config(config, installed_plugins()), communicates=True)
-    if found.transport is None or not isinstance(found.transport.options, ZenohOptions):
-        kind = "no transport" if found.transport is None else f"transport {found.transport.type}"
-        raise NotSupported(f"{found.source}: has {kind}; topics are shared by transport: {{type: zenoh, …}}")
-    options = found.transport.options
+    robot = load_config(find_config(config, installed_plugins()), communicates=True)
+    if robot.transport is None or not isinstance(robot.transport.options, ZenohOptions):
+        kind = "no transport" if robot.transport is None else f"transport {robot.transport.type}"
+        raise NotSupported(f"{robot.source}: has {kind}; topics are shared by transport: {{type: zenoh, …}}")
+    options = robot.transport.options
     connect = endpoints or options.connect or tuple(_here(endpoint) for endpoint in options.listen)
     return attrs.evolve(options, mode="client", connect=connect, listen=(), users=None, namespace="", **changes)
 

@@ -75,7 +75,7 @@ def _key_line(key: Mapping[str, Any]) -> str:
 @click.argument("name", metavar="SERVICE")
 @click.argument("request", default="null")
 @click.option("--timeout", default=60.0, show_default=True, type=click.FloatRange(0.01), help="Longest wait [s].")
-@click.option("--text", is_flag=True, help="Send REQUEST as it is, as text.")
+@click.option("--text", is_flag=True, help="Send REQUEST as text, unparsed.")
 def call(transport: ZenohTransport, namespace: str, name: str, request: str, timeout: float, text: bool) -> None:
     """Call SERVICE with REQUEST, as YAML, and print the answer.
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import queue
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from itertools import pairwise
 from typing import Any
 
@@ -28,19 +29,12 @@ def topic() -> None:
     """List, show, measure and publish topics that robots and ROS 2 nodes share over the network."""
 
 
-@contextmanager
-def _until_interrupted() -> Iterator[None]:
-    """A context that Ctrl-C ends without an error."""
-    with suppress(KeyboardInterrupt):
-        yield
-
-
 def _command(function: Callable[..., None]) -> click.Command:
     """Make a command of `topic` whose function receives a connected transport."""
 
     @functools.wraps(function)
     def run(config: str | None, endpoints: tuple[str, ...], domain: int | None, **arguments: Any) -> None:
-        with _until_interrupted(), connected(config, endpoints, domain) as transport:
+        with suppress(KeyboardInterrupt), connected(config, endpoints, domain) as transport:
             function(transport, **arguments)
 
     return topic.command(function.__name__.rstrip("_"))(network_options(run))
@@ -53,9 +47,9 @@ def list_(transport: ZenohTransport, types: bool) -> None:
     shared = transport.shared_topics(_LIST_S)
     if not shared:
         echo("no topics are shared", err=True)
-    for found in shared:
-        counts = f"  {found.type}  published by {found.publishers}, heard by {found.subscribers} ROS 2 nodes"
-        echo(f"{found.name}{counts if types else ''}")
+    for each in shared:
+        counts = f"  {each.type}  published by {each.publishers}, heard by {each.subscribers} ROS 2 nodes"
+        echo(f"{each.name}{counts if types else ''}")
 
 
 @_command
@@ -110,7 +104,7 @@ def pub(transport: ZenohTransport, name: str, type_name: str, text: str, rate: f
     E.g. `ibrobot topic pub /lamp std_msgs/msg/Bool '{data: true}'`.
     """
     message = message_from(type_name, text)
-    known = {found.type for found in transport.shared_topics(_LIST_S) if found.name == name and found.publishers}
+    known = {each.type for each in transport.shared_topics(_LIST_S) if each.name == name and each.publishers}
     if known - {message.ros_type}:
         raise TransportError(f"topic {name} carries {', '.join(sorted(known))}, not {message.ros_type}")
     if not transport.is_heard(name, message.ros_type, _HEARD_S):
@@ -125,14 +119,11 @@ def pub(transport: ZenohTransport, name: str, type_name: str, text: str, rate: f
 
 def _warn_if_unpublished(transport: ZenohTransport, name: str) -> None:
     """Warn if a topic has no publisher."""
-    published = [found.name for found in transport.shared_topics(_LIST_S) if found.publishers]
+    published = [each.name for each in transport.shared_topics(_LIST_S) if each.publishers]
     if name not in published:
         echo(f"{name} has no publisher yet; available: {', '.join(published) or 'none'}", err=True)
 
 
 def _counted(count: int | None) -> Iterator[int]:
     """Count to `count`, or without end."""
-    done = 0
-    while count is None or done < count:
-        yield done
-        done += 1
+    return iter(range(count)) if count is not None else itertools.count()
