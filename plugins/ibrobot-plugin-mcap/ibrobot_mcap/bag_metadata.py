@@ -17,7 +17,7 @@ _PLAIN = (str, int, float)
 
 
 @attrs.frozen
-class Facts:
+class BagInfo:
     """Metadata of a bag."""
 
     files: tuple[str, ...] = ()
@@ -28,24 +28,24 @@ class Facts:
     custom: Mapping[str, str] = attrs.field(factory=dict)
     """`custom_data`."""
     compressed: str = ""
-    """`message`, `file`, or empty if neither is compressed. The compression of chunks is stated in each chunk."""
+    """`message`, `file`, or empty if neither is compressed. Each chunk states its own compression."""
 
 
-def read_facts(path: Path) -> Facts | None:
+def read_bag_info(path: Path) -> BagInfo | None:
     """Read a `metadata.yaml`; None if there is none.
 
     Raises:
         RecorderError: if it cannot be read.
     """
     try:
-        return parse_facts(path.read_text(encoding="utf-8"), path)
+        return parse_bag_info(path.read_text(encoding="utf-8"), path)
     except FileNotFoundError:
         return None
     except (OSError, UnicodeDecodeError) as error:
         raise RecorderError(f"{path}: cannot be read: {error}") from error
 
 
-def parse_facts(text: str, path: Path) -> Facts:
+def parse_bag_info(text: str, path: Path) -> BagInfo:
     """Parse metadata from YAML.
 
     Args:
@@ -57,32 +57,32 @@ def parse_facts(text: str, path: Path) -> Facts:
     """
     try:
         document = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        found: Mapping[str, Any] = document.get(INFORMATION, document)
+        content: Mapping[str, Any] = document.get(INFORMATION, document)
         counts: dict[str, int] = {}
         types: dict[str, str] = {}
-        for each in found.get(_PER_TOPIC) or ():
+        for each in content.get(_PER_TOPIC) or ():
             topic = _text(each["topic_metadata"]["name"])
             counts[topic] = counts.get(topic, 0) + _count(each["message_count"])
             types[topic] = _text(each["topic_metadata"]["type"])
-        return Facts(
-            tuple(Path(_text(name)).name for name in found.get("relative_file_paths") or ()),
+        return BagInfo(
+            tuple(Path(_text(name)).name for name in content.get("relative_file_paths") or ()),
             counts,
             types,
-            {_text(key): _text(value) for key, value in dict(found.get("custom_data") or {}).items()},
-            _compressed(found),
+            {_text(key): _text(value) for key, value in dict(content.get("custom_data") or {}).items()},
+            _compressed(content),
         )
     except (yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
         raise RecorderError(f"{path}: is not metadata of a rosbag2: {error}") from error
 
 
 def custom_beside(file: Path) -> Mapping[str, str]:
-    """`custom_data` in the `metadata.yaml` that lists a file, where the outcome can have been set by hand; or empty.
+    """`custom_data` of the `metadata.yaml` that lists a file, with an outcome set by hand; empty without one.
 
     Raises:
         RecorderError: if it cannot be read.
     """
-    facts = read_facts(file.with_name(METADATA))
-    return facts.custom if facts is not None and file.name in facts.files else {}
+    info = read_bag_info(file.with_name(METADATA))
+    return info.custom if info is not None and file.name in info.files else {}
 
 
 def set_custom(directory: Path, values: Mapping[str, str]) -> None:
@@ -92,20 +92,20 @@ def set_custom(directory: Path, values: Mapping[str, str]) -> None:
         RecorderError: if it cannot be read or written.
     """
     path = directory / METADATA
-    facts = read_facts(path)
-    if facts is None:
+    info = read_bag_info(path)
+    if info is None:
         raise RecorderError(f"{directory}: has no {METADATA}")
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
-        found = document.get(INFORMATION, document)
-        write_metadata(directory, {**found, "custom_data": quoted({**facts.custom, **values})})
+        content = document.get(INFORMATION, document)
+        write_metadata(directory, {**content, "custom_data": quoted({**info.custom, **values})})
     except OSError as error:
         raise RecorderError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _compressed(found: Mapping[str, Any]) -> str:
-    mode = _text(found.get("compression_mode") or "").lower()
-    format_ = _text(found.get("compression_format") or "")
+def _compressed(content: Mapping[str, Any]) -> str:
+    mode = _text(content.get("compression_mode") or "").lower()
+    format_ = _text(content.get("compression_format") or "")
     if mode not in ("message", "file"):
         return ""
     if format_ != "zstd":

@@ -45,10 +45,10 @@ class BagFile:
     If a write fails, the file still contains only complete records.
 
     Raises:
-        OSError: if the file cannot be created or written; so do all methods.
+        OSError: if the file cannot be created or written, as in all methods.
     """
 
-    def __init__(self, path: Path, options: McapOptions, facts: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, options: McapOptions, info: Mapping[str, Any]) -> None:
         self.path = path
         self.counted = Counted()
         self.counts: dict[Topic, int] = {}
@@ -62,7 +62,7 @@ class BagFile:
         try:
             with _whole_records(self._output):
                 self._writer.start("ros2", LIBRARY)
-                self._add_facts(facts)
+                self._add_info(info)
         except BaseException:
             self._output.close()
             raise
@@ -135,11 +135,11 @@ class BagFile:
         """Begin to sync the file to the disk; see `Output.sync_aside`."""
         self._output.sync_aside()
 
-    def finish(self, facts: Mapping[str, Any]) -> None:
+    def finish(self, info: Mapping[str, Any]) -> None:
         """Write the index, and close."""
         with _whole_records(self._output):
             self._writer.flush()
-            self._add_facts(facts)
+            self._add_info(info)
             self._writer.finish()
         self._output.sync()
         self._output.close()
@@ -148,8 +148,8 @@ class BagFile:
         """Close without finishing. Safe to call twice, and after `finish`."""
         self._output.close()
 
-    def _add_facts(self, facts: Mapping[str, Any]) -> None:
-        self._writer.add_metadata(RECORD, {RECORD_KEY: dump(dict(facts))})
+    def _add_info(self, info: Mapping[str, Any]) -> None:
+        self._writer.add_metadata(RECORD, {RECORD_KEY: dump(dict(info))})
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What the commands that change episodes take, and the events that they print; pages show forms for them."""
+"""Options and events of the commands that change episodes; pages derive forms from them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DONE = {
     TRIMMED: "trimmed; this is the original",
     REPLACED: "replaced when a trim was undone",
 }
-"""What was done with an episode in the trash -> words for it."""
+"""What was done with an episode in the trash -> text for people."""
 
 
 @attrs.frozen(kw_only=True)
@@ -54,7 +54,7 @@ class TrashOptions:
     """What to do with a trash."""
 
     path: Path = option(Path("episodes"), argument=True, names="episodes", help="folder of episodes")
-    restore: str | None = option(None, help="put this one back, as it was")
+    restore: str | None = option(None, help="put back the one with this id")
     empty: bool = option(False, help="delete all of them for good, after asking")
     yes: bool = option(False, help="do not ask")
 
@@ -82,9 +82,9 @@ class Changed(Event):
 class InTrash(Event):
     """An original in a trash."""
 
-    id: str = option(help="names it within the trash; later ones sort behind earlier ones")
+    id: str = option(help="unique within the trash; ids sort by time")
     done: str = option(choices=DONE, help="what was done with the episode")
-    path: str = option(help="where it was")
+    path: str = option(help="its original place")
     size_bytes: int = option(unit="bytes", help="size")
 
     @override

@@ -46,9 +46,9 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
     problems += [f"no message of {topic}, which is in its contract" for topic in absent]
     for topic, stated in reader.stated.items():
         known = summary.topics.get(topic)
-        found = (known.count if known is not None else 0) + repeated.get(topic, 0)
-        if stated != found:
-            problems.append(f"{topic}: {found} messages, {METADATA} says {stated}")
+        counted = (known.count if known is not None else 0) + repeated.get(topic, 0)
+        if stated != counted:
+            problems.append(f"{topic}: {counted} messages, {METADATA} says {stated}")
     needed = _needed(contract) if contract is not None else {}
     span_ns = summary.start_ns, summary.end_ns
     for topic, known in summary.topics.items():
@@ -67,7 +67,7 @@ class _Times:
 
     received: list[int] = attrs.field(factory=list)
     fresh: list[int] = attrs.field(factory=list)
-    """Receipt of those with another header stamp than the one before."""
+    """Receipt of those whose header stamp differs from the previous one."""
     back: int = 0
     """How often the header stamps decreased."""
     _stamp_ns: int | None = None
@@ -109,7 +109,7 @@ def _needed(contract: Contract) -> dict[str, tuple[int, bool]]:
 
 
 def _pause(stamps: list[int], longest_gap: float, start_ns: int) -> str:
-    """The longest pause of a topic if it is too long, or nothing."""
+    """The longest pause of a topic, if it is too long; else empty."""
     if len(stamps) < _FEW:
         return ""
     pauses = np.diff(stamps) / 1e6
@@ -121,7 +121,7 @@ def _pause(stamps: list[int], longest_gap: float, start_ns: int) -> str:
 
 
 def _silence(stamps: list[int], limit_ns: int, span_ns: tuple[int, int]) -> str:
-    """The longest silence of a topic of the contract if it is longer than `limit_ns`, or nothing.
+    """The longest silence of a topic of the contract, if it exceeds `limit_ns`; else empty.
 
     Args:
         stamps: receipt of each new sample [ns]; at least one.

@@ -25,7 +25,7 @@ from ibrobot_core.api import (
 from ibrobot_mcap.reader import Rosbag2Reader
 
 _COMMAND = re.compile(r"command|cmd|action|goal|target|leader|trajectory|desired")
-"""Words in the names of command topics."""
+"""Parts of the names of command topics."""
 _COMMON = frozenset(
     ("camera", "image", "image_raw", "image_rect", "compressed", "compresseddepth", "color", "rgb", "raw")
 )
@@ -77,9 +77,9 @@ def draft(reader: Rosbag2Reader) -> str:
         RecorderError: if the bag has no suitable topics.
     """
     summary = reader.summary()
-    found = [topic for name, each in summary.topics.items() if (topic := _topic(reader, name, each.count))]
-    signals = [topic for topic in found if topic.signal]
-    topics = [topic for topic in found if topic not in signals]
+    readable = [topic for name, each in summary.topics.items() if (topic := _topic(reader, name, each.count))]
+    signals = [topic for topic in readable if topic.signal]
+    topics = [topic for topic in readable if topic not in signals]
     cameras = [topic for topic in topics if isinstance(topic.first, Image)]
     vectors = [topic for topic in topics if topic not in cameras and any(_numbers(topic.first))]
     if not cameras and not vectors:
@@ -106,14 +106,14 @@ def draft(reader: Rosbag2Reader) -> str:
 def _topic(reader: Rosbag2Reader, name: str, messages: int) -> _Topic | None:
     """A topic with its first message; None if no message can be read."""
     try:
-        found = list(islice(reader.messages({name}), _LOOKED_AT))
+        items = list(islice(reader.messages({name}), _LOOKED_AT))
     except RecorderError:
         return None
-    if not found:
+    if not items:
         return None
-    periods = np.diff([item.received_ns for item in found])
+    periods = np.diff([item.received_ns for item in items])
     rate_hz = NS_PER_S / float(np.median(periods)) if periods.size and np.median(periods) > 0 else 0.0
-    return _Topic(name, found[0].message.ros_type, messages, rate_hz, found[0].message)
+    return _Topic(name, items[0].message.ros_type, messages, rate_hz, items[0].message)
 
 
 def _state(topic: _Topic) -> list[str]:

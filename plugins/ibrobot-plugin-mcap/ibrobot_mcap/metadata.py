@@ -17,17 +17,18 @@ RECORD = "rosbag2"
 RECORD_KEY = "serialized_metadata"
 """Name and key of the equivalent metadata record in an MCAP file."""
 OUTCOME = "outcome"
+"""Key of `custom_data` with the outcome."""
 DROPPED = "dropped"
+"""Key of `custom_data`: JSON, topic -> number of lost messages."""
 FAULTS = "faults"
-"""Faults and emergency stops during the episode, as a JSON list; left out without any."""
-"""Keys that the recorder adds to `custom_data`: the outcome, and JSON topic -> number of lost messages."""
+"""Key of `custom_data`: faults and emergency stops during the episode, as a JSON list; missing without any."""
 MISSING = "missing"
-"""Key that a repair adds: JSON topic -> number of recorded messages that could not be read."""
+"""Key that a repair adds: JSON, topic -> number of recorded messages that could not be read."""
 
 _FOR_EVER = {"sec": 9223372036, "nsec": 854775807}
 
 MARKED = "marked"
-"""Key that states that the outcome was set by hand."""
+"""Key of episodes whose outcome was set by hand."""
 
 
 @attrs.define
@@ -146,11 +147,11 @@ def quoted(custom: Mapping[str, str]) -> dict[str, str]:
 
 
 def dump(document: dict[str, Any] | Sequence[Any]) -> str:
-    """YAML of plain data, in the order given."""
+    """YAML of plain data, in its order."""
     return yaml.dump(document, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=2**31)
 
 
-def write_metadata(directory: Path, facts: dict[str, Any]) -> None:
+def write_metadata(directory: Path, info: dict[str, Any]) -> None:
     """Write `metadata.yaml` atomically, and sync it to the disk.
 
     Raises:
@@ -158,7 +159,7 @@ def write_metadata(directory: Path, facts: dict[str, Any]) -> None:
     """
     temporary = directory / f".{METADATA}"
     with temporary.open("w", encoding="utf-8") as file:
-        file.write(dump({INFORMATION: facts}))
+        file.write(dump({INFORMATION: info}))
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(directory / METADATA)

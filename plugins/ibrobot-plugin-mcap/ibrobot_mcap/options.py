@@ -15,7 +15,7 @@ COMPRESSIONS = ("none", "lz4", "zstd")
 class McapOptions:
     """How episodes are written."""
 
-    compression: str = option("none", choices=COMPRESSIONS, help="compression of chunks; of no use for JPEG images")
+    compression: str = option("none", choices=COMPRESSIONS, help="compression of chunks; useless for JPEG images")
     chunk_size: int = option(MIB, unit="bytes", ge=1024, le=256 * MIB, help="a chunk of this size is written")
     chunk_period_s: float = option(0.5, unit="s", gt=0, le=60, help="a chunk of this age is written")
     split_size: int | None = option(None, unit="bytes", ge=64 * 1024, help="a file of this size is followed by another")

@@ -12,16 +12,16 @@ _BLOCK = 4096
 """Alignment of writes that bypass the page cache [bytes]."""
 _PIECE = 1024 * 1024
 """Maximum size of a write [bytes]."""
-# Not every system has a sync without the file's times.
+# Not every system can sync without the file's times.
 _sync = getattr(os, "fdatasync", os.fsync)
 
 
 class Output:
     """A file whose content survives the end of the process after `hand_over`.
 
-    Whole blocks go directly to the disk. The kernel would collect gigabytes in its page cache before writing them, and
-    even real-time processes wait meanwhile: a control loop was 2 ms late in one of a hundred ticks. The end of the
-    file, less than a block, goes through the page cache, as does everything if direct writes are not supported.
+    Whole blocks go directly to the disk: writing gigabytes back from the page cache delays even real-time processes (a
+    control loop was 2 ms late in one of a hundred ticks). The end of the file, less than a block, goes through the page
+    cache, as does everything if direct writes are not supported.
     """
 
     def __init__(self, path: Path) -> None:
@@ -31,7 +31,7 @@ class Output:
         self._written = 0
         """Number of bytes written to the disk."""
         self._filled = 0
-        """Number of bytes in the buffer, which follow these."""
+        """Number of bytes in the buffer, which come next."""
         self._closed = False
         self._aside: threading.Thread | None = None
         self._failure: OSError | None = None

@@ -1,4 +1,4 @@
-"""One owner of an episode at a time, and what an interrupted change left beside it."""
+"""Exclusive ownership of episodes, and recovery from interrupted changes."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ibrobot_core.app import InUse, Ownership
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
 
 TRIMMING, REPAIRING, UNFINISHED, DELETING = ".trimming", ".repairing", ".unfinished", ".deleting"
-"""Suffixes of hidden folders beside an episode that is changed: new episodes, and what remains to be removed."""
+"""Suffixes of hidden folders beside an episode that is changed: new episodes, and what is to be removed."""
 _ALL = (TRIMMING, REPAIRING, UNFINISHED, DELETING)
 
 
 @contextmanager
 def owning(episode: Path, doing: str) -> Iterator[None]:
-    """A context in which nobody else changes, records or converts an episode; a change that was killed is finished.
+    """A context in which nobody else changes, records or converts an episode; finishes an interrupted change.
 
     Args:
         episode: the episode's folder, which need not exist.
@@ -28,29 +28,26 @@ def owning(episode: Path, doing: str) -> Iterator[None]:
         InUse: if it has another owner.
         RecorderError: if it cannot be owned, e.g. on a read-only disk.
     """
-    try:
-        owned = Ownership(episode, doing)
-    except OSError as error:
-        raise RecorderError(f"{episode}: cannot be locked: {error.strerror}") from error
-    with owned:
+    with _owned(episode, doing, shared=False):
         _finish(episode)
         yield
 
 
-@contextmanager
-def reading_owned(episode: Path, doing: str) -> Iterator[None]:
+def reading_owned(episode: Path, doing: str) -> Ownership:
     """A context in which nobody changes or records an episode; others may read it.
 
     Raises:
         InUse: if it has an owner.
         RecorderError: if it cannot be owned.
     """
+    return _owned(episode, doing, shared=True)
+
+
+def _owned(episode: Path, doing: str, *, shared: bool) -> Ownership:
     try:
-        owned = Ownership(episode, doing, shared=True)
+        return Ownership(episode, doing, shared=shared)
     except OSError as error:
         raise RecorderError(f"{episode}: cannot be locked: {error.strerror}") from error
-    with owned:
-        yield
 
 
 def beside(episode: Path, suffix: str) -> Path:
@@ -59,16 +56,16 @@ def beside(episode: Path, suffix: str) -> Path:
 
 
 def interrupted(path: Path) -> list[Path]:
-    """The episodes at or below `path` of which a change was interrupted, or is being made now."""
-    below = (found for pattern in ("episodes", "*", "*/episodes") for found in path.glob(pattern))
+    """The episodes at or below `path` with an interrupted or a present change."""
+    below = (folder for pattern in ("episodes", "*", "*/episodes") for folder in path.glob(pattern))
     folders = [path.parent, path, *below]
-    found = {
+    episodes = {
         left.with_name(left.name[1 : -len(suffix)])
         for folder in folders
         for suffix in _ALL
         for left in folder.glob(f".*{suffix}")
     }
-    return sorted(each for each in found if each == path or each.parent != path.parent)
+    return sorted(each for each in episodes if each == path or each.parent != path.parent)
 
 
 def is_owned(episode: Path) -> bool:
@@ -83,9 +80,9 @@ def is_owned(episode: Path) -> bool:
 
 
 def _finish(episode: Path) -> None:
-    """Finish a trim, a repair or a removal of an episode that was killed.
+    """Finish an interrupted trim, repair or removal of an episode.
 
-    The original is moved away only when the new episode is complete.
+    The original has been moved away only if the new episode is complete.
     """
     try:
         for suffix in (TRIMMING, REPAIRING):

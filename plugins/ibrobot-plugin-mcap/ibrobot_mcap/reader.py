@@ -23,7 +23,7 @@ from ibrobot_core.api import (
     RecorderError,
     TopicSummary,
 )
-from ibrobot_mcap.bag_metadata import Facts, custom_beside, parse_facts, read_facts
+from ibrobot_mcap.bag_metadata import BagInfo, custom_beside, parse_bag_info, read_bag_info
 from ibrobot_mcap.compressed import Expanded, MessageCompressed
 from ibrobot_mcap.damage import reading
 from ibrobot_mcap.metadata import DROPPED, METADATA, MISSING, OUTCOME, RECORD, RECORD_KEY, Topic
@@ -40,7 +40,7 @@ def is_rosbag2(path: Path) -> bool:
     if path.is_dir():
         try:
             return (path / METADATA).is_file() or any(_storage_files(path))
-        except FileNotFoundError:  # another command moved it meanwhile
+        except FileNotFoundError:  # moved meanwhile
             return False
     return path.suffix in _SOURCES
 
@@ -58,24 +58,24 @@ class Rosbag2Reader(EpisodeReader):
         self._path = path
         if not path.exists():
             raise RecorderError(f"{path}: there is no such episode")
-        facts = read_facts(path / METADATA) if path.is_dir() else None
-        self._finished = facts is not None or not path.is_dir()
+        info = read_bag_info(path / METADATA) if path.is_dir() else None
+        self._finished = info is not None or not path.is_dir()
         self._closing = ExitStack()
         try:
             with reading(path):
-                self._source = self._open(facts or Facts())
-            facts = facts or self._recorded() or Facts()
+                self._source = self._open(info or BagInfo())
+            info = info or self._recorded() or BagInfo()
             self._codec = Codec(self._source.definitions)
             self._types = {topic: self._delivered(topic, type_) for topic, type_ in self._source.types.items()}
         except BaseException:
             self.close()
             raise
-        self._is_part = not path.is_dir() and len(facts.files) > 1
-        self.stated: Mapping[str, int] = facts.counts if path.is_dir() else self._source.stated
+        self._is_part = not path.is_dir() and len(info.files) > 1
+        self.stated: Mapping[str, int] = info.counts if path.is_dir() else self._source.stated
         """Topic -> number of messages according to the bag's metadata, including copies in later files."""
-        self._stated_types = facts.types
+        self._stated_types = info.types
         beside = {} if path.is_dir() else custom_beside(path)
-        self._custom = dict(beside or facts.custom or self._source.custom)
+        self._custom = dict(beside or info.custom or self._source.custom)
 
     @property
     def finished(self) -> bool:
@@ -84,8 +84,8 @@ class Rosbag2Reader(EpisodeReader):
 
     def short(self) -> dict[str, int]:
         """Topic -> number of messages in the metadata that are missing from the files."""
-        found = Counter(self._source.counts) + Counter(self._source.repeated)
-        return {topic: stated - found[topic] for topic, stated in self.stated.items() if stated > found[topic]}
+        counts = Counter(self._source.counts) + Counter(self._source.repeated)
+        return {topic: stated - counts[topic] for topic, stated in self.stated.items() if stated > counts[topic]}
 
     @override
     def summary(self) -> EpisodeSummary:
@@ -112,7 +112,7 @@ class Rosbag2Reader(EpisodeReader):
     @override
     def messages_since(self, stamp_ns: int, topics: Collection[str] | None = None) -> Iterator[Recorded]:
         source, short = self._source, self.short()
-        if short and source.finished:  # in the middle, so the rest would not match the recording
+        if short and source.finished:  # the gap is in the middle: the rest would not match the recording
             missing = ", ".join(f"{count} of {self.stated[topic]} of {topic}" for topic, count in short.items())
             raise RecorderError(
                 f"{self._path}: is damaged: messages are missing in the middle: {missing}; "
@@ -129,11 +129,11 @@ class Rosbag2Reader(EpisodeReader):
 
     @override
     def digest(self) -> str:
-        found = hashlib.sha256()
+        content = hashlib.sha256()
         for raw in self.raw():
-            found.update(f"{raw.topic} {raw.type} {raw.received_ns} {raw.published_ns} {len(raw.data)}\n".encode())
-            found.update(raw.data)
-        return found.hexdigest()
+            content.update(f"{raw.topic} {raw.type} {raw.received_ns} {raw.published_ns} {len(raw.data)}\n".encode())
+            content.update(raw.data)
+        return content.hexdigest()
 
     def raw(self) -> Iterator[Raw]:
         """The stored messages, not decoded, in the order of receipt."""
@@ -173,7 +173,7 @@ class Rosbag2Reader(EpisodeReader):
         self._closing.close()
 
     def _delivered(self, topic: str, type_: str) -> str:
-        """The type in which `messages` delivers a topic; for compressed images, the first one determines it."""
+        """The type in which `messages` delivers a topic; that of compressed images depends on the first one."""
         if type_ != CompressedImage.ros_type:
             return type_
         first = next(self._source.messages({topic}), None)
@@ -185,7 +185,7 @@ class Rosbag2Reader(EpisodeReader):
             return type_  # reading it will raise the error
         return Image.ros_type if isinstance(message, CompressedImage) and is_known(message) else type_
 
-    def _recorded(self) -> Facts | None:
+    def _recorded(self) -> BagInfo | None:
         """The newest metadata record, for an episode without `metadata.yaml`."""
         source = self._source
         texts = [
@@ -193,11 +193,11 @@ class Rosbag2Reader(EpisodeReader):
             for record in (source.metadata if isinstance(source, McapSource) else ())
             if record.name == RECORD and RECORD_KEY in record.metadata
         ]
-        return parse_facts(texts[-1], self._path) if texts else None
+        return parse_bag_info(texts[-1], self._path) if texts else None
 
-    def _open(self, facts: Facts) -> Source:
-        files = self._files(facts)
-        if facts.compressed == "file":
+    def _open(self, info: BagInfo) -> Source:
+        files = self._files(info)
+        if info.compressed == "file":
             expanded = Expanded(files)
             self._closing.callback(expanded.close)
             files = expanded.paths
@@ -206,13 +206,13 @@ class Rosbag2Reader(EpisodeReader):
             raise RecorderError(f"{self._path}: its files must all be .mcap, or all .db3; found: {_names(files)}")
         source: Source = _SOURCES[suffixes.pop()](files)
         self._closing.callback(source.close)
-        return MessageCompressed(self._path, source) if facts.compressed == "message" else source
+        return MessageCompressed(self._path, source) if info.compressed == "message" else source
 
-    def _files(self, facts: Facts) -> list[Path]:
+    def _files(self, info: BagInfo) -> list[Path]:
         path = self._path
         if not path.is_dir():
             return [path]
-        listed = [path / name for name in facts.files]
+        listed = [path / name for name in info.files]
         for file in listed:
             if not file.is_file():
                 raise RecorderError(f"{path}: {file.name} is missing, which {METADATA} lists")

@@ -125,7 +125,7 @@ class McapRecorder(Recorder):
             kept = self._topics[topic] = self._topic(topic, message.ros_type)
         if message.ros_type != kept.type:
             raise RecorderError(f"carries {message.ros_type}, was {kept.type} before")
-        # Encode it now, because the caller may change arrays afterwards.
+        # Encode now: the caller may change arrays afterwards.
         return Item(kept, encode(message), received_ns, received_ns)
 
     def _topic(self, topic: str, type_: str) -> Topic:

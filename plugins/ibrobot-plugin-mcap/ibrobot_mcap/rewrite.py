@@ -24,7 +24,7 @@ REPAIRED = "repaired"
 STATED = "stated_outcome"
 """Key of the outcome before the repair, or before the end was cut off."""
 TRIMMED_FROM = "trimmed_from"
-"""Key of a part: the recordings of which it is a part, newest last; each by its UUID, or by its digest without one."""
+"""Key of the recordings of which an episode is a part, newest last, by UUID or, without one, by digest."""
 
 
 @attrs.frozen
@@ -53,7 +53,7 @@ def rewrite(
         end_ns: time of receipt of the last message to copy [ns].
         marks: keys to add to the metadata.
 
-    The outcome of a part without the end is unknown: what was judged may not be in it.
+    The outcome of a part without the end is unknown.
 
     Raises:
         RecorderError: if `source` cannot be read or `target` cannot be written; `target` is then removed.
@@ -100,7 +100,7 @@ def rewrite(
 def _of_a_part(
     reader: Rosbag2Reader, summary: EpisodeSummary, begin_ns: int | None, end_ns: int | None
 ) -> dict[str, str]:
-    """The metadata that identify a part of an episode: its own UUID, and the recordings of which it is a part."""
+    """Metadata of a part of an episode: its own UUID, and the recordings of which it is a part."""
     uuid = summary.metadata.get("uuid", summary.path.name)
     own = str(uuid5(NAMESPACE_OID, f"{uuid} {begin_ns} {end_ns}"))
     whole = uuid if _is_random(uuid) else reader.digest()

@@ -36,7 +36,7 @@ _LARGEST = 4 << 30
 """Maximum size of a chunk in the format's own libraries [bytes]."""
 _KNOWN = range(1, Opcode.DATA_END + 1)
 _PRIVATE = range(0x80, 0x100)
-"""Opcodes that a file can have."""
+"""Valid opcodes."""
 
 
 @attrs.frozen
@@ -186,7 +186,7 @@ class McapFile:
             opcode, length = _RECORD.unpack(file.read(_RECORD.size))
             content, position = position + _RECORD.size, position + _RECORD.size + length
             if position > end or not (opcode in _KNOWN or opcode in _PRIVATE):
-                return  # the rest was not written completely
+                return  # the last record is incomplete
             if opcode == Opcode.CHUNK:
                 start_ns, end_ns = struct.unpack("<QQ", file.read(16))
                 self.blocks.append(Block(content, length, start_ns, end_ns, repeated=repeated))
@@ -265,7 +265,7 @@ class McapFile:
             except RecorderError:
                 if not last_of_unfinished:
                     raise
-                self.blocks.remove(block)  # its writer ended while writing it
+                self.blocks.remove(block)  # was not written completely
                 break
             block.counts = counts
         for block in self.blocks:

@@ -69,7 +69,7 @@ class McapSource(Source):
         except BaseException:
             self.close()
             raise
-        # The originals of messages that the first file repeats are not among these files.
+        # The first file's repeated messages are kept: their originals are not among these files.
         blocks = [
             (block.start_ns, number, block)
             for number, file in enumerate(self._files)
@@ -132,7 +132,7 @@ class McapSource(Source):
                 yield self._raw(self._files[origin].channels[entry.channel], entry)
 
     def _raw(self, channel: Channel, entry: Entry) -> Raw:
-        # Copy, because a view would keep the whole chunk in memory.
+        # Copy: a view would keep the whole chunk in memory.
         return Raw(channel.topic, self.types[channel.topic], bytes(entry.data), entry.received_ns, entry.published_ns)
 
     @override

@@ -119,7 +119,7 @@ class Storage:
 
         Raises:
             RecorderError: if the write fails; the episode then remains unfinished but readable. Also if its folder or
-                one of its files is no longer the one at its path, since what was recorded is then not there.
+                one of its files was moved, replaced or removed.
         """
         if self._broken is not None:
             self._file.abandon()
@@ -130,7 +130,7 @@ class Storage:
         try:
             self._check_place()
             self._close_file(custom)
-            write_metadata(self._directory, self._facts(custom))
+            write_metadata(self._directory, self._information(custom))
         except OSError as error:
             self._file.abandon()
             self._fail(error)
@@ -142,7 +142,7 @@ class Storage:
         """Remove the episode.
 
         Raises:
-            RecorderError: if it cannot be removed, or if what is at its path is not what was recorded.
+            RecorderError: if it cannot be removed, or was moved or replaced.
         """
         self._file.abandon()
         self._check_place()
@@ -154,7 +154,7 @@ class Storage:
     def _open_file(self) -> BagFile:
         name = os.fsencode(self._directory.name).decode("utf-8", "replace")  # `metadata.yaml` lists it
         path = self._directory / f"{name}_{len(self._files)}.mcap"
-        file = BagFile(path, self._options, self._facts(self._episode.metadata))
+        file = BagFile(path, self._options, self._information(self._episode.metadata))
         self._files[path.name] = file.counted
         self._inodes[path] = path.stat()
         self._looked_at = 0
@@ -163,7 +163,7 @@ class Storage:
     def _close_file(self, custom: Mapping[str, str] | None = None) -> None:
         for topic in self._topics:
             self._file.announce(topic)
-        self._file.finish(self._facts(self._episode.metadata if custom is None else custom))
+        self._file.finish(self._information(self._episode.metadata if custom is None else custom))
         self._waits_since_s = None
 
     def _is_full(self, item: Item) -> bool:
@@ -174,14 +174,14 @@ class Storage:
         return full or (duration is not None and item.received_ns - self._file.counted.start_ns >= duration * NS_PER_S)
 
     def _repeat(self, received_ns: int) -> None:
-        """Begin a file with latched messages, so that it can be played without the previous one."""
+        """Repeat the latched messages, so that a file can be played without the previous one."""
         items = [Item(i.topic, i.data, received_ns, i.published_ns) for i in self._latched.values()]
         if items:
             self._file.add_repeated(items)
         for item in items:
             self._topics[item.topic] += 1
 
-    def _facts(self, custom: Mapping[str, str]) -> dict[str, object]:
+    def _information(self, custom: Mapping[str, str]) -> dict[str, object]:
         return information(self._files, self._topics, custom, self._episode.stamp_ns)
 
     def _flush(self) -> None:
@@ -189,7 +189,7 @@ class Storage:
         self._waits_since_s = None
 
     def _check_place(self) -> None:
-        """Check that the folder and all files are still at their paths: other programs may ignore who owns them."""
+        """Check that the folder and all files are still at their paths: other programs may ignore the ownership."""
         for path, created in self._inodes.items():
             try:
                 there = os.path.samestat(created, path.stat())
@@ -222,7 +222,7 @@ class Storage:
 
 
 def _check_text(episode: EpisodeStart) -> None:
-    """Check that the metadata can be written, and read again."""
+    """Check that the metadata is valid Unicode."""
     for key, value in episode.metadata.items():
         try:
             value.encode()

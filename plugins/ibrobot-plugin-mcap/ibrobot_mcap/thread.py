@@ -28,7 +28,6 @@ class WriterThread:
         self._limit = limit
         self._items: deque[Item] = deque()
         self._size = 0
-        """Size of the items that wait or are being written [bytes]."""
         self._changed = threading.Condition()
         self._ending = False
         self._failure: RecorderError | None = None
@@ -44,7 +43,7 @@ class WriterThread:
         """Queue an item, or drop it if the queue is full.
 
         Raises:
-            RecorderError: the error of the storage, after which nothing is written.
+            RecorderError: after an error of the storage; nothing more is written.
         """
         with self._changed:
             if self._failure is not None:

@@ -1,7 +1,7 @@
 """Deletes and trims episodes so that both can be undone: the original moves to a trash folder beside the episode.
 
-`FOLDER/.trash/ID/` holds one original under its own name, and `undo.json`, which says what was done. Commands that look
-for episodes skip folders whose names begin with a dot.
+`FOLDER/.trash/ID/` holds one original under its own name, and `undo.json` with what was done. Commands that search for
+episodes skip folders whose names begin with a dot.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ class Trashed:
     """Name of the episode."""
     done: str
     link: str | None = None
-    """Where it pointed, if it was a link to an episode."""
+    """The target, if it was a link to an episode."""
 
     @property
     def id(self) -> str:
-        """Names it within its trash folder; later ones sort behind earlier ones."""
+        """Unique within its trash folder; ids sort by time."""
         return self.folder.name
 
     @property
@@ -95,7 +95,7 @@ def _discard(episode: Path, done: str) -> Trashed:
         (trashed.folder / _NOTE).write_text(json.dumps(note), encoding="utf-8")
         if link is None:
             episode.rename(trashed.kept)
-        else:  # a relative one would point to nothing from there
+        else:  # a relative one would be wrong there
             trashed.kept.symlink_to(episode.resolve())
             episode.unlink()
     except OSError as error:
@@ -155,20 +155,20 @@ def _copy_part(episode: Path, output: Path, begin_s: float, end_s: float | None)
     begin_ns = ns(begin_s)
     end_ns = length_ns if end_s is None else ns(end_s)
     if not 0 <= begin_ns < end_ns <= length_ns:
-        asked = f"--from {begin_s:g} --to {seconds(end_ns):g}"
-        raise RecorderError(f"{episode}: is {seconds(length_ns):.2f} s long; {asked} is outside it")
+        part = f"--from {begin_s:g} --to {seconds(end_ns):g}"
+        raise RecorderError(f"{episode}: is {seconds(length_ns):.2f} s long; {part} is outside it")
     marks = {"trimmed": f"{begin_s:g} s to {seconds(end_ns):g} s of {episode.name}"}
     return rewrite(episode, output, begin_ns=start_ns + begin_ns, end_ns=start_ns + end_ns, marks=marks)
 
 
 def trashed_in(path: Path) -> list[Trashed]:
     """The originals in the trash folders at or below `path`, oldest first."""
-    found = {each.folder: each for each in _found(path)}  # a dataset's trash matches two patterns
-    return sorted(found.values(), key=lambda each: (each.id, each.name))
+    originals = {each.folder: each for each in _originals(path)}  # a dataset's trash matches two patterns
+    return sorted(originals.values(), key=lambda each: (each.id, each.name))
 
 
 def restore(trashed: Trashed) -> Path:
-    """Put an original back. What a trim had made of it moves to the trash in its place.
+    """Put an original back. The trimmed episode takes its place in the trash.
 
     Returns:
         Where it is now: its own place, or `NAME_restored` if a later recording has taken its name.
@@ -187,7 +187,7 @@ def restore(trashed: Trashed) -> Path:
             while origin.exists():
                 origin = origin.with_name(f"{origin.name}_restored")
             _put_back(trashed, origin)
-            with suppress(OSError):  # it has another original by now
+            with suppress(OSError):  # not empty
                 trashed.folder.parent.rmdir()
         except OSError as error:
             raise RecorderError(f"{trashed.kept}: cannot be restored: {error.strerror}") from error
@@ -209,15 +209,15 @@ def empty(path: Path) -> list[Trashed]:
     Raises:
         RecorderError: if one cannot be deleted.
     """
-    found = trashed_in(path)
+    originals = trashed_in(path)
     try:
-        for trashed in found:
+        for trashed in originals:
             shutil.rmtree(trashed.folder)
-            with suppress(OSError):  # it has another original by now
+            with suppress(OSError):  # not empty
                 trashed.folder.parent.rmdir()
     except OSError as error:
         raise RecorderError(f"{path}: cannot be emptied: {error.strerror}") from error
-    return found
+    return originals
 
 
 def _new_folder(trash: Path) -> Path:
@@ -225,19 +225,19 @@ def _new_folder(trash: Path) -> Path:
     for number in itertools.count():
         folder = trash / f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}-{number}"
         with suppress(FileExistsError):
-            folder.mkdir(parents=True)  # a restore at the same time may have removed the empty trash
+            folder.mkdir(parents=True)  # a simultaneous restore may have removed the empty trash
             return folder
     raise AssertionError
 
 
-def _found(path: Path) -> Iterator[Trashed]:
+def _originals(path: Path) -> Iterator[Trashed]:
     for pattern in (TRASH, f"episodes/{TRASH}", f"*/{TRASH}", f"*/episodes/{TRASH}"):
         for note in path.glob(f"{pattern}/*/{_NOTE}"):
             try:
-                known = json.loads(note.read_text(encoding="utf-8"))
-                link = known.get("link")
-                found = Trashed(note.parent, Path(known["name"]).name, str(known["done"]), link and str(link))
+                content = json.loads(note.read_text(encoding="utf-8"))
+                link = content.get("link")
+                trashed = Trashed(note.parent, Path(content["name"]).name, str(content["done"]), link and str(link))
             except (OSError, ValueError, KeyError, TypeError, AttributeError):
-                continue  # not from here
-            if not found.name.startswith(".") and found.kept.is_dir() and is_rosbag2(found.kept):
-                yield found
+                continue  # not ours
+            if not trashed.name.startswith(".") and trashed.kept.is_dir() and is_rosbag2(trashed.kept):
+                yield trashed

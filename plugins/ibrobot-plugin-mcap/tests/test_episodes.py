@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from ibrobot_mcap import rewrite
 from ibrobot_mcap.commands import episodes
-from ibrobot_mcap.commands.plot import Facts, actions_of
+from ibrobot_mcap.commands.plot import PlotData, actions_of
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.storage import Storage
 from mcap.reader import make_reader
@@ -340,7 +340,7 @@ def test_plot_shows_the_first_and_the_last_picture_and_bears_states_without_posi
         bench.recorder.write(CAMERA, picture(index), stamp(index))
     bench.write(100, "/leader", start=100)
     bench.end()
-    facts = Facts(bench.path)
+    facts = PlotData(bench.path)
     pictures = facts.pictures[CAMERA]
     assert [place for place in pictures if place < 7] == list(range(len(pictures) - 1)), "none from its end on"
     np.testing.assert_array_equal(pictures[0][1], picture(0).data.reshape(48, 64, 3))

@@ -7,8 +7,8 @@ import sys
 import click
 
 
-def agree(question: str) -> bool:
-    """Ask a yes/no question, which `--yes` answers without a terminal.
+def confirmed(question: str) -> bool:
+    """Ask a yes/no question.
 
     Raises:
         click.UsageError: if standard input has no answer.

@@ -8,7 +8,7 @@ from ibrobot_core.api import RecorderError
 from ibrobot_core.app import Declined, declared, echo, wrong_input
 from ibrobot_mcap import DELETE
 from ibrobot_mcap.changes import Changed, DeleteOptions
-from ibrobot_mcap.commands.tell import told
+from ibrobot_mcap.commands.report import report
 
 
 @click.command()
@@ -20,8 +20,8 @@ def delete(options: DeleteOptions, events: bool) -> None:
     After --to-trash, `ibrobot episodes trash --restore` brings them back.
     """
     from ibrobot_mcap import trash
-    from ibrobot_mcap.commands.ask import agree
-    from ibrobot_mcap.commands.find_episodes import size_of, told_size
+    from ibrobot_mcap.commands.ask import confirmed
+    from ibrobot_mcap.commands.find_episodes import size_of, size_text
     from ibrobot_mcap.reader import is_rosbag2
 
     for episode in options.episodes:
@@ -32,9 +32,9 @@ def delete(options: DeleteOptions, events: bool) -> None:
             trashed = trash.discard(episode)
             if not events:
                 echo(f"to undo: ibrobot episodes trash {episode.parent} --restore {trashed.id}", err=True)
-            told(DELETE, Changed(str(episode), f"moved to {trash.TRASH}"), events=events)
+            report(DELETE, Changed(str(episode), f"moved to {trash.TRASH}"), events=events)
             continue
-        if not (options.yes or agree(f"delete {episode} ({told_size(size_of(episode))})?")):
+        if not (options.yes or confirmed(f"delete {episode} ({size_text(size_of(episode))})?")):
             raise Declined
         trash.delete(episode)
-        told(DELETE, Changed(str(episode), "deleted"), events=events)
+        report(DELETE, Changed(str(episode), "deleted"), events=events)

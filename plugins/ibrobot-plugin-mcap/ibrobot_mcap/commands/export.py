@@ -70,9 +70,7 @@ def _rows(items: Iterator[tuple[int, Message]], output: Path) -> int:
                 writer = csv.DictWriter(file, list(row))
                 writer.writeheader()
             if row.keys() - set(writer.fieldnames):
-                raise RecorderError(
-                    f"message {count} has other fields than the first, so they do not fit into one table"
-                )
+                raise RecorderError(f"message {count} has other fields than the first: they do not fit into one table")
             writer.writerow(row)
             count += 1
     return count

@@ -24,8 +24,8 @@ def episodes_in(path: Path) -> list[Path]:
     if is_rosbag2(path):
         return [path]
     patterns = ("*", "episodes/*", "*/episodes/*")
-    found = {p for pattern in patterns for p in path.glob(pattern) if p.is_dir() and not p.name.startswith(".")}
-    episodes = sorted(folder for folder in found if is_rosbag2(folder))
+    folders = {p for pattern in patterns for p in path.glob(pattern) if p.is_dir() and not p.name.startswith(".")}
+    episodes = sorted(folder for folder in folders if is_rosbag2(folder))
     if not episodes:
         raise RecorderError(f"{path}: contains no episode")
     return episodes
@@ -64,7 +64,7 @@ def summary_of(path: Path) -> EpisodeSummary:
 def size_of(path: Path) -> int:
     """Total size of an episode's files [bytes]."""
     size = 0
-    with suppress(FileNotFoundError):  # another command moved it meanwhile
+    with suppress(FileNotFoundError):  # moved meanwhile
         for file in path.rglob("*") if path.is_dir() else (path,):
             size += file.stat().st_size if file.is_file() else 0
     return size
@@ -82,22 +82,22 @@ def date_of(summary: EpisodeSummary) -> str:
     return datetime.fromtimestamp(summary.start_ns / NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M")
 
 
-def told_stated(summary: EpisodeSummary) -> str:
-    """A description of the outcome before the end was lost or cut off; empty if the outcome is not unknown."""
+def stated_outcome_text(summary: EpisodeSummary) -> str:
+    """A remark on the outcome before the end was lost or cut off; empty if the outcome is known."""
     stated = summary.metadata.get(STATED)
     if stated is None or summary.outcome != "unknown":
         return ""
     return f"; its outcome was {stated}, now it is unknown: `ibrobot episodes mark` sets it"
 
 
-def told_interrupted(path: Path) -> Iterator[str]:
-    """A line for each episode at or below `path` of which a change was interrupted."""
+def interrupted_lines(path: Path) -> Iterator[str]:
+    """A line for each episode at or below `path` with an interrupted change."""
     for episode in interrupted(path):
         if not is_owned(episode):
             yield f"interrupted: {episode}: `ibrobot episodes repair {episode}` finishes the change"
 
 
-def told_size(size: int) -> str:
+def size_text(size: int) -> str:
     """A human-readable size."""
     number = float(size)
     for unit in ("B", "kB", "MB"):

@@ -25,7 +25,7 @@ def info(episode: Path, as_json: bool) -> None:
 
     The episode may be unfinished.
     """
-    from ibrobot_mcap.commands.find_episodes import date_of, duration_s, size_of, summary_of, told_size
+    from ibrobot_mcap.commands.find_episodes import date_of, duration_s, size_of, size_text, summary_of
 
     summary = summary_of(episode)
     if as_json:
@@ -35,7 +35,7 @@ def info(episode: Path, as_json: bool) -> None:
     state = summary.outcome if summary.finished else "unfinished; `ibrobot episodes repair` makes it whole"
     console.print(f"{episode}: {state}", soft_wrap=True)
     began = f"{date_of(summary)} UTC" if date_of(summary) else "no messages"
-    console.print(f"{began}, {duration_s(summary):.2f} s, {told_size(size_of(episode))}")
+    console.print(f"{began}, {duration_s(summary):.2f} s, {size_text(size_of(episode))}")
     table = Table(box=None, padding=(0, 1))
     for heading in ("topic", "type", "messages", "Hz", "lost"):
         # Names are folded rather than truncated, because `export` needs complete ones.

@@ -31,13 +31,13 @@ def list_episodes(path: Path, as_json: bool) -> None:
         date_of,
         duration_s,
         episodes_in,
+        interrupted_lines,
         size_of,
+        size_text,
         summary_of,
-        told_interrupted,
-        told_size,
     )
 
-    for line in told_interrupted(path):
+    for line in interrupted_lines(path):
         echo(line, err=True)
     rows = []
     problems = []
@@ -81,7 +81,7 @@ def list_episodes(path: Path, as_json: bool) -> None:
                 str(row["messages"]),
                 str(row["dropped"]),
                 str(row["outcome"]) if row["finished"] else styled("unfinished", "red"),
-                told_size(int(str(row["bytes"]))),
+                size_text(int(str(row["bytes"]))),
                 *([str(row["prompt"])] if prompts else []),
             )
         console.print(table)

@@ -8,7 +8,7 @@ from ibrobot_core.api import RecorderError
 from ibrobot_core.app import declared, wrong_input
 from ibrobot_mcap import MARK
 from ibrobot_mcap.changes import Changed, MarkOptions
-from ibrobot_mcap.commands.tell import told
+from ibrobot_mcap.commands.report import report
 
 
 @click.command()
@@ -28,4 +28,4 @@ def mark(options: MarkOptions, events: bool) -> None:
             if not whole:
                 raise RecorderError(f"{episode}: is unfinished, or lacks messages; run `ibrobot episodes repair` first")
             set_custom(episode, {OUTCOME: options.outcome, MARKED: "true"})
-        told(MARK, Changed(str(episode), options.outcome), events=events)
+        report(MARK, Changed(str(episode), options.outcome), events=events)

@@ -31,11 +31,11 @@ def plot(episode: Path, output: Path | None) -> None:
         raise RecorderError("plot needs matplotlib: pip install 'ibrobot-plugin-mcap[plot]'") from None
     mpl.use("Agg")
     output = output or Path(f"{episode.name}.png")
-    _draw(Facts(episode), output)
+    _draw(PlotData(episode), output)
     echo(str(output))
 
 
-class Facts:
+class PlotData:
     """The data of an episode to plot."""
 
     def __init__(self, episode: Path) -> None:
@@ -68,7 +68,7 @@ class Facts:
                     place = (item.received_ns - start_ns) * (_THUMBNAILS - 1) // span_ns
                     if place not in shown and place < _THUMBNAILS - 1:
                         shown[place] = (at_s, pixels_of(message))
-        for topic, (at_s, message) in newest.items():  # the last images, which show the outcome
+        for topic, (at_s, message) in newest.items():  # the last images show the outcome
             self.pictures[topic][_THUMBNAILS - 1] = (at_s, pixels_of(message))
         self.actions = actions_of(self.summary.metadata, self.vectors)
 
@@ -81,27 +81,27 @@ def actions_of(metadata: Mapping[str, str], topics: Collection[str]) -> dict[str
     return {topic: () for topic in topics if topic.endswith("/commands")}
 
 
-def _draw(facts: Facts, output: Path) -> None:
+def _draw(data: PlotData, output: Path) -> None:
     from matplotlib import pyplot as plt
     from matplotlib.ticker import LogFormatter
 
-    summary = facts.summary
-    heights = [3.0, 3.0, 3.0, *[1.6] * len(facts.pictures)]
+    summary = data.summary
+    heights = [3.0, 3.0, 3.0, *[1.6] * len(data.pictures)]
     figure = plt.figure(figsize=(14, sum(heights)), layout="constrained")
     grid = figure.add_gridspec(len(heights), _THUMBNAILS, height_ratios=heights)
     state = summary.outcome if summary.finished else "unfinished"
     prompt = summary.metadata.get("prompt", "")
-    figure.suptitle(f"{facts.name}: {state}" + (f", “{prompt}”" if prompt else ""))
+    figure.suptitle(f"{data.name}: {state}" + (f", “{prompt}”" if prompt else ""))
     joints = figure.add_subplot(grid[0, :])
     colours: dict[str, Any] = {}
-    several = len({topic for topic, _ in facts.joints}) > 1
-    for (topic, joint), points in facts.joints.items():
+    several = len({topic for topic, _ in data.joints}) > 1
+    for (topic, joint), points in data.joints.items():
         (line,) = joints.plot(*zip(*points, strict=True), label=f"{topic} {joint}" if several else joint, linewidth=1)
         colours.setdefault(joint, line.get_color())
     joints.set(title="joints", ylabel="rad")
     actions = figure.add_subplot(grid[1, :], sharex=joints)
-    for topic, names in facts.actions.items():
-        values = facts.vectors.get(topic, [])
+    for topic, names in data.actions.items():
+        values = data.vectors.get(topic, [])
         for index in range(max((len(vector) for _, vector in values), default=0)):
             points = [(at, vector[index]) for at, vector in values if index < len(vector)]
             name = names[index] if index < len(names) else f"{topic} {index}"
@@ -111,7 +111,7 @@ def _draw(facts: Facts, output: Path) -> None:
         if axes.lines:
             axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     gaps = figure.add_subplot(grid[2, :], sharex=joints)
-    for topic, stamps in facts.stamps.items():
+    for topic, stamps in data.stamps.items():
         if len(stamps) > 2:
             ms = np.diff(stamps) / 1e6
             at_s = (np.array(stamps[1:]) - summary.start_ns) / NS_PER_S
@@ -122,9 +122,9 @@ def _draw(facts: Facts, output: Path) -> None:
     gaps.set(title="time between messages", ylabel="ms", xlabel="s", yscale="log")
     gaps.yaxis.set_major_formatter(LogFormatter())
     gaps.yaxis.set_minor_formatter(LogFormatter())
-    if facts.stamps:
+    if data.stamps:
         gaps.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, markerscale=4)
-    for row, (topic, pictures) in enumerate(facts.pictures.items(), 3):
+    for row, (topic, pictures) in enumerate(data.pictures.items(), 3):
         first = min(pictures)
         for column, (at, pixels) in pictures.items():
             axes = figure.add_subplot(grid[row, column])
@@ -132,7 +132,7 @@ def _draw(facts: Facts, output: Path) -> None:
             axes.set_axis_off()
             axes.set_title(f"{topic}\n{at:.1f} s" if column == first else f"{at:.1f} s", fontsize="small", loc="left")
     try:
-        figure.savefig(output, dpi=80, format=output.suffix[1:] or "png")  # keep the given name
+        figure.savefig(output, dpi=80, format=output.suffix[1:] or "png")  # savefig would add a suffix
     except (OSError, ValueError) as error:
         raise RecorderError(f"{output}: cannot be written: {error}") from error
     finally:

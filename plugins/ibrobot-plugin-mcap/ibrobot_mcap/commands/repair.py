@@ -10,7 +10,7 @@ from ibrobot_core.api import EpisodeSummary, RecorderError
 from ibrobot_core.app import Failed, InUse, declared, echo, emit, wrong_input
 from ibrobot_mcap import REPAIR
 from ibrobot_mcap.changes import Changed, RepairOptions
-from ibrobot_mcap.commands.tell import told
+from ibrobot_mcap.commands.report import report
 
 
 @click.command()
@@ -21,8 +21,8 @@ def repair(options: RepairOptions, events: bool) -> None:
 
     It writes index and metadata.yaml for the readable part. The episode records the missing messages, and `verify`
     reports them. The outcome becomes unknown, since the end may be missing: look at the episode, and set it with
-    `mark`. The original is removed only after the new episode has been read back and has all its messages. Trims,
-    repairs and deletions that were interrupted are finished.
+    `mark`. The original is removed only after the new episode has been read back and has all its messages.
+    Interrupted trims, repairs and deletions are finished.
     """
     from ibrobot_mcap import rewrite
     from ibrobot_mcap.commands.find_episodes import duration_s, episodes_in
@@ -31,7 +31,7 @@ def repair(options: RepairOptions, events: bool) -> None:
     path, failed = options.path, 0
     for episode in interrupted(path):
         with suppress(InUse), owning(episode, "is being repaired"):
-            told(REPAIR, Changed(str(episode), "an interrupted change is finished"), events=events)
+            report(REPAIR, Changed(str(episode), "an interrupted change is finished"), events=events)
     for episode in episodes_in(path):
         try:
             made = rewrite.repair(episode)
@@ -46,14 +46,14 @@ def repair(options: RepairOptions, events: bool) -> None:
         if made is not None:
             count = sum(topic.count for topic in made.summary.topics.values())
             what = f"repaired, {count} messages, {duration_s(made.summary):.2f} s{_description(made.summary)}"
-        told(REPAIR, Changed(str(episode), what), events=events)
+        report(REPAIR, Changed(str(episode), what), events=events)
     if failed:
         raise SystemExit(1)
 
 
 def _description(summary: EpisodeSummary) -> str:
-    """A description of missing messages, and the former outcome."""
-    from ibrobot_mcap.commands.find_episodes import told_stated
+    """A remark on missing messages and the former outcome."""
+    from ibrobot_mcap.commands.find_episodes import stated_outcome_text
 
     missing = sum(topic.missing for topic in summary.topics.values())
-    return (f", {missing} are missing" if missing else "") + told_stated(summary)
+    return (f", {missing} are missing" if missing else "") + stated_outcome_text(summary)

@@ -1,4 +1,4 @@
-"""Tells what a command has done: as an event to a program, or as a line."""
+"""Prints what a command has done: as an event for a program, or as a line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from ibrobot_core.app import Command, echo, emit
 from ibrobot_mcap.changes import Changed
 
 
-def told(command: Command, change: Changed, *, events: bool) -> None:
+def report(command: Command, change: Changed, *, events: bool) -> None:
     """Print a change."""
     if events:
         emit(command, change)

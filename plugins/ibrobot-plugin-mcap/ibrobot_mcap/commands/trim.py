@@ -9,7 +9,7 @@ import click
 from ibrobot_core.app import declared, echo, wrong_input
 from ibrobot_mcap import TRIM
 from ibrobot_mcap.changes import Changed, TrimOptions
-from ibrobot_mcap.commands.tell import told
+from ibrobot_mcap.commands.report import report
 
 
 @click.command()
@@ -24,12 +24,12 @@ def trim(options: TrimOptions, output: Path | None, events: bool) -> None:
     it. After --in-place, `ibrobot episodes trash --restore` puts the original back.
     """
     from ibrobot_mcap import trash
-    from ibrobot_mcap.commands.find_episodes import duration_s, opened, told_stated
+    from ibrobot_mcap.commands.find_episodes import duration_s, opened, stated_outcome_text
 
     episode, begin_s, end_s = options.episode, options.begin_s, options.end_s
     if options.in_place == (output is not None):
         raise click.UsageError("give either --output or --in-place")
-    with opened(episode):  # explains what an episode is
+    with opened(episode):  # raises the error for what is not an episode
         pass
     if output is None:
         made, trashed = trash.trim(episode, begin_s, end_s)
@@ -38,5 +38,5 @@ def trim(options: TrimOptions, output: Path | None, events: bool) -> None:
     else:
         made = trash.copy_part(episode, output, begin_s, end_s)
     count = sum(topic.count for topic in made.summary.topics.values())
-    what = f"{count} messages, {duration_s(made.summary):.2f} s{told_stated(made.summary)}"
-    told(TRIM, Changed(str(made.path), what), events=events)
+    what = f"{count} messages, {duration_s(made.summary):.2f} s{stated_outcome_text(made.summary)}"
+    report(TRIM, Changed(str(made.path), what), events=events)
