@@ -1,4 +1,4 @@
-"""The plugin's hooks: planners, the command source of modes with one, executors of goals, and the section `world`."""
+"""The plugin's hooks: planners, their command source, executors, the sections `world` and `tasks`, commands."""
 
 from __future__ import annotations
 

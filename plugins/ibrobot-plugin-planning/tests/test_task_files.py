@@ -11,7 +11,7 @@ import pytest
 from ibrobot_kinematics.poses import orientation, pose_at
 from ibrobot_kinematics.rotations import from_rpy
 from ibrobot_planning.goals.grammar import upright
-from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
+from ibrobot_planning.tasks.checks import CheckedTask, Situation, check_task
 from ibrobot_planning.tasks.format import MoveStep
 from ibrobot_planning.tasks.reading import EXAMPLES, find_task, read_task
 from ibrobot_planning.world.objects import Sphere, World, WorldObject
@@ -48,7 +48,7 @@ def check(loaded: tuple[RobotConfig, Registry]) -> Check:
     def checked(text: str, mode: str = "plan", parameters: tuple[str, ...] = (), **changes: Any) -> CheckedTask:
         given = {"world": world, "movable": ("cube", "ball"), **changes}
         robot = attrs.evolve(config, default_control_mode=mode)
-        return check_task(read_task(text, "task.yaml", parameters), Circumstances(robot, registry, **given))
+        return check_task(read_task(text, "task.yaml", parameters), Situation(robot, registry, **given))
 
     return checked
 

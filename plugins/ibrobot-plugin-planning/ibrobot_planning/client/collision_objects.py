@@ -84,7 +84,7 @@ class CollisionObjects:
         """Add a shape of shape_msgs/msg/SolidPrimitive, or replace an object; its dimensions are as there [m].
 
         Raises:
-            NotSupported: for other shapes than box, sphere and cylinder.
+            NotSupported: unless it is a box, sphere or cylinder.
         """
         if primitive_type not in _PRIMITIVES:
             raise NotSupported(f"primitive type {primitive_type} is not a box (1), sphere (2) or cylinder (3)")
@@ -141,8 +141,8 @@ class CollisionObjects:
     def detach_all_collision_objects(self) -> None:
         """Detach all objects."""
         self.update_planning_scene()
-        for name, found in self._scene["objects"].items():
-            if found["link"] is not None:
+        for name, thing in self._scene["objects"].items():
+            if thing["link"] is not None:
                 self.detach_collision_object(name)
 
     def clear_all_collision_objects(self) -> Future[bool]:
@@ -171,7 +171,7 @@ class CollisionObjects:
         return _done()
 
     def process_allow_collision_future(self, future: Future[bool]) -> bool:
-        """Whether the object may touch what was asked."""
+        """Whether `allow_collisions` succeeded."""
         return future.result()
 
     def update_planning_scene(self) -> bool:
@@ -220,19 +220,21 @@ class CollisionObjects:
 
 
 def numbers(values: Vector3 | Quaternion | Sequence[float], names: str) -> list[float]:
-    """Numbers of a vector or quaternion.
+    """Components of a vector or quaternion.
 
     Raises:
-        PlanningError: for another number of values than of `names`.
+        PlanningError: if their number is not that of `names`.
     """
     if isinstance(values, Vector3):
         values = (values.x, values.y, values.z)
     elif isinstance(values, Quaternion):
         values = (values.x, values.y, values.z, values.w)
-    found = [float(each) for each in values]
-    if len(found) != len(names):
-        raise PlanningError(f"expected {', '.join(names)}, got {len(found)} numbers", PlanCode.INVALID_GOAL_CONSTRAINTS)
-    return found
+    components = [float(each) for each in values]
+    if len(components) != len(names):
+        raise PlanningError(
+            f"expected {', '.join(names)}, got {len(components)} numbers", PlanCode.INVALID_GOAL_CONSTRAINTS
+        )
+    return components
 
 
 def _done() -> Future[bool]:

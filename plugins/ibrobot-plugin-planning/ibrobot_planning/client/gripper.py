@@ -10,20 +10,20 @@ from ibrobot_planning.client.motion import JointStates, Motions
 from ibrobot_planning.client.node import BaseNode
 
 _NEAR = 0.1
-"""Share of the way between closed and open within which a gripper counts as open."""
+"""Fraction of the range from closed to open within which a gripper counts as open."""
 
 
 class GripperInterface:
     """Opens and closes the gripper by the executor `gripper` of the robot's planning mode.
 
-    Arguments about planning groups, actions and effort have no effect: the robot YAML has these.
+    The robot YAML sets planning groups, actions and effort: arguments about these have no effect.
 
     Args:
         node: the connection to the robot.
         gripper_joint_names: joints of the gripper.
         open_gripper_joint_positions: positions of the open gripper [rad].
         closed_gripper_joint_positions: positions of the closed gripper [rad].
-        gripper_group_name: has no effect, like the arguments below but the next.
+        gripper_group_name: no effect.
         execute_via_moveit: no effect.
         ignore_new_calls_while_executing: whether calls during a motion are ignored.
         skip_planning: no effect.
@@ -35,7 +35,7 @@ class GripperInterface:
         use_move_group_action: no effect.
 
     Raises:
-        PlanningError: for unknown joints, or other numbers of positions than of joints.
+        PlanningError: for unknown joints, or if the number of positions is not that of joints.
     """
 
     def __init__(
@@ -67,12 +67,12 @@ class GripperInterface:
         self.close() if self.is_open else self.open()
 
     def open(self, skip_if_noop: bool = False) -> None:
-        """Open; with `skip_if_noop` only where it is not open."""
+        """Open; with `skip_if_noop` only if it is not open."""
         if not (skip_if_noop and self.is_open):
             self._move(self._open)
 
     def close(self, skip_if_noop: bool = False) -> None:
-        """Close, or grasp what is between the fingers; with `skip_if_noop` only where it is open."""
+        """Close, or grasp what is between the fingers; with `skip_if_noop` only if it is open."""
         if not (skip_if_noop and self.is_closed):
             self._move(self._closed)
 

@@ -17,7 +17,7 @@ from ibrobot_planning.client.node import BaseNode
 
 _POLL_S = 0.02
 _STATE_S = 0.02
-"""Age up to which a joint state is not asked for again [s]."""
+"""Age up to which a joint state is reused [s]."""
 
 
 class MoveIt2State(Enum):
@@ -26,7 +26,7 @@ class MoveIt2State(Enum):
     IDLE = 0
     """Nothing is executed."""
     REQUESTING = 1
-    """Kept for scripts that compare with it: requests are accepted or refused at once."""
+    """Never the state: requests are accepted or refused at once. For scripts that compare with it."""
     EXECUTING = 2
     """The robot plans or moves."""
 
@@ -67,7 +67,7 @@ class Motions:
         self._results: dict[int, Mapping[str, Any]] = {}
 
     def ask(self, service: str, request: Any) -> None:
-        """Ask for a motion, unless calls are ignored while one is executed."""
+        """Ask for a motion, unless one is executed and calls are ignored meanwhile."""
         if self._ignores and self.state is MoveIt2State.EXECUTING:
             self.node.get_logger().warning("the robot executes a motion; this call is ignored")
             return
@@ -104,17 +104,17 @@ class Motions:
     def result(self, number: int) -> Mapping[str, Any] | None:
         """The result of a motion; None while it is under way."""
         if number not in self._results:
-            found = self.node.call("/planning/result", number)
-            if found is None:
+            result = self.node.call("/planning/result", number)
+            if result is None:
                 return None
-            self._results[number] = found
+            self._results[number] = result
         return self._results[number]
 
     def await_result(self, number: int) -> Mapping[str, Any]:
         """The result of a motion, once it has ended."""
-        while (found := self.result(number)) is None:
+        while (result := self.result(number)) is None:
             self.node.wait(_POLL_S)
-        return found
+        return result
 
     def wait(self) -> bool:
         """Wait for the end of the newest motion; returns whether it succeeded."""
@@ -133,7 +133,7 @@ class Motions:
 
 
 class JointStates:
-    """The robot's joint states, asked for when they are read."""
+    """The robot's joint states, requested when they are read."""
 
     def __init__(self, node: BaseNode) -> None:
         self._node = node
@@ -156,7 +156,7 @@ def background[**P, T](call: Callable[P, T], *arguments: P.args, **options: P.kw
     def run() -> None:
         try:
             future.set_result(call(*arguments, **options))
-        except Exception as error:  # noqa: BLE001 - it is the caller's, who asks for the result
+        except Exception as error:  # noqa: BLE001 - `future.result` raises it
             future.set_exception(error)
 
     threading.Thread(target=run, daemon=True).start()

@@ -27,7 +27,7 @@ __all__ = ["MoveIt2", "MoveIt2State", "MoveItErrorCodes"]
 type JointPositions = JointState | Sequence[float]
 
 _LEAST = 1e-6
-"""Fraction of a straight path in place of 0, which means any."""
+"""Sent in place of the fraction 0, which accepts any part of a straight path."""
 
 
 class _WithoutEffect:
@@ -54,9 +54,9 @@ _BY_YAML = "it is an option of the planner in the robot YAML"
 class MoveIt2(CollisionObjects):
     """Plans and moves an arm that `ibrobot launch` runs in a mode with a planner.
 
-    Methods, arguments and defaults are those of pymoveit2. Failures of planning and moving are logged, and answered
-    with None or False, as there. Arguments without an effect here: `weight_…`, `cartesian_max_step`, `group_name`,
-    `callback_group` and the names of actions.
+    Methods, arguments and defaults are those of pymoveit2. If planning or moving fails, they log
+    why and return None or False, as in pymoveit2. `weight_…`, `cartesian_max_step`, `group_name`, `callback_group` and
+    the names of actions have no effect.
 
     Args:
         node: the connection to the robot.
@@ -126,7 +126,7 @@ class MoveIt2(CollisionObjects):
         """Plan and move to a pose, or to a position with any orientation; returns at once.
 
         Raises:
-            PlanningError: for a goal that makes no sense.
+            PlanningError: for an invalid goal.
         """
         self.set_pose_goal(pose, position, quat_xyzw, frame_id, target_link, tolerance_position, tolerance_orientation)
         if cartesian:
@@ -144,7 +144,7 @@ class MoveIt2(CollisionObjects):
         """Plan and move to joint positions [rad]; returns at once.
 
         Raises:
-            PlanningError: for a goal that makes no sense.
+            PlanningError: for an invalid goal.
         """
         self.set_joint_goal(joint_positions, joint_names, tolerance)
         self._motions.ask("/move_action", {"goals": self._taken_goals(), **self._scalings()})
@@ -161,7 +161,7 @@ class MoveIt2(CollisionObjects):
         """Plan without moving; None if there is no plan.
 
         Raises:
-            PlanningError: for a goal that makes no sense.
+            PlanningError: for an invalid goal.
         """
         self.set_pose_goal(pose, position, quat_xyzw, frame_id, target_link, tolerance_position, tolerance_orientation)
         if joint_positions is not None:
@@ -318,7 +318,7 @@ class MoveIt2(CollisionObjects):
 
         Raises:
             NotSupported: for constraints.
-            PlanningError: for a goal that makes no sense.
+            PlanningError: for an invalid goal.
         """
         if constraints is not None:
             raise NotSupported("compute_ik takes no constraints")
@@ -347,16 +347,16 @@ class MoveIt2(CollisionObjects):
 
     @property
     def new_joint_state_available(self) -> bool:
-        """Always True: joint states are asked for when they are read."""
+        """Always True: joint states are requested when they are read."""
         return True
 
     def reset_new_joint_state_checker(self) -> None:
-        """Do nothing: joint states are asked for when they are read."""
+        """Do nothing: joint states are requested when they are read."""
 
     def force_reset_executing_state(self) -> None:
         """Do nothing: the robot knows whether it executes a motion."""
 
-    # What pymoveit2 has and this client has not.
+    # Not supported.
 
     def reset_controller(self, *arguments: Any, **options: Any) -> None:
         """Raise NotSupported."""
@@ -377,10 +377,8 @@ class MoveIt2(CollisionObjects):
         """Raise NotSupported."""
         raise NotSupported("the workspace is bounded by objects of the world: add planes or boxes")
 
-    # Inside.
-
     def _taken_goals(self) -> list[dict[str, Any]]:
-        """The goals set, which are forgotten."""
+        """Return the goals, and clear them."""
         goals = [goal for goal in self._goals if goal]
         self.clear_goal_constraints()
         turned = {"beyond_reach": self.beyond_reach}

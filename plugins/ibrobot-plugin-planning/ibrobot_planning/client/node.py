@@ -89,7 +89,7 @@ class Node(BaseNode):
         name: name of the script.
         options: the transport's options, e.g. `connect=[tcp/192.168.1.5:7447]`; by default a robot on this machine.
         namespace: the robot's namespace, e.g. `arm1`.
-        transport: type of the transport; by default the one that is installed.
+        transport: type of the transport; by default the installed one.
 
     Raises:
         PluginError: if no transport is installed.
@@ -102,14 +102,14 @@ class Node(BaseNode):
         registry = installed_plugins()
         descriptor = registry.find("transport", transport or registry.default("transport"))
         assert isinstance(descriptor, TransportDescriptor)
-        chosen = single_options(descriptor.options, options or (_DEFAULT,), "transport", "options of Node:")
+        parsed = single_options(descriptor.options, options or (_DEFAULT,), "transport", "options of Node:")
         log = logging.getLogger(f"ibrobot.{name}")
-        self._transport: Transport = descriptor.make(chosen, Context(name, RealClock(), log, Robot(name, ())))
+        self._transport: Transport = descriptor.make(parsed, Context(name, RealClock(), log, Robot(name, ())))
         self._endpoint = endpoint(namespace)
         self._await_robot()
 
     def _await_robot(self) -> None:
-        """Wait until the robot answers, as a connection takes a moment."""
+        """Wait until the robot answers: connecting takes a moment."""
         deadline = time.monotonic() + _CONNECT_S
         while True:
             try:
@@ -151,7 +151,7 @@ class LocalNode(BaseNode):
 
     @override
     def call(self, service: str, request: Any = None) -> Any:
-        # The same bytes as over a network, so that a script behaves alike.
+        # Encoded as for a network, so that a script behaves the same.
         call = decode_call(encode_call(Call(service, request)))
         try:
             answer = Answer(self._runtime.session.bus.call(call.service, call.request))

@@ -1,4 +1,4 @@
-"""Names of robots, as the modules of `pymoveit2.robots` give them."""
+"""Names of robots, like the modules of `pymoveit2.robots`."""
 
 from __future__ import annotations
 
@@ -47,4 +47,4 @@ so101 = RobotNames(
     OPEN_GRIPPER_JOINT_POSITIONS=(1.5,),
     CLOSED_GRIPPER_JOINT_POSITIONS=(0.0,),
 )
-"""The SO-101, as the robot YAML `so101` has it."""
+"""The SO-101 of the robot YAML `so101`."""

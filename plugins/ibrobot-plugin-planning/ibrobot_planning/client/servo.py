@@ -27,8 +27,8 @@ class MoveIt2Servo:
         enable_at_init: whether to call `enable`.
         callback_group: no effect.
         mode: the robot's mode with the teleop `twist`. Not in pymoveit2, like the next.
-        mode_afterwards: the mode that `disable` enters, e.g. one with a planner; by default the robot stays, and holds.
-        service: the service of the teleop, which has the name of its topic.
+        mode_afterwards: the mode that `disable` enters, e.g. one with a planner; empty: the robot stays, and holds.
+        service: the service of the teleop, named like its topic.
 
     Attributes:
         frame_id: as the argument.
@@ -62,7 +62,7 @@ class MoveIt2Servo:
         """Send a twist: velocities of the tool, multiplied by `linear_speed` and `angular_speed`.
 
         Raises:
-            PlanningError: for other than three numbers, or where the robot takes no twists.
+            PlanningError: unless each has three numbers, and the robot takes twists.
         """
         if not self._enabled and not (enable_if_disabled and self.enable()):
             self._node.get_logger().warning("the twist is not sent: the servo is not enabled")

@@ -71,9 +71,9 @@ def srdf_of(robot: Robot, pairs: Mapping[Pair, str], names: Mapping[str, str]) -
                 for joint in joints
             ]
             lines += ["  </group_state>"]
-    found = {sorted_pair(names[a], names[b]): reason for (a, b), reason in pairs.items() if a in names and b in names}
+    renamed = {sorted_pair(names[a], names[b]): reason for (a, b), reason in pairs.items() if a in names and b in names}
     lines += [
         f"  <disable_collisions link1={quoteattr(a)} link2={quoteattr(b)} reason={quoteattr(reason)}/>"
-        for (a, b), reason in sorted(found.items())
+        for (a, b), reason in sorted(renamed.items())
     ]
     return "\n".join([*lines, "</robot>", ""])

@@ -25,15 +25,12 @@ from ibrobot_core.api import (
     PositionGoal,
     Robot,
     Vector,
-    ns,
-    seconds,
 )
 from ibrobot_core.app import (
     ControlMode,
     LaunchRequest,
     RobotConfig,
     Session,
-    Spline,
     echo,
     find_config,
     installed_plugins,
@@ -43,6 +40,7 @@ from ibrobot_core.app import (
 )
 from ibrobot_planning.execution.plans import GoalPlans, arm_joints
 from ibrobot_planning.goals.text import Target, target
+from ibrobot_planning.planners.timing import motion_of
 from ibrobot_planning.world.objects import world_of
 
 if TYPE_CHECKING:
@@ -101,34 +99,34 @@ def plan(start: str, goal: str, speed: float, plot: Path | None, config: str | N
         robot = loaded.robot
         joints = arm_joints(loaded, mode)
         from_ = _positions(start, robot)
-        wanted = target(goal, robot, speed)
-    facts: dict[str, Any] = {
+        aim = target(goal, robot, speed)
+    report: dict[str, Any] = {
         "robot": robot.name,
         "mode": mode.name,
         "planner": mode.planner.type if mode.planner else "",
         "from": start,
         "goal": goal,
-        "kind": _kind(wanted),
+        "kind": _kind(aim),
     }
     try:
-        found = _planned(loaded, mode, options["seed"], joints, from_, wanted, facts)
+        sampled = _planned(loaded, mode, options["seed"], joints, from_, aim, report)
     except PlanningError as error:
-        facts |= {"success": False, "code": error.code.name, "message": str(error)}
+        report |= {"success": False, "code": error.code.name, "message": str(error)}
         if options["as_json"]:
-            echo(json.dumps(facts, indent=2))
+            echo(json.dumps(report, indent=2))
         else:
             echo(f"error: no plan: {error.code.name}: {error}", err=True)
         sys.exit(_NO_PLAN)
     if plot is not None:
-        _figure(found, robot, goal).savefig(plot)
-    echo(json.dumps(facts, indent=2) if options["as_json"] else _text(facts))
+        _figure(sampled, robot, goal).savefig(plot)
+    echo(json.dumps(report, indent=2) if options["as_json"] else _text(report))
 
 
 def _loaded(config: str | None, options: dict[str, Any]) -> tuple[RobotConfig, ControlMode]:
     """The robot, and its mode with a planner.
 
     Raises:
-        NotSupported: where the mode has no planner, or none is named and there are several.
+        NotSupported: if the mode has no planner, or several modes have one and none is named.
     """
     registry = installed_plugins()
     loaded = load_config(
@@ -158,19 +156,19 @@ def _positions(text: str, robot: Robot) -> Vector:
     return np.array([parsed.joints.get(name, 0.0) for name in robot.joint_names])
 
 
-def _kind(wanted: Target) -> str:
-    if isinstance(wanted.tool, PositionGoal):
-        return "position" if wanted.tool.axis is None else "position with axis"
-    if isinstance(wanted.tool, PoseGoal):
+def _kind(aim: Target) -> str:
+    if isinstance(aim.tool, PositionGoal):
+        return "position" if aim.tool.axis is None else "position with axis"
+    if isinstance(aim.tool, PoseGoal):
         return "pose"
-    return "joints" if "=" in wanted.text else "named pose"
+    return "joints" if "=" in aim.text else "named pose"
 
 
 def _planned(
-    config: RobotConfig, mode: ControlMode, seed: int, joints: tuple[str, ...], start: Vector, wanted: Target,
-    facts: dict[str, Any],
+    config: RobotConfig, mode: ControlMode, seed: int, joints: tuple[str, ...], start: Vector, aim: Target,
+    report: dict[str, Any],
 ) -> Plan:  # fmt: skip
-    """The plan; adds what is printed to `facts`.
+    """The plan; adds its figures to `report`.
 
     Raises:
         PlanningError: if there is none.
@@ -181,27 +179,30 @@ def _planned(
         planner = plans.make()
         planner.load()
         begun = time.monotonic()
-        plans.check(wanted)
-        result = plans.plan(wanted, start)[1]
+        plans.check(aim)
+        goals, result = plans.plan(aim, start)
         elapsed_s = time.monotonic() - begun
         planner.close()
         if result is None:
-            raise PlanningError(f"goal {wanted.text!r} moves no joint of the arm: {', '.join(joints)}")
-        found = _sampled(result.trajectory, robot, start)
+            raise PlanningError(f"goal {aim.text!r} moves no joint of the arm: {', '.join(joints)}")
+        trajectory = next(each for each in goals.values() if isinstance(each, JointTrajectory))
+        sampled = _sampled(trajectory, robot, start)
         others = dict(zip(robot.joint_names, start.tolist(), strict=True))
-        clearance = _clearance(session, joints, others, found)
+        clearance = _clearance(session, joints, others, sampled)
     limits = robot.max_velocity[robot.indices(joints)]
-    peaks = np.abs(found.velocities).max(axis=0)
-    facts |= {
+    peaks = np.abs(sampled.velocities).max(axis=0)
+    report |= {
         "success": True,
         "code": PlanCode.SUCCESS.name,
         "message": "",
-        "goal_joints": dict(zip(joints, found.positions[-1].tolist(), strict=True)),
+        "goal_joints": dict(zip(joints, sampled.positions[-1].tolist(), strict=True)),
         "position_error_m": result.position_error,
         "orientation_error_rad": result.orientation_error,
-        "length_rad": float(np.linalg.norm(np.diff(found.positions, axis=0), axis=1).sum()),
-        "tool_path_m": None if found.tool is None else float(np.linalg.norm(np.diff(found.tool, axis=0), axis=1).sum()),
-        "duration_s": float(found.times[-1]),
+        "length_rad": float(np.linalg.norm(np.diff(sampled.positions, axis=0), axis=1).sum()),
+        "tool_path_m": None
+        if sampled.tool is None
+        else float(np.linalg.norm(np.diff(sampled.tool, axis=0), axis=1).sum()),
+        "duration_s": float(sampled.times[-1]),
         "clearance": clearance,
         "peak_velocity": {
             name: {"rad_s": float(peak), "share_of_limit": float(peak / limit)}
@@ -209,12 +210,12 @@ def _planned(
         },
         "planning_time_s": elapsed_s,
     }
-    return found
+    return sampled
 
 
 @contextmanager
 def _session(config: RobotConfig, seed: int) -> Iterator[Session]:
-    """A run that never starts, but whose bus has the world."""
+    """A run that is not started, except for its world."""
     session = Session(config, installed_plugins(), LaunchRequest(seed=seed))
     with ExitStack() as stack:
         for descriptor, options in session.registry.sections(config):
@@ -226,17 +227,10 @@ def _session(config: RobotConfig, seed: int) -> Iterator[Session]:
 
 
 def _sampled(trajectory: JointTrajectory, robot: Robot, start: Vector) -> Plan:
-    points = trajectory.points
-    fields = [
-        np.array([point.positions for point in points]),
-        np.array([point.velocities for point in points]),
-        np.array([point.accelerations for point in points]),
-    ]
-    stamps = np.array([point.time_from_start_ns for point in points], dtype=np.int64)
-    spline = Spline(stamps, *(each if each.size else None for each in fields))  # type: ignore[arg-type]
-    times = np.append(np.arange(0.0, seconds(spline.end_ns), _STEP_S), seconds(spline.end_ns))
-    samples = [spline.at(ns(float(moment))) for moment in times]
-    positions = np.array([sample[0] for sample in samples])
+    motion = motion_of(trajectory)
+    assert motion is not None, "GoalPlans completes trajectories"
+    times = np.append(np.arange(0.0, motion.duration, _STEP_S), motion.duration)
+    positions, velocities, _ = motion.sampled(_STEP_S)
     tool = None
     if robot.description.mjcf is not None:
         from ibrobot_kinematics import robot_model
@@ -244,13 +238,13 @@ def _sampled(trajectory: JointTrajectory, robot: Robot, start: Vector) -> Plan:
         whole = np.repeat(start[None], len(times), axis=0)
         whole[:, robot.indices(trajectory.joint_names)] = positions
         tool = robot_model(robot).forward(whole).position
-    return Plan(trajectory, times, positions, np.array([sample[1] for sample in samples]), tool)
+    return Plan(trajectory, times, positions, velocities, tool)
 
 
 def _clearance(
-    session: Session, joints: tuple[str, ...], others: dict[str, float], found: Plan
+    session: Session, joints: tuple[str, ...], others: dict[str, float], sampled: Plan
 ) -> dict[str, Any] | None:
-    """The least distance of the arm, and of what it carries, from objects; None without objects or collision checks."""
+    """The least distance of the arm, and of what it carries, from objects; None without objects."""
     world = world_of(session.bus)
     if not world.objects:
         return None
@@ -260,7 +254,7 @@ def _clearance(
     checked = checked_arm(session.config.robot, session.log)
     checks = Collisions(checked.arm, world, joints, others, unchecked=checked.unchecked)
     nearest: dict[str, Any] | None = None
-    for moment, q in zip(found.times.tolist(), found.positions, strict=True):
+    for moment, q in zip(sampled.times.tolist(), sampled.positions, strict=True):
         for (first, second), distance in checks.distances(q).items():
             standing = any(name in world.objects and world.objects[name].link is None for name in (first, second))
             if standing and (nearest is None or distance < nearest["distance_m"]):
@@ -268,27 +262,27 @@ def _clearance(
     return nearest
 
 
-def _text(facts: dict[str, Any]) -> str:
+def _text(report: dict[str, Any]) -> str:
     rows = [
-        ("planner", f"{facts['planner']}, mode {facts['mode']}"),
-        ("goal", f"{facts['goal']} ({facts['kind']})"),
-        ("joints at the goal", ", ".join(f"{name} {value:.3f}" for name, value in facts["goal_joints"].items())),
-        ("off the goal", f"{1e3 * facts['position_error_m']:.2f} mm, {facts['orientation_error_rad']:.4f} rad"),
-        ("path", f"{facts['length_rad']:.3f} rad"),
-        ("duration", f"{facts['duration_s']:.3f} s"),
+        ("planner", f"{report['planner']}, mode {report['mode']}"),
+        ("goal", f"{report['goal']} ({report['kind']})"),
+        ("joints at the goal", ", ".join(f"{name} {value:.3f}" for name, value in report["goal_joints"].items())),
+        ("off the goal", f"{1e3 * report['position_error_m']:.2f} mm, {report['orientation_error_rad']:.4f} rad"),
+        ("path", f"{report['length_rad']:.3f} rad"),
+        ("duration", f"{report['duration_s']:.3f} s"),
     ]
-    if facts["tool_path_m"] is not None:
-        rows.append(("path of the tool", f"{facts['tool_path_m']:.3f} m"))
-    if (nearest := facts["clearance"]) is not None:
+    if report["tool_path_m"] is not None:
+        rows.append(("path of the tool", f"{report['tool_path_m']:.3f} m"))
+    if (nearest := report["clearance"]) is not None:
         between = " and ".join(nearest["between"])
         rows.append(
             ("clearance", f"{1e3 * nearest['distance_m']:.1f} mm between {between}, at {nearest['at_s']:.2f} s")
         )
     peaks = (
         f"{name} {peak['rad_s']:.2f} rad/s ({100 * peak['share_of_limit']:.0f} %)"
-        for name, peak in facts["peak_velocity"].items()
+        for name, peak in report["peak_velocity"].items()
     )
-    rows += [("peak velocities", ", ".join(peaks)), ("planned in", f"{1e3 * facts['planning_time_s']:.0f} ms")]
+    rows += [("peak velocities", ", ".join(peaks)), ("planned in", f"{1e3 * report['planning_time_s']:.0f} ms")]
     return "\n".join(f"{name:18}  {value}" for name, value in rows)
 
 
@@ -307,26 +301,26 @@ def _check_plot(path: Path) -> None:
         raise NotSupported(f"--plot {path}: no folder {path.parent}")
 
 
-def _figure(found: Plan, robot: Robot, title: str) -> Figure:
+def _figure(sampled: Plan, robot: Robot, title: str) -> Figure:
     """Positions and velocities over time, and the path of the tool from above and from the side."""
     from matplotlib.figure import Figure
 
-    columns = 1 if found.tool is None else 2
+    columns = 1 if sampled.tool is None else 2
     figure = Figure(figsize=(5.5 * columns, 6), layout="constrained")
     axes = figure.subplots(2, columns, squeeze=False)
-    limits = robot.max_velocity[robot.indices(found.trajectory.joint_names)]
-    for number, name in enumerate(found.trajectory.joint_names):
-        axes[0][0].plot(found.times, found.positions[:, number], label=name)
-        axes[1][0].plot(found.times, 100 * found.velocities[:, number] / limits[number], label=name)
+    limits = robot.max_velocity[robot.indices(sampled.trajectory.joint_names)]
+    for number, name in enumerate(sampled.trajectory.joint_names):
+        axes[0][0].plot(sampled.times, sampled.positions[:, number], label=name)
+        axes[1][0].plot(sampled.times, 100 * sampled.velocities[:, number] / limits[number], label=name)
     axes[0][0].set(title=title, ylabel="position [rad]")
     axes[0][0].legend(fontsize="small")
     axes[1][0].set(xlabel="time [s]", ylabel="velocity [% of the limit]")
-    if found.tool is not None:
+    if sampled.tool is not None:
         for row, (across, up, view) in enumerate(((0, 1, "from above"), (0, 2, "from the side"))):
             path = axes[row][1]
-            path.plot(found.tool[:, across], found.tool[:, up])
-            path.plot(*found.tool[0, [across, up]], "o", label="start")
-            path.plot(*found.tool[-1, [across, up]], "s", label="goal")
+            path.plot(sampled.tool[:, across], sampled.tool[:, up])
+            path.plot(*sampled.tool[0, [across, up]], "o", label="start")
+            path.plot(*sampled.tool[-1, [across, up]], "s", label="goal")
             path.set(
                 title=f"tool, {view}", xlabel="x [m]", ylabel=f"{'xyz'[up]} [m]", aspect="equal", adjustable="datalim"
             )

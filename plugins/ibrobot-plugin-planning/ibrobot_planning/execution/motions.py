@@ -1,4 +1,4 @@
-"""Execution of planned motions by the executors of a mode: how they begin, blend, stop, and are supervised."""
+"""Execution of planned motions by the executors of a mode: begin, blend, stop, supervise."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ibrobot_planning.planners.blend import Limits, braking, cut, joined
 from ibrobot_planning.planners.timing import Motion, motion_of, trajectory_of
 
 _LATENCY_S = 0.04
-"""How far ahead a trajectory takes over from the running one: it must arrive there in time."""
+"""How far ahead a trajectory takes over from the running one, so that its goal arrives in time."""
 _LEAD_S = 0.15
 """How long a replaced motion goes on before it brakes, so that quick replans do not slow the arm."""
 
@@ -35,13 +35,13 @@ type ExecutorGoal = JointTrajectory | float
 
 
 def commanded(session: RunView) -> Vector:
-    """Commanded positions [rad], shape (J,): unlike the measured ones, they do not sag."""
+    """Commanded positions [rad], shape (J,): unlike measured ones, they do not sag."""
     return session.state.command if session.state is not None else session.measured().position
 
 
 @attrs.define(eq=False)
 class _Track:
-    """What an executor follows."""
+    """A goal that an executor follows."""
 
     goal_id: str
     trajectory: JointTrajectory | None
@@ -56,11 +56,11 @@ class _Track:
 
 @attrs.define(eq=False)
 class _Next:
-    """A goal that waits."""
+    """A goal that waits for the braking motion."""
 
     goal: ExecutorGoal
     refused: str = ""
-    """Why the executor last refused to let it take over from the braking motion; often because it came too late."""
+    """Why the executor last refused it; often because it came too late."""
 
     @cached_property
     def motion(self) -> Motion | None:
@@ -69,11 +69,11 @@ class _Next:
 
 
 class Execution:
-    """The goals of executors under way. Methods may be called from several threads.
+    """The goals that executors follow. Methods may be called from several threads.
 
     Args:
         session: the run.
-        planner: says whether a motion touches anything.
+        planner: checks motions for collisions.
     """
 
     def __init__(self, session: RunView, planner: Planner) -> None:
@@ -81,16 +81,16 @@ class Execution:
         self._planner = planner
         self._lock = threading.RLock()
         self._tracks: dict[str, _Track] = {}
-        """Executors that have not ended yet."""
+        """Executor -> the goal that it follows."""
         self._ahead: dict[str, _Next] = {}
-        """Goals that wait until the executor's braking motion permits them."""
+        """Executor -> the goal that waits for its braking motion."""
         self._number = 0
         self._stops = 0
         """Number of emergency stops when the present move was requested."""
 
     @property
     def under_way(self) -> bool:
-        """Whether an executor has not ended yet."""
+        """Whether an executor follows a goal."""
         return bool(self._tracks or self._ahead)
 
     def begin(self, number: int, goals: Mapping[str, ExecutorGoal], stops: int) -> None:
@@ -130,14 +130,14 @@ class Execution:
                 self._tracks[name] = _Track(goal_id, None)
 
     def brake(self, number: int, stops: int) -> Vector | None:
-        """Let trajectories go on for a moment, and then brake along their path, until `follow` adds the next motion.
+        """Brake along the path after a moment, unless `follow` adds the next motion before.
 
         Args:
             number: of the next move.
             stops: as for `begin`.
 
         Returns:
-            Where the robot comes to rest [rad], shape (J,); None if a running goal cannot be continued like that.
+            Where the robot comes to rest [rad], shape (J,); None if a running goal cannot brake.
         """
         with self._lock:
             braked = self._braked()
@@ -174,10 +174,10 @@ class Execution:
                     self._ahead.pop(name, None)
 
     def take(self, event: Mapping[str, Any]) -> str | None:
-        """Take an event of an executor.
+        """Process an event of an executor.
 
         Returns:
-            None if its present goal did not end by it; otherwise what went wrong, or an empty text.
+            None if the event did not end its goal; otherwise what went wrong, or an empty text.
         """
         name, state = str(event["executor"]), str(event["state"])
         with self._lock:
@@ -206,7 +206,7 @@ class Execution:
         return ""
 
     def touched(self) -> str:
-        """What the arm touches, or is too near to, where it stands; empty if nothing."""
+        """What the arm touches or is too near to at present; empty if nothing."""
         session, position = self._session, commanded(self._session)
         robot = session.config.robot
         others = dict(zip(robot.joint_names, position.tolist(), strict=True))
@@ -227,14 +227,14 @@ class Execution:
         self._tracks[name] = _Track(goal_id, None if isinstance(goal, float) else goal)
 
     def _begin(self, name: str, following: _Next) -> bool:
-        """Send a goal to an executor at rest."""
+        """Send a goal to an executor at rest; True, as it needs no retry."""
         if following.refused:
             self._session.log.warning("the next motion of %s began after a stop: %s", name, following.refused)
         self._send(name, f"{self._number}:{name}", following.goal)
         return True
 
     def _take_over(self, name: str, following: _Next, way: JointTrajectory, takes_over: Mapping[str, Any]) -> bool:
-        """Let a trajectory take over from the running one; return False if the executor refuses it, e.g. too late."""
+        """Let a trajectory take over from the running one; False if the executor refuses it, e.g. as too late."""
         try:
             self._send(name, f"{self._number}:{name}", way, takes_over)
         except HardwareError as error:
@@ -243,9 +243,9 @@ class Execution:
         return True
 
     def _braked(self) -> dict[str, tuple[int, JointTrajectory]] | None:
-        """Executor -> when its braking motion takes over [ns], and that motion; None if one cannot brake like that."""
+        """Executor -> when its braking motion takes over [ns], and that motion; None if one cannot brake."""
         robot, state = self._session.config.robot, self._session.state
-        found = {}
+        braked = {}
         for name, track in self._tracks.items():
             if track.trajectory is None and self._session.config.executors[name].goals == "position":
                 continue
@@ -257,13 +257,13 @@ class Execution:
                 return None
             joints = track.trajectory.joint_names
             way = braking(old, begin_s, begin_s + _LEAD_S, robot.max_acceleration[robot.indices(joints)])
-            found[name] = ns(begin_s), trajectory_of(way, joints, self._session.clock.now_ns())
-        return found or None
+            braked[name] = ns(begin_s), trajectory_of(way, joints, self._session.clock.now_ns())
+        return braked or None
 
     def _blended(
         self, name: str, track: _Track, running: JointTrajectory, following: _Next, goal: JointTrajectory
     ) -> bool:
-        """Let a motion begin while the executor brakes; return False if its time has not come."""
+        """Begin a motion while the executor brakes; False if its time has not come."""
         state, old, new = self._session.state, track.motion, following.motion
         if track.begin_ns is None or state is None or old is None:
             return False
@@ -280,7 +280,7 @@ class Execution:
         )
         others = dict(zip(robot.joint_names, state.command.tolist(), strict=True))
         for way in joined(old, new, begin_s, limits):
-            # After the old motion the way is that of the new one, which the planner has checked.
+            # Only the overlap needs a check: the planner has checked the rest of the new motion.
             overlap = trajectory_of(cut(way, old.duration - begin_s), running.joint_names, goal.header.stamp_ns)
             if not self._planner.blocked(overlap, others):
                 blend = trajectory_of(way, running.joint_names, goal.header.stamp_ns)

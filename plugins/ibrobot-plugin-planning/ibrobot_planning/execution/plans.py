@@ -56,7 +56,7 @@ class GoalPlans:
         """Held while the planner plans."""
 
     def make(self) -> Planner:
-        """Make the planner; its `load` takes a moment."""
+        """Make the planner, without loading it."""
         assert self._mode.planner is not None
         self.planner = self._session.make("planner", self._mode.planner, self._mode.planner.type)
         return self.planner
@@ -76,7 +76,7 @@ class GoalPlans:
         return world_of(self._session.bus), self.tool.model.forward(start).position if relative else None
 
     def any_goal(self, goals: Sequence[GoalOptions], start: Vector) -> Goal:
-        """One goal as it is, several as alternatives.
+        """The only goal, or all as alternatives.
 
         Raises:
             PlanningError: without goals, or as `GoalOptions.goal`.
@@ -90,7 +90,7 @@ class GoalPlans:
         """Check that the mode takes goals of this kind.
 
         Raises:
-            PlanningError: if its planner does not take such goals, or no executor of the mode can reach it.
+            PlanningError: if the planner does not take such goals, or no executor of the mode can reach it.
         """
         if target.tool is not None and not isinstance(target.tool, JointGoal):
             self._check_planner(target)
@@ -111,10 +111,10 @@ class GoalPlans:
         """Executor -> its part of a goal: a goal to plan for, a position [rad], or a trajectory to follow.
 
         Raises:
-            PlanningError: where no executor of the mode can reach the goal.
+            PlanningError: if no executor of the mode can reach the goal.
         """
         executors = {name: self._session.config.executors[name] for name in self._mode.executors}
-        found: dict[str, Goal | float | JointTrajectory] = {}
+        parts: dict[str, Goal | float | JointTrajectory] = {}
         if (trajectory := target.trajectory) is not None:
             wanted = sorted(trajectory.joint_names)
             arms = [
@@ -130,11 +130,11 @@ class GoalPlans:
         for name, executor in executors.items():
             mine = [joint for joint in executor.joints if joint in target.joints]
             if mine and executor.goals == "position":
-                found[name] = target.joints[mine[0]]
+                parts[name] = target.joints[mine[0]]
             elif mine:
-                found[name] = JointGoal(tuple(mine), np.array([target.joints[joint] for joint in mine]))
+                parts[name] = JointGoal(tuple(mine), np.array([target.joints[joint] for joint in mine]))
         if target.tool is None:
-            return found
+            return parts
         arms = [name for name, executor in executors.items() if executor.goals == "trajectory"]
         if len(arms) != 1:
             raise PlanningError(
@@ -143,10 +143,10 @@ class GoalPlans:
                 PlanCode.INVALID_GROUP_NAME,
             )
         joints = executors[arms[0]].joints
-        if arms[0] in found:
-            given = ", ".join(joint for joint in target.joints if joint in joints)
-            raise invalid_goal(f"goal {target.text!r}: {given} moves the tool, and cannot be given beside its position")
-        return {arms[0]: target.tool, **found}
+        if arms[0] in parts:
+            both = ", ".join(joint for joint in target.joints if joint in joints)
+            raise invalid_goal(f"goal {target.text!r}: {both} moves the tool, and cannot be given beside its position")
+        return {arms[0]: target.tool, **parts}
 
     def plan(self, target: Target, start: Vector) -> tuple[dict[str, ExecutorGoal], PlanResult | None]:
         """Plan a goal.
@@ -156,7 +156,7 @@ class GoalPlans:
             start: positions of all joints [rad], shape (J,), from which the motion begins.
 
         Returns:
-            Executor -> what it has to do, and the last plan; None if nothing had to be planned.
+            Executor -> its goal, and the plan; None if nothing had to be planned.
 
         Raises:
             PlanningError: with MoveIt's code.
@@ -191,10 +191,10 @@ class GoalPlans:
         return goals, planned
 
     def _checked(self, trajectory: JointTrajectory, start: Vector, others: Mapping[str, float]) -> JointTrajectory:
-        """Complete a trajectory, and check its limits and its collisions in the present world.
+        """Complete a trajectory, and check it for limits and for collisions in the present world.
 
         Raises:
-            PlanningError: if it is not.
+            PlanningError: if it fails a check.
         """
         robot, config = self._session.config.robot, self._session.config
         whole = completed(
@@ -217,7 +217,7 @@ class GoalPlans:
             except IbrobotError:
                 raise
             except Exception as error:
-                # A request that no planner foresaw must not end the run of a robot.
+                # A planner's bug must not end the run of a robot.
                 self._session.log.exception("a bug of planner %s; please report it", type(self.planner).__name__)
                 raise PlanningError(f"the planner failed: {type(error).__name__}: {error}", PlanCode.FAILURE) from error
 
@@ -232,7 +232,7 @@ def arm_joints(config: RobotConfig, mode: ControlMode) -> tuple[str, ...]:
     """The joints of the arm.
 
     Raises:
-        PlanningError: where the mode has not exactly one executor of trajectories.
+        PlanningError: unless the mode has exactly one executor of trajectories.
     """
     executors = [config.executors[name] for name in mode.executors]
     arms = [executor.joints for executor in executors if executor.goals == "trajectory"]

@@ -25,7 +25,7 @@ from ibrobot_planning.goals.text import Target
 
 
 def _few(most: int) -> Callable[[object, attrs.Attribute[Any], Sequence[object]], None]:
-    """A validator of the number of items."""
+    """A validator that limits the number of items."""
 
     def check(instance: object, attribute: attrs.Attribute[Any], value: Sequence[object]) -> None:
         if len(value) > most:
@@ -51,10 +51,10 @@ class MoveRequest:
 @documented
 @attrs.frozen
 class PlanQuery:
-    """A request to `/plan_kinematic_path`: plan to the first of several goals that can be reached, and stay."""
+    """A request to `/plan_kinematic_path`: plan to the first of several goals that can be reached, without moving."""
 
     goals: tuple[GoalOptions, ...] = option(validator=_few(20), help="alternatives, in order of preference")
-    start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints are where they are")
+    start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints: the present position")
     velocity_scaling: float = _scaling("velocity")
     acceleration_scaling: float = _scaling("acceleration")
 
@@ -70,10 +70,10 @@ class GoTo:
 @documented
 @attrs.frozen
 class PlanAhead:
-    """A request to `/planning/plan`: plan to a goal, and stay."""
+    """A request to `/planning/plan`: plan to a goal, without moving."""
 
     goal: str | Goal | Target = option(plain=str, help="as `/planning/go_to` takes it")
-    start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints are where they are")
+    start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints: the present position")
 
 
 @documented
@@ -87,7 +87,7 @@ class MoveToPose:
 
 @attrs.frozen(eq=False)
 class JointTarget:
-    """A sensor_msgs/msg/JointState as a goal, of which only names and positions are read."""
+    """A sensor_msgs/msg/JointState as a goal; only names and positions are read."""
 
     name: tuple[str, ...]
     position: Vector
@@ -113,7 +113,7 @@ class MoveToConfiguration:
 class Numbered:
     """A request to `/planning/result`."""
 
-    number: int = option(ge=0, help="what the service that took the goal answered with")
+    number: int = option(ge=0, help="the number that the service answered when it took the goal")
 
 
 @documented
@@ -125,7 +125,7 @@ class CartesianQuery:
         validator=_few(100), help="positions of the tool, with or without axis or orientation"
     )
     least_fraction: float = option(1.0, gt=0, le=1, help="fraction of the path that must be possible")
-    start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints are where they are")
+    start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints: the present position")
     velocity_scaling: float = _scaling("velocity")
     acceleration_scaling: float = _scaling("acceleration")
 
@@ -136,8 +136,8 @@ class IkQuery:
     """A request to `/compute_ik`: joint positions for a position or pose of the tool."""
 
     goal: GoalOptions = option(help="position of the tool, with or without axis or orientation")
-    start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints are where they are")
-    avoid_collisions: bool = option(True, help="whether configurations that touch something are left out")
+    start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints: the present position")
+    avoid_collisions: bool = option(True, help="leave out configurations with collisions")
 
 
 @documented
@@ -145,7 +145,7 @@ class IkQuery:
 class FkQuery:
     """A request to `/compute_fk`: poses of links."""
 
-    joints: Mapping[str, float] = option(factory=dict, unit="rad", help="positions; other joints are where they are")
+    joints: Mapping[str, float] = option(factory=dict, unit="rad", help="positions; other joints: the present position")
     links: tuple[str, ...] = option(
         (), validator=_few(100), help="links of the MJCF or the URDF, or the tip; only the tip if empty"
     )

@@ -32,7 +32,7 @@ class MoveResult:
     fraction: float = 1.0
     """Fraction of a straight path that was planned."""
     alternative: int = 0
-    """Index of the goal that was chosen, of several."""
+    """Index of the chosen goal, of several."""
 
 
 class Results:
@@ -66,7 +66,7 @@ class Results:
         """The result of a goal; None before it has ended.
 
         Raises:
-            PlanningError: for a goal that there was not, or whose result is no longer kept.
+            PlanningError: for an unknown goal, or one whose result is no longer kept.
         """
         with self._lock:
             if number in self._moving:
@@ -82,5 +82,5 @@ _RESULTS: WeakKeyDictionary[RunView, Results] = WeakKeyDictionary()
 
 
 def results_of(session: RunView) -> Results:
-    """The results of a run, which its modes share: a number means one goal, also after a switch of the mode."""
+    """The results of a run. Its modes share them, so that a number stays valid when the mode changes."""
     return _RESULTS.setdefault(session, Results())

@@ -49,8 +49,10 @@ if TYPE_CHECKING:
 
 COMPUTE_IK = Service("/compute_ik", IkQuery, IkAnswer, "Joint positions for a position or pose of the tool.")
 COMPUTE_FK = Service("/compute_fk", FkQuery, FkAnswer, "Poses of links.")
-PLAN = Service("/plan_kinematic_path", PlanQuery, PlanAnswer, "Plan to the first goal that can be reached, and stay.")
-PLAN_GOAL = Service("/planning/plan", PlanAhead, PlanAnswer, "Plan to a goal, and stay.", alone="goal")
+PLAN = Service(
+    "/plan_kinematic_path", PlanQuery, PlanAnswer, "Plan to the first goal that can be reached, without moving."
+)
+PLAN_GOAL = Service("/planning/plan", PlanAhead, PlanAnswer, "Plan to a goal, without moving.", alone="goal")
 CARTESIAN = Service(
     "/compute_cartesian_path", CartesianQuery, PlanAnswer, "Plan straight lines of the tool through waypoints."
 )
@@ -99,10 +101,10 @@ class PlanningServices:
         def planned() -> PlanResult:
             aim = target(query.goal, self._robot)
             self._plans.check(aim)
-            found = self._plans.plan(aim, self._start(query.start))[1]
-            if found is None:
+            plan = self._plans.plan(aim, self._start(query.start))[1]
+            if plan is None:
                 raise invalid_goal(f"goal {aim.text!r} needs no plan")
-            return found
+            return plan
 
         return _answer(planned)
 
@@ -121,10 +123,10 @@ class PlanningServices:
 
         return _answer(planned)
 
-    def _start(self, given: Mapping[str, float]) -> Vector:
-        """Present or given positions of all joints [rad], shape (J,)."""
+    def _start(self, positions: Mapping[str, float]) -> Vector:
+        """Positions of all joints [rad], shape (J,); joints that are not named are at their present positions."""
         start = commanded(self._session).copy()
-        for name, value in given.items():
+        for name, value in positions.items():
             if name not in self._robot.joint_names:
                 raise PlanningError(
                     f"start: no joint {name!r}; the joints are: {', '.join(self._robot.joint_names)}",
@@ -139,12 +141,12 @@ class PlanningServices:
         try:
             start = self._start(query.start)
             goal = query.goal.tool_goal(*self._plans.surroundings((query.goal,), start))
-            found = self._plans.tool.candidates(goal, start)
+            candidates = self._plans.tool.candidates(goal, start)
             if query.avoid_collisions:
-                found = self._free(found)
+                candidates = self._free(candidates)
         except PlanningError as error:
             return IkAnswer(error.code, str(error))
-        best = found[0]
+        best = candidates[0]
         state = JointState(Header(self._session.clock.now_ns()), self._robot.joint_names, best.joints)
         return IkAnswer(PlanCode.SUCCESS, "", state, best.position_error, best.orientation_error)
 
@@ -152,7 +154,7 @@ class PlanningServices:
         """The candidates without contacts.
 
         Raises:
-            PlanningError: where all of them touch something.
+            PlanningError: if all of them touch something.
         """
         from ibrobot_planning.world.collision import Collisions
 

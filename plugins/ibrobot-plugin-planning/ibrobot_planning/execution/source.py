@@ -1,4 +1,4 @@
-"""Planning: goals become trajectories for the executors of a planning mode."""
+"""The command source of planning modes: goals become trajectories for the executors."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ CANCEL = Service(
 MOVE_ACTION = Service(
     "/move_action", MoveRequest, int, "Move to the first goal that can be reached; answers with its number."
 )
-"""Named like MoveIt's action, and so is the next one."""
+"""Named like MoveIt's action, as is the next one."""
 EXECUTE = Service(
     "/execute_trajectory",
     Execute,
@@ -73,7 +73,7 @@ MOVE_TO_CONFIGURATION = Service(
 CMD_POSE = "/cmd_pose"
 """geometry_msgs/msg/PoseStamped or Pose: a goal."""
 MOTION_STATUS = "/moveit_gateway/motion_status"
-"""std_msgs/msg/String: `idle`, `executing`, `succeeded` or `failed`, as IB-Robot's gateway has it."""
+"""std_msgs/msg/String: `idle`, `executing`, `succeeded` or `failed`, as in IB-Robot's gateway."""
 FRAMES = ("", "base", "base_link")
 """Names of the base frame in `/cmd_pose`."""
 _STATUS_NS = ns(0.1)
@@ -84,7 +84,7 @@ _WATCH_S = 0.02
 """Interval at which a motion is checked against the present world [s]."""
 _ENDED = MoveResult(False, "the mode or the run ended, or control was reset", 0.0, "CANCELLED", PlanCode.PREEMPTED)
 _STILL_RAD = 1e-4
-"""Commands that change less between two checks are at rest."""
+"""Commands that change less between two checks count as at rest."""
 _POLICIES: tuple[OrientationPolicy, ...] = ("keep_axis", "arm_plane", "current", "free")
 
 
@@ -95,7 +95,7 @@ class _Move:
     number: int
     target: Target
     asked: bool = False
-    """Whether the run ends after all such goals."""
+    """Whether the run was started with this goal; it ends after all such goals."""
     stops: int = 0
     """Number of emergency stops before it was requested."""
     failures: list[str] = attrs.field(factory=list)
@@ -112,12 +112,11 @@ class _Move:
 class PlannerSource(SourceWorker):
     """Moves to goals, planned from the robot's present position.
 
-    The goals of the request are reached one after the other, in the mode in which the run begins. A goal of a service
-    or of `/cmd_pose` takes the place of all others; its motion blends with the one under way. A motion that something
-    blocks stops.
+    The goals of the request are reached one after the other, in the mode in which the run begins. A goal from a service
+    or `/cmd_pose` replaces all others; its motion blends with the one under way. A motion stops if something blocks it.
 
     Raises:
-        PlanningError: for a goal of the request that makes no sense for this robot.
+        PlanningError: for an invalid goal of the request.
     """
 
     def __init__(self, session: RunAccess, mode: ControlMode) -> None:
@@ -134,9 +133,9 @@ class PlannerSource(SourceWorker):
         self._worker = 0
         self._choosing = threading.Lock()
         """Held while the move under way changes."""
-        self._watched = threading.Event()
-        """Set when nothing more is to be watched."""
-        self._seen: ControlState | None = None
+        self._unwatched = threading.Event()
+        """Set to end the watching thread."""
+        self._last_state: ControlState | None = None
         for goal in () if session.has_control else session.request.goals:
             try:
                 self._queue.append(self._new(goal, asked=True))
@@ -169,11 +168,11 @@ class PlannerSource(SourceWorker):
         self.on_end.callback(self._drop_all)
         planner.load()
         if not self.session.request.lockstep:
-            self._watched.clear()
+            self._unwatched.clear()
             watcher = threading.Thread(target=self._watch_on, name=f"{self.name} watch", daemon=True)
             watcher.start()
             self.on_end.callback(watcher.join)
-            self.on_end.callback(self._watched.set)
+            self.on_end.callback(self._unwatched.set)
 
     @override
     def begin_mode(self, seed: int) -> None:
@@ -194,7 +193,7 @@ class PlannerSource(SourceWorker):
             self._finish(self._move, "CANCELLED", PlanCode.PREEMPTED, _ENDED.message)
 
     def _forget(self) -> None:
-        """End the goals of services that wait: a mode that is entered again moves to no goal of an earlier time."""
+        """End waiting goals of services: a mode that is entered again must not move to old goals."""
         while not self._inbox.empty():
             item = self._inbox.get()
             if isinstance(item, _Move):
@@ -219,7 +218,7 @@ class PlannerSource(SourceWorker):
             items = []
         with self.lock:
             wanted = [item for item in items if not isinstance(item, Mapping)]
-            for move in filter(None, wanted[:-1]):  # as each would be planned for, a cancel would wait behind a flood
+            for move in filter(None, wanted[:-1]):  # planning each would delay a cancel behind many goals
                 self._finish(move, "CANCELLED", PlanCode.PREEMPTED, _replaced(wanted[-1]))
             for item in items:
                 if isinstance(item, Mapping):
@@ -275,7 +274,7 @@ class PlannerSource(SourceWorker):
         return self._submit(Target("trajectory", trajectory=request.trajectory())).number
 
     def _accepted(self, move: _Move) -> _Move:
-        """A goal that may be followed.
+        """Accept a goal.
 
         Raises:
             PlanningError: while the robot is stopped, since a goal must not wait for the reset.
@@ -338,7 +337,7 @@ class PlannerSource(SourceWorker):
             self._show("failed")
 
     def _replace(self, move: _Move | None) -> None:
-        """Drop all goals in favour of `move`; None holds."""
+        """Replace all goals by `move`; None: hold."""
         why = _replaced(move)
         dropped = list(self._queue)
         self._queue.clear()
@@ -349,7 +348,7 @@ class PlannerSource(SourceWorker):
         old = self._move
         if old is None or old.dropped or old.blocked:
             return
-        # A given trajectory begins where the robot stands.
+        # A trajectory from outside begins where the robot stands.
         if move is None or move.target.trajectory is not None or not self._hand_over(old, move):
             old.dropped = why
             self._execution.stop(old.number)
@@ -381,7 +380,7 @@ class PlannerSource(SourceWorker):
             self._end_move(move)
 
     def _following(self, move: _Move, step: Callable[[], None]) -> None:
-        """Go on with a move; where that fails, the arm slows down."""
+        """Go on with a move; if that fails, slow down."""
         try:
             step()
         except (HardwareError, PlanningError) as error:
@@ -389,7 +388,7 @@ class PlannerSource(SourceWorker):
             self._execution.stop(move.number)
 
     def _watch(self) -> None:
-        """Stop a motion that is blocked in the world as it is now."""
+        """Stop a motion that the present world blocks."""
         move = self._move
         if move is None or move.dropped or move.blocked:
             return
@@ -405,17 +404,17 @@ class PlannerSource(SourceWorker):
 
     def _watch_on(self) -> None:
         try:
-            while not self._watched.wait(_WATCH_S):
+            while not self._unwatched.wait(_WATCH_S):
                 self._watch()
-        except Exception as error:  # noqa: BLE001 - a motion that nobody watches must not go on
+        except Exception as error:  # noqa: BLE001 - an unwatched motion must not go on
             self.session.fail(self.name, error)
 
     def _at_rest(self) -> bool:
         """Whether the commands are at rest: the safety layer may follow the executors with a delay."""
-        state, seen = self.session.state, self._seen
+        state, seen = self.session.state, self._last_state
         if state is None or (seen is not None and state.stamp_ns == seen.stamp_ns):
             return False
-        self._seen = state
+        self._last_state = state
         return seen is not None and bool(np.abs(state.command - seen.command).max() < _STILL_RAD)
 
     def _begin(self, move: _Move) -> None:
@@ -457,7 +456,7 @@ class PlannerSource(SourceWorker):
             self._finish(move, "SUCCEEDED", PlanCode.SUCCESS, "")
 
     def _stopped(self, move: _Move) -> str:
-        """Where a blocked arm came to rest."""
+        """How a blocked arm came to rest."""
         try:
             touched = self._execution.touched()
         except PlanningError as error:
@@ -473,10 +472,8 @@ class PlannerSource(SourceWorker):
                 self._move = None
         duration = seconds(session.clock.now_ns() - move.begun_ns) if move.begun_ns is not None else 0.0
         plan = move.planned
-        facts = (
-            (plan.position_error, plan.orientation_error, plan.fraction, plan.alternative) if plan is not None else ()
-        )
-        move.result = MoveResult(success, message, duration, outcome, code, *facts)
+        errors = (plan.position_error, plan.orientation_error, plan.fraction, plan.alternative) if plan else ()
+        move.result = MoveResult(success, message, duration, outcome, code, *errors)
         self._results.end(move.number, move.result)
         move.ended.set()
         if success:
@@ -498,13 +495,13 @@ class PlannerSource(SourceWorker):
         self.session.bus.publish(MOTION_STATUS, String(status), latched=True)
 
     def _drop_all(self) -> None:
-        """End all goals, so that no caller waits for them."""
+        """End all goals and the waiting of their callers."""
         self.end()
         self._over = True
 
 
 def _replaced(move: _Move | None) -> str:
-    """Why goals end in favour of `move`; None holds."""
+    """Why goals end when `move` replaces them; None: they are cancelled."""
     return "cancelled" if move is None else f"replaced by goal {move.target.text}"
 
 

@@ -26,7 +26,7 @@ from ibrobot_core.api import (
 from ibrobot_planning.executors.options import GripperOptions
 
 _SHARE = 0.99
-"""Of the acceleration limit, what is used: rounding must not exceed it."""
+"""Share of the acceleration limit that is used, so that rounding does not exceed it."""
 
 
 @attrs.define
@@ -35,19 +35,19 @@ class _Running:
     stops: bool = False
     """Whether it only slows down."""
     still_ns: int = 0
-    """Time since the gripper last moved [ns], in which it had setpoints."""
+    """Time with setpoints since the gripper last moved [ns]."""
 
 
 class GripperExecutor(Executor):
     """Moves one joint's setpoint to the goal at `velocity`, and keeps it there regardless of the result.
 
-    It speeds up and slows down within the joint's acceleration limit, also from one goal to the next.
+    It accelerates and brakes within the joint's limit, also from one goal to the next.
 
     Reached: the measured position is within `goal_tolerance` of the goal. Stalled: the measured speed has been below
     `stall_velocity` for `stall_time`; something is in the way. With `allow_stalling` that is a success (grasped) and
-    the setpoint goes on to the goal, so that the gripper keeps squeezing; without, the goal is aborted and the measured
-    position held, as it is by `cancel`. The goal `{"stop": True}` slows down and holds. With `max_effort` the setpoint
-    goes no further while the measured effort is at or above it, also after the goal has ended.
+    the setpoint goes on to the goal, so that the gripper keeps squeezing; without it, the goal is aborted and the
+    measured position held, as by `cancel`. The goal `{"stop": True}` slows down and holds. With `max_effort` the
+    setpoint stays while the measured effort is at or above it, also after the goal has ended.
     """
 
     def __init__(self, options: GripperOptions, ctx: Context) -> None:
@@ -64,7 +64,7 @@ class GripperExecutor(Executor):
         self._fastest = min(options.velocity, joint.max_velocity) * period_s
         self._change = _SHARE * joint.max_acceleration * period_s**2
         self._stall_ns = ns(options.stall_time)
-        # A tick that comes later was missed: it had no setpoint, and a gripper that stood meanwhile has not stalled.
+        # Longer pauses are missed ticks: a gripper that stood without setpoints has not stalled.
         self._longest_ns = 2 * ctx.period_ns
         self._setpoint = self._target = math.nan
         self._step = 0.0
@@ -125,7 +125,7 @@ class GripperExecutor(Executor):
         self._statuses.append(GoalStatus(goal.goal_id, GoalState.EXECUTING))
 
     def _braking_distance(self) -> float:
-        """How far the setpoint goes until it has come to rest [rad]."""
+        """How far the setpoint moves before it comes to rest [rad]."""
         ticks = math.floor(abs(self._step) / self._change)
         return math.copysign(ticks * (abs(self._step) - (ticks + 1) * self._change / 2), self._step)
 

@@ -1,4 +1,4 @@
-"""What the YAML may say of the executors `trajectory` and `gripper`."""
+"""Options of the executors `trajectory` and `gripper`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The `trajectory` executor: follows joint trajectories within tolerances and says how they ended."""
+"""The `trajectory` executor: follows joint trajectories within tolerances, and reports how they ended."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from ibrobot_planning.executors.options import TrajectoryOptions
 from ibrobot_planning.executors.trajectory_goal import Takeover, TrajectoryGoal, parse_goal
 
 LAG_S = 0.1
-"""How long after its setpoint a joint that follows may be at a place [s], as in ADR 16."""
+"""Longest lag of a joint behind its setpoint [s], as in ADR 16."""
 START_TOLERANCE_RAD = 0.1
 """How far from the present setpoint a trajectory's point at time zero may lie."""
 
 
 _ROUNDING_RAD = 1e-9
-"""How far the polynomials of a trajectory may leave its points by rounding."""
+"""Largest rounding error of a trajectory's polynomials at its points."""
 _STOP_SHARE = 0.8
-"""Of the acceleration limits, what a stop uses: it is computed from tick to tick."""
+"""Share of the acceleration limits that a stop uses: it is computed tick by tick."""
 
 
 @attrs.define(eq=False)
 class _Stop:
-    """How far a trajectory that slows down has come."""
+    """Progress of a trajectory that slows down."""
 
     stamp_ns: int
     phase_ns: float
-    """Time of the trajectory that is reached [ns]."""
+    """Time along the trajectory [ns]."""
     rate: float = 1.0
-    """How fast that time passes, 1 to 0."""
+    """Rate at which that time passes, from 1 to 0."""
 
 
 @attrs.frozen(eq=False)
@@ -50,18 +50,17 @@ class _Running:
 class TrajectoryExecutor(Executor):
     """Interpolates a goal's points by the fields given: linear, cubic with velocities, quintic with accelerations.
 
-    A trajectory begins at the setpoint of the moment, and at its velocity and acceleration where its points have these
-    fields, so a new goal replaces a running one without a step. A point at time zero says where the trajectory was
-    planned from: it must lie near the setpoint, which then stands for it. The last point is held. Success: the measured
-    position comes within the goal tolerance, at the end or up to `goal_time` after it. A joint further off its path
-    than the path tolerance and a servo's lag of 0.1 s, or late, aborts the goal. Aborting and cancelling hold the
-    measured position.
+    A trajectory begins at the present setpoint, velocity and acceleration (the latter if its points have these fields),
+    so that a new goal replaces a running one without a step. A point at time zero must lie near the setpoint, which
+    replaces it. The last point is held. Success: the measured position comes within the goal tolerance, at the end or
+    up to `goal_time` after it. A joint further off its path than the path tolerance plus a servo's lag of 0.1 s, or
+    late at the goal, aborts it. Aborting and cancelling hold the measured position.
 
-    A trajectory with `takes_over` waits until the running one has come to a given time, and begins at that time's
-    setpoint, velocity and acceleration. The goal `{"stop": True}` slows down along the trajectory under way, within the
+    A trajectory with `takes_over` begins at a given time of the running one, with its setpoint, velocity and
+    acceleration at that time. The goal `{"stop": True}` slows down along the trajectory under way, within the
     acceleration limits, and holds where it comes to rest.
 
-    Trajectories advance by one control period per tick: ticks that are missed delay them, and skip nothing.
+    Trajectories advance by one control period per tick: missed ticks delay them, and skip nothing.
     """
 
     def __init__(self, options: TrajectoryOptions, ctx: Context) -> None:
@@ -76,7 +75,7 @@ class TrajectoryExecutor(Executor):
         self._next: _Running | None = None
         """Takes over from the running trajectory when it begins."""
         self._now_ns = self._stamp_ns = 0
-        """Time that passes by at most a period per tick, and the time of the last tick."""
+        """Time, advanced by at most a period per tick, and the time of the last tick."""
         self._statuses: deque[GoalStatus] = deque()
 
     @override
@@ -207,7 +206,7 @@ class TrajectoryExecutor(Executor):
         return self._statuses.popleft() if self._statuses else None
 
     def _without_rounding(self, setpoint: Vector) -> Vector:
-        """The setpoint, at the limit where only rounding takes it beyond: the safety layer has nothing to correct."""
+        """The setpoint without rounding beyond a limit, which the safety layer would count as a correction."""
         inside = np.clip(setpoint, self._lower, self._upper)
         return np.where(np.abs(setpoint - inside) <= _ROUNDING_RAD, inside, setpoint)
 
@@ -233,7 +232,7 @@ class TrajectoryExecutor(Executor):
         stop.stamp_ns, stop.rate = now_ns, rate if stop.phase_ns < spline.end_ns else 0.0
 
     def _fastest_change(self, spline: Spline, phase_ns: float, rate: float) -> float:
-        """How fast the rate may fall there [1/s], negative."""
+        """Steepest permitted change of the rate [1/s], negative."""
         _, velocity, acceleration = spline.at(round(phase_ns))
         moving = velocity != 0
         if not moving.any():
@@ -242,7 +241,7 @@ class TrajectoryExecutor(Executor):
         return float((-left[moving] / np.abs(velocity[moving])).max())
 
     def _spline(self, goal: TrajectoryGoal, begin_ns: int) -> Spline:
-        """The goal's points in time [ns], begun at the setpoint of `begin_ns` [ns]."""
+        """A spline through the goal's points, from the setpoint at `begin_ns` [ns]."""
         position, velocity, acceleration = self._sample(begin_ns)
         times_ns, positions = goal.times_ns, goal.positions
         velocities, accelerations = goal.velocities, goal.accelerations
@@ -272,7 +271,7 @@ class TrajectoryExecutor(Executor):
         return self._held.copy()
 
     def _end(self, state: GoalState, message: str) -> None:
-        """End the running goal, and the one that waits to take over from it."""
+        """End the running goal, and the one that is to take over from it."""
         if self._next is not None:
             self._statuses.append(GoalStatus(self._next.goal_id, GoalState.CANCELED, message))
             self._next = None
@@ -286,5 +285,5 @@ class TrajectoryExecutor(Executor):
 
 
 def _exceeds(error: Vector, tolerance: Vector) -> NDArray[np.bool_]:
-    """Where `error` is not within `tolerance`; a tolerance of 0 is not checked, a NaN error is never within."""
+    """Where `error` is not within `tolerance`; a tolerance of 0 is not checked, NaN is outside."""
     return (tolerance > 0) & ~(error <= tolerance)

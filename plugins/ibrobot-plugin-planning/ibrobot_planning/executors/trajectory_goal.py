@@ -1,4 +1,4 @@
-"""What a trajectory goal may say: checked, and ordered by the executor's joints."""
+"""Trajectory goals: checked, and in the executor's order of joints."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Takeover:
     goal: str
     """Name of the running goal."""
     time_ns: int
-    """From the beginning of its trajectory [ns]."""
+    """Time along its trajectory [ns]."""
 
 
 @attrs.frozen(eq=False)
@@ -52,7 +52,7 @@ def parse_goal(goal: Mapping[str, Any], joints: Sequence[str], options: Trajecto
     """Check a goal for the executor's `joints`.
 
     Raises:
-        GoalRejected: with what is wrong, where, and what would be right.
+        GoalRejected: for the first fault.
     """
     _keys(goal, ("trajectory",), ("path_tolerance", "goal_tolerance", "goal_time", "takes_over"), "the goal")
     trajectory = goal["trajectory"]
@@ -106,7 +106,7 @@ def _keys(value: Any, required: Sequence[str], optional: Sequence[str], what: st
 
 
 def _order(names: Any, joints: Sequence[str]) -> list[int]:
-    """For each of `joints` its place in `names`."""
+    """Index in `names` of each of `joints`."""
     if not isinstance(names, list | tuple) or sorted(map(str, names)) != sorted(joints):
         raise GoalRejected(f"joint_names must be, in any order, {', '.join(joints)}; got {names!r}")
     return [names.index(joint) for joint in joints]
@@ -131,15 +131,15 @@ def _time_ns(value: Any, what: str, key: str = "time_ns") -> int:
 
 
 def _field(points: Sequence[Mapping[str, Any]], name: str, order: Sequence[int]) -> Vector | None:
-    """Field `name` of all points in the executor's order, shape (N, J); None where no point has it."""
+    """Field `name` of all points in the executor's order, shape (N, J); None if no point has it."""
     rows = [point.get(name, ()) for point in points]
-    # An empty list is how ROS says that a field is not given.
-    given = [not (isinstance(row, list | tuple) and not row) for row in rows]
-    if not any(given):
+    # In ROS, an empty list means that the field is missing.
+    present = [not (isinstance(row, list | tuple) and not row) for row in rows]
+    if not any(present):
         return None
-    if not all(given):
+    if not all(present):
         raise GoalRejected(
-            f"point {given.index(False)} has no {name} but point {given.index(True)} has; all or none must"
+            f"point {present.index(False)} has no {name} but point {present.index(True)} has; all or none must"
         )
     for index, row in enumerate(rows):
         if not isinstance(row, list | tuple) or len(row) != len(order):
@@ -151,7 +151,7 @@ def _field(points: Sequence[Mapping[str, Any]], name: str, order: Sequence[int])
 
 
 def _tolerance(goal: Mapping[str, Any], name: str, default: float, joints: Sequence[str]) -> Vector:
-    """Tolerance of each joint [rad], shape (J,); 0 where none is checked."""
+    """Tolerance of each joint [rad], shape (J,); 0: not checked."""
     value = goal.get(name, 0)
     by_joint = value if isinstance(value, Mapping) else dict.fromkeys(joints, value)
     for joint in by_joint:
@@ -161,7 +161,7 @@ def _tolerance(goal: Mapping[str, Any], name: str, default: float, joints: Seque
 
 
 def _setting(value: Any, default: float, name: str, highest: float = sys.float_info.max) -> float:
-    """0 stands for the default, -1 for none (returned as 0)."""
+    """A setting; 0 means the default, -1 none (returned as 0)."""
     if not _is_finite(value) or (value < 0 and value != -1):
         raise GoalRejected(f"{name} is {value!r}; it must be above 0, or 0 for the default, or -1 for none")
     if value > highest:

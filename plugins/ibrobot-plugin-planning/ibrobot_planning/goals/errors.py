@@ -6,7 +6,7 @@ from ibrobot_core.api import PlanCode, PlanningError
 
 
 def invalid_goal(message: str) -> PlanningError:
-    """The error for a goal that makes no sense."""
+    """The error for an invalid goal."""
     return PlanningError(message, PlanCode.INVALID_GOAL_CONSTRAINTS)
 
 

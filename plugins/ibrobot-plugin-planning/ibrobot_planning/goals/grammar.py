@@ -1,4 +1,4 @@
-"""The keys of a goal: the same in task files, in requests to services and, written `key=value`, in text."""
+"""The keys of a goal, common to task files, requests to services and, as `key=value`, text."""
 
 from __future__ import annotations
 
@@ -34,28 +34,28 @@ type Triple = tuple[float, float, float]
 DIRECTIONS: Mapping[str, Triple] = {"down": (0.0, 0.0, -1.0), "up": (0.0, 0.0, 1.0)}
 POLICIES: tuple[str, ...] = get_args(OrientationPolicy)
 LEAST_SCALING = 0.01
-"""Least fraction of the limits of velocity and acceleration that a goal may ask for."""
+"""Least fraction of the velocity and acceleration limits that a goal may ask for."""
 _NEARLY_ONE = 1e-3
 """Allowed deviation of a quaternion's length from 1."""
 _UPRIGHT = math.cos(math.radians(45.0))
 
 
-def exactly_one(what: str, given: Mapping[str, bool]) -> None:
-    """Check that one of several keys is given.
+def exactly_one(what: str, present: Mapping[str, bool]) -> None:
+    """Check that exactly one of several keys is present.
 
     Raises:
         ValueError: for none, or more than one.
     """
-    names = [name for name, there in given.items() if there]
+    names = [name for name, is_present in present.items() if is_present]
     if len(names) != 1:
-        found = f"{' and '.join(names)} exclude each other" if names else "there is none"
-        raise ValueError(f"{what} has one of {', '.join(given)}; {found}")
+        fault = f"{' and '.join(names)} exclude each other" if names else "there is none"
+        raise ValueError(f"{what} has one of {', '.join(present)}; {fault}")
 
 
 @documented
 @attrs.frozen
 class GoalOptions:
-    """A goal of the arm: a named pose, joints, or a position of the tool, if wanted with a direction or orientation."""
+    """A goal of the arm: a named pose, joints, or a position of the tool, with an optional direction or orientation."""
 
     pose: str | None = option(None, help="a pose of the robot YAML or the SRDF")
     joints: Mapping[str, float] = option(factory=dict, unit="rad", help="joint -> position; the others stay")
@@ -98,7 +98,7 @@ class GoalOptions:
             raise ValueError(f"quaternion has length {length:.3g}, must be 1; the order is x, y, z, w")
 
     def kinds(self) -> dict[str, bool]:
-        """The kinds of goals, of which it has one."""
+        """Kind of goal -> whether it is this kind."""
         return {"pose": self.pose is not None, "joints": bool(self.joints), "xyz or object": self.of_tool}
 
     @property
@@ -118,10 +118,10 @@ class GoalOptions:
         return f"({where}) m{of}"
 
     def goal(self, world: World, tool: Vector | None = None) -> JointGoal | NamedGoal | PositionGoal | PoseGoal:
-        """The goal as planners take it.
+        """The goal, in the form that planners take.
 
         Args:
-            world: the objects that it may refer to, where they are now.
+            world: the objects that it may refer to.
             tool: present position of the tool [m], shape (3,), for a relative goal.
 
         Raises:
@@ -137,7 +137,7 @@ class GoalOptions:
         """The position or pose of the tool; arguments and errors are those of `goal`.
 
         Raises:
-            PlanningError: also for a goal of another kind.
+            PlanningError: also for other kinds of goals.
         """
         if not self.of_tool:
             raise invalid_goal(f"goal {self.text} is not a position of the tool: give xyz")
@@ -174,8 +174,8 @@ def line_goal(
 def upright(thing: Pose) -> Vector:
     """The frame of an object in which goals are given, shape (4, 4).
 
-    Its origin is that of the object, its z axis points up, and its x axis along the horizontal part of the object's x
-    axis, or of its y axis where the x axis stands upright.
+    Its origin is that of the object. Its z axis points up, its x axis along the horizontal part of the object's x axis,
+    or of the y axis if the x axis is upright.
     """
     placed = matrix(thing)
     across = placed[:3, 0] if abs(placed[2, 0]) < _UPRIGHT else placed[:3, 1]
@@ -184,7 +184,7 @@ def upright(thing: Pose) -> Vector:
 
 
 def object_pose(world: World, name: str) -> Pose:
-    """Where an object stands.
+    """The pose of an object.
 
     Raises:
         PlanningError: for an unknown object, or one that a link carries.
@@ -199,12 +199,12 @@ def object_pose(world: World, name: str) -> Pose:
 
 
 def scaling_fault(name: str, scaling: float) -> str:
-    """Why a fraction of the limits cannot be planned with; empty if it can.
+    """Why a fraction of the limits is invalid; empty if it is valid.
 
     Args:
         name: its name, e.g. `velocity_scaling`.
         scaling: the fraction.
     """
-    if LEAST_SCALING <= scaling <= 1:  # NaN is no such number
+    if LEAST_SCALING <= scaling <= 1:  # false for NaN
         return ""
     return f"{name} is {scaling}, must be from {LEAST_SCALING} to 1"

@@ -23,23 +23,23 @@ def pose_names(robot: Robot) -> list[str]:
 
 
 def named_pose(robot: Robot, name: str) -> dict[str, float]:
-    """Joint -> position [rad], of a pose of the robot YAML, or else of all group states of this name in the SRDF.
+    """Joint -> position [rad], from the robot YAML, or else from all group states of this name in the SRDF.
 
     Raises:
         PlanningError: for an unknown name, group states that contradict each other, or files that cannot be read.
     """
     if name in robot.description.poses:
         return dict(zip(robot.joint_names, robot.pose(name).tolist(), strict=True))
-    found = [state for state in _group_states(robot) if state.name == name]
-    if not found:
+    states = [state for state in _group_states(robot) if state.name == name]
+    if not states:
         raise invalid_goal(f"no pose {name!r}; the poses are: {', '.join(pose_names(robot)) or 'none'}")
     positions: dict[str, float] = {}
-    for state in found:
+    for state in states:
         for joint, value in state.positions.items():
             if joint not in robot.joint_names:
                 continue
             if positions.setdefault(joint, value) != value:
-                groups = ", ".join(each.group for each in found)
+                groups = ", ".join(each.group for each in states)
                 raise invalid_goal(f"pose {name!r} of the SRDF has two positions of joint {joint}, in groups {groups}")
     return positions
 
@@ -55,7 +55,7 @@ def _group_states(robot: Robot) -> tuple[GroupState, ...]:
 
 
 def without_names(goal: Goal, robot: Robot, joints: Sequence[str]) -> Goal:
-    """A goal with the positions of `joints` in place of named poses.
+    """The goal, with named poses replaced by the positions of `joints`.
 
     Raises:
         PlanningError: as `named_pose`.
@@ -69,7 +69,7 @@ def without_names(goal: Goal, robot: Robot, joints: Sequence[str]) -> Goal:
 
 
 def joint_target(goal: JointGoal | NamedGoal, robot: Robot, joints: Sequence[str], start: Vector) -> Vector:
-    """Where the planned `joints` end [rad], shape (len(joints),).
+    """Goal positions of the planned `joints` [rad], shape (len(joints),).
 
     Raises:
         PlanningError: for unknown poses and joints, wrong shapes, and positions outside the limits.

@@ -1,4 +1,4 @@
-"""Goals as text, e.g. `xyz=0.2,0.0,0.1 axis=down`, and how a goal is divided among executors."""
+"""Goals as text, e.g. `xyz=0.2,0.0,0.1 axis=down`, and their division among executors."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Target:
     velocity_scaling: float = 1.0
     acceleration_scaling: float = 1.0
     trajectory: JointTrajectory | None = None
-    """A trajectory to follow as it is, in place of a goal."""
+    """A trajectory to follow unchanged, in place of a goal."""
 
 
 def target(goal: str | Goal | Target, robot: Robot, velocity_scaling: float = 1.0) -> Target:
@@ -51,12 +51,12 @@ def target(goal: str | Goal | Target, robot: Robot, velocity_scaling: float = 1.
 
     Args:
         goal: a goal, a `Target`, or text: a pose's name; `joint=radians,joint=radians`; `xyz=X,Y,Z` [m], alone or with
-            other keys of `GoalOptions`. Joints that do not move the tool may stand beside a position.
+            other keys of `GoalOptions`. Joints that do not move the tool may accompany a position.
         robot: the robot.
         velocity_scaling: fraction of the velocity limits, from `LEAST_SCALING` to 1.
 
     Raises:
-        PlanningError: for a goal that makes no sense for this robot.
+        PlanningError: for a goal that is invalid for this robot.
     """
     if isinstance(goal, Target):
         return goal
@@ -115,29 +115,29 @@ def _parsed(text: str, robot: Robot) -> tuple[Goal | None, dict[str, float]]:
             return None, named_pose(robot, text)
         except PlanningError as error:
             raise invalid_goal(f"{error}; or give {_EXAMPLES}") from None
-    words = _words(text)
-    joints = {key: _angle(key, values, robot) for key, values in words.items() if key not in _KEYS}
-    keys = {key: _value(key, values) for key, values in words.items() if key in _KEYS}
+    values_by_key = _split(text)
+    joints = {key: _angle(key, values, robot) for key, values in values_by_key.items() if key not in _KEYS}
+    keys = {key: _value(key, values) for key, values in values_by_key.items() if key in _KEYS}
     if keys and "xyz" not in keys:
         raise invalid_goal(f"{next(iter(keys))} needs a position, e.g. xyz=0.2,0.0,0.1")
     return GoalOptions(**keys).goal(World()) if keys else None, joints
 
 
-def _words(text: str) -> dict[str, list[str]]:
-    """Key -> its values, of `key=value,value key=value`."""
-    words: dict[str, list[str]] = {}
+def _split(text: str) -> dict[str, list[str]]:
+    """Key -> its values, from `key=value,value key=value`."""
+    values_by_key: dict[str, list[str]] = {}
     key = ""
     for word in text.replace(",", " ").replace("=", "= ").split():
         if word.endswith("="):
             key = word[:-1]
-            if key in words:
+            if key in values_by_key:
                 raise invalid_goal(f"{key} is given twice")
-            words[key] = []
+            values_by_key[key] = []
         elif not key:
             raise invalid_goal(f"{word!r} is neither a joint nor {', '.join(_KEYS)}, each followed by = and its value")
         else:
-            words[key].append(word)
-    return words
+            values_by_key[key].append(word)
+    return values_by_key
 
 
 def _value(key: str, words: list[str]) -> Any:

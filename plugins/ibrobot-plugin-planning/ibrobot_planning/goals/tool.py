@@ -14,7 +14,7 @@ from ibrobot_core.api import PoseGoal, PositionGoal, Vector, Vector3
 from ibrobot_planning.goals.errors import invalid_goal, unreachable
 
 _PITCHES = np.linspace(-np.pi / 2, np.pi / 2, 7)
-"""Directions of the tool that are tried at a position without one: from straight down to straight up."""
+"""Directions of the tool that are tried if a goal has none: from straight down to straight up."""
 _SAME = 1e-3
 """Solutions that differ less [rad] count as one."""
 _SEEDS = 12
@@ -22,7 +22,7 @@ _SEEDS = 12
 _BRANCHES = 8
 """Most branches of a position with an axis."""
 _AS_NEAR = 0.02
-"""Orientations count as equally near up to this difference [rad]."""
+"""Orientations whose errors differ less [rad] count as equally near."""
 _POSITION_WEIGHT = 100.0
 """A centimetre weighs as much as a radian."""
 _TURNS, _SETTLED = 40, 1e-6
@@ -30,7 +30,7 @@ _TURNS, _SETTLED = 40, 1e-6
 _FAR = 10.0
 """Positions farther than this many times the arm's reach are refused at once."""
 _WIDEST = 100.0
-"""Tolerances beyond this [m or rad] mean nothing."""
+"""Larger tolerances [m or rad] are refused."""
 _NEARLY_ONE = 1e-3
 """How far from 1 the length of a quaternion may be."""
 
@@ -75,7 +75,7 @@ def unit(value: Vector3) -> Vector:
     largest = float(np.abs(direction).max())
     if largest < 1e-9:
         raise invalid_goal("the axis of the goal has no length; give a direction, e.g. (0, 0, -1) for down")
-    direction /= largest  # first, as the squares of large numbers overflow
+    direction /= largest  # the squares of large numbers would overflow
     return np.asarray(direction / np.linalg.norm(direction))
 
 
@@ -106,10 +106,10 @@ class Tool:
 
         Args:
             goal: the goal.
-            start: where all joints of the model are [rad], shape (J,); those that do not move the tip stay.
+            start: positions of all joints of the model [rad], shape (J,); joints that do not move the tip stay.
 
         Raises:
-            PlanningError: for a goal that makes no sense, or that the arm cannot reach, with how far off it is.
+            PlanningError: for an invalid goal, or one that the arm cannot reach, with the distance that remains.
         """
         if isinstance(goal, PositionGoal):
             position = vector(goal.position, "the position")
@@ -124,12 +124,12 @@ class Tool:
         if goal.orientation_tolerance is None:
             return self._at(position, None, start, goal.position_tolerance, 0.01)
         _tolerances(orientation_tolerance=goal.orientation_tolerance)
-        found = self._posed(position, rotation, start, goal.position_tolerance)
-        met = [each for each in found if each.orientation_error <= goal.orientation_tolerance]
-        return met or self._beyond(goal, position, rotation, start, found)
+        candidates = self._posed(position, rotation, start, goal.position_tolerance)
+        met = [each for each in candidates if each.orientation_error <= goal.orientation_tolerance]
+        return met or self._beyond(goal, position, rotation, start, candidates)
 
     def check_reach(self, position: Vector, start: Vector) -> None:
-        """Refuse a position [m], shape (3,), far beyond reach, where numbers would overflow or lines never end.
+        """Refuse a position [m], shape (3,), so far away that numbers would overflow or lines never end.
 
         Raises:
             PlanningError: with the nearest position that the arm reaches.
@@ -141,21 +141,21 @@ class Tool:
                 raise unreachable(str(error)) from error
 
     def _beyond(
-        self, goal: PoseGoal, position: Vector, rotation: Vector, start: Vector, found: list[Candidate]
+        self, goal: PoseGoal, position: Vector, rotation: Vector, start: Vector, nearest: list[Candidate]
     ) -> list[Candidate]:
         """Handle an unreachable orientation by the goal's policy."""
         tolerance = goal.position_tolerance
         policy = goal.beyond_reach
-        if policy in ("refuse", "nearest") or not found:
-            if not found:
-                self._at(position, None, start, tolerance, 0.01)  # the error says how far off the position is
-            if policy == "refuse" or not found:
-                off = np.degrees(found[0].orientation_error) if found else 180.0
+        if policy in ("refuse", "nearest") or not nearest:
+            if not nearest:
+                self._at(position, None, start, tolerance, 0.01)  # its error tells how far off the position is
+            if policy == "refuse" or not nearest:
+                off = np.degrees(nearest[0].orientation_error) if nearest else 180.0
                 raise unreachable(
                     f"{self.model.tip} cannot take this orientation at {_text(position)};"
                     f" the nearest found is {off:.1f} degrees off (beyond_reach chooses what to do then)"
                 )
-            return found
+            return nearest
         if policy == "free":
             taken = self._at(position, None, start, tolerance, 0.01)
         elif policy == "keep_axis":
@@ -184,24 +184,24 @@ class Tool:
     def _at(
         self, position: Vector, axis: Vector | None, start: Vector, tolerance: float, axis_tolerance: float
     ) -> list[Candidate]:
-        """Configurations at a position, all branches where there is a closed form."""
-        found: list[Vector] = []
+        """Configurations at a position; all branches if there is a closed form."""
+        solutions: list[Vector] = []
         error: UnreachableError | None = None
         tolerances = {"position_tolerance": tolerance, "rotation_tolerance": axis_tolerance}
         axes = [axis] if axis is not None else [None, *self._pitched(position)]
-        for asked in axes:
-            target = Target(position, axis=asked)
+        for direction in axes:
+            target = Target(position, axis=direction)
             try:
-                found += solve_all(self.model, target, start, **tolerances)
+                solutions += solve_all(self.model, target, start, **tolerances)
             except UnreachableError as failure:
                 error = error or failure
-                if asked is None:
+                if direction is None:
                     break
             except KinematicsError:  # no closed form
-                solutions, error = self._numerical(target, start, tolerances)
-                found += solutions
+                numerical, error = self._numerical(target, start, tolerances)
+                solutions += numerical
                 break
-        distinct = _distinct(found)
+        distinct = _distinct(solutions)
         if not distinct:
             assert error is not None
             raise unreachable(str(error)) from error
@@ -218,21 +218,21 @@ class Tool:
             yield from (np.cos(pitch) * out / length + np.sin(pitch) * up for pitch in _PITCHES)
 
     def _posed(self, position: Vector, rotation: Vector, start: Vector, tolerance: float) -> list[Candidate]:
-        """Configurations at a position, the orientation as near to `rotation` as found, nearest first."""
-        found: list[Vector] = []
+        """Configurations at a position, with orientations near `rotation`, the nearest first."""
+        seeds: list[Vector] = []
         for axis in (rotation[:, 2], self._in_plane(position, rotation[:, 2]), None, *self._pitched(position)):
             try:
-                found += solve_all(self.model, Target(position, axis=axis), start, position_tolerance=tolerance)
+                seeds += solve_all(self.model, Target(position, axis=axis), start, position_tolerance=tolerance)
             except UnreachableError:
                 continue
             except KinematicsError:  # no closed form
-                found += list(self._seeds(start))
+                seeds += self._seeds(start)
                 break
         candidates: list[Candidate] = []
-        for begin in (start, *_distinct(found)):
+        for begin in (start, *_distinct(seeds)):
             q = _turned_towards(self.model, position, rotation, begin)
             candidates.append(self._compared(q, position, rotation))
-            # The branches of the tool's axis come first: where they meet the orientation, no other is nearer.
+            # The branches of the tool's axis come first: if one of them has the orientation, no other is nearer.
             if len(candidates) > _BRANCHES and min(each.orientation_error for each in candidates) < _SAME:
                 break
         placed = sorted(
@@ -245,15 +245,14 @@ class Tool:
     def _numerical(
         self, target: Target, start: Vector, tolerances: Mapping[str, float]
     ) -> tuple[list[Vector], UnreachableError | None]:
-        found: list[Vector] = []
-        error = None
+        solutions: list[Vector] = []
         for begin in (start, *self._seeds(start)):
             try:
-                found.append(solve(self.model, target, begin, **tolerances))
+                solutions.append(solve(self.model, target, begin, **tolerances))
             except UnreachableError as failure:
-                # Each of these searched from many configurations.
-                return found, failure
-        return found, error
+                # No retry: `solve` has searched from many configurations.
+                return solutions, failure
+        return solutions, None
 
     def _seeds(self, start: Vector) -> Iterator[Vector]:
         moving = self.model.moving
@@ -269,10 +268,10 @@ class Tool:
 
 
 def _turned_towards(model: KinematicModel, position: Vector, rotation: Vector, start: Vector) -> Vector:
-    """The configuration with the orientation nearest to `rotation` at a position that a search from `start` finds.
+    """Search from `start` for the configuration at a position with the orientation nearest to `rotation`.
 
-    Levenberg-Marquardt steps within the limits; the position weighs so much that its error stays below a tenth of a
-    millimetre where it can be reached.
+    Levenberg-Marquardt steps within the limits; the weight of the position keeps its error below 0.1 mm if it can be
+    reached.
     """
     moving = model.moving
     lower, upper = model.lower[moving], model.upper[moving]
@@ -290,7 +289,7 @@ def _turned_towards(model: KinematicModel, position: Vector, rotation: Vector, s
             step = np.zeros(len(moving))
             some = rows[:, free]
             step[free] = np.linalg.solve(some.T @ some + damping * np.eye(int(free.sum())), some.T @ error)
-            # Joints that would leave their limits stay there, and the others find their way without them.
+            # Joints that would leave their limits stay there; the step is solved again for the others.
             out = free & (
                 (q[moving] + step < lower) & (q[moving] <= lower) | (q[moving] + step > upper) & (q[moving] >= upper)
             )
@@ -321,9 +320,9 @@ def turned(tip: TipPose, rotation: Vector | None, axis: Vector | None = None) ->
     return 0.0
 
 
-def _distinct(found: Sequence[Vector]) -> list[Vector]:
+def _distinct(solutions: Sequence[Vector]) -> list[Vector]:
     kept: list[Vector] = []
-    for q in found:
+    for q in solutions:
         if all(np.abs(q - other).max() > _SAME for other in kept):
             kept.append(q)
     return kept

@@ -1,8 +1,8 @@
 """Blends from one motion into the next: the first slows down along its path while the next one already begins.
 
-A motion that another one replaces brakes along its own path, which is known to be free. The next motion is planned from
-where the arm comes to rest. It is then added to the braking motion, as early as limits and obstacles permit. At worst
-it begins when the arm stands.
+A replaced motion brakes along its own path, which is known to be free. The next motion is planned from where the arm
+comes to rest, and added to the braking motion as early as limits and obstacles permit. At worst it begins when the arm
+stands.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ STEP_S = 0.01
 """Time between the points of the motions made here."""
 _SAMPLE_S = 0.001
 _SHARE = 0.5
-"""Of the acceleration limits, what braking uses: the rest lets the next motion begin at once."""
+"""Share of the acceleration limits that braking uses: the rest lets the next motion begin at once."""
 _JERK = 400.0
-"""Jerk of the joint that moves fastest, where braking begins and ends [rad/s^3]."""
+"""Jerk of the fastest joint when braking begins and ends [rad/s^3]."""
 _OVERLAPS = 6
 """Number of times at which the next motion may begin while the arm brakes."""
 _SLOWED = (1.0, 1.2, 1.4, 1.8)
-"""How much slower the next motion may be for an earlier beginning."""
+"""Factors by which the next motion may be slowed to begin earlier."""
 _GLANCE = 5
-"""Number of samples from one to the next that are checked before all."""
+"""Every fifth sample is checked before all of them."""
 _ROUNDING = 1e-3
 """Allowed excess of the limits, as a share of them."""
 
@@ -69,8 +69,8 @@ def braking(old: Motion, begin_s: float, brake_s: float, acceleration: Vector) -
 
     Args:
         old: the motion.
-        begin_s: where the result begins.
-        brake_s: where the braking begins; not before `begin_s`.
+        begin_s: time at which the result begins.
+        brake_s: time at which braking begins; not before `begin_s`.
         acceleration: limits of the joints [rad/s^2], shape (J,).
     """
     samples = _samples(old)
@@ -106,7 +106,7 @@ def joined(old: Motion, new: Motion, begin_s: float, limits: Limits) -> Iterator
         old: comes to rest where `new` begins.
         new: from rest to rest.
         begin_s: time of `old`, before its end.
-        limits: which the result keeps.
+        limits: limits of the result.
     """
     rest = _samples(old)[:, round(begin_s / _SAMPLE_S) :]
     slowed = {factor: _samples(new, factor) for factor in _SLOWED}
@@ -114,7 +114,7 @@ def joined(old: Motion, new: Motion, begin_s: float, limits: Limits) -> Iterator
     ways = [(start, slowed[factor]) for start, factor in product(starts, _SLOWED)]
     for start, following in sorted(ways, key=lambda way: way[0] + way[1].shape[1]):
         rows = _sum(rest, following, start)
-        # Executors refuse a motion that does not end at rest, be it by rounding.
+        # Executors refuse a motion that does not end at rest, even if only by rounding.
         rows[1:, -1] = 0.0
         if limits.hold_at(rows[:, ::_GLANCE]):
             candidate = _every(rows.transpose(1, 0, 2), STEP_S)
@@ -136,7 +136,7 @@ def _sum(rest: Vector, following: Vector, start: int) -> Vector:
 
 @lru_cache(maxsize=16)
 def _samples(motion: Motion, slower: float = 1.0) -> Vector:
-    """Samples of a motion in `slower` times its time, shape (3, N, J); kept, since changes are tried at every tick."""
+    """Samples of a motion in `slower` times its time, shape (3, N, J); cached, since blends are tried at every tick."""
     return motion.slowed(slower).sampled(_SAMPLE_S)
 
 
@@ -149,7 +149,7 @@ def cut(whole: Motion, end_s: float) -> Motion:
 
 
 def _every(rows: Vector, step_s: float) -> Motion:
-    """A motion through every so many of `rows`, shape (N, 3, J), one per sample, and through the last."""
+    """A motion through samples of `rows`, shape (N, 3, J), that are `step_s` [s] apart, and through the last."""
     every, last = round(step_s / _SAMPLE_S), max(len(rows) - 1, 1)
     kept = np.append(np.arange(0, last, every), last)
     rows = rows[np.minimum(kept, len(rows) - 1)]

@@ -6,7 +6,7 @@ fields are computed here, so that the robot makes exactly the motion that was ch
 - Positions alone: the cubic spline with continuous accelerations, at rest at both ends.
 - Positions and velocities: the cubic between two points. Where the acceleration jumps from one cubic to the next, two
   more points close by limit the change to a fraction of a control period.
-- A first point that is not quite where the robot stands: a short motion from rest to rest leads there.
+- A first point not quite where the robot stands: a short motion from rest to rest leads there.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import JointTrajectory, PlanCode, PlanningError, Robot, Vector, ns, seconds
-from ibrobot_planning.planners.timing import LONGEST_S, Motion, motion_of, trajectory_of
+from ibrobot_planning.planners.timing import LONGEST_S, Motion, evaluated, motion_of, quintics, trajectory_of
 
 START_RAD = 0.01
-"""Allowed distance between the start of a trajectory and the robot, that of MoveIt."""
+"""Allowed distance between the start of a trajectory and the robot, as in MoveIt."""
 MOST_POINTS = 2000
-"""Points of a given trajectory, at most: the control process reads them between two ticks."""
+"""Most points of a trajectory from outside: the control process reads them between two ticks."""
 _SAME_RAD = 1e-6
 """A start this near to the robot needs no motion to it."""
 _STILL = 1e-6
@@ -33,7 +33,7 @@ _MORE = 1.01
 _BEYOND_RAD = 1e-5
 """Allowed excess of positions, for rounding."""
 _MOST_PARTS = 20
-"""Samples within half a control period, at most."""
+"""Most samples within half a control period."""
 _JUMP = 1e-3
 """Jumps of the acceleration, as a share of its limit, that need no further points."""
 _QUINTIC_SPEED, _QUINTIC_RATE = 1.875, 5.7736
@@ -55,7 +55,7 @@ class _Points:
 
 
 def check_size(trajectory: JointTrajectory) -> None:
-    """Refuse a given trajectory that costs too much to check and to send.
+    """Refuse a trajectory that costs too much to check and to send.
 
     Raises:
         PlanningError: with too many points, or too long a duration.
@@ -71,8 +71,8 @@ def completed(trajectory: JointTrajectory, start: Vector, robot: Robot, period_n
     """The motion of a robot that follows a trajectory from rest, with velocities and accelerations in all points.
 
     Args:
-        trajectory: of joints of the robot, from rest to rest.
-        start: where these joints are commanded [rad], shape (J,).
+        trajectory: from rest to rest.
+        start: commanded positions of its joints [rad], shape (J,).
         robot: the robot.
         period_ns: control period.
 
@@ -80,8 +80,8 @@ def completed(trajectory: JointTrajectory, start: Vector, robot: Robot, period_n
         The trajectory itself if nothing is missing.
 
     Raises:
-        PlanningError: if a number is missing or not finite, if the trajectory does not begin where the robot stands or
-            does not end at rest, or exceeds a limit.
+        PlanningError: if a number is missing or not finite, or if the trajectory begins away from the robot, does not
+            end at rest, or exceeds a limit.
     """
     names = trajectory.joint_names
     order = robot.indices(names)
@@ -96,13 +96,13 @@ def completed(trajectory: JointTrajectory, start: Vector, robot: Robot, period_n
 
 
 def _is_whole(made: Motion, start: Vector) -> bool:
-    """Whether a motion begins exactly at the robot, at rest and without an acceleration."""
+    """Whether a motion begins exactly at `start`, at rest and without acceleration."""
     begins = made.times[0] == 0 and np.abs(made.positions[0] - start).max() <= _SAME_RAD
     return bool(begins and not made.velocities[0].any() and not made.accelerations[0].any())
 
 
 def _points(trajectory: JointTrajectory) -> _Points:
-    """The points as arrays, after a check of their numbers."""
+    """The checked points as arrays."""
     points, names = trajectory.points, trajectory.joint_names
     if not points:
         raise _invalid("the trajectory has no points; it needs two, or one after time 0")
@@ -148,7 +148,7 @@ def _field(rows: list[Vector], name: str, number: int) -> Vector | None:
 def _from_robot(
     points: _Points, start: Vector, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...], period_ns: int
 ) -> _Points:
-    """The points, with a motion to the first one from where the robot stands.
+    """The points, after a motion from where the robot stands to the first one.
 
     Raises:
         PlanningError: if they begin elsewhere.
@@ -172,7 +172,7 @@ def _from_robot(
             float((_QUINTIC_SPEED * away / fastest).max()), float(np.sqrt(_QUINTIC_RATE * away / strongest).max())
         )
         later_ns = max(ns(_MORE * lead_s), 2 * period_ns)
-        if velocities is None:  # the way to the first point ends at rest, and is no part of the spline
+        if velocities is None:  # the motion to the first point ends at rest: the spline begins after it
             velocities = _spline_velocities(points.times_ns, points.positions)
     rest = np.zeros((1, len(start)))
     return _Points(
@@ -214,16 +214,16 @@ def _smooth(points: _Points, max_acceleration: Vector, period_ns: int) -> Motion
     lengths = np.diff(points.times_ns)
     near_ns = np.minimum(lengths, period_ns) // 4
     rows = [(points.times_ns, points.positions, velocities, means)]
-    for piece, at_ns in ((jumps[:-1], near_ns), (jumps[1:], lengths - near_ns)):
-        chosen = np.flatnonzero(piece & (near_ns > 0))
-        rows.append(_at(points, velocities, left, right, chosen, at_ns[chosen]))
+    for has_jump, at_ns in ((jumps[:-1], near_ns), (jumps[1:], lengths - near_ns)):
+        pieces = np.flatnonzero(has_jump & (near_ns > 0))
+        rows.append(_at(points, velocities, left, right, pieces, at_ns[pieces]))
     times, *values = (np.concatenate(columns) for columns in zip(*rows, strict=True))
     kept = np.argsort(times, kind="stable")
     return Motion(times[kept] / ns(1.0), *(column[kept] for column in values))
 
 
 def _accelerations(points: _Points, velocities: Vector) -> tuple[Vector, Vector]:
-    """Accelerations at the begin and at the end of each piece between points [rad/s^2], both shape (N - 1, J)."""
+    """Accelerations at the start and at the end of each piece between points [rad/s^2], both shape (N - 1, J)."""
     if points.accelerations is not None:
         return points.accelerations[:-1], points.accelerations[1:]
     h = (np.diff(points.times_ns) / ns(1.0))[:, None]
@@ -235,31 +235,18 @@ def _accelerations(points: _Points, velocities: Vector) -> tuple[Vector, Vector]
 def _at(
     points: _Points, velocities: Vector, left: Vector, right: Vector, pieces: NDArray[np.intp], at_ns: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], Vector, Vector, Vector]:
-    """Times, positions, velocities and accelerations at a time [ns] within each of some pieces, as quintics have it."""
+    """Times, positions, velocities and accelerations of the quintics at a time [ns] within each of some pieces."""
     h = (np.diff(points.times_ns)[pieces] / ns(1.0))[:, None]
-    u = (at_ns / ns(1.0))[:, None] / h
-    p0, way = points.positions[pieces], points.positions[pieces + 1] - points.positions[pieces]
-    v0, v1, a0, a1 = (
-        velocities[pieces] * h,
-        velocities[pieces + 1] * h,
-        left[pieces] * h * h,
-        right[pieces] * h * h,
-    )
-    c3 = 10 * way - 6 * v0 - 4 * v1 - 1.5 * a0 + 0.5 * a1
-    c4 = -15 * way + 8 * v0 + 7 * v1 + 1.5 * a0 - a1
-    c5 = 6 * way - 3 * v0 - 3 * v1 - 0.5 * a0 + 0.5 * a1
-    return (
-        points.times_ns[pieces] + at_ns,
-        p0 + u * (v0 + u * (a0 / 2 + u * (c3 + u * (c4 + u * c5)))),
-        (v0 + u * (a0 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h,
-        (a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / (h * h),
-    )
+    begins = points.positions[pieces], velocities[pieces], left[pieces]
+    ends = points.positions[pieces + 1], velocities[pieces + 1], right[pieces]
+    at = evaluated(quintics(h, begins, ends), (at_ns / ns(1.0))[:, None] / h, h)
+    return (points.times_ns[pieces] + at_ns, *at)
 
 
 def _check_limits(
     made: Motion, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...], period_s: float, shortest_s: float
 ) -> None:
-    """Check positions, speeds and changes of speed as the safety layer sees them: by setpoints a control period apart.
+    """Check positions, velocities and accelerations as the safety layer does: by setpoints a control period apart.
 
     Args:
         made: the motion.
@@ -267,18 +254,18 @@ def _check_limits(
         order: indices of the joints.
         names: their names.
         period_s: control period.
-        shortest_s: least time between two given points.
+        shortest_s: least time between two points of the original trajectory.
 
     Raises:
         PlanningError: for the joint that exceeds a limit most.
     """
-    # Setpoints may fall anywhere between the points: samples lie as near to one another as the nearest given points.
+    # Setpoints may fall anywhere between the points: sample as densely as the nearest points.
     parts = min(max(math.ceil(period_s / (2 * shortest_s)), 1), _MOST_PARTS)
     step = period_s / 2 / parts
     inner = made.sampled(step)[0]
     rest = np.repeat(inner[-1:], 3 * parts, axis=0)
     positions = np.concatenate([np.repeat(inner[:1], 2 * parts, axis=0), inner, rest])
-    # A motion may begin outside the positions, and lead inwards.
+    # A motion may begin outside the limits, and lead inwards.
     lower, upper = np.minimum(robot.lower[order], inner[0]), np.maximum(robot.upper[order], inner[0])
     speeds = np.abs(positions[parts:] - positions[:-parts]) / (parts * step)
     middle = positions[2 * parts : -2 * parts]
@@ -292,11 +279,11 @@ def _check_limits(
         if not (values <= limits).all():
             worst, joint = np.unravel_index(int((values / limits).argmax()), values.shape)
             peak, limit = values[worst, joint], limits[joint] / _MORE
-            said = f"a {what} of {peak:.4g} {unit}; its limit is {limit:.4g} {unit}"
+            fault = f"a {what} of {peak:.4g} {unit}; its limit is {limit:.4g} {unit}"
             if what == "position":
-                said = f"a position {peak:.4g} rad outside its limits"
+                fault = f"a position {peak:.4g} rad outside its limits"
             at = min(max(float(worst) - parts, 0) * step, made.duration)
-            raise _invalid(f"the trajectory gives {names[int(joint)]} near {at:.3f} s {said}")
+            raise _invalid(f"the trajectory gives {names[int(joint)]} near {at:.3f} s {fault}")
 
 
 def _invalid(message: str) -> PlanningError:

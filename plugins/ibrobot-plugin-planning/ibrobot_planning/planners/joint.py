@@ -1,4 +1,4 @@
-"""The joint-space planner: a straight line from rest to rest, in the least time that the limits allow."""
+"""The joint-space planner: a straight line from rest to rest, in the least time within the limits."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from ibrobot_planning.planners.options import JointPlannerOptions
 from ibrobot_planning.planners.timing import check_duration
 
 _SHORTEST_PHASE_S = 1e-5
-"""Shorter phases of the profile get no point of their own: interpolation would divide by their time."""
+"""Shorter phases of the profile get no point: interpolation would divide by their time."""
 _AT_GOAL = 1e-9
-"""Greatest distance [rad] that counts as none."""
+"""Smaller distances [rad] count as none."""
 
 
 class JointPlanner(Planner):
@@ -68,10 +68,10 @@ class JointPlanner(Planner):
         distance = float(np.max(np.abs(delta), initial=0.0))
         if distance < _AT_GOAL:
             rest = np.zeros(len(joints))
-            # Two points, since an executor needs time to arrive.
+            # Two points: the last one must be after time 0.
             stay = tuple(JointTrajectoryPoint(stamp, request.start, rest, rest) for stamp in (0, self._period_ns))
             return PlanResult(JointTrajectory(header, request.joints, stay))
-        # Limits along the line, measured on the joint that moves farthest: the others move by a fraction of its way.
+        # Limits along the line, in terms of the joint that moves farthest: the others move by a fraction of its way.
         share = np.abs(delta) / distance
         moving = share > _AT_GOAL
 
@@ -93,7 +93,7 @@ class JointPlanner(Planner):
         return PlanResult(JointTrajectory(header, request.joints, points))
 
     def _check_start(self, request: PlanRequest) -> list[Joint]:
-        """The joints of the request, after a check of the request."""
+        """Check the request, and return its joints."""
         joints = [self._joint(name) for name in request.joints]
         if np.shape(request.start) != (len(joints),):
             raise PlanningError(f"start has shape {np.shape(request.start)}, must be ({len(joints)},): one per joint")
@@ -112,8 +112,8 @@ class JointPlanner(Planner):
 class RestToRest:
     """A symmetric profile of seven phases, each of constant jerk; some have no length.
 
-    Speed rises over three phases (jerk `+j`, 0, `-j`), stays, and falls as it rose. Of the three limits those hold that
-    the distance lets the motion reach.
+    Speed rises over three phases (jerk `+j`, 0, `-j`), stays constant, and falls symmetrically. Over a short
+    distance, velocity and acceleration may not reach their limits.
 
     Args:
         distance: way from rest to rest, above 0.
@@ -128,7 +128,7 @@ class RestToRest:
     def __init__(self, distance: float, max_velocity: float, max_acceleration: float, max_jerk: float) -> None:
         self.distance = distance
         speed = min(max_velocity, _peak_speed(distance, max_acceleration, max_jerk))
-        # The acceleration is a trapezium over time, or a triangle where the speed is reached before the limit.
+        # The acceleration is a trapezium over time, or a triangle if the speed is reached before its limit.
         ramp = min(max_acceleration / max_jerk, math.sqrt(speed / max_jerk))
         plateau = max(speed / (max_jerk * ramp) - ramp, 0.0)
         cruise = max(distance / speed - 2 * ramp - plateau, 0.0)
@@ -154,7 +154,7 @@ class RestToRest:
 def _peak_speed(distance: float, max_acceleration: float, max_jerk: float) -> float:
     """The peak speed without a velocity limit."""
     ramp = max_acceleration / max_jerk
-    if distance <= 2 * max_acceleration * ramp**2:  # slows down before the acceleration reaches its limit
+    if distance <= 2 * max_acceleration * ramp**2:  # braking begins before the acceleration reaches its limit
         return math.cbrt(distance**2 * max_jerk / 4)
     # From distance = speed * (speed / max_acceleration + ramp).
     return max_acceleration * (math.sqrt(ramp**2 / 4 + distance / max_acceleration) - ramp / 2)

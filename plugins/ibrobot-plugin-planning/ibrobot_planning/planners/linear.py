@@ -22,7 +22,7 @@ _EXACT_M = 1e-4
 _TURN_M = 0.1
 """Distance that corresponds to a rotation of one radian."""
 _LARGEST_JUMP = 0.35
-"""A joint that moves further [rad] between two of them would leave the line between."""
+"""A joint that moves further [rad] between two configurations would take the tool off the line."""
 
 
 @attrs.frozen(eq=False)
@@ -32,9 +32,9 @@ class LinearPath:
     joints: Vector
     """All joints [rad], shape (N, J)."""
     fractions: Vector
-    """Share of the path up to each, shape (N,)."""
+    """Fraction of the path up to each, shape (N,)."""
     errors: Vector
-    """Angle between the tool and the asked orientation at each [rad], shape (N,)."""
+    """Angle between the actual and the requested orientation at each [rad], shape (N,)."""
     reason: str
     """Why it ends early; empty if it is complete."""
 
@@ -44,11 +44,11 @@ def linear_path(tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start:
 
     Args:
         tool: inverse kinematics.
-        waypoints: where the lines end; a direction or orientation that one leaves free stays free up to there.
-        start: all joints at the begin [rad], shape (J,).
+        waypoints: ends of the lines; if one leaves direction or orientation free, they are free along its line.
+        start: all joints at the start [rad], shape (J,).
 
     Raises:
-        PlanningError: for no waypoints, or one that makes no sense.
+        PlanningError: without waypoints, or for an invalid one.
     """
     if not waypoints:
         raise invalid_goal("a straight path needs at least one waypoint")
@@ -80,7 +80,7 @@ def linear_path(tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start:
 def _followed(
     model: KinematicModel, target: Target, start: Vector, tolerance: float, axis_tolerance: float
 ) -> Vector | None:
-    """The configuration nearest to `start` at a target close by, by Gauss-Newton steps; None where they miss it."""
+    """The configuration nearest to `start` at a target close by, by Gauss-Newton steps; None if they fail."""
     moving = model.moving
     q = start.copy()
     weight = _TURN_M if axis_tolerance < 1 else 0.01 * _TURN_M
@@ -106,7 +106,7 @@ def _followed(
 def _targets(
     tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start: Vector
 ) -> tuple[list[tuple[Target, float, float]], list[float]]:
-    """Targets along the lines with their tolerances, and the length of the path up to each from the one before."""
+    """Targets along the lines with their tolerances, and the length of the path to each from the previous one."""
     tip = tool.model.forward(start)
     position, rotation = tip.position, tip.rotation
     targets, lengths = [], []

@@ -37,7 +37,9 @@ class RrtConnectOptions:
     )
     max_jerk: float = option(400.0, unit="rad/s^3", gt=0, help="maximum jerk of any joint")
     step: float = option(0.01, unit="s", ge=0.002, le=0.05, help="time between points of the trajectory")
-    blend: float = option(0.5, unit="rad", ge=0, help="how far before a corner of the path the arm may leave it")
+    blend: float = option(
+        0.5, unit="rad", ge=0, help="distance from a corner of the path at which the arm may leave it"
+    )
     start_beyond_limits: float = option(
         0.1, unit="rad", ge=0, help="how far outside its limits a joint may start; from there it moves only inwards"
     )

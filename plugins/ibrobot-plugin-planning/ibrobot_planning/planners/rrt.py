@@ -1,4 +1,4 @@
-"""The planner around obstacles: goals to configurations, search, shortening, timing, check of the timed motion."""
+"""The planner around obstacles: inverse kinematics, search, shortening, timing, check of the timed motion."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ _FINEST_M = 0.0015
 _CHECK_S = 0.001
 """Time between checks of the timed motion."""
 _WATCH_STRIDE = 2
-"""Of these times, every second is checked again when the world has changed."""
+"""Every second one of these times is checked again when the world has changed."""
 _REPAIRS = 12
-"""Attempts to time one path, each with smaller blends where the previous motion touched."""
+"""Attempts to time a path, each with smaller blends at the contacts of the previous one."""
 _LEAST_BLEND = 0.01
 """Smaller blends [rad] become stops."""
 _WIDEST_WINDOW_S, _LINEAR_WINDOW_S = 0.1, 0.03
-"""The moving average of free motions and of straight lines: the wider, the further they leave the path."""
+"""Widths of the moving average of free motions and of straight lines; a wider one leaves the path further."""
 _ROUNDING = 1e-6
 """Allowed excess of positions beyond a limit [rad]."""
 _WORSE_M = 1e-4
@@ -70,7 +70,7 @@ class RrtConnectPlanner(Planner):
     """Plans around the objects of a world, with padding.
 
     Attributes:
-        world: what is around the arm where the run has no section `world`; replace it at any time.
+        world: the objects, if the run has no section `world`; may be replaced at any time.
     """
 
     def __init__(self, options: RrtConnectOptions, ctx: Context) -> None:
@@ -81,7 +81,7 @@ class RrtConnectPlanner(Planner):
         self._tool: Tool | None = None
         self._unchecked: Mapping[Pair, str] = {}
         self._checked: deque[tuple[JointTrajectory, World]] = deque(maxlen=8)
-        """Trajectories found free, each with the world in which it is."""
+        """Free trajectories, each with the world in which it is free."""
 
     @override
     def load(self) -> None:
@@ -112,15 +112,14 @@ class RrtConnectPlanner(Planner):
     @override
     def blocked(self, trajectory: JointTrajectory, others: Mapping[str, float], from_ns: int = 0) -> str:
         world = self._snapshot()
-        # A trajectory needs a new check when the world has changed.
         if any(known is trajectory and in_world == world for known, in_world in tuple(self._checked)):
             return ""
         checks = self._collisions(world, trajectory.joint_names, others)
         made = motion_of(trajectory)
         if made is None:
-            return "nothing is known of a trajectory without velocities and accelerations"
+            return "a trajectory without velocities and accelerations cannot be checked"
         positions = made.sampled(_CHECK_S)[0][round(seconds(from_ns) / _CHECK_S) :: _WATCH_STRIDE]
-        # Contacts that exist already may open.
+        # Contacts at the start may open.
         leaving = _outwards(checks, positions) or 0 if len(positions) else 0
         hit = leaving + checks.first_hit_on_path(positions[leaving:])
         if hit < len(positions):
@@ -195,7 +194,7 @@ class _Plan:
         failures: list[PlanningError] = []
         for number, alternative in enumerate(alternatives):
             try:
-                # The remaining time is divided, so that a hard alternative leaves some for the next.
+                # Divide the remaining time, so that a hard alternative leaves some for the next.
                 share = (self.deadline - time.monotonic()) / (len(alternatives) - number)
                 return self._reach(tool, alternative, number, way_out, time.monotonic() + share)
             except PlanningError as failure:
@@ -244,11 +243,11 @@ class _Plan:
         rng = np.random.default_rng(self.ctx.seed)
         for resolution in _RESOLUTIONS_M:
             space = Space(self.checks, *self._limits, resolution)
-            found = connect(space, start, goals, rng, lambda: time.monotonic() > deadline)
-            if found is None:
+            path = connect(space, start, goals, rng, lambda: time.monotonic() > deadline)
+            if path is None:
                 return
             for closely in _RESOLUTIONS_M[1:]:
-                yield shortened(Space(self.checks, *self._limits, closely), found, rng, self._pace)
+                yield shortened(Space(self.checks, *self._limits, closely), path, rng, self._pace)
 
     def _candidates(self, tool: Tool, goal: object) -> list[Candidate]:
         robot = self.ctx.robot
@@ -277,7 +276,7 @@ class _Plan:
         """The configurations without contacts.
 
         Raises:
-            PlanningError: where all of them touch something.
+            PlanningError: if all of them touch something.
         """
         free = [candidate for candidate in candidates if self.checks.free(candidate.joints[self._order])]
         if not free and isinstance(goal, JointGoal) and goal.tolerance > 0:
@@ -292,21 +291,21 @@ class _Plan:
         raise PlanningError(f"the goal is in collision{at_all}: {_sentence(least)}", PlanCode.GOAL_IN_COLLISION)
 
     def _nearby(self, whole: Vector, goal: JointGoal) -> list[Candidate]:
-        """The nearest free one of random configurations within the goal's tolerance."""
+        """The nearest of random free configurations within the goal's tolerance."""
         rng = np.random.default_rng(self.ctx.seed)
         robot = self.ctx.robot
-        found = []
+        free = []
         indices = robot.indices(goal.joints)
         for share in np.linspace(0.1, 1.0, 100):
             near = whole.copy()
             near[indices] += share * goal.tolerance * rng.uniform(-1, 1, len(indices))
             near = np.clip(near, robot.lower, robot.upper)
             if self.checks.free(near[self._order]):
-                found.append(Candidate(near))
-        return sorted(found, key=lambda each: float(np.abs(each.joints - whole).max()))[:1]
+                free.append(Candidate(near))
+        return sorted(free, key=lambda each: float(np.abs(each.joints - whole).max()))[:1]
 
     def _way_out(self) -> list[Vector]:
-        """Waypoints from the start to a configuration within limits and without contacts; the start alone if it is one.
+        """Waypoints from the start to one within limits and without contacts; only the start if it is such a one.
 
         Raises:
             PlanningError: if the start overlaps too deeply, or no short motion leads out.
@@ -371,19 +370,19 @@ class _Plan:
     @property
     def _pace(self) -> Pace:
         """Limits of the motion, for estimates of its time."""
+        return Pace(*self._scaled_limits(_WIDEST_WINDOW_S), self.options.blend)
+
+    def _scaled_limits(self, window_s: float) -> tuple[Vector, Vector]:
+        """Velocity and acceleration; the average over `window_s` [s] then keeps the jerk limit."""
         robot, options, request = self.ctx.robot, self.options, self.request
         velocity = robot.max_velocity[self._order] * options.velocity_scaling * request.velocity_scaling
         limit = robot.max_acceleration[self._order] * options.acceleration_scaling * request.acceleration_scaling
-        return Pace(velocity, np.minimum(limit, options.max_jerk * _WIDEST_WINDOW_S / 2), options.blend)
+        return velocity, np.minimum(limit, options.max_jerk * window_s / 2)
 
     def _checked(self, path: Sequence[Vector], *, linear: bool = False) -> Motion | None:
-        """The fastest motion along a path without contacts; None if even one that stops at corners touches."""
-        robot, options, request = self.ctx.robot, self.options, self.request
-        way = np.array(path)
-        velocity = robot.max_velocity[self._order] * options.velocity_scaling * request.velocity_scaling
-        limit = robot.max_acceleration[self._order] * options.acceleration_scaling * request.acceleration_scaling
-        widest = _LINEAR_WINDOW_S if linear else _WIDEST_WINDOW_S
-        acceleration = np.minimum(limit, options.max_jerk * widest / 2)
+        """The fastest motion along a path without contacts; None if it touches even when it stops at corners."""
+        options, way = self.options, np.array(path)
+        velocity, acceleration = self._scaled_limits(_LINEAR_WINDOW_S if linear else _WIDEST_WINDOW_S)
         window = 2 * float(acceleration.max()) / options.max_jerk
         blends = self._blends(way)
         for number in range(_REPAIRS):
@@ -402,7 +401,7 @@ class _Plan:
         return None if len(self._touching(motion)) else motion
 
     def _free_closely(self, way: Vector) -> bool:
-        """Whether the path itself is free: where it is not, no blend helps."""
+        """Whether the path itself is free; if not, no blend helps."""
         begin = 0 if self.checks.free(way[0]) else 1
         finest = Space(self.checks, *self._limits, _FINEST_M)
         return all(finest.free(a, b) for a, b in pairwise(way[begin:]))
@@ -421,7 +420,7 @@ class _Plan:
                     break
                 blends[i] /= 2
             else:
-                # Lines of many points have short segments: their blends touch as little as the corners do.
+                # Lines of many points have short segments, whose blends hardly leave the path.
                 blends[i] = blends[i] if lengths[i : i + 2].max() < 4 * _LEAST_BLEND else 0.0
         return blends
 
@@ -443,7 +442,7 @@ class _Plan:
             checked += self.checks.first_hit_on_path(positions[checked:])
             if checked < len(positions):
                 bad.append(positions[checked : checked + 1])
-                # On past this contact, by what a corner takes at least.
+                # Continue past this contact, by the least duration of a corner.
                 checked += 10
         return np.asarray(np.concatenate(bad))
 
@@ -456,7 +455,7 @@ class _Plan:
         return f"{message}; on the straight way {_sentence(self.checks.contacts(line[hit]))}"
 
     def _result(self, motion: Motion, end: Candidate, number: int, fraction: float = 1.0) -> PlanResult:
-        # Rounding may leave the limits, which executors refuse.
+        # Executors refuse positions outside the limits, even if only by rounding.
         lower, upper = self._limits
         positions = np.clip(motion.positions, np.minimum(lower, self.start), np.maximum(upper, self.start))
         inside = attrs.evolve(motion, positions=positions)
@@ -465,7 +464,7 @@ class _Plan:
 
 
 def _outwards(checks: Collisions, configurations: Vector) -> int | None:
-    """Number of configurations in contact from the start on, while distances grow; None if one shrinks."""
+    """Number of configurations before the first free one, while distances grow; None if one shrinks."""
     before = {(each.first, each.second): each.distance for each in checks.contacts(configurations[0])}
     for number, q in enumerate(configurations):
         if checks.free(q):

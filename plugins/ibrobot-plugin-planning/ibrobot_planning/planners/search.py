@@ -19,21 +19,21 @@ import numpy as np
 from ibrobot_core.api import Vector
 
 _RUNS = ((1.6, True), (1.6, True), (0.8, False))
-"""Length of the extensions of the trees [rad], run by run, and whether one that is blocked is left out. That is fast;
-narrow passages need the free part of it."""
+"""For each run, the length of the trees' extensions [rad], and whether blocked ones are dropped whole. That is fast;
+in narrow passages, trees also need their free parts."""
 _SOME_JOINTS = 0.3
-"""Share of extensions that move only some of the joints, which mostly fit through narrow passages better."""
+"""Share of extensions that move only some of the joints: these pass narrow passages more easily."""
 _ITERATIONS, _MORE = 300, 1.6
-"""Iterations of the first run, and how many times as many each further one has. Some random trees run into dead ends
-for a minute where others take a tenth of a second, so that starting again is faster."""
+"""Iterations of the first run, and the factor from one run to the next. Some random trees are stuck for a minute where
+others take a tenth of a second, so that starting again is faster."""
 _FIRST_NODES = 256
 _DRAWN = 50
 """Samples drawn at a time."""
 _FRUITLESS = 15
-"""Attempts to shorten a path, one after the other, that end the shortening."""
+"""Shortening ends after this many failed attempts in a row."""
 _ATTEMPTS = 200
 _SHORTER = 1e-3
-"""Share by which a shortcut must be faster to be taken."""
+"""Share by which a shortcut must be faster."""
 _STRAIGHT = 0.5
 """Share of straight shortcuts; the others straighten the motion of one joint."""
 
@@ -155,7 +155,7 @@ class _Tree:
         return node
 
     def distance(self, a: Vector, b: Vector) -> float:
-        """The distance that `nearest` goes by [rad]."""
+        """Weighted distance, as in `nearest` [rad]."""
         way = (b - a) * self._weights
         return math.sqrt(way @ way)
 
@@ -181,11 +181,11 @@ def connect(
         space: where to search.
         start: shape (J,).
         goals: each of shape (J,); at least one.
-        rng: samples come from it.
+        rng: source of the samples.
         expired: whether to give up.
 
     Returns:
-        Waypoints with both ends, or None where the search gave up.
+        Waypoints with both ends, or None if the search gave up.
     """
     for goal in sorted(goals, key=lambda each: float(np.linalg.norm(each - start))):
         if space.free(start, goal):
@@ -207,14 +207,14 @@ def _grown(
     extended: Extended,
 ) -> list[Vector] | None:  # fmt: skip
     """One run of RRT-Connect."""
-    # A joint that moves the arm little counts little.
+    # Weight joints by how far they move the arm.
     weights = np.sqrt(space.checks.reach / space.checks.reach.max())
     here, there = _Tree(start[None], weights), _Tree(np.array(goals), weights)
     forwards = True
     for sample, some, joints in _samples(space, rng, iterations):
         if expired():
             return None
-        # The smaller tree grows, so that both grow equally.
+        # Grow the smaller tree.
         if here.size > there.size:
             here, there, forwards = there, here, not forwards
         parent = here.nearest(sample)
@@ -233,7 +233,7 @@ def _grown(
 def _samples(space: Space, rng: Random, number: int) -> Iterator[tuple[Vector, bool, Vector]]:
     """Random configurations, whether to move only some joints towards each, and which, shape (J,).
 
-    Drawn many at once: that takes a fraction of the time.
+    Drawn many at once, which is much faster.
     """
     width = space.upper - space.lower
     for _ in range(0, number, _DRAWN):
@@ -248,7 +248,7 @@ def _extended(space: Space, longest: float, tree: _Tree, parent: int, target: Ve
     Most blocked extensions are found at their middle or end, which costs little.
 
     Returns:
-        The last new node, or None where there was none.
+        The last new node; None without any.
     """
     base = tree.node(parent).copy()
     number = max(math.ceil(tree.distance(base, target) / longest), 1)
@@ -268,7 +268,7 @@ def _extended_in_part(
     """Grow a tree from a node towards `target`, as far as the line is free; with `once`, by one extension at most.
 
     Returns:
-        The new node, or None where there was none.
+        The new node; None without any.
     """
     base = tree.node(parent).copy()
     length = tree.distance(base, target)
@@ -277,7 +277,7 @@ def _extended_in_part(
     free = space.checks.first_hit(line)
     if free == 0:
         return None
-    # The last free configuration is close to contact: a node some way before it can be extended more often.
+    # The last free configuration is close to contact: extensions from a node before it succeed more often.
     if free < len(line):
         free = max(free // 2, 1) if once else free
     return tree.add(line[free - 1] if free < len(line) else end, parent)

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache, cached_property
 from itertools import pairwise
 
@@ -24,9 +25,9 @@ _BLEND_POINTS = 8
 _SAMPLE_S = 0.001
 """Time between samples of the motion before it is averaged."""
 LONGEST_S = 300.0
-"""Duration of a motion, at most: it is computed, checked and sent in samples."""
+"""Longest motion: motions are computed, checked and sent in samples."""
 _STILL = 1e-9
-"""Shorter segments [rad] are left out."""
+"""Shorter segments [rad] are skipped."""
 _PEAKS = 20
 """Samples between two points, for the maximum velocity and acceleration."""
 _EASED = 2e-3
@@ -76,14 +77,7 @@ class Motion:
         at = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         h = np.diff(self.times)[at][:, None]
         u = (times - self.times[at])[:, None] / h
-        c0, c1, c2, c3, c4, c5 = self._quintics[:, at]
-        return np.stack(
-            [
-                c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5)))),
-                (c1 + u * (2 * c2 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h,
-                (2 * c2 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / (h * h),
-            ]
-        )
+        return np.stack(evaluated(self._quintics[:, at], u, h))
 
     def positions_within(self, step: float) -> Vector:
         """Positions of the quintic at most `step` [s] apart, shape (M, J), all points among them."""
@@ -108,20 +102,36 @@ class Motion:
     @cached_property
     def _quintics(self) -> Vector:
         """Coefficients of the positions between points, by powers of the share of the time, shape (6, N - 1, J)."""
-        h = np.diff(self.times)[:, None]
-        way = np.diff(self.positions, axis=0)
-        v0, v1 = self.velocities[:-1] * h, self.velocities[1:] * h
-        a0, a1 = self.accelerations[:-1] * (h * h), self.accelerations[1:] * (h * h)
-        return np.stack(
-            [
-                self.positions[:-1],
-                v0,
-                a0 / 2,
-                10 * way - 6 * v0 - 4 * v1 - 1.5 * a0 + 0.5 * a1,
-                -15 * way + 8 * v0 + 7 * v1 + 1.5 * a0 - a1,
-                6 * way - 3 * v0 - 3 * v1 - 0.5 * a0 + 0.5 * a1,
-            ]
-        )
+        fields = self.positions, self.velocities, self.accelerations
+        begins, ends = [each[:-1] for each in fields], [each[1:] for each in fields]
+        return quintics(np.diff(self.times)[:, None], begins, ends)
+
+
+def quintics(h: Vector, begins: Sequence[Vector], ends: Sequence[Vector]) -> Vector:
+    """Coefficients of positions by powers of the share of the time, shape (6, N, J).
+
+    Args:
+        h: durations [s], shape (N, 1).
+        begins: positions, velocities and accelerations at their begin, each shape (N, J).
+        ends: the same at their end.
+    """
+    way = ends[0] - begins[0]
+    v0, v1 = begins[1] * h, ends[1] * h
+    a0, a1 = begins[2] * (h * h), ends[2] * (h * h)
+    c3 = 10 * way - 6 * v0 - 4 * v1 - 1.5 * a0 + 0.5 * a1
+    c4 = -15 * way + 8 * v0 + 7 * v1 + 1.5 * a0 - a1
+    c5 = 6 * way - 3 * v0 - 3 * v1 - 0.5 * a0 + 0.5 * a1
+    return np.stack([begins[0], v0, a0 / 2, c3, c4, c5])
+
+
+def evaluated(coefficients: Vector, u: Vector, h: Vector) -> tuple[Vector, Vector, Vector]:
+    """Positions, velocities and accelerations of quintics at shares `u` of their durations `h` [s], shape (N, 1)."""
+    c0, c1, c2, c3, c4, c5 = coefficients
+    return (
+        c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5)))),
+        (c1 + u * (2 * c2 + u * (3 * c3 + u * (4 * c4 + u * 5 * c5)))) / h,
+        (2 * c2 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5))) / (h * h),
+    )
 
 
 def motion_of(trajectory: JointTrajectory) -> Motion | None:
@@ -146,7 +156,7 @@ def trajectory_of(made: Motion, joints: tuple[str, ...], stamp_ns: int) -> Joint
 
 @cache
 def _powers(number: int) -> tuple[Vector, Vector, Vector]:
-    """Factors of a quintic's coefficients at shares 0, 1 / number, …: of the value, and its two derivatives."""
+    """Factors of a quintic's coefficients at shares 0, 1 / number, …, for its value and two derivatives."""
     u = (np.arange(number) / number)[:, None]
     n = np.arange(6)
     return (
@@ -168,13 +178,13 @@ def timed(
         blends: how far before and after each inner waypoint the motion may leave the path [rad], shape (N - 2,); 0
             stops there.
         window: width of the moving average [s]: the jerk stays below 2 max_acceleration / window.
-        step: greatest time between points [s]; less where the window is narrow.
+        step: greatest time between points [s]; less if the window is narrow.
 
     Returns:
         From the first to the last waypoint, both at rest.
 
     Raises:
-        PlanningError: for limits so low that the motion would take longer than `LONGEST_S`.
+        PlanningError: if the limits are so low that the motion takes longer than `LONGEST_S`.
     """
     path, blends = _without_repeats(np.asarray(path, dtype=float), blends)
     if len(path) == 1:
@@ -188,17 +198,17 @@ def timed(
         _fastest(path[first : last + 1], blends[first : last - 1], max_velocity, max_acceleration)
         for first, last in pairwise(stops)
     ]
-    # Rest for the width of the average, so that it does not cut a corner at which the motion stops.
+    # Rest for the width of the average, which would otherwise cut a corner at which the motion stops.
     rested = [np.concatenate([part, np.repeat(part[-1:], samples, axis=0)]) for part in parts]
     motion = _averaged(np.concatenate([np.repeat(path[:1], samples, axis=0), *rested]), samples, step)
-    # Between its points the quintic goes a little further than they do.
+    # Between its points the quintic exceeds them a little.
     velocities, accelerations = motion.peaks
     beyond = np.maximum(velocities / max_velocity, np.sqrt(accelerations / max_acceleration)).max()
     return motion.slowed(max(float(beyond), 1.0))
 
 
 def _without_repeats(path: Vector, blends: Vector) -> tuple[Vector, Vector]:
-    """Without waypoints on their predecessor; of those that stay, the blends."""
+    """The path without repeated waypoints, and the blends of the others."""
     blends = np.concatenate([[0.0], blends, [0.0]])[: len(path)]
     kept = [0]
     for i in range(1, len(path)):
@@ -228,7 +238,7 @@ def _fastest(path: Vector, blends: Vector, max_velocity: Vector, max_acceleratio
     squared = _speeds(s, slopes, bends, max_velocity, max_acceleration)
     speeds = np.sqrt(squared)
     stamps = np.concatenate([[0.0], np.cumsum(2 * np.diff(s) / (speeds[1:] + speeds[:-1]))])
-    # Slower by the excess between grid points.
+    # Slow down by the excess between grid points.
     rates = np.diff(squared) / (2 * np.diff(s))
     begins, ends = (
         slopes[which] * rates[:, None] + bends * squared[which, None] for which in (slice(-1), slice(1, None))
@@ -247,7 +257,7 @@ def _fastest(path: Vector, blends: Vector, max_velocity: Vector, max_acceleratio
 def _grid(path: Vector, blends: Vector) -> tuple[Vector, Vector, Vector, Vector]:
     """The path over its parameter s: grid [rad], positions, slopes dq/ds, and d2q/ds2 of each interval.
 
-    On a straight part s is the way. A corner P between directions a and b is the parabola with the tangents a and b
+    On a straight part, s is the distance. A corner P between directions a and b is the parabola with tangents a and b
     from P - l a to P + l b, on which the slope changes evenly while s grows by 2 l.
     """
     ways = np.diff(path, axis=0)
@@ -292,7 +302,7 @@ def _speeds(s: Vector, slopes: Vector, bends: Vector, max_velocity: Vector, max_
         most = np.concatenate([max_acceleration, max_acceleration])
         h = most / np.abs(factors)
         k = bent / factors
-        # A joint that does not move at this point bounds x alone.
+        # A joint that does not move here bounds only x.
         still = np.abs(factors) < 1e-9
         flat = np.where(still & (bent != 0), most / np.abs(bent), np.inf).min(axis=1)
         h, k = np.where(still, np.inf, h), np.where(still, 0.0, k)

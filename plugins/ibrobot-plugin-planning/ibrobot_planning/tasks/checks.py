@@ -29,8 +29,8 @@ type Key = tuple[str | int, ...]
 
 
 @attrs.frozen(eq=False)
-class Circumstances:
-    """What a task is checked against."""
+class Situation:
+    """The robot and the situation for which a task is checked."""
 
     config: RobotConfig
     registry: Registry
@@ -39,7 +39,7 @@ class Circumstances:
     movable: Collection[str] = ()
     """Objects that a policy may move."""
     start: Vector | None = None
-    """All joints [rad], shape (J,), where they are known."""
+    """All joints [rad], shape (J,); None if they are not known."""
     no_recording: str = ""
     """Why no episode can be recorded; empty if one can."""
     elsewhere: Collection[str] = ()
@@ -48,7 +48,7 @@ class Circumstances:
 
 @attrs.frozen(eq=False)
 class CheckedTask:
-    """A task that makes sense for a robot."""
+    """A task that is valid for a robot."""
 
     file: TaskFile
     mode: ControlMode
@@ -59,22 +59,22 @@ class CheckedTask:
     """The mode's executors of positions."""
 
 
-def check_task(file: TaskFile, given: Circumstances) -> CheckedTask:
+def check_task(file: TaskFile, situation: Situation) -> CheckedTask:
     """Check a task for a robot: names, limits, order of the steps, models, and reach where positions are known.
 
     Raises:
         ConfigError: with all faults.
     """
-    return _Checks(file, given).run()
+    return _Checks(file, situation).run()
 
 
 class _Checks:
-    def __init__(self, file: TaskFile, given: Circumstances) -> None:
-        self._file, self._document, self._given = file, file.document, given
-        self._within_reach = Reach(given.config.robot, given.start)
-        self._tool_planners = tool_planners(given.registry)
-        self._moved = set(given.elsewhere)
-        """Objects that are not where the world has them."""
+    def __init__(self, file: TaskFile, situation: Situation) -> None:
+        self._file, self._document, self._situation = file, file.document, situation
+        self._within_reach = Reach(situation.config.robot, situation.start)
+        self._tool_planners = tool_planners(situation.registry)
+        self._moved = set(situation.elsewhere)
+        """Objects that have left the poses that the world has for them."""
         self._held: str | None = None
         self._recording: Key | None = None
         """A step that records the next policy."""
@@ -85,7 +85,7 @@ class _Checks:
         mode = self._mode()
         self._document.raise_problems()
         assert mode is not None
-        executors = {name: self._given.config.executors[name] for name in mode.executors}
+        executors = {name: self._situation.config.executors[name] for name in mode.executors}
         self._mode_name, self._planner = mode.name, mode.planner.type if mode.planner is not None else ""
         self._trajectories = [name for name, each in executors.items() if each.goals == "trajectory"]
         arm = tuple(joint for name in self._trajectories for joint in executors[name].joints)
@@ -140,8 +140,8 @@ class _Checks:
             self._out_of_reach = []
         self._moved = moved
         if len(ends) > 1:
-            found = ", ".join(sorted("nothing" if each is None else repr(each) for each in ends))
-            self._document.add(key, f"the alternatives end with different objects in the gripper: {found}")
+            held_objects = ", ".join(sorted("nothing" if each is None else repr(each) for each in ends))
+            self._document.add(key, f"the alternatives end with different objects in the gripper: {held_objects}")
         if all(unreachable):
             self._out_of_reach = [each[0] for each in unreachable]
 
@@ -153,7 +153,7 @@ class _Checks:
         self._recording = None
 
     def _mode(self) -> ControlMode | None:
-        config, name = self._given.config, self._file.task.mode
+        config, name = self._situation.config, self._file.task.mode
         planning = [each for each, mode in config.control_modes.items() if mode.planner is not None]
         if name is None:
             first = config.default_control_mode
@@ -175,15 +175,15 @@ class _Checks:
         return config.control_modes[name]
 
     def _available(self, key: Key, mode: str) -> None:
-        if (reason := self._given.config.unavailable.get(mode)) is not None:
+        if (reason := self._situation.config.unavailable.get(mode)) is not None:
             self._document.add(key, f"mode {mode!r} is unavailable: {reason}")
 
     def _object(self, key: Key, name: str) -> bool:
-        """Whether there is an object; adds a fault if not."""
-        if self._given.world is None:
+        """Whether an object exists; adds a fault if not."""
+        if self._situation.world is None:
             self._document.add(key, "objects need a section `world` in the robot YAML, e.g. `world: {scene: true}`")
             return False
-        return self._document.refer(key, name, list(self._given.world.objects), "object")
+        return self._document.refer(key, name, list(self._situation.world.objects), "object")
 
     def _move(self, key: Key, step: MoveStep) -> None:
         before = len(self._document.problems)
@@ -196,8 +196,8 @@ class _Checks:
             self._reach(key, step)
 
     def _goal(self, key: Key, goal: GoalOptions) -> bool:
-        """Check the names and limits of one goal; whether its position is known."""
-        robot = self._given.config.robot
+        """Check the names and limits of a goal; returns whether its position is known."""
+        robot = self._situation.config.robot
         if goal.pose is not None:
             self._pose((*key, "pose"), goal.pose)
         for joint, value in goal.joints.items():
@@ -229,7 +229,7 @@ class _Checks:
         return self._object((*key, "object"), goal.object) and goal.object not in self._moved
 
     def _pose(self, key: Key, name: str) -> None:
-        robot = self._given.config.robot
+        robot = self._situation.config.robot
         try:
             if self._document.refer(key, name, pose_names(robot), "pose"):
                 named_pose(robot, name)
@@ -237,10 +237,10 @@ class _Checks:
             self._document.add(key, str(error))
 
     def _reach(self, key: Key, step: MoveStep) -> None:
-        """Check by inverse kinematics that the tool can be where a step wants it."""
+        """Check by inverse kinematics that the tool can reach the goal of a step."""
         try:
-            world = self._given.world or World()
-            goal = step.target(self._given.config.robot, self._arm, world).tool
+            world = self._situation.world or World()
+            goal = step.target(self._situation.config.robot, self._arm, world).tool
             if goal is not None:
                 self._within_reach.check(goal)
         except IbrobotError as error:
@@ -248,12 +248,11 @@ class _Checks:
             self._out_of_reach.append((key, f"{code}{error}"))
 
     def _gripper(self, key: Key, step: GripperStep) -> None:
-        config = self._given.config
+        config = self._situation.config
+        fits = len(self._grippers) == 1
         if step.executor is not None:
             fits = self._document.refer((*key, "executor"), step.executor, self._grippers, "gripper")
-        elif fits := len(self._grippers) == 1:
-            pass
-        else:
+        elif not fits:
             which = f"name its executor: {', '.join(self._grippers)}" if self._grippers else "use another mode"
             self._document.add(key, f"mode {self._mode_name!r} has {len(self._grippers)} grippers; {which}")
         if fits:
@@ -275,8 +274,8 @@ class _Checks:
             self._moved.add(step.release)
 
     def _policy(self, key: Key, step: PolicyStep) -> None:
-        config, key = self._given.config, (*key, "mode")
-        self._moved.update(self._given.movable)
+        config, key = self._situation.config, (*key, "mode")
+        self._moved.update(self._situation.movable)
         self._recording = None
         if self._records_task:
             self._document.add(
@@ -293,22 +292,21 @@ class _Checks:
             self._available(key, step.mode)
         else:
             try:
-                check_models(config, self._given.registry, [step.mode])
+                check_models(config, self._situation.registry, [step.mode])
             except IbrobotError as error:
                 self._document.add(key, str(error))
 
     def _look(self, key: Key, step: LookStep) -> None:
-        for name in ("object", "near"):
-            value = step.object if name == "object" else step.near
+        for name, value in (("object", step.object), ("near", step.near)):
             if value is not None:
                 self._object((*key, name), value)
         if step.camera is not None:
-            cameras = [name for name, each in self._given.config.peripherals.items() if each.kind == "camera"]
+            cameras = [name for name, each in self._situation.config.peripherals.items() if each.kind == "camera"]
             self._document.refer((*key, "camera"), step.camera, cameras, "camera")
 
     def _record(self, key: Key, step: RecordStep) -> None:
-        if self._given.no_recording:
-            self._document.add(key, self._given.no_recording)
+        if self._situation.no_recording:
+            self._document.add(key, self._situation.no_recording)
         elif self._records_task:
             self._document.add(key, "a step before it records the whole task already")
         elif self._recording is not None:

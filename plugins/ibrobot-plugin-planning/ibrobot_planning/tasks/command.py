@@ -25,7 +25,7 @@ from ibrobot_core.app import (
     run_robot,
 )
 from ibrobot_planning.execution.requests import Numbered
-from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
+from ibrobot_planning.tasks.checks import CheckedTask, Situation, check_task
 from ibrobot_planning.tasks.reading import TaskFile, find_task, read_task
 from ibrobot_planning.tasks.result import TaskResult
 from ibrobot_planning.tasks.runner import RESULT, TaskRunner
@@ -102,14 +102,14 @@ def _read(file: str, parameters: tuple[str, ...]) -> TaskFile:
 
 
 def _checked(file: TaskFile, robot: RobotConfig, registry: Registry) -> CheckedTask:
-    """Check a task without a run: objects are where they are at the beginning."""
+    """Check a task without a run, with the objects at their first poses."""
     scene = scene_objects(robot, registry)
     section = robot.plugin_sections.get(SECTION)
     world = first_world(section.options, scene) if section is not None else None
-    # The seed of the run decides where these are.
+    # The seed of the run places these.
     movable = [thing.name for thing in scene if thing.topic]
     why = "" if robot.recording is not None else "the robot YAML has no section `recording`"
-    return check_task(file, Circumstances(robot, registry, world, movable, None, why, elsewhere=movable))
+    return check_task(file, Situation(robot, registry, world, movable, None, why, elsewhere=movable))
 
 
 class TaskHooks(RunHooks):
@@ -119,7 +119,7 @@ class TaskHooks(RunHooks):
         self._session, self._file = runtime.session, file
         self._runner = next(each for each in runtime.plan.components if isinstance(each, TaskRunner))
         self._number: int | None = None
-        # A run that ends before it begins the task has not performed it.
+        # Counts as failed until the task begins.
         self._session.outcome.goals_failed += 1
         self._result: TaskResult | None = None
 
@@ -154,11 +154,11 @@ class TaskHooks(RunHooks):
         rows = [("task", f"{result.name}: {result.outcome.lower()} after {result.duration_s:.1f} s")]
         for step in result.steps:
             facts = f" {json.dumps(dict(step.facts))}" if step.facts else ""
-            told = f": {step.why}" if step.message else facts
+            detail = f": {step.why}" if step.message else facts
             rows.append(
                 (
                     f"  step {step.number}",
-                    f"{step.outcome.lower():9} {step.duration_s:5.1f} s  {step.name or step.kind}{told}",
+                    f"{step.outcome.lower():9} {step.duration_s:5.1f} s  {step.name or step.kind}{detail}",
                 )
             )
         return rows

@@ -29,10 +29,10 @@ class MoveStep(GoalOptions):
 
     def __attrs_post_init__(self) -> None:
         several = next((name for name, goals in (("any", self.any), ("line", self.line)) if goals), "")
-        given = attrs.asdict(self, recurse=False)
-        # With several goals, the other keys of a goal belong to each of these.
+        values = attrs.asdict(self, recurse=False)
+        # Keys of a goal belong to the goals in `any` or `line`.
         for field in attrs.fields(GoalOptions) if several else ():
-            if given[field.name] not in (field.default, {}) and not self.kinds().get(field.name):
+            if values[field.name] not in (field.default, {}) and not self.kinds().get(field.name):
                 raise ValueError(f"{field.name} belongs to the goals in {several}")
         super().__attrs_post_init__()
         if self.least_fraction != 1 and not self.line:
@@ -50,8 +50,8 @@ class MoveStep(GoalOptions):
 
         Args:
             robot: the robot.
-            arm: the joints that a motion may move; those of a named pose are limited to them.
-            world: the objects that goals refer to, where they are now.
+            arm: the joints that a motion may move; a named pose applies to these only.
+            world: the objects that goals refer to.
             tool: present position of the tool [m], shape (3,), for relative goals.
 
         Raises:
@@ -112,11 +112,11 @@ class PolicyStep:
 @documented
 @attrs.frozen
 class LookStep:
-    """`look`: where an object is, or a new image of a camera."""
+    """`look`: find an object, or wait for a new image of a camera."""
 
     object: str | None = option(None, help="object of the world; the result has its position")
     near: str | None = option(None, help="object from whose centre it must be no further than `within`")
-    within: float | None = option(None, unit="m", gt=0, help="the largest distance from `near`, else the step fails")
+    within: float | None = option(None, unit="m", gt=0, help="largest distance from `near`; beyond it the step fails")
     camera: str | None = option(None, help="camera among `peripherals`: waits for an image that begins after this step")
     timeout: float = option(5.0, unit="s", gt=0, le=600, help="longest wait for the image")
 
@@ -206,7 +206,7 @@ class AlternativesStep:
 @documented
 @attrs.frozen
 class TaskStep(Step):
-    """A step of a task: as within alternatives, or alternatives."""
+    """A step of a task: one that alternatives may have, or alternatives."""
 
     alternatives: tuple[tuple[Step, ...], ...] | None = option(
         None, validator=_some_lists, help="lists of steps: the first one whose motions can be planned and that succeeds"
@@ -227,5 +227,5 @@ class Task:
     name: str = option("", help="for feedback and results")
     mode: str | None = option(None, help="planning mode that moves the robot; None: the only one, or the first mode")
     parameters: Mapping[str, str | float | bool] = option(
-        factory=dict, help="name -> value, for which $name stands in the steps"
+        factory=dict, help="name -> value, which replaces $name in the steps"
     )

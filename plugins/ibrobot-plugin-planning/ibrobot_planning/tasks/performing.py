@@ -40,9 +40,9 @@ from ibrobot_planning.world.section import ATTACH, DETACH, TOUCH
 BEGIN_EPISODE, END_EPISODE = "/record_episode/start", "/record_episode/stop"
 """Services of a run that records: take a prompt, and an outcome."""
 _GRASP_RAD = 0.01
-"""A gripper that comes closer to its goal has grasped nothing, where its executor states no tolerance."""
+"""A gripper that comes closer to its goal has grasped nothing; used if its executor has no tolerance."""
 _ALIVE_NS = ns(2.0)
-"""How long the contract's topics may take to be alive after a recorded step has begun."""
+"""How long the contract's topics may stay silent after a recorded step has begun."""
 
 type Steps = Generator[None, None, Mapping[str, Any]]
 
@@ -75,7 +75,7 @@ class Performance:
     Attributes:
         begun_ns: when it began [ns].
         cancelled: why it ends early; empty otherwise.
-        results: of the steps that have ended.
+        results: results of the steps that have ended.
     """
 
     def __init__(self, session: RunView, checked: CheckedTask, begins: Callable[[Step], None]) -> None:
@@ -94,7 +94,7 @@ class Performance:
         self._arm = self._perform()
 
     def advance(self) -> bool:
-        """Go on with the steps, without waiting; return whether the task has ended."""
+        """Go on with the steps without waiting; returns whether the task has ended."""
         return next(self._arm, True) is True
 
     def end(self) -> None:
@@ -167,7 +167,7 @@ class Performance:
     def _alternatives(self, step: AlternativesStep) -> Steps:
         """Perform the first list of steps that succeeds; lists whose first motions cannot be planned are skipped.
 
-        A failure while the gripper holds what a list has grasped, or of the robot, ends them all.
+        All fail if the robot stops, or if a list fails after it has grasped or released something.
         """
         failures: list[StepFailed | IbrobotError] = []
         held = self._held
@@ -189,7 +189,7 @@ class Performance:
         raise StepFailed(f"no alternative succeeded: {reasons}", _code(failures[0]))
 
     def _check_ahead(self, steps: Sequence[Step]) -> None:
-        """Plan the motions of steps, each from the end of the one before, up to the first that moves anything else.
+        """Plan the motions of steps, each from the end of the previous one, up to the first step that is unpredictable.
 
         Raises:
             StepFailed: if one cannot be planned.
@@ -313,7 +313,7 @@ class Performance:
             elif not solved:
                 raise StepFailed(f"no success within {step.seconds:g} s")
         finally:
-            # The mode, and with it the episode, ends here: nothing else moves the robot on.
+            # Leave the mode, so that the policy stops.
             if recorded and session.bus.serves(END_EPISODE):
                 session.bus.call(END_EPISODE, outcome)
             if session.bus.serves(SET_MODE):
@@ -371,14 +371,14 @@ class Performance:
         return True
 
     def _end_recording(self, outcome: str) -> None:
-        """End the episode of the task, if there is one."""
+        """End the episode of the task, if one is recorded."""
         recorded, self._recording = self._recording, False
         if recorded and self._session.bus.serves(END_EPISODE):
             self._session.bus.call(END_EPISODE, outcome)
 
 
 def _code(error: Exception) -> str:
-    """MoveIt's name of an error; empty without one."""
+    """MoveIt's name of an error, or empty."""
     if isinstance(error, StepFailed):
         return error.code
     return error.code.name if isinstance(error, PlanningError) else ""

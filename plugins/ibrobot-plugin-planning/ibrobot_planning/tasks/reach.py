@@ -1,4 +1,4 @@
-"""Whether the tool can be where a goal wants it, by inverse kinematics."""
+"""Whether the tool can reach a goal, by inverse kinematics."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
 
 class Reach:
-    """Checks the reach of a robot; its model is read with the first check.
+    """Checks the reach of a robot; the first check reads its model.
 
     Args:
         robot: the robot.
-        start: all joints [rad], shape (J,), where they are known.
+        start: all joints [rad], shape (J,); None if they are not known.
     """
 
     def __init__(self, robot: Robot, start: Vector | None) -> None:

@@ -1,4 +1,4 @@
-"""Task files: from text, with parameters filled in."""
+"""Task files: read from text, with parameters filled in."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WORDS = ("true", "false", "null")
 
 @attrs.frozen(eq=False)
 class TaskFile:
-    """A task, and where each of its keys stands."""
+    """A task, and the lines of its keys."""
 
     task: Task
     document: Document
@@ -70,7 +70,7 @@ def read_task(text: str, file: str, parameters: Sequence[str] = (), *, expands: 
         values[name] = parse_yaml(value, flag).root
     filled = _PARAMETER.sub(lambda match: _shown(values[match[1]]) if match[1] in values else match[0], text)
     document = parse_yaml(filled, file, expands=expands)
-    for key, name in _left(document.root, ()):
+    for key, name in _unfilled(document.root, ()):
         document.add(key, f"no parameter {name!r}{did_you_mean(name, list(values), 'parameters')}")
     document.raise_problems()
     task = single_options(Task, (), file, text=filled, expands=expands)
@@ -78,20 +78,20 @@ def read_task(text: str, file: str, parameters: Sequence[str] = (), *, expands: 
 
 
 def _shown(value: Any) -> str:
-    """A value as YAML that stands for itself, also within text."""
+    """A value as YAML, plain if possible, so that it may be part of a text."""
     if isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _WORDS:
         return value
     return json.dumps(value)
 
 
-def _left(value: Any, key: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
+def _unfilled(value: Any, key: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
     """Key and name of each parameter that was not filled in."""
     if isinstance(value, str):
         for match in _PARAMETER.finditer(value):
             yield key, match[1]
     elif isinstance(value, Mapping):
         for name, item in value.items():
-            yield from _left(item, (*key, name))
+            yield from _unfilled(item, (*key, name))
     elif isinstance(value, list):
         for i, item in enumerate(value):
-            yield from _left(item, (*key, i))
+            yield from _unfilled(item, (*key, i))

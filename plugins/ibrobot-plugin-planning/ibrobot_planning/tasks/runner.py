@@ -15,7 +15,7 @@ import attrs
 from ibrobot_core.api import PlanningError, String, documented, option, seconds
 from ibrobot_core.app import CONTROL, NoRequest, RequestLimits, RunView, Service, SessionWorker
 from ibrobot_planning.execution.requests import Numbered
-from ibrobot_planning.tasks.checks import CheckedTask, Circumstances, check_task
+from ibrobot_planning.tasks.checks import CheckedTask, Situation, check_task
 from ibrobot_planning.tasks.format import Step
 from ibrobot_planning.tasks.performing import Performance
 from ibrobot_planning.tasks.reading import TaskFile, read_task
@@ -105,12 +105,11 @@ class TaskRunner(SessionWorker):
                 raise PlanningError(f"task {self._running.number} is running; {CANCEL.name} ends it")
             number = next(self._numbers)
             performance = Performance(self.session, checked, lambda step: self._show(number, performance, step))
-            running = _Running(number, performance)
-            self._running, self._results[number] = running, None
+            self._running, self._results[number] = _Running(number, performance), None
             while len(self._results) > _KEPT:
                 self._results.pop(next(iter(self._results)))
         self._wake.put(None)
-        return running.number
+        return number
 
     def cancel(self, why: str) -> None:
         """End the present task, if there is one: the robot slows down and holds."""
@@ -119,7 +118,7 @@ class TaskRunner(SessionWorker):
             running.task.cancelled = why
 
     def line(self) -> str:
-        """Where the present task is, in one line; empty without a task."""
+        """The step of the present task, in one line; empty without a task."""
         running = self._running
         if running is None:
             return ""
@@ -158,7 +157,7 @@ class TaskRunner(SessionWorker):
         world = session.bus.call(SNAPSHOT) if session.bus.serves(SNAPSHOT) else None
         movable = [thing.name for thing in scene if thing.topic]
         start = session.state.command if session.state is not None else None
-        return check_task(file, Circumstances(config, session.registry, world, movable, start, why))
+        return check_task(file, Situation(config, session.registry, world, movable, start, why))
 
     def result(self, number: int) -> TaskResult | None:
         """The result of a task; None until it has ended.
@@ -194,7 +193,7 @@ class TaskRunner(SessionWorker):
         self.cancel("the run ended")
         waits = 0.0
         while self._running is running:
-            # In lockstep time has stopped: a motion cannot end.
+            # In lockstep, time has stopped: a motion cannot end.
             if self.session.request.lockstep or waits > _STOP_S:
                 running.task.end()
                 self._finish(running)
@@ -204,10 +203,10 @@ class TaskRunner(SessionWorker):
             threading.Event().wait(_POLL_S)
 
     def _show(self, number: int, performance: Performance, step: Step | None, state: str = "executing") -> None:
-        """Publish where the task is."""
+        """Publish the status of the task."""
         task = performance.checked.file.task
         position = len(performance.results) + (step is not None)
-        where = {"task": task.name, "number": number, "step": position, "steps": len(task.steps), "state": state}
+        status = {"task": task.name, "number": number, "step": position, "steps": len(task.steps), "state": state}
         if step is not None:
-            where |= {"kind": step.kind, "name": step.name}
-        self.session.bus.publish(STATUS, String(json.dumps(where)), latched=True)
+            status |= {"kind": step.kind, "name": step.name}
+        self.session.bus.publish(STATUS, String(json.dumps(status)), latched=True)

@@ -1,6 +1,6 @@
 """The collision model of the arm: joints and the shapes of its links, from the MJCF.
 
-MuJoCo reads the file. Pinocchio computes where links are and Coal what touches; ADR 31 has why.
+MuJoCo reads the file, Pinocchio places the links, Coal finds contacts (ADR 31).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Arm:
     columns: np.ndarray[tuple[int], np.dtype[np.intp]]
     """Index of each joint in Pinocchio's vector, shape (J,)."""
     reference: Vector
-    """Positions at which the joints move nothing [rad or m], shape (J,)."""
+    """Positions at which the joints have no effect [rad or m], shape (J,)."""
     lower: Vector
     """[rad or m], shape (J,)."""
     upper: Vector
@@ -66,7 +66,7 @@ class Arm:
     slides: np.ndarray[tuple[int], np.dtype[np.bool_]]
     """Which joints are prismatic, shape (J,)."""
     hulls: tuple[LinkShape, ...] = ()
-    """Fewer shapes that contain `shapes`, for quick checks; empty where there are none. See `with_hulls`."""
+    """Fewer shapes that contain `shapes`, for quick checks; may be empty. See `with_hulls`."""
 
     def native(self, q: Vector) -> Vector:
         """Joint positions, shape (..., J), in Pinocchio's order and zero."""
@@ -124,12 +124,12 @@ class Arm:
 
     def adjacent(self) -> set[Pair]:
         """Links that one joint connects."""
-        found = set()
+        connected = set()
         for i, j in self.pairs():
             a, b = self.shapes[i], self.shapes[j]
             if self.model.parents[a.joint] == b.joint or self.model.parents[b.joint] == a.joint:
-                found.add(sorted_pair(a.link, b.link))
-        return found
+                connected.add(sorted_pair(a.link, b.link))
+        return connected
 
 
 def sorted_pair(a: str, b: str) -> Pair:
@@ -163,7 +163,7 @@ def read_arm(path: Path, joints: tuple[str, ...]) -> Arm:
         joints: the joints that may move, in the order of vectors. Others stay at their reference position.
 
     Raises:
-        PlanningError: when the file cannot be read, lacks a joint, or one is neither a hinge nor a slide.
+        PlanningError: if the file cannot be read, lacks a joint, or one is neither a hinge nor a slide.
     """
     import pinocchio
 
@@ -226,7 +226,7 @@ def _compiled(path: Path) -> Any:
             geoms = list(body.geoms)
             if not any(geom.contype or geom.conaffinity for geom in geoms):
                 for geom in geoms:
-                    geom.contype = 1  # so that the compiler finds its hull
+                    geom.contype = 1  # makes the compiler compute its hull
         return spec.compile()
     except ValueError as error:
         raise _unusable(f"{path} cannot be loaded: {error}") from error
@@ -284,8 +284,7 @@ def _hull(source: Any, mesh: int) -> tuple[Vector, np.ndarray[tuple[int, ...], n
 def reach(arm: Arm, carried: Sequence[LinkShape]) -> Vector:
     """Maximum distance of any point of the arm, and of what it carries, from each joint's axis [m], shape (J,).
 
-    An upper bound, from bounding spheres of the shapes on links that are stretched out in any direction; 1 for slide
-    joints.
+    An upper bound, from bounding spheres of the shapes on a stretched-out arm; 1 for slide joints.
     """
     model, farthest = arm.model, _farthest(arm).copy()
     for shape in carried:

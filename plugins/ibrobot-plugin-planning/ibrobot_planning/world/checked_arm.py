@@ -1,6 +1,6 @@
 """A robot's arm for collision checks: pairs of links that need none, and hulls that make the others quick.
 
-Where nothing touches the convex hull of a link, nothing touches the shapes in it.
+What does not touch the convex hull of a link does not touch the shapes in it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from ibrobot_planning.world.collision import Collisions, unchecked_pairs
 from ibrobot_planning.world.objects import World
 
 _SAMPLES = 200
-"""Number of configurations that determine which hulls make checks faster."""
+"""Random configurations that decide which hulls make checks faster."""
 _VAIN_SHARE = 0.05
-"""A link whose hull touches another link in more of the free configurations keeps its shapes."""
+"""A link keeps its shapes if its hull touches another link in more of the free configurations."""
 
 
 @attrs.frozen(eq=False)
@@ -65,13 +65,13 @@ def checked_arm(robot: Robot, log: logging.Logger) -> CheckedArm:
 
 
 def urdf_names(arm: Arm, urdf: Urdf) -> dict[str, str]:
-    """Link of the MJCF -> link of the URDF, of the links that the same joints carry, and of the base."""
+    """Link of the MJCF -> link of the URDF that the same joint carries; also the base."""
     children = {joint.name: joint.child for joint in urdf.joints}
     numbers = {int(number): name for number, name in zip(arm.numbers, arm.joint_names, strict=True)}
     names: dict[str, str] = {}
     named: set[int] = set()
     for link, (joint, _) in arm.frames.items():
-        # The first link of a joint, from the base outwards, is the one that it carries; others are fixed to it.
+        # The first link of a joint, from the base outwards, is its child; others are fixed to it.
         if link == "world" or joint in named:
             continue
         named.add(joint)
@@ -83,7 +83,7 @@ def urdf_names(arm: Arm, urdf: Urdf) -> dict[str, str]:
 
 
 def with_hulls(arm: Arm, unchecked: Collection[Pair]) -> Arm:
-    """The arm with one hull in place of the shapes of each link, where that makes checks faster.
+    """The arm with one hull in place of the shapes of each link, if that makes checks faster.
 
     Args:
         arm: the arm.
@@ -111,13 +111,13 @@ def with_hulls(arm: Arm, unchecked: Collection[Pair]) -> Arm:
         ]
         if not vain:
             return attrs.evolve(arm, hulls=few)
-        # The link that touches most is at fault; the others may be good without it.
+        # Only the worst hull is dropped: without it, the others may do.
         _, link = max(vain)
         hulls[link] = of_links[link]
 
 
 def _hulls(shapes: Sequence[LinkShape]) -> Sequence[LinkShape]:
-    """One shape that contains the shapes of a link; shapes that are not convex stay."""
+    """One shape that contains the convex shapes of a link, and the others."""
     points, others = [], []
     for shape in shapes:
         corners = enclosing(shape.geometry)

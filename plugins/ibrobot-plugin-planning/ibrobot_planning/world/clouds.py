@@ -33,11 +33,11 @@ from ibrobot_planning.world.voxels import cloud_points, depth_points, outside, v
 CLEAR = Service("/clear_octomap", NoRequest, NoneType, "Remove the cells of all clouds until the next message.")
 """MoveIt's name."""
 _PIXELS = 3
-"""Least pixels along the edge of a cell at the furthest distance; images are thinned to about this."""
+"""Pixels along the edge of a cell at the furthest distance; images are thinned to about this."""
 
 
 class CloudKeeper(SessionWorker):
-    """Keeps the world of a run, with the cells that clouds occupy as objects of the clouds' names.
+    """Keeps the world of a run, with the cells of each cloud as an object of its name.
 
     Cells of the arm, of what it carries and of other objects are left out.
     """
@@ -91,9 +91,9 @@ class CloudKeeper(SessionWorker):
             if not isinstance(thing.shape, Voxels):
                 shapes = others if thing.link is None else arm_shapes
                 shapes.append((geometry(thing.shape), frame @ matrix(thing.pose)))
-        left = outside(cells, arm_shapes, margin)
-        # What stands on an object must stay, however flat.
-        return None if left is None else outside(left, others, cells.size / 2)
+        remaining = outside(cells, arm_shapes, margin)
+        # The small margin keeps flat things that stand on an object.
+        return None if remaining is None else outside(remaining, others, cells.size / 2)
 
     def _clear(self, request: NoRequest) -> None:
         for name, cloud in self._clouds.items():
@@ -173,7 +173,7 @@ class _Cloud:
         return depth_points(depth[::step, ::step], k, pose(np.eye(4)), furthest=options.furthest)
 
     def kept(self, cells: Voxels | None, now_ns: int) -> Voxels | None:
-        """These cells and earlier ones that are still kept, at most as many as allowed."""
+        """These cells and earlier ones that are still kept, at most `most_cells`."""
         options = self.options
         if options.keep == 0:
             self._seen.clear()
@@ -183,14 +183,14 @@ class _Cloud:
             self._seen.append((now_ns, cells))
         if not self._seen:
             return None
-        found = np.unique(np.concatenate([each.cells for _, each in self._seen]), axis=0)
-        if len(found) > options.most_cells:
-            self.report(f"{len(found)} occupied cells, only the nearest {options.most_cells} are kept (most_cells)")
-            found = found[np.argsort(np.linalg.norm(found, axis=1), kind="stable")[: options.most_cells]]
-        return Voxels(options.cell, found)
+        occupied = np.unique(np.concatenate([each.cells for _, each in self._seen]), axis=0)
+        if len(occupied) > options.most_cells:
+            self.report(f"{len(occupied)} occupied cells, only the nearest {options.most_cells} are kept (most_cells)")
+            occupied = occupied[np.argsort(np.linalg.norm(occupied, axis=1), kind="stable")[: options.most_cells]]
+        return Voxels(options.cell, occupied)
 
     def forget(self) -> None:
-        """Forget what was seen."""
+        """Drop all cells."""
         self._seen.clear()
 
     def report(self, message: str) -> None:
@@ -201,7 +201,7 @@ class _Cloud:
 
 
 class _Frames:
-    """The newest transforms on `/tf` and `/tf_static`: where a sensor is in the base frame."""
+    """Poses of sensors in the base frame, from `/tf` and `/tf_static`."""
 
     def __init__(self, bus: Bus) -> None:
         self._subscriptions = [bus.subscribe(topic, 10, TFMessage) for topic in ("/tf_static", "/tf")]
@@ -227,9 +227,9 @@ class _Frames:
         for _ in self._newest:
             if frame not in self._newest:
                 break
-            found = self._newest[frame]
-            placed = matrix(Pose(found.translation, found.rotation)) @ placed
-            frame = found.header.frame_id
+            transform = self._newest[frame]
+            placed = matrix(Pose(transform.translation, transform.rotation)) @ placed
+            frame = transform.header.frame_id
         return placed
 
     def close(self) -> None:

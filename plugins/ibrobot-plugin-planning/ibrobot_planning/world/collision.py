@@ -19,12 +19,12 @@ from ibrobot_planning.world.coal_shapes import geometry
 from ibrobot_planning.world.objects import World
 
 _FEW = 4
-"""Lines of so few configurations are checked one by one."""
+"""Lines of at most this many configurations are checked one by one."""
 _SAMPLES = 1000
 """Number of configurations that determine which links always touch."""
 WIDER_M = (0.0, 0.004, 0.02)
-"""Distances [m] by which margins are widened: as long as nothing is closer than a widened margin, the arm can move by
-that distance without a check."""
+"""Distances [m] by which margins are widened: if nothing is closer than a widened margin, the arm can move that far
+without a check."""
 _ALWAYS_SHARE = 0.95
 """Links that touch in at least this share of configurations always touch, as in MoveIt's setup assistant."""
 
@@ -55,10 +55,10 @@ class Collisions:
 
     Args:
         arm: the arm.
-        world: what is around it, and what it carries.
-        joints: the joints that vectors have, J in number.
-        others: positions of further joints [rad]; those left out are at 0.
-        padding: least distance [m] from objects that stand in the world; also that of carried objects from them.
+        world: the objects around it, and those that it carries.
+        joints: the joints of vectors, J in number.
+        others: positions of other joints [rad]; joints in neither are at 0.
+        padding: least distance [m] of the arm, and of what it carries, from objects that stand in the world.
         self_padding: least distance [m] between links, and between links and what other links carry.
         unchecked: pairs of links that may touch; see `unchecked_pairs`.
 
@@ -107,7 +107,7 @@ class Collisions:
 
     @property
     def pairs(self) -> list[Pair]:
-        """Names of what each pair of `geometry.collisionPairs` has, links and objects."""
+        """Names, of links and objects, for each of `geometry.collisionPairs`."""
         names = self._exact.names
         return [(names[pair.first], names[pair.second]) for pair in self.geometry.collisionPairs]
 
@@ -125,8 +125,8 @@ class Collisions:
     def first_hit_on_path(self, path: Vector) -> int:
         """Number of free configurations before the first in collision, of a path in small steps, shape (N, J).
 
-        Equal to `first_hit`, with fewer checks: a configuration that is free with a margin wider by w proves that all
-        those are free to which no point of the arm moves farther than w.
+        Equal to `first_hit`, with fewer checks: if a configuration is free with a margin wider by w, so are all
+        configurations to which no point of the arm moves farther than w.
         """
         native, number, levels, widely = self.native(path), len(path), len(WIDER_M), self._coarse.touches
         travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path, axis=0)) @ self.reach)]).tolist()
@@ -151,8 +151,8 @@ class Collisions:
         """Whether the straight line from `a`, which is not checked, to `b` is free, both shape (J,).
 
         Args:
-            a: begin.
-            b: end.
+            a: the start.
+            b: the end.
             resolution: maximum motion of any point of the arm between two checks [m].
         """
         begin, way = self._still.copy(), np.zeros(len(self._still))
@@ -184,7 +184,7 @@ class Collisions:
         """Contacts closer than their padding at `q`, shape (J,): the closest of each pair of names, deepest first."""
         shapes, results, names = self.geometry, self.results, self._exact.names
         pinocchio.computeCollisions(self.arm.model, self.data, shapes, results, self.native(q[None])[0], False)
-        found: dict[Pair, Contact] = {}
+        closest: dict[Pair, Contact] = {}
         for number, (pair, result) in enumerate(zip(shapes.collisionPairs, results.collisionResults, strict=True)):
             if not result.isCollision():
                 continue
@@ -192,19 +192,19 @@ class Collisions:
             distance = pinocchio.computeDistance(shapes, results, number).min_distance
             padding = self._exact.margins[0][pair.first, pair.second]
             contact = Contact(first, second, float(distance), float(padding))
-            known = found.get((first, second))
+            known = closest.get((first, second))
             if known is None or contact.distance < known.distance:
-                found[first, second] = contact
-        return sorted(found.values(), key=lambda contact: contact.distance)
+                closest[first, second] = contact
+        return sorted(closest.values(), key=lambda contact: contact.distance)
 
     def distances(self, q: Vector) -> dict[Pair, float]:
-        """Distance [m] of each checked pair of names at `q`, shape (J,); negative where they overlap."""
+        """Distance [m] of each checked pair of names at `q`, shape (J,); negative if they overlap."""
         shapes, results, native = self.geometry, self.results, self.native(q[None])[0]
         pinocchio.computeDistances(self.arm.model, self.data, shapes, results, native)
-        found: dict[Pair, float] = {}
+        distances: dict[Pair, float] = {}
         for names, result in zip(self.pairs, results.distanceResults, strict=True):
-            found[names] = min(float(result.min_distance), found.get(names, np.inf))
-        return found
+            distances[names] = min(float(result.min_distance), distances.get(names, np.inf))
+        return distances
 
     def native(self, configurations: Vector) -> Vector:
         """Configurations of the planned joints, shape (N, J), completed with all other joints for Pinocchio."""
@@ -249,7 +249,7 @@ class _Engine:
     Args:
         model: pinocchio.Model.
         data: pinocchio.Data.
-        shapes: S in number.
+        shapes: the shapes, S in number.
         checked: which pairs to check, shape (S, S).
         margins: their least distances [m], shape (S, S).
     """
@@ -265,7 +265,7 @@ class _Engine:
         self.geometry.setCollisionPairs(checked, True)
         self.margins = [margins + width for width in WIDER_M]
         self._set = -1
-        """Which of the margins `results` has."""
+        """Index of the margins that `results` has."""
 
     @cached_property
     def results(self) -> Any:
@@ -274,10 +274,10 @@ class _Engine:
 
     @cached_property
     def _managers(self) -> list[Any]:
-        """One for each of the margins.
+        """One manager for each of the margins.
 
-        The naive manager compares all bounding boxes natively: for the few dozen shapes of an arm it is the fastest. It
-        widens the boxes by the margins that are set when it is made.
+        The naive manager compares all bounding boxes, which is fastest for the few dozen shapes of an arm. It widens
+        the boxes by the margins that are set when it is made.
         """
         managers = []
         for level in range(len(WIDER_M)):
@@ -301,7 +301,7 @@ class _Engine:
 
 @lru_cache(maxsize=1024)
 def spread(number: int) -> tuple[list[int], Vector]:
-    """Indices 0 to number - 1, each far from those before it (van der Corput), and (index + 1) / number of each.
+    """Indices 0 to number - 1, each far from the previous ones (van der Corput), and (index + 1) / number of each.
 
     The shares have shape (number, 1).
     """
@@ -318,13 +318,13 @@ def unchecked_pairs(arm: Arm, *, samples: int = _SAMPLES, seed: int = 0, never: 
 
     Args:
         arm: the arm.
-        samples: random configurations to look at.
-        seed: of the random configurations.
-        never: whether to add pairs that touch in none of the configurations. That saves little time, and rare contacts
-            may be among them.
+        samples: number of random configurations.
+        seed: their seed.
+        never: whether to add pairs that touch in none of the configurations. That saves little time, and may miss rare
+            contacts.
     """
-    found = dict.fromkeys(arm.adjacent(), ADJACENT)
-    checks = Collisions(arm, World(), arm.joint_names, unchecked=found)
+    reasons = dict.fromkeys(arm.adjacent(), ADJACENT)
+    checks = Collisions(arm, World(), arm.joint_names, unchecked=reasons)
     touching: dict[Pair, int] = {}
     for q in np.random.default_rng(seed).uniform(arm.lower, arm.upper, (samples, len(arm.joint_names))):
         for contact in checks.contacts(q) if not checks.free(q) else ():
@@ -332,13 +332,13 @@ def unchecked_pairs(arm: Arm, *, samples: int = _SAMPLES, seed: int = 0, never: 
             touching[pair] = touching.get(pair, 0) + 1
     for i, j in arm.pairs():
         pair = sorted_pair(arm.shapes[i].link, arm.shapes[j].link)
-        if pair in found:
+        if pair in reasons:
             continue
         if touching.get(pair, 0) >= _ALWAYS_SHARE * samples:
-            found[pair] = ALWAYS
+            reasons[pair] = ALWAYS
         elif never and pair not in touching:
-            found[pair] = NEVER
-    return found
+            reasons[pair] = NEVER
+    return reasons
 
 
 def _objects(arm: Arm, world: World) -> list[LinkShape]:

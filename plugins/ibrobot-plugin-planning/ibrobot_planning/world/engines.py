@@ -1,4 +1,4 @@
-"""Whether the packages for planning around obstacles are installed, with the library that they need."""
+"""Checks that the packages for planning around obstacles, and their system library, are installed."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The surroundings of the arm: objects with shapes, at poses in the base frame or attached to a link; all immutable.
 
-A plan takes one `World`; changes make a new one.
+A plan uses one `World`; changes make a new one.
 """
 
 from __future__ import annotations
@@ -194,10 +194,10 @@ class World:
         return World({**self.objects, name: thing})
 
     def remove(self, name: str) -> World:
-        """The world without an object, which no other object may touch any more.
+        """The world without an object; others lose the permission to touch it.
 
         Raises:
-            PlanningError: for a name that no object has; so do the methods below.
+            PlanningError: for a name that no object has, as in the methods below.
         """
         self.named(name)
         others = {key: value for key, value in self.objects.items() if key != name}
@@ -242,11 +242,11 @@ class World:
         return World({**self.objects, name: attrs.evolve(thing, may_touch=may_touch | carrier)})
 
     def check(self, links: Collection[str], others: Collection[str] | None = None) -> None:
-        """Check that the names of the objects, and those that they use, make sense for a robot.
+        """Check the names of objects, and the names that they refer to, for a robot.
 
         Args:
             links: names of the robot's links.
-            others: further names that objects may touch, of objects that come and go; None: any.
+            others: names of temporary objects that may be touched; None: any name.
 
         Raises:
             PlanningError: for an object that is named like a link, or that names an unknown link or object.
@@ -294,19 +294,19 @@ def read_mesh(path: Path, scale: float = 1.0, *, convex: bool = False) -> Mesh:
 
     Args:
         path: the file.
-        scale: what its numbers are multiplied by, e.g. 0.001 for millimetres.
+        scale: factor of its numbers, e.g. 0.001 for millimetres.
         convex: whether to take the convex hull.
 
     Raises:
-        ValueError: when the file cannot be read, or has no usable triangles.
+        ValueError: if the file cannot be read, or has no usable triangles.
     """
     import coal
 
     try:
-        found = path.is_file()
+        exists = path.is_file()
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}") from error
-    if not found:
+    if not exists:
         raise ValueError(f"no file {path}")
     if not scale > 0:
         raise ValueError(f"scale is {scale}, must be above 0")
@@ -322,7 +322,7 @@ def read_mesh(path: Path, scale: float = 1.0, *, convex: bool = False) -> Mesh:
 
 
 def _reason(error: Exception, path: Path) -> str:
-    """What Assimp says about a file, of all the lines that Coal wraps it in."""
+    """Assimp's reason, without the lines that Coal adds."""
     lines = str(error).strip().splitlines()
     begin = next((i + 1 for i, line in enumerate(lines) if "Could not load resource" in line), 0)
     text = " ".join(line.strip() for line in lines[begin:] if not line.startswith("Hint:"))

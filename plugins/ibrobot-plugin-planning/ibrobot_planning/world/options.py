@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ibrobot_planning.world.objects import WorldObject
 
 FURTHEST = 1000.0
-"""The largest number of a position [m] or an angle [rad] that can be meant."""
+"""Positions [m] and angles [rad] beyond this are refused as mistakes."""
 _KEYS = {
     "box": ("size",),
     "sphere": ("radius",),
@@ -41,8 +41,8 @@ class ObjectOptions:
     radius: float | None = option(None, unit="m", gt=0, help="of a sphere, cylinder or capsule")
     height: float | None = option(None, unit="m", gt=0, help="of a cylinder, or of the cylinder of a capsule")
     file: Path | None = option(None, help="mesh: STL, OBJ or PLY")
-    scale: float = option(1.0, gt=0, help="what the numbers of the mesh are multiplied by, e.g. 0.001 for millimetres")
-    convex: bool = option(False, help="whether to take the mesh's convex hull: solid, and faster to check")
+    scale: float = option(1.0, gt=0, help="factor of the mesh's numbers, e.g. 0.001 for millimetres")
+    convex: bool = option(False, help="take the mesh's convex hull: solid, and faster to check")
     position: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="m", help="in the base frame")
     rpy: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="rad", help="turns about the base's x, y and z axis")
     link: str | None = option(None, help="link of the MJCF that carries it; its position and turns are in that frame")
@@ -50,8 +50,8 @@ class ObjectOptions:
 
     def __attrs_post_init__(self) -> None:
         needed = _KEYS.get(self.shape, ())
-        given = {"size": self.size, "radius": self.radius, "height": self.height, "file": self.file}
-        for key, value in given.items():
+        values = {"size": self.size, "radius": self.radius, "height": self.height, "file": self.file}
+        for key, value in values.items():
             if key in needed and value is None:
                 raise ValueError(f"a {self.shape} needs {' and '.join(needed)}; {key} is missing")
             if key not in needed and value is not None:
@@ -67,7 +67,7 @@ class ObjectOptions:
         """The object.
 
         Raises:
-            ValueError: for a size that cannot be meant, or a mesh that cannot be read.
+            ValueError: for an implausible size, or a mesh that cannot be read.
         """
         from ibrobot_kinematics.poses import pose_at
 
@@ -103,14 +103,14 @@ class CloudOptions:
     info: str = option("", help="topic of the depth camera's CameraInfo; camera_info beside the topic if empty")
     frame: str = option("", help="frame of the sensor; that of the messages if empty")
     cell: float = option(0.02, unit="m", ge=0.002, le=0.2, help="edge of a cell")
-    furthest: float = option(1.5, unit="m", gt=0, help="points beyond this distance from the camera are left out")
-    reach: float = option(1.0, unit="m", gt=0, help="points beyond this distance from the base are left out")
-    least_points: int = option(3, ge=1, help="points that make a cell occupied; more drop outliers")
+    furthest: float = option(1.5, unit="m", gt=0, help="points beyond this distance from the camera are ignored")
+    reach: float = option(1.0, unit="m", gt=0, help="points beyond this distance from the base are ignored")
+    least_points: int = option(3, ge=1, help="points that make a cell occupied; a larger number drops outliers")
     margin: float = option(
         0.02,
         unit="m",
         ge=0,
-        help="cells this near to the arm, or to what it carries, are left out",
+        help="cells this near to the arm, or to what it carries, are ignored",
     )
     rate: float = option(2.0, unit="Hz", gt=0, le=30, help="updates per second, at most")
     keep: float = option(0.0, unit="s", ge=0, help="how long cells stay after they were last seen; 0: until the next")
@@ -124,8 +124,10 @@ class WorldOptions:
 
     objects: Mapping[str, ObjectOptions] = option(factory=dict, help="objects by name")
     clouds: Mapping[str, CloudOptions] = option(factory=dict, help="point clouds and depth images by name")
-    meshes: Path | None = option(None, help="folder of meshes that requests to /world/add may name, besides packages'")
-    scene: bool = option(False, help="whether a simulation adds the objects of its scene, at their present poses")
+    meshes: Path | None = option(
+        None, help="folder of meshes that requests to /world/add may use, besides meshes of packages"
+    )
+    scene: bool = option(False, help="add the objects of a simulation's scene, at their present poses")
 
 
 def _short(instance: object, attribute: attrs.Attribute[str], value: str) -> None:
@@ -140,7 +142,7 @@ class Added:
 
     name: str = option(validator=_short, help="a name that no object has")
     object: ObjectOptions = option(help="the object, as in the YAML")
-    replace: bool = option(False, help="whether to replace an object of this name")
+    replace: bool = option(False, help="replace an object of this name")
 
 
 @documented
@@ -157,7 +159,9 @@ class Moved:
     """A request to `/world/move`."""
 
     name: str = option(help="the object's name")
-    position: tuple[float, float, float] = option(unit="m", help="in the frame in which the object stands")
+    position: tuple[float, float, float] = option(
+        unit="m", help="in the object's frame: of the base, or of the link that carries it"
+    )
     rpy: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="rad", help="turns about its x, y and z axis")
 
 

@@ -1,4 +1,4 @@
-"""The component of the section `world`: keeps the world of a run, and changes it by services."""
+"""The component of the section `world`: keeps the world of a run, which services change."""
 
 from __future__ import annotations
 
@@ -47,24 +47,24 @@ if TYPE_CHECKING:
 
 SECTION = "world"
 MOST_OBJECTS = 200
-"""Objects that requests can bring the world to."""
+"""Most objects of the world; requests for more are refused."""
 MOST_TRIANGLES = 200_000
-"""Triangles that requests can bring the meshes of the world to."""
+"""Most triangles of the world's meshes; requests for more are refused."""
 LARGEST_MESH = 4_000_000
-"""Size of the file of a mesh that a request names, at most [bytes]."""
+"""Largest mesh file that a request may name [bytes]."""
 _MESHES = (".stl", ".obj", ".ply")
 _ANSWER = " Answers with the names of all objects."
 ADD = Service("/world/add", Added, list, "Add an object." + _ANSWER)
 REMOVE = Service("/world/remove", Named, list, "Remove an object." + _ANSWER, alone="name")
-MOVE = Service("/world/move", Moved, list, "Put an object elsewhere." + _ANSWER)
+MOVE = Service("/world/move", Moved, list, "Move an object." + _ANSWER)
 ATTACH = Service("/world/attach", Attached, list, "Let a link carry an object from now on." + _ANSWER)
-DETACH = Service("/world/detach", Detached, list, "Leave an object where it is." + _ANSWER)
+DETACH = Service("/world/detach", Detached, list, "Put down an object where it is." + _ANSWER)
 TOUCH = Service("/world/touch", Touched, list, "Let the hand touch objects, until the next call." + _ANSWER)
 ALLOW = Service("/world/allow", Allowed, list, "State what an object may touch." + _ANSWER)
 _FARTHEST_M = 1000.0
 """Positions beyond this are errors."""
 _STILL = 1e-4
-"""Smaller changes of an object's position [m] and axes are no motion."""
+"""Smaller changes of an object's position [m] and axes do not count as motion."""
 
 
 def scene_objects(config: RobotConfig, registry: Registry) -> tuple[SceneObject, ...]:
@@ -81,7 +81,7 @@ def first_world(options: WorldOptions, scene: Sequence[SceneObject]) -> World:
     """The world at the beginning of a run.
 
     Raises:
-        PlanningError: for a name that is in the YAML and in the scene.
+        PlanningError: for a name both in the YAML and in the scene.
         ValueError: as `ObjectOptions.made`.
     """
     world = World({name: thing.made() for name, thing in options.objects.items()})
@@ -111,8 +111,8 @@ def _shape(thing: SceneObject) -> Shape:
 class WorldKeeper(Component):
     """Serves `/world/add`, `remove`, `move`, `attach`, `detach`, `allow` and `touch`; snapshots and clearances.
 
-    A change answers with the names of all objects. Planners see a whole world: each change makes a new one. Objects of
-    the simulated scene are where the simulation has them now, unless they are attached.
+    A change answers with the names of all objects, and makes a new world, so that planners see consistent ones. Objects
+    of the simulated scene are where the simulation has them, unless they are attached.
     """
 
     def __init__(self, options: WorldOptions, session: RunView) -> None:
@@ -139,8 +139,8 @@ class WorldKeeper(Component):
             ALLOW: self._changing(lambda world, it: world.allow(it.name, frozenset(it.may_touch))),
             CLEARANCE: self._distance,
         }
-        self._near: tuple[World, Clearance] | None = None
-        self._passing = frozenset({FLOOR, *options.clouds})
+        self._clearance: tuple[World, Clearance] | None = None
+        self._temporary = frozenset({FLOOR, *options.clouds})
         """Names that objects may touch while no object has them."""
 
     @override
@@ -148,7 +148,7 @@ class WorldKeeper(Component):
         for topic in {thing.topic for thing in self._moving.values()}:
             self._poses[topic] = self._session.bus.subscribe(topic, 1, Float64MultiArray)
         if self._session.config.robot.description.mjcf is not None:
-            self._robot()  # reading it takes a moment, which the first service call should not wait for
+            self._robot()  # slow, so not in the first service call
         self._check(self._world)
         for service, handler in self._services.items():
             self._session.bus.serve(service, handler, self._mesh_file)
@@ -170,8 +170,8 @@ class WorldKeeper(Component):
         carried = any(thing.link is not None for thing in world.objects.values())
         if carried or self._session.config.robot.description.mjcf is not None:
             links = self._robot().frames
-            world.check(links, self._passing)
-            if named := sorted(self._passing & set(links)):
+            world.check(links, self._temporary)
+            if named := sorted(self._temporary & set(links)):
                 raise PlanningError(f"a cloud has the name of link {named[0]!r}")
 
     def _snapshot(self) -> World:
@@ -201,7 +201,7 @@ class WorldKeeper(Component):
                 if thing.topic == topic and name in world.objects and world.objects[name].link is None:
                     x, y, z, qw, qx, qy, qz = message.data[thing.first : thing.first + 7].tolist()
                     now = Pose(Vector3(x, y, z), Quaternion(qx, qy, qz, qw))
-                    # Physics trembles: the world stays the same until an object has really moved.
+                    # Physics jitters: the world stays the same until an object has really moved.
                     if np.abs(matrix(now) - matrix(world.objects[name].pose)).max() > _STILL:
                         world = world.move(name, now)
         return world
@@ -213,10 +213,10 @@ class WorldKeeper(Component):
             self._world = World(others if thing is None else {**others, name: thing})
 
     def _changing[T](self, change: Callable[[World, T], World]) -> Callable[[T], list[str]]:
-        def handler(wanted: T) -> list[str]:
+        def handler(request: T) -> list[str]:
             with self._lock:
                 try:
-                    world = change(self._observed(), wanted)
+                    world = change(self._observed(), request)
                 except ValueError as error:
                     raise PlanningError(str(error)) from error
                 self._check(world)
@@ -228,7 +228,7 @@ class WorldKeeper(Component):
     def _add(self, it: Added) -> list[str]:
         _check_position(it.object.position)
         try:
-            thing = it.object.made()  # reading a mesh takes a moment, in which motions are still watched
+            thing = it.object.made()  # outside the lock: reading a mesh is slow, and motions are checked meanwhile
         except ValueError as error:
             raise PlanningError(str(error)) from error
 
@@ -236,13 +236,13 @@ class WorldKeeper(Component):
             if it.replace and it.name in world.objects:
                 world = world.remove(it.name)
             if len(world.objects) >= MOST_OBJECTS:
-                raise PlanningError(f"there are {MOST_OBJECTS} objects already, more are not checked in time")
+                raise PlanningError(f"there are {MOST_OBJECTS} objects already; checks of more would take too long")
             world = world.add(it.name, thing)
             meshes = [each.shape for each in world.objects.values() if isinstance(each.shape, Mesh)]
             triangles = sum(len(mesh.triangles) for mesh in meshes)
             if isinstance(thing.shape, Mesh) and triangles > MOST_TRIANGLES:
                 raise PlanningError(
-                    f"the meshes would have {triangles} triangles; {MOST_TRIANGLES} are checked in time"
+                    f"the meshes would have {triangles} triangles; checks of more than {MOST_TRIANGLES} take too long"
                 )
             return world
 
@@ -307,7 +307,7 @@ class WorldKeeper(Component):
         return self._robot().link_pose(link, self._session.measured().position)
 
     def _distance(self, request: Configuration) -> float:
-        """Distance of the arm from the nearest object [m], where joints not given are where they are measured."""
+        """Distance of the arm from the nearest object [m]; missing joints are at their measured positions."""
         from ibrobot_planning.world.collision import Clearance
 
         q = self._session.measured().position.copy()
@@ -319,9 +319,9 @@ class WorldKeeper(Component):
         q[robot.indices(tuple(positions))] = list(positions.values())
         world = self._snapshot()
         with self._measuring:
-            if self._near is None or self._near[0] != world:
-                self._near = world, Clearance(self._robot(), world)
-            return self._near[1](q)
+            if self._clearance is None or self._clearance[0] != world:
+                self._clearance = world, Clearance(self._robot(), world)
+            return self._clearance[1](q)
 
 
 def _check_position(position: Sequence[float]) -> None:

@@ -24,7 +24,7 @@ def voxels(points: Vector, size: float, *, least_points: int = 1) -> Voxels | No
         least_points: how many points make a cell occupied; more than 1 drops single outliers.
 
     Returns:
-        None where no cell is occupied.
+        None if no cell is occupied.
 
     Raises:
         ValueError: for points of another shape, or a size or number that is not above 0.
@@ -50,7 +50,7 @@ def depth_points(depth: Vector, intrinsics: Vector, camera: Pose, *, furthest: f
             as missing.
         intrinsics: camera matrix K as in sensor_msgs/msg/CameraInfo, shape (3, 3).
         camera: pose of the optical frame (z forward, x right, y down, REP 103) in the frame of the points.
-        furthest: pixels beyond this [m] are left out.
+        furthest: pixels beyond this [m] are ignored.
 
     Returns:
         [m], shape (N, 3).
@@ -105,7 +105,7 @@ def cloud_points(message: PointCloud2) -> Vector:
 
 
 def outside(cells: Voxels, shapes: Iterable[tuple[Any, Vector]], margin: float) -> Voxels | None:
-    """The cells whose centres are further than `margin` and half a cell from all shapes; None where there are none.
+    """The cells whose centres are further than `margin` and half a cell from all shapes; None without any.
 
     Args:
         cells: the cells.
@@ -122,7 +122,7 @@ def outside(cells: Voxels, shapes: Iterable[tuple[Any, Vector]], margin: float) 
         local = (centres - placed[:3, 3]) @ placed[:3, :3]
         shape.computeLocalAABB()
         box = shape.aabb_local
-        # The box of a half space is unbounded; only what is near the box is checked against the shape itself.
+        # Only cells near the bounding box are checked against the shape itself; the box of a half space is unbounded.
         near = kept & (local > box.min_ - reach).all(axis=1) & (local < box.max_ + reach).all(axis=1)
         for number in np.flatnonzero(near):
             there = coal.Transform3s(np.eye(3), local[number])
