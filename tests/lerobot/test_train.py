@@ -63,7 +63,7 @@ def test_policy_that_would_download_weights_is_refused_before_it_starts(
     message = refused(small_dataset, tmp_path / "out", "--policy", "smolvla")
     assert "vlm_model_name is HuggingFaceTB/SmolVLM2-500M-Video-Instruct" in message
     message = refused(small_dataset, tmp_path / "out", "--policy", "xvl")
-    assert "'xvl' is no policy type of LeRobot" in message
+    assert "'xvl' is not a policy type of LeRobot" in message
     assert "did you mean 'xvla'?" in message
 
 

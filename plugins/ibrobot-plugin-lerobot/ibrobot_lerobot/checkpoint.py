@@ -43,7 +43,7 @@ _SHORTER_CHUNKS = frozenset({"diffusion", "multi_task_dit"})
 _ACTION_HEADS = {"act": "model.action_head.weight", "diffusion": "diffusion.unet.final_conv.1.weight"}
 """Type -> the tensor of weights whose first dimension is the size of an action."""
 _EMPTY_CAMERA = "observation.images.empty_camera_"
-"""Placeholder for a camera of a pretrained model that the robot does not have; the model fills it in."""
+"""Placeholder for a camera of a pretrained model that the robot lacks; the model fills it in."""
 
 
 @attrs.frozen
@@ -163,7 +163,7 @@ def read_checkpoint(path: Path, base_models: Collection[str] = ()) -> Checkpoint
 
 
 def rename_map(path: Path, step: Mapping[str, Any]) -> dict[str, str]:
-    """The map from the robot's to the policy's observation names, from a step `RENAME` of the processor at `path`.
+    """Robot's -> policy's names of observations, from a step `RENAME` of the processor at `path`.
 
     Raises:
         PolicyError: if it is not a map of names.
@@ -209,7 +209,7 @@ def hash_weights(path: Path) -> str:
 
 
 def _note_path(path: Path) -> Path | None:
-    """The file that describes the training data: beside the checkpoint, or else in the dataset if that still exists."""
+    """The file that describes the training data, beside the checkpoint or in the dataset; None if there is none."""
     if (path / NOTE).is_file():
         return path / NOTE
     if not (path / TRAINING).is_file():

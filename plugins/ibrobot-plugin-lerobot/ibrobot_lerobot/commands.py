@@ -26,27 +26,27 @@ def datasets() -> None:
 @wrong_input()
 def info(options: InfoOptions, as_json: bool, events: bool) -> None:
     """Show the counts, features, units and statistics of a DATASET."""
-    from ibrobot_lerobot.dataset_facts import dataset_contents
+    from ibrobot_lerobot.read_contents import dataset_contents
 
-    found = dataset_contents(options.dataset)
+    contents = dataset_contents(options.dataset)
     if events:
-        emit(INFO, found)
+        emit(INFO, contents)
         return
     if as_json:
-        echo(json.dumps(attrs.asdict(found), indent=2))
+        echo(json.dumps(attrs.asdict(contents), indent=2))
         return
     console = Screen(width=None if sys.stdout.isatty() else 1000)
     console.print(
-        f"{found.path}: {found.episodes} episodes, {found.frames} frames at {found.fps:g} Hz, "
-        f"{found.seconds:.1f} s, {found.bytes / 1e6:.1f} MB",
+        f"{contents.path}: {contents.episodes} episodes, {contents.frames} frames at {contents.fps:g} Hz, "
+        f"{contents.seconds:.1f} s, {contents.bytes / 1e6:.1f} MB",
         soft_wrap=True,
     )
-    for task in found.tasks:
+    for task in contents.tasks:
         console.print(f"task: {task or '(empty)'}", soft_wrap=True)
     table = Table(box=None, padding=(0, 1))
     for heading in ("feature", "type", "shape", "unit", "value", "min", "mean", "max", "std"):
         table.add_column(heading, justify="right" if heading in ("min", "mean", "max", "std") else "left")
-    for feature in found.features:
+    for feature in contents.features:
         for row in _rows(feature):
             table.add_row(*row)
     console.print(table)

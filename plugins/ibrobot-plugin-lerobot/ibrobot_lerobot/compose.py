@@ -173,20 +173,20 @@ def _fields(pairs: list[tuple[Leaf, Any]]) -> dict[str, Any]:
 
 def _build(owner: type[Any], prefix: str, known: Mapping[str, Any], header: Header) -> Any:
     """An object of class `owner` with the values whose paths begin with `prefix`."""
-    given: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     for name, kind in _hints(owner).items():
         path = prefix + name
         if kind is Header:
-            given[name] = header
+            fields[name] = header
         elif path in known:
-            given[name] = _cast(path, known[path], kind)
+            fields[name] = _cast(path, known[path], kind)
         elif attrs.has(kind) and (_is_numeric(kind) or any(each.startswith(f"{path}.") for each in known)):
-            given[name] = _build(kind, f"{path}.", known, header)
+            fields[name] = _build(kind, f"{path}.", known, header)
         elif kind in (float, str):
-            given[name] = np.nan if kind is float else ""
+            fields[name] = np.nan if kind is float else ""
         elif attrs.fields_dict(owner)[name].default is attrs.NOTHING:
             raise ContractError(f"cannot make a {owner.__name__} from {', '.join(known)}: {path} is unknown")
-    return owner(**given)
+    return owner(**fields)
 
 
 def _cast(path: str, value: Any, kind: Any) -> Any:

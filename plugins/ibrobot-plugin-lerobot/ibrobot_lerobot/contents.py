@@ -1,4 +1,4 @@
-"""What `ibrobot datasets info` takes and prints: the contents of a dataset."""
+"""Options and event of `ibrobot datasets info`: the contents of a dataset."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class FeatureContents:
     key: str = option(help="its name")
     dtype: str = option(help="type of its values")
     shape: tuple[int, ...] = option(help="shape of a value")
-    names: tuple[str, ...] = option(help="names of the values; none for pictures")
+    names: tuple[str, ...] = option(help="names of the values; empty for pictures")
     unit: str = option(help="unit of the values; empty if the dataset does not say")
     stats: Mapping[str, tuple[float | None, ...]] = option(
-        help="min, max, mean, std, q01 and q99 of each value or colour; null where one is no finite number"
+        help="min, max, mean, std, q01 and q99 of each value or colour; null if not finite"
     )
     picture: bool = option(help="whether it is a picture")
 

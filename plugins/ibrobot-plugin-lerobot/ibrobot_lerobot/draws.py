@@ -21,7 +21,7 @@ class NotByRequest(Exception):
     """The rows of a draw cannot be assigned to the requests of a batch."""
 
 
-class Draws(TorchFunctionMode):  # type: ignore[misc]  # torch brings no types here
+class Draws(TorchFunctionMode):  # type: ignore[misc]  # torch has no types here
     """A context in which random functions draw the rows of each request with that request's seed.
 
     A request's rows equal those that it would draw alone, bit by bit. Unknown functions draw from the global

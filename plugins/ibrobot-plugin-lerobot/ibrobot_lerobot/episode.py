@@ -186,14 +186,14 @@ class EpisodeWriter:
 def counter_stats(frames: int, fps: int, begin: int, episode: int, task_numbers: NDArray[Any]) -> dict[str, Stats]:
     """Statistics of the columns that the writer generates."""
     index = np.arange(frames)
-    found = {
+    values_of = {
         "timestamp": index / fps,
         "frame_index": index,
         "episode_index": np.full(frames, episode),
         "index": index + begin,
         "task_index": task_numbers,
     }
-    return {key: vector_stats(values[:, None]) for key, values in found.items()}
+    return {key: vector_stats(values[:, None]) for key, values in values_of.items()}
 
 
 def plain(stats: Mapping[str, Stats]) -> dict[str, Any]:

@@ -36,7 +36,7 @@ class Jpeg(PictureCodec):
         try:
             height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
             if (height, width) != shape[:2]:
-                raise WireError(f"JPEG of {height}x{width} pixels where {shape[0]}x{shape[1]} were said")
+                raise WireError(f"JPEG of {height}x{width} pixels where {shape[0]}x{shape[1]} were announced")
             pixels: NDArray[np.uint8] = simplejpeg.decode_jpeg(jpeg, _SPACES[shape[2]])
         except ValueError as error:
             raise WireError(f"a damaged JPEG: {error}") from error

@@ -94,12 +94,12 @@ def columns(features: Mapping[str, Feature], *, videos: bool) -> dict[str, Colum
     Raises:
         DatasetError: if LeRobot cannot store a feature.
     """
-    found = {}
+    stored = {}
     for key, feature in features.items():
         if key in COUNTERS or key == "task" or "/" in key:
             raise DatasetError(f"feature {key!r}: the name is reserved by LeRobot or contains a slash")
-        found[key] = Column(key, feature, _storage(key, feature, videos))
-    return found
+        stored[key] = Column(key, feature, _storage(key, feature, videos))
+    return stored
 
 
 def _storage(key: str, feature: Feature, videos: bool) -> str:

@@ -35,10 +35,10 @@ _MIB = 1 << 20
 
 
 def complete(root: Path) -> None:
-    """Finish a complete merge whose move was interrupted.
+    """Finish a merge that was interrupted while its files were moved.
 
     Raises:
-        InUse: if another process merges into the dataset, and takes long.
+        InUse: if another process keeps merging into the dataset.
         DatasetError: if a file cannot be moved.
     """
     if (root / _MERGED).is_dir():
@@ -84,14 +84,14 @@ def merge(root: Path, parts: Sequence[Path], metadata: Mapping[str, Any]) -> Non
 
 @contextmanager
 def reading(root: Path, doing: str) -> Iterator[None]:
-    """A context in which nobody merges into the dataset; a complete merge that was interrupted is finished first.
+    """A context in which nobody merges into the dataset; finishes an interrupted merge first.
 
     Args:
         root: the dataset.
         doing: what is done with it, for others' errors, e.g. `is being trained on`.
 
     Raises:
-        InUse: if another process merges into the dataset, and takes long.
+        InUse: if another process keeps merging into the dataset.
         DatasetError: if an interrupted merge cannot be finished, or the dataset cannot be locked.
     """
     complete(root)
@@ -200,7 +200,7 @@ class _Merge:
         self._write_meta(metadata)
 
     def _check(self, part: OnDisk) -> None:
-        """Check that a part is compatible; an empty dataset takes over the first part's description."""
+        """Check that a part is compatible; an empty dataset adopts the first part's description."""
         if not self._info:
             self._info = part.info
         for name in ("fps", "features"):
@@ -253,13 +253,13 @@ class _Merge:
         """Statistics of all rows, old and new, with one column at a time in memory."""
         old = self._old.files(layout.DATA, "parquet") if self._old else []
         files = [*old, *sorted((self._target / layout.DATA).glob("chunk-*/file-*.parquet"))]
-        found = {}
+        stats = {}
         for key in self._info["features"]:
             if key in self._pictures:
-                found[key] = self._pictures[key].stats()
+                stats[key] = self._pictures[key].stats()
             else:
-                found[key] = vector_stats(np.concatenate([_column(path, key) for path in files]))
-        return found
+                stats[key] = vector_stats(np.concatenate([_column(path, key) for path in files]))
+        return stats
 
     def _append_table(self, path: Path, tasks: np.ndarray[Any, Any]) -> int:
         """Append a part's table, renumbered; returns the number of the file to which it was added."""
@@ -373,12 +373,12 @@ def _replaced(table: pa.Table, name: str, values: np.ndarray[Any, Any]) -> pa.Ta
 
 
 def _row_stats(row: Mapping[str, Any]) -> dict[str, Stats]:
-    found: dict[str, Stats] = {}
+    stats: dict[str, Stats] = {}
     for column, value in row.items():
         if column.startswith("stats/"):
             key, _, name = column.removeprefix("stats/").rpartition("/")
-            found.setdefault(key, {})[name] = np.array(value)
-    return found
+            stats.setdefault(key, {})[name] = np.array(value)
+    return stats
 
 
 def _difference(found: Any, wanted: Any) -> str:

@@ -123,14 +123,16 @@ class PolicyModel:
 
     def inputs(self, batch: Sequence[Tensors]) -> dict[str, Any]:
         """The network's inputs: the requests' tensors on its device, with normalised images."""
-        found: dict[str, Any] = {
+        inputs: dict[str, Any] = {
             name: torch.from_numpy(np.concatenate([tensors[name] for tensors in batch])).to(self._device)
             for name in batch[0]
             if name not in _OWN and name not in self._pictures
         }
-        return found | self._steps({name: self._seen([tensors[name] for tensors in batch]) for name in self._pictures})
+        return inputs | self._steps(
+            {name: self._pixels([tensors[name] for tensors in batch]) for name in self._pictures}
+        )
 
-    def _seen(self, pictures: Sequence[NDArray[Any]]) -> torch.Tensor:
+    def _pixels(self, pictures: Sequence[NDArray[Any]]) -> torch.Tensor:
         """Images in LeRobot's layout, (B, ..., C, H, W), from 0 to 1."""
         pixels = torch.from_numpy(np.stack(pictures)).to(self._device)
         return pixels.movedim(-1, -3).contiguous().to(torch.float32) / 255
@@ -194,11 +196,11 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _device(asked: str) -> str:
-    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    if asked == "auto":
-        return next(name for name, found in there.items() if found)
-    if not there[asked]:
-        has = ", ".join(name for name, found in there.items() if found)
-        raise PolicyError(f"torch finds no device {asked!r} on this machine; available: {has}")
-    return asked
+def _device(requested: str) -> str:
+    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    names = [name for name, is_available in available.items() if is_available]
+    if requested == "auto":
+        return names[0]
+    if requested not in names:
+        raise PolicyError(f"torch finds no device {requested!r} on this machine; available: {', '.join(names)}")
+    return requested

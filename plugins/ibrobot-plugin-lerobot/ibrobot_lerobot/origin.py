@@ -1,4 +1,4 @@
-"""Origin of a dataset's episodes, as stored by `ibrobot convert` or given by the caller."""
+"""Origin of a dataset's episodes, as stored by `ibrobot convert` or stated by the caller."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, given: 
         contract = Contract.from_canonical(metadata["contract"]).without_signals()
         recorded = dict(episode.get("recorded", {}))
         norm_mode = metadata["conversion"]["norm_mode"]
-        told_apart = {"prompt": episode["prompt"], "source": f"{root.resolve().name}:{number}"}
+        own = {"prompt": episode["prompt"], "source": f"{root.resolve().name}:{number}"}
         outcome, start_ns = episode["outcome"], episode["start_ns"]
     except (KeyError, IndexError, TypeError) as error:
         raise RecorderError(f"{root}: the metadata of episode {number} cannot be read: {error!r}") from None
-    recorded |= told_apart | robot_metadata(contract, document, {"converted": calibration} if calibration else {})
+    recorded |= own | robot_metadata(contract, document, {"converted": calibration} if calibration else {})
     return Origin(recorded, contract, document, calibration, norm_mode, outcome, start_ns)
 
 

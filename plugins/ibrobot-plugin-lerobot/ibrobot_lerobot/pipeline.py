@@ -56,9 +56,9 @@ class LeRobotSteps:
             PolicyError: if a step returns a value that is not an array, and so cannot be sent to a model.
         """
         tensors: dict[str, Any] = {key: torch.from_numpy(np.array(value)) for key, value in batch.items()}
-        found = self._pre({**tensors, "task": prompt, "robot_type": robot_type})
+        outputs = self._pre({**tensors, "task": prompt, "robot_type": robot_type})
         result: dict[str, NDArray[Any]] = {}
-        for key, value in found.items():
+        for key, value in outputs.items():
             if isinstance(value, torch.Tensor):
                 tensor = value.float() if value.dtype == torch.bfloat16 else value
                 result[key] = np.array(tensor.numpy(force=True))
@@ -68,17 +68,16 @@ class LeRobotSteps:
 
     def postprocess(self, action: NDArray[Any]) -> NDArray[Any]:
         """Run actions, shape (1, N, A), through the postprocessor."""
-        found = self._post(torch.from_numpy(np.array(action)))
-        return np.array(found.numpy(force=True))
+        return np.array(self._post(torch.from_numpy(np.array(action))).numpy(force=True))
 
 
 def _check_class(path: Path, name: str) -> None:
     """Refuse a class below `lerobot` that is not a processor step, before LeRobot calls it."""
     module, _, attribute = name.rpartition(".")
     try:
-        found = vars(import_module(module)).get(attribute)
+        step = vars(import_module(module)).get(attribute)
     except ImportError as error:
         raise PolicyError(f"{path}: step {name!r} cannot be imported: {error}") from None
-    if not (isinstance(found, type) and issubclass(found, ProcessorStep) and found.__module__.startswith("lerobot.")):
+    if not (isinstance(step, type) and issubclass(step, ProcessorStep) and step.__module__.startswith("lerobot.")):
         raise PolicyError(f"{path}: step {name!r} is not a processor step of LeRobot")
-    check_step_name(path, str(vars(found).get("_registry_name", "")))
+    check_step_name(path, str(vars(step).get("_registry_name", "")))

@@ -61,7 +61,7 @@ class LeRobotPolicy(Policy):
         self._pictures: tuple[str, ...] = () if self._pre.others else _pictures(self.spec)
         """Observations that `infer` normalises."""
         self._model: PolicyModel | None = None
-        self._taken: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
+        self._expected: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
         """Tensors of a request without a prefix: dtypes and shapes, with -1 for any size."""
         self._seed = ctx.seed
         self._weights = ""
@@ -78,7 +78,7 @@ class LeRobotPolicy(Policy):
         tensors = self.preprocess(self._zeros())
         model.warm_up(tensors)
         # The length of a text, and the output of LeRobot's own steps for it, are not known in advance.
-        self._taken = {
+        self._expected = {
             name: (array.dtype, (-1,) * array.ndim if self._pre.others and name != SEED else array.shape)
             for name, array in tensors.items()
         }
@@ -152,21 +152,21 @@ class LeRobotPolicy(Policy):
 
     def _check(self, tensors: Tensors) -> None:
         """Check that a request, which may be from an untrusted client, has the tensors that `preprocess` makes."""
-        taken = dict(self._taken)
+        expected = dict(self._expected)
         if self.spec.prompt:
-            taken[TASK] = (np.dtype(np.uint8), (1, -1))
+            expected[TASK] = (np.dtype(np.uint8), (1, -1))
         if self.spec.prefix and tensors.keys() & {PREFIX, DELAY}:
-            taken[PREFIX] = (np.dtype(np.float32), (1, -1, self._checkpoint.action_size))
-            taken[DELAY] = (np.dtype(np.int64), (1,))
+            expected[PREFIX] = (np.dtype(np.float32), (1, -1, self._checkpoint.action_size))
+            expected[DELAY] = (np.dtype(np.int64), (1,))
         wrong = []
-        for name, (dtype, shape) in taken.items():
+        for name, (dtype, shape) in expected.items():
             array = tensors.get(name)
             if array is None or array.dtype != dtype or not _fits(array.shape, shape):
                 got = "is missing" if array is None else f"is {array.dtype} {array.shape}"
                 wrong.append(f"{name} {got}, must be {dtype} {shape}")
         if not self._pre.others:
-            wrong += [f"{name} is unknown" for name in tensors if name not in taken]
-        if not wrong and PREFIX in taken:
+            wrong += [f"{name} is unknown" for name in tensors if name not in expected]
+        if not wrong and PREFIX in expected:
             delay, length, most = int(tensors[DELAY][0]), tensors[PREFIX].shape[1], self._checkpoint.chunk_size
             if not 0 <= delay <= length <= most:
                 wrong.append(

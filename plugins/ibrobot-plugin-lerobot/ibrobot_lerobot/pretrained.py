@@ -1,4 +1,4 @@
-"""What a policy type of LeRobot needs beyond LeRobot itself: extras to install, and weights to download.
+"""Requirements of LeRobot's policy types beyond LeRobot itself: extras to install, and weights to download.
 
 Everything is read from the installed LeRobot's metadata and source text, without importing torch.
 """
@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 from ibrobot_core.api import MissingDependency, did_you_mean
 
 _EXTRAS = {"pi0": "pi", "pi05": "pi", "pi0_fast": "pi", "wall_x": "wallx"}
-"""Policy type -> its extra, where LeRobot names them differently."""
+"""Policy type -> its extra, if their names differ."""
 _HUB = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 """A repository on the Hugging Face Hub."""
 _BACKBONE = re.compile(r"(?P<model>[A-Za-z0-9]+)_Weights\.\w+")
@@ -35,19 +35,19 @@ def check_policy(policy: str, options: Sequence[str], *, download: bool, on_page
         policy: the policy type, e.g. `act`.
         options: further arguments of `lerobot-train`, which may choose other weights.
         download: whether LeRobot may download weights.
-        on_page: whether a page shows the error, which has no field for options of `lerobot-train`.
+        on_page: whether the error is for a page, which has no field for options of `lerobot-train`.
 
     Raises:
         MissingDependency: for an unknown type, a missing extra, or weights that are not on this machine.
     """
-    found = find_spec("lerobot")
-    if found is None or not found.submodule_search_locations:
+    spec = find_spec("lerobot")
+    if spec is None or not spec.submodule_search_locations:
         return
-    policies = Path(found.submodule_search_locations[0]) / "policies"
+    policies = Path(spec.submodule_search_locations[0]) / "policies"
     known = sorted(path.parent.name for path in policies.glob("*/modeling_*.py"))
     if policy not in known:
         raise MissingDependency(
-            f"--policy: {policy!r} is no policy type of LeRobot {version('lerobot')}",
+            f"--policy: {policy!r} is not a policy type of LeRobot {version('lerobot')}",
             remedy=f"choose another{did_you_mean(policy, known, 'the types are')}",
         )
     if missing := missing_packages(policy):
@@ -57,9 +57,9 @@ def check_policy(policy: str, options: Sequence[str], *, download: bool, on_page
         )
     if download:
         return
-    chosen = dict(option.removeprefix("--policy.").partition("=")[::2] for option in options)
+    overrides = dict(option.removeprefix("--policy.").partition("=")[::2] for option in options)
     for key, source in pretrained(policies / policy).items():
-        if (wanted := chosen.get(key, source)) and not on_this_machine(wanted):
+        if (wanted := overrides.get(key, source)) and not on_this_machine(wanted):
             raise MissingDependency(
                 f"policy {policy} begins with pretrained weights that are not on this machine: {key} is {wanted}",
                 remedy="--download lets LeRobot fetch them" + ("" if on_page else f"; {_offline(key, wanted)}"),
@@ -97,12 +97,12 @@ def _missing(extra: str, requirements: Sequence[Requirement]) -> Iterator[str]:
 
 
 def pretrained(folder: Path) -> Mapping[str, str]:
-    """Option of a policy -> the weights or tokenizer that it names by default and that LeRobot would download.
+    """Option of a policy -> the weights or tokenizer that LeRobot downloads by default.
 
     Args:
         folder: the folder of the policy type in LeRobot's source.
     """
-    found: dict[str, str] = {}
+    sources: dict[str, str] = {}
     for file in (*folder.glob("configuration_*.py"), *folder.glob("processor_*.py")):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             match node:
@@ -113,8 +113,8 @@ def pretrained(folder: Path) -> Mapping[str, str]:
                 case _:
                     continue
             if _HUB.fullmatch(text) or _BACKBONE.fullmatch(text):
-                found[name] = text
-    return found
+                sources[name] = text
+    return sources
 
 
 def on_this_machine(source: str) -> bool:

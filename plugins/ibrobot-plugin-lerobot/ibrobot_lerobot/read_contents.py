@@ -1,4 +1,4 @@
-"""Reads what a dataset contains: counts, features with units, statistics, and episodes."""
+"""Reads the contents of a dataset: counts, features with units, statistics, and episodes."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ _SHOWN = ("min", "max", "mean", "std", "q01", "q99")
 
 
 def dataset_contents(root: Path) -> Contents:
-    """What the dataset at `root` contains.
+    """The contents of the dataset at `root`.
 
     Raises:
-        DatasetError: if there is none, or it cannot be read.
+        DatasetError: if there is no dataset, or it cannot be read.
     """
-    found = layout.open_dataset(root)
-    if found is None:
+    dataset = layout.open_dataset(root)
+    if dataset is None:
         raise DatasetError(f"{root}: is not a LeRobot dataset: it has no {layout.INFO}")
-    info, own = found.info, found.metadata
+    info, own = dataset.info, dataset.metadata
     norm_mode = str((own.get("conversion") or {}).get("norm_mode", ""))
     try:
         return Contents(
             path=str(root), robot_type=info.get("robot_type") or "", fps=float(info["fps"]),
             episodes=info["total_episodes"], frames=info["total_frames"],
-            seconds=info["total_frames"] / info["fps"], tasks=tuple(found.tasks), norm_mode=norm_mode,
+            seconds=info["total_frames"] / info["fps"], tasks=tuple(dataset.tasks), norm_mode=norm_mode,
             bytes=sum(file.stat().st_size for file in root.rglob("*") if file.is_file()),
             fingerprint=str(own.get("fingerprint", "")),
             features=tuple(
-                _feature(key, entry, norm_mode, found.stats.get(key) or {})
+                _feature(key, entry, norm_mode, dataset.stats.get(key) or {})
                 for key, entry in info["features"].items() if key not in layout.COUNTERS
             ),
-            list=_episodes(found, own),
+            list=_episodes(dataset, own),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         raise DatasetError(f"{root}: is not a LeRobot dataset: {error!r}") from error
@@ -55,27 +55,27 @@ def _feature(key: str, entry: Mapping[str, Any], norm_mode: str, stats: Mapping[
         shape=tuple(entry["shape"]),
         names=() if picture else tuple(str(name) for name in names),
         unit=_unit(entry, norm_mode, names),
-        stats={name: tuple(float(x) if np.isfinite(x) else None for x in found) for name, found in values.items()},
+        stats={name: tuple(float(x) if np.isfinite(x) else None for x in each) for name, each in values.items()},
         picture=picture,
     )
 
 
 def _unit(entry: Mapping[str, Any], norm_mode: str, names: Any) -> str:
-    """The unit of a feature; empty if the dataset does not say it."""
+    """The unit of a feature; empty if unknown."""
     if entry["dtype"] in ("video", "image"):
         return str((entry.get("info") or {}).get("depth_unit", "")) or "colour, 0 to 1 in the statistics"
     joints = bool(names) and all(str(name).endswith(".pos") for name in names)
     return _UNITS.get(norm_mode, "") if joints else ""
 
 
-def _episodes(found: layout.OnDisk, own: Mapping[str, Any]) -> tuple[EpisodeContents, ...]:
+def _episodes(dataset: layout.OnDisk, own: Mapping[str, Any]) -> tuple[EpisodeContents, ...]:
     recorded = own.get("episodes") or []
     rows = []
-    for row in found.episodes():
+    for row in dataset.episodes():
         number = int(row["episode_index"])
         known = recorded[number] if number < len(recorded) else {}
         rows.append(EpisodeContents(
-            number=number, frames=int(row["length"]), seconds=int(row["length"]) / found.info["fps"],
+            number=number, frames=int(row["length"]), seconds=int(row["length"]) / dataset.info["fps"],
             task="; ".join(row["tasks"]), source=known.get("source", ""), outcome=known.get("outcome", ""),
         ))  # fmt: skip
     return tuple(rows)

@@ -1,4 +1,4 @@
-"""Reader `lerobot`: reads an episode of a dataset as messages that its contract would convert to the same rows."""
+"""Reader `lerobot`: an episode of a dataset as messages that its contract converts to the same rows."""
 
 from __future__ import annotations
 
@@ -56,22 +56,22 @@ class LeRobotReader(EpisodeReader):
         except DatasetError as error:
             raise RecorderError(str(error)) from error
         self._path = root.with_name(f"{root.name}:{address.number}")
-        self._origin = found = episode_origin(root, dataset.metadata, address.number, address.given)
-        self._contract = found.contract
-        _check_features(root, dataset.features, found.contract)
-        self._units = JointUnits(found.norm_mode, found.contract, found.calibration, found.document)
-        self._composer = Composer(found.contract)
+        self._origin = origin = episode_origin(root, dataset.metadata, address.number, address.given)
+        self._contract = origin.contract
+        _check_features(root, dataset.features, origin.contract)
+        self._units = JointUnits(origin.norm_mode, origin.contract, origin.calibration, origin.document)
+        self._composer = Composer(origin.contract)
         self._step_ns = round(NS_PER_S / dataset.info["fps"])
-        start_ns = found.start_ns
+        start_ns = origin.start_ns
         self._start_ns = self._rows.begin * self._step_ns if start_ns is None else start_ns
 
     @override
     def summary(self) -> EpisodeSummary:
-        rows, found = self._rows, self._origin
+        rows, origin = self._rows, self._origin
         topics = {topic: TopicSummary(type_, rows.length) for topic, type_ in sorted(self._contract.topics.items())}
-        metadata = {"prompt": "; ".join(rows.tasks), **found.metadata}
+        metadata = {"prompt": "; ".join(rows.tasks), **origin.metadata}
         end_ns = self._start_ns + (rows.length - 1) * self._step_ns
-        return EpisodeSummary(self._path, True, self._start_ns, end_ns, topics, metadata, found.outcome)
+        return EpisodeSummary(self._path, True, self._start_ns, end_ns, topics, metadata, origin.outcome)
 
     @override
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
@@ -79,7 +79,9 @@ class LeRobotReader(EpisodeReader):
 
     @override
     def messages_since(self, stamp_ns: int, topics: Collection[str] | None = None) -> Iterator[Recorded]:
-        first = -(-(stamp_ns - 1 - self._start_ns) // self._step_ns)  # rounded up; some messages follow 1 ns later
+        first = -(
+            -(stamp_ns - 1 - self._start_ns) // self._step_ns
+        )  # rounded up; some messages follow their tick by 1 ns
         first = min(max(0, first), self._rows.length)
         wanted = set(self._contract.topics if topics is None else topics)
         try:
@@ -95,16 +97,16 @@ class LeRobotReader(EpisodeReader):
 
     @override
     def digest(self) -> str:
-        """Digest of the vectors only, because images would have to be decoded."""
+        """Digest of the vectors only: images would have to be decoded."""
         features = self._contract.features()
-        found = hashlib.sha256(f"{self._start_ns}".encode())
+        content = hashlib.sha256(f"{self._start_ns}".encode())
         try:
             for values in self._rows.read([key for key, each in features.items() if len(each.shape) == 1]):
                 for key in sorted(values):
-                    found.update(values[key].tobytes())
+                    content.update(values[key].tobytes())
         except DatasetError as error:
             raise RecorderError(f"{self._path}: {error}") from error
-        return found.hexdigest()
+        return content.hexdigest()
 
     @override
     def close(self) -> None:

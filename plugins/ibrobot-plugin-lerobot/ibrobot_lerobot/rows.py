@@ -36,16 +36,16 @@ class EpisodeRows:
 
     def __init__(self, dataset: OnDisk, number: int) -> None:
         total = dataset.info["total_episodes"]
-        found = next((row for row in dataset.episodes() if row["episode_index"] == number), None)
-        if found is None:
-            there = f"0 to {total - 1}" if total else "none"
-            raise DatasetError(f"{dataset.root}: has no episode {number}; available: {there}")
+        row = next((row for row in dataset.episodes() if row["episode_index"] == number), None)
+        if row is None:
+            available = f"0 to {total - 1}" if total else "none"
+            raise DatasetError(f"{dataset.root}: has no episode {number}; available: {available}")
         self._dataset = dataset
         self._number = number
-        self._row = found
-        self.length: int = found["length"]
-        self.tasks: list[str] = list(found["tasks"])
-        self.begin: int = found["dataset_from_index"]
+        self._row = row
+        self.length: int = row["length"]
+        self.tasks: list[str] = list(row["tasks"])
+        self.begin: int = row["dataset_from_index"]
         """Number of frames in the dataset before this episode."""
 
     def read(self, keys: Collection[str], first: int = 0) -> Iterator[dict[str, NDArray[Any]]]:

@@ -157,7 +157,7 @@ def _normalise(path: Path, entry: Mapping[str, Any], *, inverse: bool) -> Normal
 
 
 def _check_sizes(file: Path, statistics: Mapping[str, Array], kind: str, shape: Sequence[int]) -> None:
-    """Check that statistics have one value per element of a feature, or per channel of a camera."""
+    """Check that statistics have one value per element of a feature, or per channel of an image."""
     wanted = {math.prod(shape), *shape[:1]} if kind == "VISUAL" else {math.prod(shape)}
     for name, statistic in statistics.items():
         if statistic.size not in wanted:

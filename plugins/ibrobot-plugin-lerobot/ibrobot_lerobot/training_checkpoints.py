@@ -37,33 +37,33 @@ class TrainingCheckpoint:
 def newest_checkpoint(out: Path) -> TrainingCheckpoint | None:
     """The newest complete checkpoint of a training; None if there is none.
 
-    LeRobot moves the link `last` once a checkpoint is complete. Without the link, it was killed during the first save
-    or while it moved the link: then the files tell whether a checkpoint is complete.
+    LeRobot moves the link `last` when a checkpoint is complete. If the link is missing, it was killed during the first
+    save or while it moved the link; the files then show whether a checkpoint is complete.
     """
     folder = out / "checkpoints"
     last = folder / "last"
-    found = [last.resolve()] if last.exists() else sorted(filter(Path.is_dir, folder.glob("*")), reverse=True)
-    return next((each for path in found if (each := _read(folder / path.name)) is not None), None)
+    folders = [last.resolve()] if last.exists() else sorted(filter(Path.is_dir, folder.glob("*")), reverse=True)
+    return next((each for path in folders if (each := _read(folder / path.name)) is not None), None)
 
 
 def _read(folder: Path) -> TrainingCheckpoint | None:
     """A checkpoint, or None if it is not complete."""
     state = folder / "training_state"
     try:
-        found = TrainingCheckpoint(folder, int(json.loads((state / "training_step.json").read_bytes())["step"]))
-        settings = json.loads(found.settings.read_bytes())
+        checkpoint = TrainingCheckpoint(folder, int(json.loads((state / "training_step.json").read_bytes())["step"]))
+        settings = json.loads(checkpoint.settings.read_bytes())
         if settings.get("scheduler") is not None:  # the last file that LeRobot writes
             json.loads((state / "scheduler_state.json").read_bytes())
-        for file in (found.policy / "model.safetensors", state / "optimizer_state.safetensors"):
+        for file in (checkpoint.policy / "model.safetensors", state / "optimizer_state.safetensors"):
             with safe_open(file, "numpy"):  # refuses a file that is shorter than its head says
                 pass
     except (OSError, ValueError, KeyError, TypeError, SafetensorError):
         return None
-    return found
+    return checkpoint
 
 
 def begun_in_vain(out: Path) -> bool:
-    """Whether `out` has only what a training leaves that ended before its first checkpoint was complete."""
+    """Whether `out` has only the remains of a training that ended before its first checkpoint."""
     inside = {path.name for path in out.iterdir()}
     return inside <= {"checkpoints"} and newest_checkpoint(out) is None
 
@@ -72,7 +72,7 @@ def check_same(checkpoint: TrainingCheckpoint, arguments: Sequence[str]) -> None
     """Check that arguments of `lerobot-train` continue the training of a checkpoint.
 
     Raises:
-        DatasetError: for settings that differ; names them.
+        DatasetError: with the settings that differ.
     """
     settings = json.loads(checkpoint.settings.read_text(encoding="utf-8"))
     if differing := list(_differing(settings, arguments)):

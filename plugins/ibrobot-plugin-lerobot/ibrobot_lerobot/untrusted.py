@@ -12,7 +12,7 @@ from typing import Any
 from ibrobot_core.api import PolicyError
 
 MAX_ACTIONS = 10_000
-"""Of a chunk."""
+"""Maximum number of actions of a chunk."""
 MAX_HISTORY = 1_000
 """Maximum number of ticks of observations that a policy uses."""
 _MAX_JSON = 8 << 20
@@ -37,7 +37,7 @@ _NAMES_A_MODEL = re.compile(
 """Keys that name additional models or files to load."""
 _LOOKS_LIKE_A_PATH = re.compile(r"[~.]|.*[/\\]", re.DOTALL)
 _NOT_LOADED = frozenset({"pretrained_path", "repo_id", "license", "tags"})
-"""Keys that `lerobot-train` only records."""
+"""Keys that `lerobot-train` only records: nothing is loaded."""
 _PROSE = re.compile(r".*(prompt|template|instruction).*")
 BASE_MODELS = frozenset(
     {
@@ -189,15 +189,15 @@ def check_models(path: Path, documents: Mapping[str, Mapping[str, Any]], base_mo
         PolicyError: names all untrusted models, and what allows them.
     """
     trusted = {*BASE_MODELS, *base_models}
-    found = {
+    untrusted = {
         value: f"{file}: {'.'.join(map(str, place))}"
         for file, document in documents.items()
         for place, value in _leaves(document)
         if isinstance(value, str) and value not in trusted and names_a_model(_key(place), value)
     }
-    if found:
-        named = " and ".join(f"{where} loads {value!r}" for value, where in found.items())
-        it, allowed = "it" if len(found) == 1 else "them", ", ".join([*base_models, *found])
+    if untrusted:
+        named = " and ".join(f"{where} loads {value!r}" for value, where in untrusted.items())
+        it, allowed = "it" if len(untrusted) == 1 else "them", ", ".join([*base_models, *untrusted])
         raise PolicyError(
             f"{path}: {named} in addition to the checkpoint; if you trust {it}, allow {it} in the robot YAML with the "
             f"model's base_models: [{allowed}]"

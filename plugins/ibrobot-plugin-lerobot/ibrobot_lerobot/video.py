@@ -25,7 +25,7 @@ from ibrobot_lerobot.stats import PixelStats
 PIXEL_FORMAT = "yuv420p"
 _GPU = ("h264_nvenc", "hevc_nvenc", "h264_videotoolbox", "hevc_videotoolbox")
 _QUEUED = 8
-"""Number of images that may wait for their encoder; a faster writer waits."""
+"""Most images queued for their encoder; then the writer waits."""
 _SVT_PRESET = "12"
 
 os.environ.setdefault("SVT_LOG", "1")  # otherwise libsvtav1 logs every file to stderr
@@ -46,15 +46,15 @@ def choose_encoder(options: LeRobotOptions, shapes: Collection[Sequence[int]] = 
 
     Args:
         options: the codec and its settings.
-        shapes: of the images, (H, W, 3).
+        shapes: shapes of the images, (H, W, 3).
 
     Raises:
         DatasetError: if it is not available on this machine, or cannot encode images of these sizes.
     """
     if options.codec == "auto":
         encoders = (_encoder(codec, options) for codec in _GPU)
-        found = (each for each in encoders if _opens(each) is None and not _misfits(each, shapes))
-        return next(found, None) or _encoder("libsvtav1", options)
+        usable = (each for each in encoders if _opens(each) is None and not _misfits(each, shapes))
+        return next(usable, None) or _encoder("libsvtav1", options)
     encoder = _encoder(options.codec, options)
     if (reason := _opens(encoder)) is not None:
         raise DatasetError(
@@ -229,7 +229,7 @@ class VideoTrack:
                     self._stats.add(frame.to_ndarray())
                     self._container.mux(self._stream.encode(frame))
                 self._container.mux(self._stream.encode(None))
-        except Exception as error:  # noqa: BLE001 - contained: raised where the next picture is added
+        except Exception as error:  # noqa: BLE001 - the next `add` raises it
             self._failure = error
 
 
@@ -263,16 +263,16 @@ def join_videos(parts: Sequence[VideoFile], path: Path, fps: int) -> None:
                         stream = joined.add_stream_from_template(source, opaque=True)
                         stream.time_base = source.time_base
                     offset = round(begin / (fps * source.time_base))
-                    found = 0
+                    count = 0
                     for packet in container.demux(source):
                         if packet.dts is None:
                             continue
                         packet.pts, packet.dts = packet.pts + offset, packet.dts + offset
                         packet.stream = stream
                         joined.mux(packet)
-                        found += 1
-                if found != part.frames:
-                    raise DatasetError(f"{part.path}: has {found} images, its table {part.frames} rows")
+                        count += 1
+                if count != part.frames:
+                    raise DatasetError(f"{part.path}: has {count} images, its table {part.frames} rows")
                 begin += part.frames
     except (av.error.FFmpegError, OSError) as error:
         raise DatasetError(f"{path}: cannot be joined: {error}") from error

@@ -25,8 +25,8 @@ _SAVED = ".episodes"
 class LeRobotDatasetWriter(DatasetWriter):
     """Writes LeRobot's format v3.0.
 
-    Saved episodes are separate LeRobot datasets in `ROOT/.episodes/000000`, … until `finalize` merges them. So a killed
-    process loses none of them.
+    Saved episodes are separate LeRobot datasets in `ROOT/.episodes/000000`, … until `finalize` merges them, so that a
+    killed process loses none of them.
 
     `metadata` contains `robot_type` and is stored in `meta/ibrobot.json`.
     """
@@ -110,11 +110,13 @@ class LeRobotDatasetWriter(DatasetWriter):
     @override
     def summary(self, root: Path) -> DatasetSummary | None:
         complete(root)
-        found = layout.open_dataset(root)
-        if found is None:
+        dataset = layout.open_dataset(root)
+        if dataset is None:
             return None
-        info = found.info
-        return DatasetSummary(info["fps"], found.features, found.metadata, info["total_episodes"], info["total_frames"])
+        info = dataset.info
+        return DatasetSummary(
+            info["fps"], dataset.features, dataset.metadata, info["total_episodes"], info["total_frames"]
+        )
 
     @override
     def merge(self, root: Path, parts: Sequence[Path], metadata: Mapping[str, Any]) -> None:

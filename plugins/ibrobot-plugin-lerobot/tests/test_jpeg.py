@@ -33,7 +33,7 @@ def test_other_bytes_are_refused_as_jpeg(noise: bytes, at: int) -> None:
     assert jpeg is not None
     with pytest.raises(WireError, match="a damaged JPEG"):
         CODEC.decode(memoryview(noise), (24, 32, 3))
-    with pytest.raises(WireError, match="JPEG of 24x32 pixels where 480x640 were said"):
+    with pytest.raises(WireError, match="JPEG of 24x32 pixels where 480x640 were announced"):
         CODEC.decode(memoryview(jpeg), (480, 640, 3))
     try:
         damaged = CODEC.decode(memoryview(jpeg[:at] + noise + jpeg[at:]), (24, 32, 3))
