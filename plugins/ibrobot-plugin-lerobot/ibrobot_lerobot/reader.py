@@ -79,9 +79,7 @@ class LeRobotReader(EpisodeReader):
 
     @override
     def messages_since(self, stamp_ns: int, topics: Collection[str] | None = None) -> Iterator[Recorded]:
-        first = -(
-            -(stamp_ns - 1 - self._start_ns) // self._step_ns
-        )  # rounded up; some messages follow their tick by 1 ns
+        first = -(-(stamp_ns - 1 - self._start_ns) // self._step_ns)  # rounded up; some messages are 1 ns late
         first = min(max(0, first), self._rows.length)
         wanted = set(self._contract.topics if topics is None else topics)
         try:
