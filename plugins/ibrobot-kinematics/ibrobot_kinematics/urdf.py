@@ -49,7 +49,7 @@ class Urdf:
     joints: tuple[UrdfJoint, ...]
     """In file order."""
     root: str
-    """The link that is no joint's child."""
+    """The link without a parent joint."""
 
     @cached_property
     def carriers(self) -> Mapping[str, UrdfJoint]:
