@@ -173,6 +173,7 @@ def test_draining_server_finishes_its_requests_and_its_robots_go_on_elsewhere(fl
     drained = fleet.pool.submit(fleet.servers[0].drain, PATIENCE_S)
     while fleet.servers[0].state != "draining":
         threading.Event().wait(0.002)
+    assert fleet.network.served(offer_name("net")) == {offer_name("net", fleet.servers[1].id)}
     assert robots[1].ask() == 1
     assert not drained.done(), "a request is still at work"
     old.gate.set()
