@@ -12,9 +12,8 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -40,6 +39,8 @@ _PHASES = {
     "Start offline training": "training",
 }
 """Text in the output of `lerobot-train` -> what it does from then on. Loading torch comes first."""
+type Follow = Callable[[Iterable[str], int, int], None]
+"""Receives the lines of the trainer, the step that it begins with, and its last step."""
 _REPORTS = 200
 """Reports of progress in a training."""
 _END_S = 10.0
@@ -58,7 +59,38 @@ def train(options: TrainOptions, events: bool) -> None:
     """Train a policy on a DATASET with LeRobot, which must be installed.
 
     The same command continues a training that was interrupted, from its newest checkpoint.
-    LEROBOT_OPTIONS are passed to lerobot-train, e.g. --seed=1.
+    LEROBOT_OPTIONS are passed to lerobot-train, e.g. --seed=1. With --each seed=1,2,3 it trains a policy for each of
+    these seeds, in folders below --out.
+    """
+    if options.each or options.on:
+        from ibrobot_lerobot.several import train_several
+
+        train_several(options, events=events)
+        return
+    code, newest = run_training(options, _report if events else None)
+    if code or newest is None:
+        first = options.save_every or saving_step(options.steps)
+        _tell_end(newest, first, interrupted=code == _INTERRUPTED, events=events)
+        sys.exit(code or 1)
+    trained = options.out / "checkpoints" / "last" / newest.policy.name
+    if events:
+        emit(TRAIN, Report(str(trained)))
+    else:
+        echo(f"trained: {trained}")
+
+
+def run_training(options: TrainOptions, follow: Follow | None) -> tuple[int, TrainingCheckpoint | None]:
+    """Begin a training, or continue it.
+
+    Args:
+        options: what to train.
+        follow: reads the trainer's output; without it, the output goes to the terminal.
+
+    Returns:
+        The trainer's exit code, and the newest checkpoint.
+
+    Raises:
+        IbrobotError: e.g. if there is no dataset, or the folder has another training.
     """
     from ibrobot_lerobot.merge import reading
 
@@ -66,33 +98,24 @@ def train(options: TrainOptions, events: bool) -> None:
     if not (dataset / "meta" / "info.json").is_file():
         raise DatasetError(f"{dataset}: is not a LeRobot dataset: it has no meta/info.json")
     program = find_trainer()
-    chosen = [*arguments(options), *options.lerobot_options]
+    given = (*arguments(options), *options.lerobot_options)
+    chosen = list({each.partition("=")[0]: each for each in given}.values())  # of two for one option, the last counts
     with reading(dataset, "is being trained on"), _owning(out):
         newest = _begun(out, chosen)
         if newest is None:
             if policy != SMALL:
-                check_policy(policy, options.lerobot_options, download=options.download, on_page=events)
+                check_policy(policy, options.lerobot_options, download=options.download, on_page=follow is not None)
             command = [program, *chosen]
         else:
             kept = [each for each in chosen if each.partition("=")[0] in _WHEN_CONTINUING]
             command = [program, f"--config_path={newest.settings}", "--resume=true", *kept]
         begun = 0 if newest is None else newest.step
-        if begun < steps:
-            if not events:
-                echo(f"$ {shlex.join(command)}", err=True)
-            code = _run(command, _environment(policy, download=options.download), begun, steps, events=events)
-            newest = newest_checkpoint(out)
-            if code or newest is None:
-                _tell_end(
-                    newest, options.save_every or saving_step(steps), interrupted=code == _INTERRUPTED, events=events
-                )
-                sys.exit(code or 1)
-    assert newest is not None
-    trained = out / "checkpoints" / "last" / newest.policy.name
-    if events:
-        emit(TRAIN, Report(str(trained)))
-    else:
-        echo(f"trained: {trained}")
+        if begun >= steps:
+            return 0, newest
+        if follow is None:
+            echo(f"$ {shlex.join(command)}", err=True)
+        code = _run(command, _environment(policy, download=options.download), begun, steps, follow)
+        return code, newest_checkpoint(out)
 
 
 def _environment(policy: str, *, download: bool) -> dict[str, str]:
@@ -190,17 +213,17 @@ def progress(line: str, reports: int, steps: int, begun: int = 0) -> tuple[int, 
     return step, loss if math.isfinite(loss) else None, float(rate) if rate else None
 
 
-def _run(command: Sequence[str], environment: Mapping[str, str], begun: int, steps: int, *, events: bool) -> int:
+def _run(command: Sequence[str], environment: Mapping[str, str], begun: int, steps: int, follow: Follow | None) -> int:
     """Run `lerobot-train` from step `begun`, until Ctrl-C or the death of this process. Returns its exit code."""
     # A group of its own: Ctrl-C in the terminal reaches this process alone, which then ends the training.
     watch = subprocess.Popen([sys.executable, "-c", _WATCH], stdin=subprocess.PIPE, process_group=0)
     process = subprocess.Popen(
         command, env=environment, stdin=subprocess.DEVNULL, process_group=watch.pid, text=True, errors="replace",
-        stdout=subprocess.PIPE if events else None, stderr=subprocess.STDOUT if events else None,
+        stdout=subprocess.PIPE if follow else None, stderr=subprocess.STDOUT if follow else None,
     )  # fmt: skip
     try:
-        if process.stdout is not None:
-            _report(process.stdout, begun, steps)
+        if process.stdout is not None and follow is not None:
+            follow(process.stdout, begun, steps)
         return process.wait()
     except KeyboardInterrupt:
         process.terminate()
@@ -214,7 +237,7 @@ def _run(command: Sequence[str], environment: Mapping[str, str], begun: int, ste
             process.stdout.close()
 
 
-def _report(output: Any, begun: int, steps: int) -> None:
+def _report(output: Iterable[str], begun: int, steps: int) -> None:
     """Print the progress as events, and all other lines as they are."""
     begin, reports = time.monotonic(), 0
     first: tuple[int, float] | None = None

@@ -11,7 +11,7 @@ from typing import Any, override
 import attrs
 
 from ibrobot_core.api import MissingDependency, option
-from ibrobot_core.app import Event, Shown
+from ibrobot_core.app import Event, Shown, on_option
 
 LEROBOT = "lerobot[dataset,training]>=0.6.1,<0.7"
 SMALL = "small_act"
@@ -58,6 +58,12 @@ def _matches(pattern: str, example: str) -> Any:
     return check
 
 
+def _check_each(instance: object, attribute: object, each: tuple[str, ...]) -> None:
+    for text in each:
+        if not re.fullmatch(r"[A-Za-z][\w.]*=[^,=/\s]+(,[^,=/\s]+)*", text):
+            raise ValueError(f"{text!r} is no option with values; give e.g. seed=1,2,3")
+
+
 @attrs.frozen(kw_only=True)
 class TrainOptions:
     """What is trained, on what and how long."""
@@ -93,6 +99,14 @@ class TrainOptions:
     download: bool = option(
         False, label="Download weights", more=True, help="let LeRobot download the weights that the policy begins with"
     )
+    each: tuple[str, ...] = option(
+        (), label=None, unit="option=value,value", validator=_check_each,
+        help="train once for each value of an option of LeRobot, e.g. seed=1,2,3; repeatable, for all combinations",
+    )  # fmt: skip
+    jobs: int | None = option(
+        None, ge=1, label=None, help="trainings at once; by default one on this machine, or as many as a cluster can"
+    )
+    on: str = on_option()
 
 
 @attrs.frozen

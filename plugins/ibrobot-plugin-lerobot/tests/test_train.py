@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -22,10 +23,11 @@ from ibrobot_lerobot.commands import datasets
 from ibrobot_lerobot.train import arguments, progress, train
 from ibrobot_lerobot.training import Begin, Progress, Report, TrainOptions
 from ibrobot_lerobot.training_checkpoints import newest_checkpoint
+from ibrobot_testing import ibrobot_command
 from trainer import install
 
 from ibrobot_core.api import DatasetError, Feature, MissingDependency
-from ibrobot_core.app import InUse, Shown, decode_event
+from ibrobot_core.app import InUse, RequestError, Shown, decode_event
 
 from .conftest import CAMERA, FPS, rows, write
 
@@ -100,6 +102,32 @@ def test_training_saves_a_tenth_of_its_steps_apart(dataset: Path, tmp_path: Path
     assert saved == [*(f"{step:06}" for step in range(100, 1001, 100)), "last"]
     run(train, dataset, "--out", tmp_path / "more", "--steps", 1000, "--save-every", 400)
     assert sorted(path.name for path in (tmp_path / "more/checkpoints").iterdir())[0] == "000400"
+
+
+def test_each_seed_is_trained_in_a_folder_of_its_own(dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ("train", dataset, "--out", out, "--steps", 20, "--each", "seed=1,2", "--each", "batch_size=4", "--jobs", 2)
+    command = [*ibrobot_command(), *map(str, words)]
+    environment = {**os.environ, "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for seed in (1, 2):
+        name = f"seed={seed},batch_size=4"
+        settings = json.loads((out / name / "checkpoints/last/pretrained_model/train_config.json").read_text())
+        assert (settings["seed"], settings["batch_size"]) == (seed, 4)
+        assert f"{out / name}: trained (" in done.stdout
+        assert "step:20" in (out / f"{name}.log").read_text()
+    again = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (again.returncode, again.stdout.count("trained (")) == (0, 2), "what is trained is kept"
+    command[command.index(str(out))] = str(tmp_path / "failing")
+    failing = subprocess.run([*command, "--fail"], env=environment, capture_output=True, text=True, check=False)
+    assert (failing.returncode, "2 of 2 trainings failed" in failing.stderr) == (1, True), failing.stderr
+    assert f"the training failed: see {tmp_path / 'failing/seed=1,batch_size=4.log'}" in failing.stderr
+
+
+def test_values_of_each_option_are_checked(dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match="'seed' is no option with values"):
+        run(train, dataset, "--out", tmp_path / "out", "--each", "seed")
 
 
 def interrupted(
