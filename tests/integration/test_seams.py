@@ -189,6 +189,7 @@ def test_another_name_of_a_field_of_an_event_fails(command: str, event: str, old
 
 _FLAG = re.compile(r"(?<![\w.])--[a-z][a-z-]*(?![\w.-])")
 TERMINAL = {
+    "--shard": "parts of a work on several machines, which a terminal starts",
     "--to": "from a dataset to episodes, which no page does",
     "--episodes": "episodes of a dataset, with --to bag",
     "--output": "a new episode, where a page replaces the old one",

@@ -52,7 +52,7 @@ def new(out: Path, urdf: Path, tip: str | None, packages: tuple[str, ...]) -> No
     echo(f"{out}: {model.name}, {len(arm)} joints{' and a gripper' if len(arm) < len(model.joints) else ''}")
     for note in model.notes:
         echo(f"note: {note}")
-    echo(f"try it: ibrobot launch {out} --sim --web")
+    echo(f"try it: ibrobot launch {out} --sim --mode web --web")
 
 
 def robot_yaml(model: UrdfModel, urdf: Path, folder: str) -> str:
@@ -105,6 +105,8 @@ executors:
 {lines}
 
 control_modes:
+  hold:                                   # holds its pose, and needs no other plugin
+    executors: [{stream}]
   web:                                    # in the browser, with `ibrobot launch --web`
     executors: [{stream}]
     teleop: web
@@ -114,7 +116,7 @@ control_modes:
   moveit_planning:
     executors: [{plan}]
     planner: {{type: rrt_connect}}
-default_control_mode: web
+default_control_mode: hold
 
 teleoperation:
   web: {{type: web}}

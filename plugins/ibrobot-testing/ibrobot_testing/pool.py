@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 import pytest
 
 from ibrobot_core.app import Job, Pool
-from ibrobot_testing.leaks import LeakCheck
 from ibrobot_testing.pool_jobs import (
     Order,
     die_if_odd,
@@ -23,14 +22,14 @@ from ibrobot_testing.pool_jobs import (
     square,
     wait,
 )
+from ibrobot_testing.suite import Suite
 
 _POLL_S = 0.02
 
 
-class PoolSuite:
+class PoolSuite(Suite[Pool]):
     """Checks of every `Pool`. The subclass defines `pool`."""
 
-    leak_check: ClassVar[LeakCheck] = LeakCheck()
     patience_s: ClassVar[float] = 60.0
     """Time for whatever the pool does [s]."""
 
