@@ -158,7 +158,7 @@ def copy(context: click.Context, config: str, copy: Path, values: tuple[str, ...
             raise click.BadParameter(f"expected NAME=VALUE, got {each!r}", param_hint="--value")
         chosen[name] = value
     if not defaults and sys.stdin.isatty():
-        for name, default in variables(source.read_text(encoding="utf-8")).items():
+        for name, default in variables(source).items():
             if name not in chosen:
                 chosen[name] = click.prompt(name, default=default or None, err=True)
     write_copy(source, copy, chosen)

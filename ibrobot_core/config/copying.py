@@ -12,8 +12,20 @@ from ibrobot_core.errors import ConfigError, Problem
 _ODD = re.compile(r"[{}\"'#\s\\]|:$")
 
 
-def variables(text: str) -> dict[str, str]:
-    """Variables in the values of a robot YAML, in order -> default; empty for those without."""
+def _read(source: Path) -> str:
+    try:
+        return source.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError([Problem(source, 0, "", f"cannot be read: {error}")]) from error
+
+
+def variables(source: Path) -> dict[str, str]:
+    """Variables in the values of a robot YAML, in order -> default; empty for those without.
+
+    Raises:
+        ConfigError: if it cannot be read.
+    """
+    text = _read(source)
     lines = (line.partition(" #")[0] for line in text.splitlines() if not line.lstrip().startswith("#"))
     found: dict[str, str] = {}
     for name, default in VARIABLE.findall("\n".join(lines)):
@@ -30,10 +42,9 @@ def write_copy(source: Path, copy: Path, defaults: Mapping[str, str]) -> None:
         defaults: variable -> its default in the copy; others keep theirs.
 
     Raises:
-        ConfigError: if `copy` exists, or the file lacks a variable, or a default cannot stand in YAML.
+        ConfigError: if `copy` exists, the file cannot be read or lacks a variable, or a default cannot stand in YAML.
     """
-    text = source.read_text(encoding="utf-8")
-    known = variables(text)
+    text, known = _read(source), variables(source)
     for name, value in defaults.items():
         if name not in known:
             problem = f"{source} has no variable {name!r}; its variables are: {', '.join(known) or 'none'}"

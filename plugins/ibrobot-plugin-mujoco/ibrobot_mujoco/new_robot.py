@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from ibrobot_core.api import HardwareError
-from ibrobot_core.app import echo, load_config
+from ibrobot_core.app import echo, load_config, wrong_input
 from ibrobot_mujoco.urdf_model import UrdfModel, make_model
 
 
@@ -42,10 +42,11 @@ def new(out: Path, urdf: Path, tip: str | None, packages: tuple[str, ...]) -> No
             )
         folders[name] = Path(place)
     folder = out.with_name(f"{out.stem}_model")
-    for path in (out, folder):
-        if path.exists():
-            raise HardwareError(f"{path} exists already, and is not overwritten")
-    model = make_model(urdf, folder, folders, tip)
+    with wrong_input():
+        for path in (out, folder):
+            if path.exists():
+                raise HardwareError(f"{path} exists already, and is not overwritten")
+        model = make_model(urdf, folder, folders, tip)
     out.write_text(robot_yaml(model, urdf, folder.name), encoding="utf-8")
     load_config(out, sim=True)
     arm = [joint.name for joint in model.joints if not joint.gripper]

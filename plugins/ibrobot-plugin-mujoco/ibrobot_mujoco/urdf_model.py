@@ -107,7 +107,7 @@ def _parse(urdf: Path) -> Element:
             text = xacro.process_file(str(urdf)).toxml()
         root = fromstring(text)
     except (OSError, ParseError, UnicodeDecodeError) as error:
-        raise HardwareError(f"{urdf} cannot be read: {error}") from error
+        raise HardwareError(f"{urdf} cannot be read: {error}") from None
     if root.tag != "robot":
         raise HardwareError(f"{urdf} is not a URDF: its first element is <{root.tag}>, must be <robot>")
     return root
