@@ -42,6 +42,10 @@ def new(out: Path, urdf: Path, tip: str | None, packages: tuple[str, ...]) -> No
             )
         folders[name] = Path(place)
     folder = out.with_name(f"{out.stem}_model")
+    try:
+        urdf.read_bytes()
+    except OSError as error:
+        raise click.FileError(str(urdf), hint=error.strerror) from error
     with wrong_input():
         for path in (out, folder):
             if path.exists():
