@@ -140,7 +140,7 @@ def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | 
 )
 @click.option("--defaults", is_flag=True, help="Keep all other defaults; do not ask.")
 @click.pass_context
-def copy(context: click.Context, config: str, copy: Path, values: tuple[str, ...], defaults: bool) -> None:  # fmt: skip
+def copy(context: click.Context, config: str, copy: Path, values: tuple[str, ...], defaults: bool) -> None:
     """Copy CONFIG to a file of your own, with your ports and cameras.
 
     The copy has the same text, with its comments. In a terminal, the command asks for the default of each variable,

@@ -5,24 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
+from fake_runs import finish, seconds
 
 from ibrobot_core.errors import NotSupported
-from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
+from ibrobot_core.launch.runtime import ESTOP, RESET
 
 if TYPE_CHECKING:
     from fake_runs import Runs
     from ibrobot_testing.site import Site
-
-
-def finish(runtime: Runtime) -> None:
-    while not runtime.step():
-        pass
-    runtime.stop()
-
-
-def seconds(runtime: Runtime, duration: float) -> None:
-    for _ in range(round(duration * runtime.session.config.control.rate_hz)):
-        runtime.step()
 
 
 def test_episodes_count_up_their_seeds_and_are_announced_to_plugins(runs: Runs):

@@ -118,3 +118,16 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     """An empty site, seen by this process and by those that it starts; `installed_plugins()` discovers again."""
     with made_up_site(tmp_path / "site", PLUGINS, monkeypatch) as site:
         yield site
+
+
+def finish(runtime: Runtime) -> None:
+    """Run to the end, and stop."""
+    while not runtime.step():
+        pass
+    runtime.stop()
+
+
+def seconds(runtime: Runtime, duration: float) -> None:
+    """Run for a time [s]."""
+    for _ in range(round(duration * runtime.session.config.control.rate_hz)):
+        runtime.step()

@@ -7,24 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from fake_runs import finish, seconds
 
-from ibrobot_core.app import ESTOP, Runtime
+from ibrobot_core.app import ESTOP
 
 if TYPE_CHECKING:
     from fake_runs import Runs
 
 RECORDING = "recording={type: lines, root: kept, dataset: picks}"
-
-
-def finish(runtime: Runtime) -> None:
-    while not runtime.step():
-        pass
-    runtime.stop()
-
-
-def seconds(runtime: Runtime, duration: float) -> None:
-    for _ in range(round(duration * runtime.session.config.control.rate_hz)):
-        runtime.step()
 
 
 def records(folder: Path) -> list[dict[str, Any]]:

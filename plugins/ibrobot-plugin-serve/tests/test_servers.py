@@ -380,7 +380,7 @@ def test_robots_that_choose_at_once_spread_by_their_names() -> None:
     assert all(80 < count < 120 for count in first.values()), first
     for name in map(str, range(300)):
         before, after = ranked(offers(0, 0, 0), name)[0], ranked(offers(0, 0), name)[0]
-        assert before.server in (after.server, "s2"), "only the robots of the server that left choose anew"
+        assert before.server in (after.server, "s2"), "only robots whose server has left choose another one"
 
 
 def test_robot_leaves_a_full_server_with_an_episode_for_one_that_has_settled() -> None:
