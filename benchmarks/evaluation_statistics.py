@@ -26,7 +26,6 @@ from ibrobot_eval.statistics import (
     clopper_pearson,
     decided_by,
     log_capital,
-    mcnemar_power,
     tango,
     wilson,
 )
@@ -98,6 +97,23 @@ def decided_at(first: float, second: float, rng: np.random.Generator, experiment
     losses = np.cumsum(behind & ~ahead, axis=1, dtype=np.int16)
     found = found_by[wins, losses]
     return [int(each) for each in np.where(found.any(axis=1), found.argmax(axis=1) + 1, 0)]
+
+
+def mcnemar_power(first: float, second: float, episodes: int) -> float:
+    """Probability that McNemar's exact test finds a difference after a fixed number of episodes.
+
+    For policies with these success rates and independent outcomes.
+    """
+    from scipy.stats import binom
+
+    ahead, behind = first * (1 - second), second * (1 - first)
+    numbers = np.arange(episodes + 1)
+    found: Any = np.zeros(episodes + 1)
+    for number in numbers:
+        wins = np.arange(number + 1)
+        p_values = np.minimum(1.0, 2 * binom.cdf(np.minimum(wins, number - wins), number, 0.5))
+        found[number] = binom.pmf(wins, number, ahead / (ahead + behind))[p_values <= ALPHA].sum()
+    return float(binom.pmf(numbers, episodes, ahead + behind) @ found)
 
 
 def needed_by_mcnemar(first: float, second: float, power: float) -> int | None:

@@ -85,7 +85,7 @@ STATES_LEGITIMATELY = (
     "there is no such", "is not an episode", "contains no episode", "already has a dataset", "is no longer there",
     "its trash has no", "the dataset has another state", "the dataset has this episode", "not an episode of a known",
     "run `ibrobot episodes repair` first", "outside it", "lacks messages", "has no .mcap", "nothing was added",
-    "was changed by another program meanwhile", "no message of", "has no message",
+    "another program has changed it", "no message of", "has no message",
 )  # fmt: skip
 """What a command may say because the other one ran before it."""
 

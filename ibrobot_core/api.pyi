@@ -30,7 +30,7 @@ from ibrobot_core.options import (
     OptionFault as OptionFault,
     did_you_mean as did_you_mean,
 )
-from ibrobot_core.executor_options import StreamOptions as StreamOptions
+from ibrobot_core.descriptors import StreamOptions as StreamOptions
 from ibrobot_core.component_config import SceneConfig as SceneConfig
 
 # The robot
@@ -123,6 +123,7 @@ from ibrobot_core.interfaces import (
     DatasetSummary as DatasetSummary,
     Feature as Feature,
 )
+from ibrobot_core.files import replace_file as replace_file, sync as sync
 
 # The contract
 from ibrobot_core.contract.specs import (

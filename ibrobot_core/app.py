@@ -7,24 +7,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from ibrobot_core.late_names import LateNames
 
 _NAMES = LateNames(__name__, __file__)
-
 __all__ = list(_NAMES.homes)
-
-
-def home_of(name: str) -> str:
-    """The module that defines a name of this floor."""
-    return _NAMES.homes[name]
-
-
-def __getattr__(name: str) -> Any:
-    value = globals()[name] = _NAMES.load(name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+__getattr__, __dir__, home_of = _NAMES.load, _NAMES.listed, _NAMES.home_of

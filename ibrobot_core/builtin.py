@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import Command, EngineDescriptor, ExecutorDescriptor, TransportDescriptor
+from ibrobot_core.descriptors import Command, EngineDescriptor, ExecutorDescriptor, StreamOptions, TransportDescriptor
 from ibrobot_core.errors import NotSupported
-from ibrobot_core.executor_options import StreamOptions
 from ibrobot_core.hookspecs import hookimpl
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
-from ibrobot_core.options import NoOptions, OptionFault, OptionName
+from ibrobot_core.options import NoOptions, OptionFault, OptionName, documented, option
 
 if TYPE_CHECKING:
     import click
@@ -139,11 +139,22 @@ class EngineDescriptor(Descriptor["interfaces.Engine"]):
     """Whether this machine has the model's weights, so that `ibrobot config check --deep` checks them."""
 
 
+@documented
+@attrs.frozen
+class StreamOptions:
+    """Options of any executor that follows a stream of setpoints."""
+
+    stale_timeout: float = option(0.25, unit="s", gt=0, help="age at which the last setpoint becomes stale")
+    safety_behavior: str = option(
+        "hold", choices=("hold", "relax"), help="behaviour for stale setpoints, here or in the contract's action"
+    )
+
+
 @attrs.frozen
 class ExecutorDescriptor(Descriptor["interfaces.Executor"]):
     """An executor. If `streams`, it follows setpoints (from policies and teleop) rather than goals.
 
-    The options of a streaming executor derive from `ibrobot_core.executor_options.StreamOptions`.
+    The options of a streaming executor derive from `StreamOptions`.
     """
 
     streams: bool = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import sys
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -28,12 +29,22 @@ class LateNames:
         imports = (node for node in stub.body if isinstance(node, ast.ImportFrom))
         return {alias.name: str(node.module) for node in imports for alias in node.names}
 
+    def listed(self) -> list[str]:
+        """The names, for `__all__` and `__dir__`."""
+        return list(self.homes)
+
+    def home_of(self, name: str) -> str:
+        """The module that defines a name."""
+        return self.homes[name]
+
     def load(self, name: str) -> Any:
-        """Import a name from its home.
+        """Import a name from its home into the module; the module's `__getattr__`.
 
         Raises:
             AttributeError: if the module has no such name.
         """
         if name not in self.homes:
             raise AttributeError(f"module {self._module!r} has no attribute {name!r}")
-        return getattr(import_module(self.homes[name]), name)
+        value = getattr(import_module(self.homes[name]), name)
+        setattr(sys.modules[self._module], name, value)
+        return value

@@ -13,8 +13,8 @@ from ibrobot_core.config.schema import TASK_KEY, ActionSpec, ContractConfig, Exe
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
+from ibrobot_core.descriptors import StreamOptions
 from ibrobot_core.errors import ContractError
-from ibrobot_core.executor_options import StreamOptions
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.selection import Selection
 

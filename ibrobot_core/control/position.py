@@ -8,7 +8,7 @@ from typing import ClassVar, override
 import numpy as np
 
 from ibrobot_core.control.spline import Spline, smooth_velocities
-from ibrobot_core.executor_options import StreamOptions
+from ibrobot_core.descriptors import StreamOptions
 from ibrobot_core.interfaces import Context, Executor, JointReading, Plan
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns, seconds

@@ -7,7 +7,7 @@ from typing import override
 from ibrobot_testing import ExecutorSuite
 
 from ibrobot_core.control.position import PositionExecutor
-from ibrobot_core.executor_options import StreamOptions
+from ibrobot_core.descriptors import StreamOptions
 
 
 class TestPosition(ExecutorSuite):

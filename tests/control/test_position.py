@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.control.position import PositionExecutor
+from ibrobot_core.descriptors import StreamOptions
 from ibrobot_core.errors import GoalRejected
-from ibrobot_core.executor_options import StreamOptions
 from ibrobot_core.interfaces import Context, JointReading, Plan
 from ibrobot_core.robot import Joint, Robot
 

@@ -67,7 +67,7 @@ def judge(page: Any, number: int, key: str) -> None:
     """Begin a trial and judge it, both by keys."""
     question(page, f"trial {number} (")
     page.keyboard.press("Enter")
-    question(page, "how does it end")
+    question(page, "outcome")
     page.keyboard.press(key)
 
 
@@ -104,14 +104,14 @@ def first_day(page: Any, seen: Seen, folder: Path) -> None:
     assert page.evaluate("getComputedStyle(document.querySelector('.over')).opacity") == "0.8"
     seen.look()
     page.get_by_role("button", name="Begin the trial").click()
-    question(page, "how does it end")
+    question(page, "outcome")
     seen.look()
     page.get_by_role("button", name="Void").click()
     page.get_by_label("trial 2 is void; reason").fill("the light went out, s")
     page.keyboard.press("Enter")
     question(page, "trial 3 (start 1 of 2)")
     page.keyboard.press("Enter")
-    question(page, "how does it end")
+    question(page, "outcome")
     crash(folder)
     page.locator(".job .state.failed").wait_for(timeout=WAIT_MS)
     assert page.locator(".ask:visible").count() == 0, "nobody is asked any more"
@@ -127,13 +127,13 @@ def second_day(page: Any, seen: Seen) -> None:
     seen.look()
     page.get_by_role("link", name="Eval", exact=True).click()
     page.get_by_role("button", name="Begin the trial").click()
-    question(page, "how does it end")
+    question(page, "outcome")
     page.keyboard.press("Escape")  # the emergency stop
     question(page, "trial 4 has ended")
     page.get_by_role("button", name="Failure").click()
     question(page, "trial 5 (start 2 of 2)")
     page.get_by_role("button", name="Begin the trial").click()
-    question(page, "how does it end")
+    question(page, "outcome")
     seen.look()
 
 

@@ -125,7 +125,7 @@ def test_operator_judges_blind_and_goes_on_after_a_crash(folder: Path, terminals
     first.see("trial 2: void")
     first.see("trial 3")
     first.press("\r")
-    first.see("how does it end")
+    first.see("outcome: s")
     os.kill(first.process.pid, signal.SIGKILL)  # a crash in the middle of a trial
     first.process.wait()
 
@@ -183,14 +183,14 @@ def test_keys_judge_a_running_arm_and_ctrl_c_ends_it_in_an_orderly_way(
     terminals.append(terminal)
     terminal.see(r"trial 1 \(start 1 of 1\), set the scene to start 1")
     terminal.press("\r")
-    terminal.see("how does it end")
+    terminal.see("outcome: s")
     terminal.press("s")
     terminal.see("trial 1: success")
     terminal.see("trial 2")
     terminal.press("\r")
-    terminal.see("how does it end")
+    terminal.see("outcome: s")
     os.kill(terminal.process.pid, signal.SIGINT)
-    terminal.see("to be continued")
+    terminal.see("not finished")
     assert terminal.end() == 0
     (trial,) = [json.loads(each.read_text()) for each in (tmp_path / "blind/trials").glob("*.json")]
     assert (trial["outcome"], trial["faults"], trial["time_s"] > 0) == ("success", [], True)

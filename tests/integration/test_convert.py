@@ -277,13 +277,13 @@ def test_a_gap_is_refused_skipped_or_held(tmp_path: Path) -> None:
     assert found["hold"]["reports"][0]["cuts"] == []
     default = run(tmp_path / "bag", "--out", tmp_path / "default")
     assert default.code == 0, default.err
-    assert f"cut bag: {ticks} of {found['skip']['frames'] + ticks} ticks are left out\n" in default.err
-    assert f"left out where something was missing: 1 time, at most {ticks} ticks in a row\n" in default.out
+    assert f"bag: {ticks} of {found['skip']['frames'] + ticks} ticks are left out\n" in default.err
+    assert f"incomplete ticks left out: 1 time, at most {ticks} ticks in a row\n" in default.out
     kept = json.loads((tmp_path / "default/meta/ibrobot.json").read_bytes())["episodes"][0]
     assert kept["cuts"] == [[row, ticks]]
     printed = run(tmp_path / "bag", "--out", tmp_path / "printed", "--missing", "hold").out
-    assert "missing for a time: observation.images.wrist 1\n" in printed
-    assert "without a prompt, so with an empty task: 1; --prompt TEXT gives them one" in printed
+    assert "went missing: observation.images.wrist 1\n" in printed
+    assert "episodes without a prompt, whose task is empty: 1; --prompt TEXT sets it" in printed
     asked = run(tmp_path / "bag", "--out", tmp_path / "asked", "--missing", "hold", "--prompt", "stack").out
     assert "without a prompt" not in asked
 

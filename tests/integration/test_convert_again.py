@@ -373,7 +373,7 @@ def test_a_conversion_does_not_write_into_what_changed_meanwhile(
     monkeypatch.setattr(run_module, "make_writer", lambda request: Changed(make_writer(request)))
     done = convert(second, "--out", out, "--append")
     assert done.returncode == 2
-    assert "was changed by another program meanwhile; run the same command again" in done.stderr
+    assert "another program has changed it; run the same command again" in done.stderr
     monkeypatch.undo()
     again = report(second, "--out", out, "--append")
     assert (again["episodes"], again["resumed"]) == (1, 1)

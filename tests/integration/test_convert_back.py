@@ -161,10 +161,10 @@ def test_another_episode_of_the_same_number_is_not_overwritten(exact: Path, bags
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--to", "bag", "--append"], "--append has no meaning for --to bag"),
-        (["--episodes", "0"], "--episodes has no meaning for --to dataset"),
+        (["--to", "bag", "--append"], "--append does not apply to --to bag"),
+        (["--episodes", "0"], "--episodes does not apply to --to dataset"),
         (["--to", "bag", "--episodes", "0,7"], "0,7: the dataset's episodes are 0 to 2"),
-        (["--to", "bag", "--episodes", "all"], "'all' is not a number, nor two with a dash"),
+        (["--to", "bag", "--episodes", "all"], "'all' is neither a number nor a range"),
     ],
 )
 def test_options_that_cannot_be_meant(exact: Path, convert: Convert, tmp_path: Path, arguments: list[str], words: str):

@@ -188,7 +188,7 @@ def test_merged_shards_are_the_whole_evaluation(folder: Path, whole: Path) -> No
         assert not Path("merged").exists()
         merged = run_here("eval", "merge", "part2", "part1", "--out", "merged")
     assert "part1: has scripted, seed 0, as part1 has" in twice.stderr
-    assert "is no evaluation: it has no evaluation.json" in other.stderr
+    assert "is not an evaluation: it has no evaluation.json" in other.stderr
     assert "other: differs from part1: policies faulty contract changed" in contract.stderr
     assert (merged.returncode, "scripted  3 of 3 succeeded" in merged.stdout) == (0, True), merged.stderr
     assert digests(folder / "merged") == digests(whole)

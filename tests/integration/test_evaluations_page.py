@@ -67,7 +67,7 @@ def test_an_evaluation_is_looked_at_on_the_page(tmp_path: Path) -> None:
         page.on("console", lambda line: errors.extend([line.text] * (line.type == "error")))
         page.goto(address)
         page.get_by_role("link", name="Evaluations").click()
-        page.get_by_text("broken/report.json: is no report of an evaluation").wait_for(timeout=WAIT_MS)
+        page.get_by_text("broken/report.json: is not a report of an evaluation").wait_for(timeout=WAIT_MS)
         page.get_by_role("link", name="night").click()
         page.get_by_role("heading", name="Failures (2)").wait_for(timeout=WAIT_MS)
         check_same(page, written)

@@ -111,7 +111,7 @@ RECORDING = (
     ("record", "prompt (Enter alone takes “pick the cube”, Tab goes back): pick the red cu_"),
     ("saved", "0 of 3 into episodes/default"),
     ("lost", "0 messages"),
-    ("disk", "71338 MiB left at 1.5 MiB/s, 0.0 MiB wait for it"),
+    ("disk", "71338 MiB left at 1.5 MiB/s, 0.0 MiB queued"),
     ("topics", "/joint_states 100 Hz  /arm_position_controller/commands 100 Hz"),
 )
 

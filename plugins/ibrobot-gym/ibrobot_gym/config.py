@@ -1,4 +1,4 @@
-"""The robot YAML of an environment: that of a run, with its scene and its cameras."""
+"""Robot YAML of an environment, with its scene and cameras."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def environment_config(
     rendered: str | None,
     overrides: Sequence[str],
 ) -> RobotConfig:
-    """A config with its scene and cameras.
+    """Load a robot YAML with a scene and cameras.
 
     Args:
         name: a robot YAML, or the name of a shipped one.
         scene: the type of scene; None: that of the file.
         cameras: cameras of the scene to observe, in addition to those of the file.
         size: height and width of their pictures [px].
-        rendered: the camera that `render` shows; None for an environment that renders nothing.
+        rendered: camera of `render`; None without rendering.
         overrides: `path.to.key=value`, as of `ibrobot launch --set`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The environment: a run in lockstep, which advances by one action at each step."""
+"""Gymnasium environment: a run in lockstep that advances by one action per step."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ type Observation = dict[str, Any]
 class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """A scene, stepped at the rate of the robot's contract.
 
-    Each step passes through what a run in lockstep passes through: executors, the safety layer and physics at the
-    control rate, cameras, and the alignment of the contract. Actions are joint positions [rad]. Observations have the
+    Each step is that of a run in lockstep: executors, safety layer and physics at the control rate, cameras, and the
+    alignment of the contract. Actions are joint positions [rad], shape (A,). Observations have the
     keys that LeRobot's tools know: `agent_pos`, the state; `environment_state`, the scene's ground truth; `pixels`, the
     pictures by camera. An episode ends with success (reward 1, `info["is_success"]`), or is truncated after
     `contract.max_duration_s`.
@@ -117,7 +117,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         session.clock.advance(-session.clock.now_ns() % _ALIGNED_NS)
         self._tick()
         if not session.command("reset_episode", seed=seed)["begun"]:
-            raise HardwareError("the episode does not begin: an emergency stop is latched")
+            raise HardwareError("the episode cannot begin: an emergency stop is latched")
         self._begun_ns = session.clock.now_ns()
         self._source.begin(seed)
         while (frame := self._source.frame) is None:

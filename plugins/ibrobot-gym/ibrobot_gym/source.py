@@ -1,4 +1,4 @@
-"""The command source of an environment: samples frames at the contract's ticks, and sends the actions it is given."""
+"""Command source of an environment: samples frames at the contract's ticks, and sends the environment's actions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class EnvironmentSource(SourceWorker):
         self._contract = Contract.from_config(session.config)
         self._sampler: FrameSampler | None = None
         self.frame: Frame | None = None
-        """The frame of the last tick; None before the first of an episode that has all observations."""
+        """The frame of the last tick; None before the first complete one of an episode."""
 
     @override
     def begin_mode(self, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""Certificates: how each is made and written, and the one that an installation makes for itself."""
+"""Certificates: make and write them, and the self-signed one of an installation."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _DAYS = 365
 _RENEW = timedelta(days=30)
 """A certificate is replaced this long before it expires."""
 _EARLY = timedelta(days=2)
-"""Certificates are valid from a time before their creation, for machines whose clock is behind."""
+"""Certificates are valid from a while before their creation, for machines whose clock is behind."""
 
 
 @attrs.frozen
 class Issuer:
-    """Who signs a certificate: an authority, or the certificate's own subject."""
+    """Signer of a certificate: an authority, or the subject itself."""
 
     name: x509.Name
     key: ec.EllipticCurvePrivateKey
@@ -39,12 +39,12 @@ def make_key() -> ec.EllipticCurvePrivateKey:
 
 
 def common_name(name: str) -> x509.Name:
-    """A subject that consists of a name."""
+    """A subject with only a common name."""
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
 
 
 def general_name(host: str) -> x509.GeneralName:
-    """A name or address of a machine, as certificates state it."""
+    """A host name or address as an alternative name of a certificate."""
     try:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
@@ -58,13 +58,13 @@ def make_certificate(
     """Make and sign a certificate.
 
     Args:
-        subject: whose it is.
+        subject: the owner.
         key: the subject's key.
-        issuer: who signs it.
-        ends: its expiry.
-        authority: whether other certificates may be signed with it.
-        hosts: names and addresses of its machine.
-        usages: what it may be used for, if not for everything.
+        issuer: the signer.
+        ends: expiry.
+        authority: whether it may sign other certificates.
+        hosts: names and addresses of the machine.
+        usages: permitted extended usages; any if empty.
     """
     builder = (
         x509.CertificateBuilder()

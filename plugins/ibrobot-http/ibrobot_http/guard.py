@@ -1,4 +1,4 @@
-"""The guard in front of every request: host, origin, session; and the headers of every answer.
+"""Guard of every request (host, origin, session), and headers of every answer.
 
 A page is opened by a link with a token, or by a password. Both give a session: a cookie that scripts cannot read and
 that no other site sends along. Its name contains the port, since cookies do not distinguish ports.
@@ -24,9 +24,9 @@ from ibrobot_http.listener import Listener, bracketed
 REQUEST_S = 5.0
 """Time in which a client must send a request [s]."""
 _SESSIONS = 100
-"""Number of sessions kept; the one unused for the longest time ends first."""
+"""Maximum number of sessions; the least recently used one ends first."""
 _TRY_S = 1.0
-"""Time between two attempts at the password [s]."""
+"""Minimum time between two password attempts [s]."""
 _SIGN_IN_BYTES = 4096
 """Largest form with a password [bytes]."""
 _ROLE = web.RequestKey("role", str)
@@ -58,19 +58,19 @@ _log = logging.getLogger("ibrobot.http")
 class Guard:
     """Admits requests, and adds the headers of all answers.
 
-    A request must name this server as its host, which web pages that resolve another name to this machine cannot do.
-    It must not come from another site. A WebSocket must come from this server's own page.
+    A request must name this server as its host, which defeats DNS rebinding. It must not come from another site. A
+    WebSocket must come from this server's own page.
 
     Args:
         listener: where the server listens.
         roles: what a session may do, e.g. `drive` and `watch`; each has a link of its own. Without roles, no session is
             needed.
         password: opens a session of the first role, in place of its link; None to use the link.
-        other_sites_link: whether a link on any other site, such as a scanned code, may open the page. Otherwise only
-            servers of this machine may.
+        other_sites_link: whether links from any other site, such as a scanned code, may open the page. Otherwise only
+            those from servers of this machine may.
         any_port: whether clients may name another port, e.g. that of a tunnel.
-        strict_transport: whether browsers shall refuse this machine without TLS, or with a certificate that they do not
-            trust, for a year.
+        strict_transport: whether browsers refuse this machine without TLS, or with an untrusted certificate, for a
+            year (HSTS).
         permissions: the policy for a browser's devices.
     """
 
@@ -221,7 +221,7 @@ class Guard:
 
 
 async def _read(request: web.Request) -> None:
-    """Read the body of a request, which handlers then have at once.
+    """Read the body of a request, so that handlers need not wait for it.
 
     Raises:
         web.HTTPException: if it does not arrive in time, or is no body.

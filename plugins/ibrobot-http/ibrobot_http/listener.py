@@ -1,4 +1,4 @@
-"""Where a server listens: its socket, its certificate, and the names under which browsers reach it."""
+"""Address of a server: its socket, its certificate, and the names under which browsers reach it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ibrobot_core.api import IbrobotError
 
 @attrs.frozen(eq=False)
 class Listener:
-    """A port that is open, on which a server can begin; clients wait until then."""
+    """An open port; clients wait until a server uses it."""
 
     socket: socket.socket
     names: tuple[str, ...]
@@ -40,7 +40,7 @@ class Listener:
 
 
 def bracketed(name: str) -> str:
-    """A name or address as it stands in a URL."""
+    """Format a name or address for a URL, with brackets around IPv6."""
     return f"[{name}]" if ":" in name else name
 
 

@@ -1,4 +1,4 @@
-"""A server: an application behind its guard, with limits on what clients may do to it."""
+"""A server: an application behind its guard, with limits against misbehaving clients."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from ibrobot_http import guard as guarding
 from ibrobot_http.guard import Guard
 
 _CLIENTS = 200
-"""Connections at a time, at most; others are turned away."""
+"""Maximum number of simultaneous connections; others are refused."""
 _ANSWER_S = 30.0
 """Time in which a client must read an answer [s]."""
 _LINGER_S = 1.0
-"""Time for which the rest of a request is still read after its answer [s]."""
+"""Time to read the rest of a request after its answer [s]."""
 _CLOSING_S = 0.05
-"""Time at the end in which connections close [s]."""
+"""Time for connections to close at the end [s]."""
 _log = logging.getLogger("ibrobot.http")
 _quiet = logging.getLogger("ibrobot.http.clients")
 _quiet.setLevel(logging.CRITICAL)  # not a fault of the server: clients that send no HTTP
@@ -92,7 +92,7 @@ class ServerThread:
         app: the application.
         name: of the thread.
         close_s: time for requests to end when the server does [s].
-        beside: what else runs in the server's loop.
+        beside: a further task in the server's loop.
 
     Attributes:
         loop: the server's loop.
@@ -186,7 +186,7 @@ async def _contained(
 
 
 def _quiet_about_clients(loop: asyncio.AbstractEventLoop, context: Mapping[str, Any]) -> None:
-    """Log everything but connections that clients break, e.g. in the handshake of TLS."""
+    """Log all errors but connections broken by clients, e.g. in the handshake of TLS."""
     if "transport" in context or "protocol" in context:
         _log.debug("%s", context["message"], exc_info=context.get("exception"))
     else:

@@ -1,4 +1,4 @@
-"""The plugin's hooks: the commands `ibrobot convert`, `ibrobot record`, `ibrobot replay`, and what records episodes."""
+"""The plugin's hooks: `ibrobot convert`, `ibrobot record`, `ibrobot replay`, corrections and recording."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _records(config: RobotConfig) -> bool:
 
 @hookimpl
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
-    """What records the episodes of a run with a section `recording`."""
+    """The section `episodes`, whose component records the episodes of a run."""
     yield SectionDescriptor(
         type="episodes",
         options=EpisodesOptions,

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ibrobot_core.app import RobotConfig
 
 _Progress = Callable[[int], AbstractContextManager[Any]]
-"""Receives the number of episodes, and gives the function that shows the progress."""
+"""Receives the number of episodes, and yields the function that shows the progress."""
 _MIB = 1 << 20
 _ONLY_TO_BAG = ("numbers",)
 _ONLY_TO_DATASET = (
@@ -46,11 +46,11 @@ _ONLY_TO_DATASET = (
 )  # fmt: skip
 _EVENT_S = 0.1
 _MUCH = 0.1
-"""The report names episodes that lost a larger share of their ticks."""
+"""The report lists episodes that lost more than this fraction of their ticks."""
 
 
 def _writer_flags() -> dict[str, click.Option]:
-    """Option of a dataset writer -> the flag that it is on this command line."""
+    """Option of a dataset writer -> its flag on this command line."""
     found = {}
     for entry in installed_plugins().entries.values():
         writer = entry.descriptor
@@ -90,7 +90,7 @@ def convert(
     given = [each for each in context.command.params if _given(context, each)]
     only_other = _ONLY_TO_BAG if to == "dataset" else (*_ONLY_TO_DATASET, *_writer_flags())
     if wrong := [each for each in given if each.name in only_other]:
-        raise click.UsageError(f"{wrong[0].opts[0]} has no meaning for --to {to}")
+        raise click.UsageError(f"{wrong[0].opts[0]} does not apply to --to {to}")
     try:
         with wrong_input():
             check_prompt(options.prompt)
@@ -168,10 +168,10 @@ def _to_bags(
 
 
 def _numbers(text: str | None, total: int) -> tuple[int, ...]:
-    """The numbers that e.g. `0,3-5` means, in order.
+    """Parse e.g. `0,3-5`; returns the numbers in order.
 
     Raises:
-        click.BadParameter: for other words, or a number that the dataset does not have.
+        click.BadParameter: for anything else, or a number beyond the dataset.
     """
     if text is None:
         return tuple(range(total))
@@ -180,7 +180,7 @@ def _numbers(text: str | None, total: int) -> tuple[int, ...]:
         ends = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", piece)
         if ends is None:
             raise click.BadParameter(
-                f"{piece!r} is not a number, nor two with a dash, e.g. 0,3-5", param_hint="--episodes"
+                f"{piece!r} is neither a number nor a range; write e.g. 0,3-5", param_hint="--episodes"
             )
         found |= set(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
     if not found or max(found) >= total:
@@ -190,7 +190,7 @@ def _numbers(text: str | None, total: int) -> tuple[int, ...]:
 
 
 def _overrides(flags: Mapping[str, Any]) -> list[str]:
-    """The overrides of a dataset writer's options that flags stand for."""
+    """Flags of dataset writers as overrides of their options."""
     from ibrobot_core.app import Override
 
     found: list[str] = []
@@ -238,7 +238,7 @@ def _calibration(name: str | None) -> Mapping[str, Mapping[str, Any]] | None:
 
 @contextmanager
 def _events(episodes: int) -> Iterator[Any]:
-    """A function that prints the progress as events: one for each episode, and at most ten a second beside them."""
+    """Yield a function that prints events: one for each episode, and at most ten a second in between."""
     begin = last = time.monotonic()
     done = 0
 
@@ -262,7 +262,7 @@ def _events(episodes: int) -> Iterator[Any]:
 
 @contextmanager
 def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
-    """A function that shows the progress: a bar on a terminal, otherwise one line per episode."""
+    """Yield a function that shows the progress: a bar on a terminal, otherwise one line per episode."""
     begin, done = time.monotonic(), 0
 
     def rate(frames: int) -> str:
@@ -331,12 +331,12 @@ def _print_report(report: Report) -> None:
     )
     for each in done:
         if each.skipped > _MUCH * (each.frames + each.skipped):
-            echo(f"cut {each.source}: {each.skipped} of {each.frames + each.skipped} ticks are left out", err=True)
+            echo(f"{each.source}: {each.skipped} of {each.frames + each.skipped} ticks are left out", err=True)
     if cuts := [ticks for each in done for _, ticks in each.cuts]:
         times, ticks = plural(len(cuts), "time"), plural(max(cuts), "tick")
-        echo(f"left out where something was missing: {len(cuts)} {times}, at most {max(cuts)} {ticks} in a row")
+        echo(f"incomplete ticks left out: {len(cuts)} {times}, at most {max(cuts)} {ticks} in a row")
     for what, of_each in (
-        ("missing for a time", [each.gaps for each in done]),
+        ("went missing", [each.gaps for each in done]),
         ("stamps that jumped", [each.resets for each in done]),
         ("lost in recording", [each.lost for each in done]),
         ("missing since", [each.missing for each in done]),
@@ -344,5 +344,5 @@ def _print_report(report: Report) -> None:
         if counts := sum(map(Counter, of_each), Counter[str]()):
             echo(f"{what}: {', '.join(f'{name} {count}' for name, count in counts.most_common())}")
     if summary["without_prompt"]:
-        echo(f"without a prompt, so with an empty task: {summary['without_prompt']}; --prompt TEXT gives them one")
+        echo(f"episodes without a prompt, whose task is empty: {summary['without_prompt']}; --prompt TEXT sets it")
     echo(f"{summary['size_bytes'] / _MIB:.1f} MiB in {report.seconds:.1f} s")

@@ -12,7 +12,7 @@ from ibrobot_data.options import COMMANDER, OPERATOR, PLANNER, POLICY
 
 
 def is_labelled(summary: EpisodeSummary) -> bool:
-    """Whether the episode says at each state who commanded."""
+    """Whether the episode records who commanded."""
     topic = summary.topics.get(COMMANDER)
     return topic is not None and topic.count > 0
 
@@ -39,7 +39,7 @@ class Commanders:
             self._times, self._names = [0], [_of_mode(summary)]
 
     def at(self, t_ns: int) -> str:
-        """Who commanded at `t_ns` [ns]: the newest message by then."""
+        """Who commanded at `t_ns` [ns], by the newest message up to then."""
         return self._names[max(0, bisect_right(self._times, t_ns) - 1)]
 
 
@@ -50,7 +50,7 @@ def _of_mode(summary: EpisodeSummary) -> str:
         return next((word for key, word in words.items() if mode.get(key) is not None), POLICY)
     except (KeyError, TypeError, ValueError, AttributeError):
         raise RecorderError(
-            f"nothing says who commanded: it has no {COMMANDER}, and its metadata name no mode of a robot YAML"
+            f"it is unknown who commanded: the episode has no {COMMANDER}, and its metadata no mode of a robot YAML"
         ) from None
 
 

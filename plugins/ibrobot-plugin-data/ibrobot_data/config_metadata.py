@@ -20,10 +20,10 @@ from ibrobot_core.app import (
 
 
 def load_contract(path: str | Path) -> RobotConfig:
-    """Read and check a robot YAML for its contract, or a file with a `contract` section alone.
+    """Read and check a robot YAML for its contract, or a file with only a `contract` section.
 
-    Such a file is for converting foreign bags: its actions have `joints` in place of an executor. The robot of its
-    config has no name and no joints.
+    Such a file serves to convert foreign bags: its actions have `joints` in place of an executor, and the robot of
+    the returned config has no name and no joints.
 
     Raises:
         ConfigError: with all errors, in file order.

@@ -1,4 +1,4 @@
-"""What `ibrobot convert` takes, and the events that it prints: its command line and forms for it derive from these."""
+"""Options of `ibrobot convert`, and the events that it prints. Its command line and forms derive from these."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _some(instance: object, attribute: object, paths: tuple[Path, ...]) -> None:
 
 @attrs.frozen(kw_only=True)
 class ConvertOptions:
-    """What is converted into which dataset, and how."""
+    """Which episodes are converted into which dataset, and how."""
 
     episodes: tuple[Path, ...] = option(
         argument=True, names="episodes", validator=_some, help="episodes, or folders of them"
@@ -103,15 +103,15 @@ class Begin(Event):
 
 @attrs.frozen(kw_only=True)
 class Progress(Event):
-    """How far the conversion is."""
+    """Progress of the conversion."""
 
-    done: int = option(help="episodes that are done")
+    done: int = option(help="finished episodes")
     of: int = option(help="number of episodes")
-    frames: int = option(help="frames that are done")
+    frames: int = option(help="finished frames")
     total_frames: int = option(help="estimated number of frames")
-    seconds: float = option(unit="s", help="time since the begin")
-    episode: str = option("", help="the episode that is done with this event, if one is")
-    error: str = option("", help="why it is left out; empty if it is not")
+    seconds: float = option(unit="s", help="time since the conversion began")
+    episode: str = option("", help="the episode that finished with this event, if any")
+    error: str = option("", help="why it is left out; empty if it was converted")
 
     @override
     def shown(self) -> Shown:
@@ -127,9 +127,9 @@ class Report(Event):
     out: str = option(help="the dataset")
     episodes: int = option(help="episodes that were added")
     frames: int = option(help="their frames")
-    failed: int = option(help="episodes that are left out because of an error")
-    passed_over: int = option(help="episodes that were not to be converted")
-    resumed: int = option(help="episodes that an interrupted run had converted")
+    failed: int = option(help="episodes left out because of an error")
+    passed_over: int = option(help="episodes not selected, or already in the dataset")
+    resumed: int = option(help="episodes converted by an interrupted run")
     skipped_ticks: int = option(help="ticks left out because an observation was missing")
     held_ticks: int = option(help="ticks with a repeated observation")
     gaps: int = option(help="how often an observation went missing")

@@ -1,4 +1,4 @@
-"""Corrections: in the middle of an episode an operator takes the robot from a policy, and gives it back."""
+"""Corrections: within an episode, an operator takes the robot from a policy and gives it back."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Intervene:
 
 
 INTERVENE = Service(
-    "/intervene", Intervene, str, "Take the robot from its policy; answers with who commands then.", alone="take"
+    "/intervene", Intervene, str, "Take the robot from its policy; answers who commands from then on.", alone="take"
 )
 _RELEASE_S = 0.2
 """Longest time between two repeats of a held key [s]."""
@@ -51,14 +51,14 @@ _ANSWER_S = 60.0
 
 
 class Corrections(SourceWorker):
-    """Lets an operator take the robot from a policy and give it back, as often as wanted.
+    """Lets an operator take the robot from a policy and give it back, any number of times.
 
     At a takeover the policy's plan is dropped, the arm brakes and holds, and devices with motors are driven to its
-    pose. The operator's first command ends the handover; from then on the robot follows the devices, from where it is.
-    When the operator gives it back, it brakes again, and a new plan is requested, which begins where it holds. The
-    policy's observations are sampled all the time.
+    pose. The operator's first command ends the handover; then the robot follows the devices, starting from its present
+    position. When the operator gives it back, it brakes again, and the policy is asked for a new plan, which begins at
+    the held position. The policy's observations are sampled throughout.
 
-    `/commander` has who commands at each state of control: `policy`, `operator`, or `handover` while neither does.
+    `/commander` says who commands at each state of control: `policy`, `operator`, or `handover` while neither does.
 
     Args:
         session: the run.
@@ -84,11 +84,11 @@ class Corrections(SourceWorker):
         self._held = HeldKeys(_RELEASE_S)
         self._commander = POLICY
         self._taken = False
-        """Whether the operator has the robot, or is about to have it."""
+        """Whether the operator has or is about to get the robot."""
         self._aligned = True
         """Whether the devices may command: those with motors are at the robot's pose."""
         self._waiting = False
-        """Whether the policy was requested to go on and has not commanded yet."""
+        """Whether the policy was asked to continue and has not commanded yet."""
         self._engaged = False
         """Whether the devices commanded positions at the last state."""
         self._takeovers = 0
@@ -143,16 +143,16 @@ class Corrections(SourceWorker):
         self.session.commander = ""
 
     def intervene(self, take: bool | None = None) -> str:
-        """Take the robot from the policy, give it back, or toggle; returns who commands then.
+        """Take the robot from the policy, give it back, or toggle. Returns who commands from then on.
 
         Raises:
             NotSupported: if the mode has ended.
         """
         with self.lock:
             if not self.active:
-                raise NotSupported(f"mode {self.mode.name} does not run: nobody can take the robot from its policy")
+                raise NotSupported(f"mode {self.mode.name} is not running, so its policy cannot be interrupted")
             if self.session.faults:
-                raise NotSupported(f"nobody takes the robot before a reset: {self.session.faults[-1]}")
+                raise NotSupported(f"reset the robot before taking it from the policy: {self.session.faults[-1]}")
             self._change(not self._taken if take is None else take)
             return self._commander
 
@@ -180,9 +180,10 @@ class Corrections(SourceWorker):
         return {"takeovers": self._takeovers, "operator_s": round(seconds(self._commanded_ns), 3)}
 
     def _is_key_pressed(self) -> bool:
-        """Whether the key for takeovers was pressed: what may be a press takes the robot at once.
+        """Whether the key for takeovers was pressed.
 
-        It is given back by what is certainly a press, since repeats of a held key must not do so.
+        Anything that may be a press takes the robot at once. Only a certain press gives it back, not the repeats of a
+        held key.
         """
         key, held = self._options.takeover_key, self._held
         if self._taken:
@@ -278,7 +279,7 @@ class Corrections(SourceWorker):
             self._arm.brake()
 
     def _give_back(self) -> None:
-        """Request a plan of the policy once the arm holds; it commands when the plan has arrived."""
+        """Ask the policy for a plan once the arm holds. The policy commands from the plan's arrival."""
         acting = self.session.acting
         if not self._waiting and self._arm.at_rest:
             self._arm.hold(_ANSWER_S)
@@ -298,7 +299,7 @@ class Corrections(SourceWorker):
             self._publish()
 
     def _label(self, state: ControlState) -> None:
-        """Say who commanded in a state, in the thread that publishes it, however late `work` is."""
+        """Publish who commanded at a state, in the thread that publishes the state: `work` may be late."""
         if self.active:
             self._publish()
 

@@ -1,11 +1,10 @@
-"""Conversion of one episode into a staged dataset of one episode; runs in any process."""
+"""Convert one episode into a staged dataset of one episode, in any process."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import logging
-import os
 import shutil
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -36,6 +35,7 @@ from ibrobot_core.api import (
     RealClock,
     RecorderError,
     Robot,
+    sync,
 )
 from ibrobot_core.app import TASK_KEY, DiskFull, Ownership, installed_plugins
 from ibrobot_data.commanders import Commanders, stretches
@@ -57,7 +57,7 @@ _VERSION = 5
 
 @attrs.frozen(eq=False)
 class _Row:
-    """A row of the episode: key -> value, the task, and who commanded if it matters."""
+    """A row of the episode: key -> value, the task, and who commanded if the request needs it."""
 
     values: dict[str, NDArray[Any]]
     task: str
@@ -73,7 +73,7 @@ _KEEPS: Mapping[str, Callable[[_Row], bool]] = {
 
 @attrs.frozen
 class Job:
-    """One episode to convert, and the folder of its unit, which exists completely or not at all."""
+    """One episode to convert, and the folder of its unit, which is created atomically."""
 
     request: ConversionRequest
     episode: Path
@@ -81,13 +81,13 @@ class Job:
     unit: Path
 
     def making(self) -> Path:
-        """A new name for the unit while it is incomplete: another process may convert the episode at the same time."""
+        """A unique name for the incomplete unit, since another process may convert the episode at the same time."""
         return self.unit.with_name(f"{self.unit.name}{MAKING}{uuid4().hex}")
 
 
 @attrs.frozen
 class Unit:
-    """A converted episode, staged."""
+    """A converted episode in the staging folder."""
 
     path: Path
     key: str
@@ -122,7 +122,7 @@ def make_writer(request: ConversionRequest) -> DatasetWriter:
 
 
 def unit_key(job: Job) -> str:
-    """Hash of the input of a unit: the parts of the request that affect the data, and the episode's files."""
+    """Hash of a unit's input: the parts of the request that affect the data, and the episode's files."""
     request = job.request
     contract = request.contract.canonical() if request.contract is not None else None
     shaping = [
@@ -196,7 +196,7 @@ def _convert(
 
 
 def _put(making: Path, unit: Path, key: str) -> None:
-    """Make a folder the unit, unless another process has converted the same meanwhile."""
+    """Rename a folder to that of the unit, unless another process has converted the same episode."""
     try:
         making.rename(unit)
     except OSError:
@@ -216,10 +216,10 @@ def unwanted_outcome(summary: EpisodeSummary, request: ConversionRequest) -> str
 
 
 def stop_if_full(error: BaseException, source: str) -> None:
-    """Raise an error that ends the whole conversion if a full disk caused `error`, as it would fail the others too.
+    """End the whole conversion if a full disk caused `error`, since the other episodes would fail, too.
 
     Raises:
-        DiskFull: then.
+        DiskFull: if a full disk caused the error.
     """
     cause: BaseException | None = error
     while cause is not None:
@@ -229,7 +229,7 @@ def stop_if_full(error: BaseException, source: str) -> None:
 
 
 def unexpected(error: Exception) -> str:
-    """The message of an error that no interface allows, with the line that raised it."""
+    """Message for an error that no interface documents, with the line that raised it."""
     place = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(place.filename).name}:{place.lineno}"
     return f"{type(error).__name__}: {error} (at {where}): a fault in ibrobot or a plugin; please report it"
@@ -251,7 +251,7 @@ def _write(
     job: Job, key: str, reader: EpisodeReader, summary: EpisodeSummary, report: EpisodeReport, folder: Path,
     progress: Callable[[int], None],
 ) -> Unit | None:  # fmt: skip
-    """Write the dataset of one episode, and the record that describes the unit; None if no row is wanted."""
+    """Write the dataset of one episode and the record of the unit; returns None if no row is wanted."""
     request = job.request
     contract = _contract(request, summary)
     document = request.document or _recorded(summary, "config")
@@ -315,7 +315,7 @@ def _write(
 def _labelled(
     values: dict[str, NDArray[Any]], contract: Contract, tasks: Sequence[str], prompt: str
 ) -> tuple[dict[str, NDArray[Any]], str]:
-    """A row with its signals as the dataset has them, and its task: the prompt where no topic gives one."""
+    """A row with its signals in the dataset's types, and its task: the prompt unless a topic provides it."""
     signals = {part.key: values[part.key].astype(part.feature.dtype) for part in contract.signal_parts}
     number = signals.pop(TASK_KEY, None)
     rest = {key: value for key, value in values.items() if key != TASK_KEY}
@@ -331,7 +331,7 @@ def _add(
     writer: DatasetWriter, row: _Row, request: ConversionRequest, features: Mapping[str, Feature], *,
     last: bool, succeeds: bool = False,
 ) -> None:  # fmt: skip
-    """Write a row: `last` of an episode of the dataset, with which the recorded one `succeeds`."""
+    """Write a row. `last`: it ends an episode of the dataset. `succeeds`: the recorded episode succeeds with it."""
     added: dict[str, NDArray[Any]] = {SUCCESS: np.array([succeeds])} if request.success else {}
     if request.labels:
         added[INTERVENTION] = np.array([row.commander == OPERATOR])
@@ -340,7 +340,7 @@ def _add(
 
 
 def _features(contract: Contract, values: Mapping[str, NDArray[Any]], request: ConversionRequest) -> dict[str, Feature]:
-    """The contract's features, with the sizes found in the messages, its signals, and those that the request adds."""
+    """Features of the contract, with sizes from the messages, of its signals, and those that the request adds."""
     features = {key: attrs.evolve(each, shape=values[key].shape) for key, each in contract.features().items()}
     if request.labels:
         flag = Feature("bool", (1,))
@@ -412,8 +412,4 @@ def _sync(folder: Path) -> None:
     """Flush every file to the disk."""
     for path in folder.rglob("*"):
         if path.is_file():
-            descriptor = os.open(path, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            sync(path)

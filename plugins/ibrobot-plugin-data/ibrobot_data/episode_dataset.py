@@ -10,11 +10,11 @@ from typing import Any
 
 import yaml
 
-from ibrobot_core.api import Contract, RecorderError
+from ibrobot_core.api import Contract, RecorderError, replace_file
 from ibrobot_core.app import Ownership
 
 _WAIT_S = 10.0
-"""Others change `dataset.yaml` within milliseconds."""
+"""Time to wait for another process, which changes `dataset.yaml` within milliseconds."""
 
 
 class EpisodeDataset:
@@ -92,7 +92,7 @@ class EpisodeDataset:
 
     @contextmanager
     def _owned(self) -> Iterator[None]:
-        """Change `dataset.yaml` alone."""
+        """Lock `dataset.yaml` for a change."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             owned = Ownership(self._file, "is being changed", file=self._folder / ".dataset.lock", wait_s=_WAIT_S)
@@ -113,9 +113,7 @@ class EpisodeDataset:
         return document
 
     def _write(self, facts: dict[str, Any]) -> None:
-        staged = self._file.with_suffix(".yaml.new")
         try:
-            staged.write_text(yaml.safe_dump(facts, sort_keys=False, allow_unicode=True), encoding="utf-8")
-            staged.replace(self._file)
+            replace_file(self._file, yaml.safe_dump(facts, sort_keys=False, allow_unicode=True))
         except OSError as error:
             raise RecorderError(f"{self._file}: cannot be written: {error.strerror}") from None

@@ -1,4 +1,4 @@
-"""Commands an arm without a step while its commands pass from one source to another."""
+"""Smooth handover of an arm from one command source to another."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SHORTEST_S = 0.02
 
 
 class Handover:
-    """Brakes the joints of a mode to a stand, holds them, and joins the positions of an operator's devices.
+    """Brakes the joints of a mode to a stop, holds them, and blends into the positions of an operator's devices.
 
     All arrays have one element per joint, shape (J,), in robot order.
 
@@ -46,10 +46,10 @@ class Handover:
         self._rest_ns = 0
         """When braking ends [ns]."""
         self._gap, self._fade_ns, self._fade_s = self._command, 0, 1.0
-        """Distance from the devices' positions that fades out [rad], from when [ns], and for how long [s]."""
+        """Offset from the devices' positions that fades out [rad], start of the fade [ns], and its duration [s]."""
 
     def begin(self) -> None:
-        """Forget all states: another source commands the joints."""
+        """Forget all states, since another source commands the joints."""
         self._forget()
 
     def see(self, state: ControlState) -> None:
@@ -76,23 +76,23 @@ class Handover:
         return every
 
     def brake(self) -> None:
-        """Slow down to a stand along `v (1 - s)^2`, from which `hold` goes on."""
+        """Brake to a stop along `v (1 - s)^2`; `hold` continues from there."""
         speed = np.abs(self._velocity)
         brake_s = max(_SHORTEST_S, float((2 * speed / (_BRAKE_SHARE * self._max_acceleration)).max()))
         stop = self._command + self._velocity * brake_s / 3
         self._sent = np.clip(stop, np.minimum(self._lower, self._command), np.maximum(self._upper, self._command))
-        # From the last state on, so that the executor joins the plan from its present position and velocity.
+        # The plan begins at the last state, so that the executor joins it at its present position and velocity.
         self._send(self._seen_ns, brake_s, np.array((self._sent, self._sent)))
-        # The executor takes in the plan up to two periods later.
+        # The executor reads the plan up to two periods later.
         self.holds, self._rest_ns = True, self._seen_ns + ns(brake_s + 2 / self._session.config.control.rate_hz)
 
     def hold(self, for_s: float = 0.0) -> None:
-        """Hold where the joints came to rest, for a time [s] without being called again; does nothing before."""
+        """Hold the position of rest, for `for_s` [s] unless called again; does nothing while braking."""
         if self.at_rest:
             self._send(self._seen_ns, for_s, np.array((self._sent, self._sent)[: 1 + (for_s > 0)]))
 
     def follow(self, positions: Mapping[str, float]) -> None:
-        """Follow an operator: the distance between the held position and the first of these fades out along a cubic.
+        """Follow an operator. The offset between the held position and the first of these fades out along a cubic.
 
         Args:
             positions: joint -> position [rad]; other joints hold.

@@ -32,7 +32,7 @@ def identity(reader: EpisodeReader, summary: EpisodeSummary) -> str:
 
 
 def identity_by_uuid(summary: EpisodeSummary) -> str:
-    """The identity of an episode with a random UUID; empty for another one, whose messages would have to be read."""
+    """Identity of an episode with a random UUID; empty for others, whose messages would have to be read."""
     uuid = _random_uuid(summary.metadata)
     if not uuid:
         return ""
@@ -42,7 +42,7 @@ def identity_by_uuid(summary: EpisodeSummary) -> str:
 
 
 def recording_of(metadata: Mapping[str, str], identity: str) -> str:
-    """How the parts of an episode name it: by its UUID, or without a random one by its identity."""
+    """Name by which the parts of an episode refer to it: its random UUID, or else its identity."""
     return _random_uuid(metadata) or identity
 
 
@@ -59,13 +59,13 @@ class _Known:
 
     @classmethod
     def of(cls, kept: Mapping[str, Any]) -> _Known:
-        """From what the dataset stores about an episode."""
+        """Make from what the dataset stores about an episode."""
         recorded, identity = kept.get("recorded", {}), kept.get("identity", "")
         parts = frozenset(recorded.get(TRIMMED_FROM, "").split())
         return cls(kept["source"], kept.get("outcome", ""), identity, recording_of(recorded, identity), parts)
 
     def is_of(self, source: str, recording: str, trimmed_from: frozenset[str]) -> bool:
-        """Whether both are of one recording: one is a part of the other, or both are parts under one name."""
+        """Whether both are of one recording: one is a part of the other, or both are parts of a third."""
         if self.recording in {recording, *trimmed_from} or recording in self.trimmed_from:
             return True
         return source == self.source and not self.trimmed_from.isdisjoint(trimmed_from)
@@ -85,7 +85,7 @@ class KnownEpisodes:
         self._empty = not episodes
 
     def find(self, source: str, reader: EpisodeReader, summary: EpisodeSummary) -> str:
-        """Why the episode need not be added; empty if it is new.
+        """The reason not to add an episode; empty if it is new.
 
         Raises:
             DatasetError: when the dataset has the episode in another state, or with another outcome.

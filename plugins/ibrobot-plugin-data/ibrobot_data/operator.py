@@ -23,14 +23,14 @@ class Operator(RunHooks):
     Args:
         run: the run.
         service: begins and ends its episodes.
-        count: episodes to record; None: until Ctrl-C.
-        reset_time_s: pause after an episode, for setting the scene up again [s].
-        prompt: of all episodes; None asks the operator, and Enter repeats the last one.
+        count: number of episodes to record; None: until Ctrl-C.
+        reset_time_s: pause after each episode to reset the scene [s].
+        prompt: prompt of all episodes; None asks the operator, and Enter repeats the last one.
         auto: begin every episode automatically, and end it after the contract's `max_duration_s`. If the recorder
             fails, or the disk has no room for another episode, the run ends.
         continuous: one episode, from the first complete set of messages to the end of the run.
         keys: whether the run has a terminal for the operator's keys.
-        report: gets the state of the session whenever it changes.
+        report: receives the state of the session when it changes.
 
     Raises:
         NotSupported: with `continuous` if the mode begins and ends episodes itself, or if nothing can begin one.
@@ -44,8 +44,8 @@ class Operator(RunHooks):
             raise NotSupported(f"--continuous: mode {run.mode} begins and ends its episodes itself")
         if not (service.by_mode or auto or continuous or keys or _has_start_button(run)):
             raise NotSupported(
-                "without a terminal no key can begin an episode, and no device of mode "
-                f"{run.mode} has a button start: add --auto"
+                f"nothing can begin an episode: there is no terminal for keys, and no device of mode {run.mode} has a "
+                "button `start`; add --auto"
             )
         self._run = run
         self._service = service
@@ -93,7 +93,7 @@ class Operator(RunHooks):
 
     @property
     def _spoilt(self) -> int:
-        """Number of automatic episodes with a fault or emergency stop; others take their places."""
+        """Number of automatic episodes with a fault or emergency stop, which are repeated."""
         return self._run.outcome.disturbed if self._auto else 0
 
     @override
@@ -143,7 +143,7 @@ class Operator(RunHooks):
             (
                 "disk",
                 f"{status['free_bytes'] // _MIB} MiB left at {status['bytes_per_s'] / _MIB:.1f} MiB/s, "
-                f"{status['waiting_bytes'] / _MIB:.1f} MiB wait for it",
+                f"{status['waiting_bytes'] / _MIB:.1f} MiB queued",
             ),
             ("topics", rates or "none yet"),
         ]
@@ -178,7 +178,7 @@ class Operator(RunHooks):
             return f"recording{prompt}, {service.elapsed_s():.0f} s{left}"
         pause_s = self._not_before_s - self._clock_s()
         if pause_s > 0:
-            return f"set up the scene again, {pause_s:.0f} s"
+            return f"reset the scene, {pause_s:.0f} s"
         return "waiting: Tab starts" if self._keys and not (self._auto or self._service.by_mode) else "waiting"
 
     def _tell(self, *, ended: bool = False) -> None:

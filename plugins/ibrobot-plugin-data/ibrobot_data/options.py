@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ibrobot_core.app import RobotConfig
 
 COMMANDER = "/commander"
-"""std_msgs/msg/String: who commands the robot at a state of control, in modes with `intervene`."""
+"""Topic (std_msgs/msg/String) with who commands the robot at each state of control, in modes with `intervene`."""
 POLICY, OPERATOR, HANDOVER = "policy", "operator", "handover"
 """The words on `COMMANDER`; in a handover nobody commands, and the arm holds."""
 PLANNER = "planner"

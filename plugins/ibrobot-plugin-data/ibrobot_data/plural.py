@@ -1,8 +1,8 @@
-"""Words of the commands' messages."""
+"""Plurals in messages."""
 
 from __future__ import annotations
 
 
 def plural(number: int, noun: str) -> str:
-    """The noun after a number: `1 episode`, `2 episodes`."""
+    """Inflect a noun by a number: `1 episode`, `2 episodes`."""
     return noun if number == 1 else f"{noun}s"

@@ -1,4 +1,4 @@
-"""What a prompt may be: it goes into YAML and JSON files, into datasets, and to policies."""
+"""Check of prompts, which are written to YAML, JSON and datasets, and sent to policies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def check_prompt(prompt: str) -> str:
-    """The prompt, if every file can hold it.
+    """Return the prompt if every file format can hold it.
 
     Raises:
         RecorderError: if it is too long, or has control characters or halves of characters.

@@ -1,4 +1,4 @@
-"""What `ibrobot record` takes beside the options of every run, and the events that it prints."""
+"""Options of `ibrobot record` besides those of every run, and the events that it prints."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _check_prompt(instance: object, attribute: object, prompt: str | None) -> No
 
 @attrs.frozen(kw_only=True)
 class RecordOptions:
-    """What is recorded, and where."""
+    """Which episodes are recorded, and where."""
 
     prompt: str | None = option(
         None,

@@ -24,7 +24,7 @@ _SILENT_NS = NS_PER_S
 
 
 class NoRecording(Component):
-    """Stands for the recording in a run that records nothing."""
+    """Placeholder in a run that records nothing."""
 
     @override
     def start(self) -> None:

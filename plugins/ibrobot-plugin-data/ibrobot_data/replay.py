@@ -34,7 +34,7 @@ from ibrobot_data.replay_source import Replay, ReplaySource
 from ibrobot_data.same_robot import Identity
 
 _FAR = 0.5
-"""How far outside its limits a command may be, as a fraction of the joint's range; the safety layer clips it."""
+"""Maximum distance of a command from its limits, as a fraction of the joint's range; the safety layer clips it."""
 _MODE = "replay"
 """The name of the mode in which an episode is replayed."""
 
@@ -53,7 +53,7 @@ _MODE = "replay"
 @click.option("--force-contract", is_flag=True, help="Replay even if the observations of CONFIG differ.")
 @click.option("--any-robot", is_flag=True, help="Replay even if robot, robot type or calibration differ.")
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of joints in a dataset that does not state it.")
-@click.option("--calibration", metavar="NAME", help="Of such a dataset, if its unit needs one.")
+@click.option("--calibration", metavar="NAME", help="Calibration for such a dataset, if its unit needs one.")
 @run_options("overrides", "viewer", "headless", "dry_run", "as_json")
 def replay(
     episode: Path, config: str | None, speed: float, force_contract: bool, any_robot: bool, norm_mode: str | None,
@@ -82,9 +82,9 @@ def replay(
         playback = read_playback(reader, contract, ns(1.0 / robot.control.rate_hz))
         _check_limits(playback, robot.robot, episode)
     if still := [joint for joint in contract.action_joints if joint not in playback.joints]:
-        echo(f"{episode}: has no commands of {', '.join(still)}: they hold", err=True)
+        echo(f"{episode}: has no commands of {', '.join(still)}, which hold their positions", err=True)
     if not summary.finished:
-        echo(f"{episode}: was never finished; {playback.duration:.2f} s of it could be read", err=True)
+        echo(f"{episode}: is unfinished; {playback.duration:.2f} s of it can be replayed", err=True)
     run = Replay(str(episode), playback, speed)
     request = LaunchRequest(
         options["lockstep"], playback.seed or 0, source=lambda session, mode: ReplaySource(session, mode, run)
@@ -99,14 +99,14 @@ def replay(
 
 
 def _check_robot(robot: RobotConfig, summary: EpisodeSummary) -> None:
-    """Check that the robot is the recorded one, as far as the episode says."""
+    """Check that the robot is the recorded one, as far as the episode identifies it."""
     recorded = Identity.of_episode(summary.metadata)
     if difference := Identity.of_robot(robot).difference(recorded, "this robot"):
-        raise RecorderError(f"{summary.path}: {difference}; --any-robot replays it all the same")
+        raise RecorderError(f"{summary.path}: {difference}; --any-robot replays it regardless")
 
 
 def _check_limits(playback: Playback, robot: Robot, episode: Path) -> None:
-    """Check that no command is far outside the limits, as of a damaged file, another unit or another robot."""
+    """Check that no command is far outside the limits, e.g. in a damaged file or in another unit."""
     columns = robot.indices(playback.joints)
     lower, upper = robot.lower[columns], robot.upper[columns]
     beyond = np.maximum(lower - playback.commands.positions, playback.commands.positions - upper)
@@ -115,7 +115,7 @@ def _check_limits(playback: Playback, robot: Robot, episode: Path) -> None:
         raise RecorderError(
             f"{episode}: {playback.joints[column]} is commanded to {playback.commands.positions[row, column]:.4g} rad "
             f"{playback.commands.times[row]:.2f} s after the first command, far outside its limits "
-            f"{lower[column]:.4g} to {upper[column]:.4g} rad: it is damaged, or has another unit"
+            f"{lower[column]:.4g} to {upper[column]:.4g} rad: the file is damaged, or its unit is not rad"
         )
 
 
@@ -149,7 +149,7 @@ def _recorded(summary: EpisodeSummary, changes: tuple[str, ...], *, sim: bool) -
 
 
 def _mode(robot: RobotConfig) -> str:
-    """The override that adds the mode of the replay: the executors of the contract's actions, with nothing else."""
+    """The override that adds the mode of the replay, with only the executors of the contract's actions."""
     executors = ", ".join(dict.fromkeys(spec.executor for spec in robot.contract.actions))
     return f"control_modes.{_MODE}={{executors: [{executors}]}}"
 

@@ -18,7 +18,7 @@ _PEAK_SPEED, _PEAK_ACCELERATION = 1.5, 6.0
 _AHEAD_NS = NS_PER_S
 """Duration of the motion that one plan covers [ns]."""
 _SETTLE_NS = NS_PER_S
-"""How long a scene may take to succeed after the last command, if the recording succeeded [ns]."""
+"""Maximum time from the last command to the success of the scene, if the recording succeeded [ns]."""
 
 
 @attrs.frozen(eq=False)
@@ -68,7 +68,7 @@ class ReplaySource(SourceWorker):
         if not self.session.config.simulated or recorded is None:
             return
         if not self.session.command("reset_episode", seed=recorded)["begun"]:
-            raise HardwareError("the replay does not begin before a reset: an emergency stop is latched")
+            raise HardwareError("the replay cannot begin: reset the emergency stop first")
 
     @override
     def work(self, timeout_s: float) -> None:

@@ -1,4 +1,4 @@
-"""A whole conversion: finds episodes, converts them in parallel into staged units, and merges these in order."""
+"""A conversion: find episodes, convert them in parallel into staged units, and merge these in order."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ STAGING = ".staging"
 _LOCK = "lock"
 _THERE = "{}: already has a dataset; --append adds to it"
 _MAP_FROM, _KEEP = 512 << 10, 8 << 20
-"""Thresholds of malloc [bytes]: freed images go back to the system, since they would fragment the heap."""
+"""Thresholds of malloc [bytes], so that freed images return to the system instead of fragmenting the heap."""
 
 Watch = Callable[[int, int, EpisodeReport | None], None]
-"""Receives the frames done, the estimated total, and the report of the episode just done, if any."""
+"""Receives the number of finished frames, the estimated total, and the report of an episode if one has finished."""
 
 
 def find_episodes(paths: Sequence[Path]) -> list[Path]:
-    """The episodes that `paths` name: episodes, `DATASET:N`, or folders of them. Each appears once, in numeric order.
+    """Find the episodes in `paths`: episodes, `DATASET:N`, or folders of them. Each appears once, in numeric order.
 
     Raises:
         RecorderError: for a path that neither is nor contains an episode.
@@ -94,7 +94,7 @@ def convert(
             _check_old(request, old)
         plan = _Plan(request, staging, old, episodes)
         request = plan.request
-        # Without --append nothing may be added, but the same command may have been killed when it had merged.
+        # Without --append nothing may be added, unless the same command was killed after the merge.
         if old is not None and not request.append and plan.adds(old):
             raise DatasetError(_THERE.format(request.out))
         reports = plan.run(watch)
@@ -122,7 +122,7 @@ def _merge(
     """Add the units to the dataset."""
     writer = make_writer(request)
     if writer.summary(request.out) != old:
-        raise DatasetError(f"{request.out}: was changed by another program meanwhile; run the same command again")
+        raise DatasetError(f"{request.out}: another program has changed it; run the same command again")
     writer.merge(request.out, [unit.dataset for unit in units], provenance(request, old, units, failed))
 
 
@@ -136,7 +136,7 @@ def clear_staging(staging: Path) -> None:
 
 
 def _remove_unfinished(staging: Path) -> None:
-    """Remove what processes that died have left of their units."""
+    """Remove incomplete units of processes that died."""
     for folder in staging.glob(f"*{MAKING}*"):
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -159,7 +159,7 @@ def _staging(request: ConversionRequest) -> Iterator[tuple[Path, DatasetSummary 
 
 @contextmanager
 def own_staging(out: Path) -> Iterator[None]:
-    """A context in which nobody else converts into `out`; afterwards, folders that stayed empty are removed.
+    """Lock `out` against other conversions; afterwards, remove folders that are still empty.
 
     Raises:
         InUse: if another conversion into it is running.
@@ -201,7 +201,7 @@ class _Plan:
         self, request: ConversionRequest, staging: Path, old: DatasetSummary | None, episodes: Sequence[Path]
     ) -> None:
         self.request = request
-        """Adds labels if the dataset has them, or if there is none and an episode says who commanded."""
+        """The request, with labels if the dataset has them, or if it is new and an episode records who commanded."""
         self._staging = staging
         self._reports: dict[str, EpisodeReport] = {}
         self._jobs: dict[str, Job] = {}
@@ -210,7 +210,7 @@ class _Plan:
         self._copies: dict[str, str] = {}
         """Source -> the source of which it is a copy; not converted unless that one fails."""
         self._alike: dict[Any, list[Job]] = {}
-        """What copies have in common, as far as summaries tell -> episodes that the dataset does not have."""
+        """Properties in which the summaries of copies agree -> new episodes with them."""
         self.resumed = 0
         self.sources: dict[str, None] = {}
         self._identities: dict[str, str] = {}
@@ -266,7 +266,7 @@ class _Plan:
         return tuple(source for source in self._jobs if source not in self._copies)
 
     def adds(self, old: DatasetSummary) -> bool:
-        """Whether there are episodes to convert that an earlier run did not have to leave out."""
+        """Whether there are episodes to convert besides those in which an earlier run failed."""
         failed = {source for run in old.metadata.get("runs", ()) for source in run["failed"]}
         return not failed.issuperset(self._jobs)
 
@@ -370,8 +370,8 @@ def _run_in_pool(
             report, job = done.result(), done.job.argument
             if report.kept and not job.unit.exists():
                 raise DatasetError(
-                    f"{job.unit}: was written, but is not there: episodes and dataset must be in a folder that all "
-                    "machines of the pool share"
+                    f"{job.unit}: not found after a machine of the pool wrote it: episodes and dataset must be in a "
+                    "folder that all machines of the pool share"
                 )
             watch(frames, report)
             yield report
@@ -380,7 +380,7 @@ def _run_in_pool(
 def _refuse_misfits(
     request: ConversionRequest, units: Sequence[Unit], old: DatasetSummary | None
 ) -> dict[str, EpisodeReport]:
-    """Reports of the units that do not fit the dataset, or the first unit if there is no dataset yet."""
+    """Refuse units that do not fit the dataset, or the first unit if the dataset is new."""
     if not units:
         return {}
     fps, features, contract = units[0].fps, units[0].features, units[0].contract
@@ -401,7 +401,7 @@ def _refuse_misfits(
         elif not request.any_robot and (
             difference := robot.difference(Identity.of_unit(unit.recorded, unit.robot_type, unit.calibration), first)
         ):
-            wrong = f"{difference}; --any-robot merges them all the same"
+            wrong = f"{difference}; --any-robot merges them regardless"
         if wrong:
             refused[unit.report.source] = attrs.evolve(unit.report, error=wrong)
     return refused

@@ -1,4 +1,4 @@
-"""Which robot recorded an episode: its name, type and calibration, compared before a replay or a merge."""
+"""Identity of the robot that recorded an episode, compared before a replay or a merge."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Identity:
         )
 
     def difference(self, other: Identity, this_name: str) -> str:
-        """How another robot differs, where both are known; empty if it is the same.
+        """Describe how another robot differs, where both are known; empty if it does not.
 
         Args:
             other: the other robot.

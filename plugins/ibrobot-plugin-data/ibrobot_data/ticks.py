@@ -30,7 +30,7 @@ from ibrobot_core.app import TASK_KEY, Align, FrameAssembler, SignalPart, value_
 
 ACTION = "action"
 _LONGEST_SILENCE_S = 60
-"""Longest time without a message of any topic [s]; a damaged stamp would otherwise produce rows for years."""
+"""Maximum time without a message of any topic [s]; a damaged stamp could otherwise produce years of rows."""
 _ANY_AGE = Align("asof", "receive", 1e12)
 """For signals, which may pause."""
 
@@ -40,13 +40,11 @@ type _Incomplete = tuple[int, frozenset[str]]
 
 
 def with_action(contract: Contract) -> Contract:
-    """The contract whose observations include the action: the commands of the executors, read back from their topics.
+    """Return the contract with the action as an observation: the commands of the executors, read from their topics.
 
-    With `align: hold` a row has the command in effect at its tick: the one that the robot followed at the observation,
-    after the safety layer. Commands at the control rate are at most one control period old; of commands as slow as the
-    ticks it is the one before the observation. With `align: next` it is the first command
-    after the tick. A command further from the tick than `max_age` is missing. Signals are aligned in the same way, but
-    count at any age; tasks are numbers, which index `Ticks.tasks`.
+    With `align: hold` a row has the command in effect at its tick, after the safety layer. With `align: next` it has
+    the first command after the tick. A command further from the tick than `max_age` is missing. Signals are aligned in
+    the same way, at any age; tasks are indices into `Ticks.tasks`.
     """
     parts = tuple(
         ObservationPart(
@@ -63,7 +61,7 @@ def with_action(contract: Contract) -> Contract:
 
 
 def _command(part: ActionPart, contract: Contract) -> Align:
-    """How the commands of a part become actions; `_Following` bounds the distance of those after the tick."""
+    """Alignment of a part's commands; for those after the tick, `_Following` limits the distance."""
     return _ANY_AGE if part.align == "next" else Align("asof", "receive", _max_age(part, contract) * 1e3)
 
 
@@ -87,12 +85,10 @@ def _is_task(part: ActionPart | SignalPart) -> bool:
 
 
 class _Following:
-    """The messages of a topic, each with the time of receipt of the one before it, or of the episode's start.
-
-    The newest of these at a tick is then the first that was received after it.
+    """Messages of a topic, each stamped with the receipt of the previous one, or with the episode's start.
 
     Args:
-        max_age_ns: how long after a tick its message may be received [ns]; None for any time.
+        max_age_ns: maximum time from a tick to the receipt of its message [ns]; None for no limit.
     """
 
     def __init__(self, reader: EpisodeReader, part: ActionPart | SignalPart, max_age_ns: int | None) -> None:
@@ -100,7 +96,7 @@ class _Following:
         self.end_ns: int | None = None
         """Receipt of the last message [ns]; None until it is known."""
         self._silences: deque[tuple[int, int]] = deque()
-        """The times that no message follows soon enough [ns]: from the first, up to but without the second."""
+        """Half-open intervals of ticks that no message follows within `max_age_ns` [ns]."""
 
     def __iter__(self) -> Iterator[Recorded]:
         before_ns = self._reader.summary().start_ns
@@ -197,9 +193,9 @@ class _Source:
             return False
         if (silent_s := seconds(recorded.received_ns - self._newest_ns)) > _LONGEST_SILENCE_S:
             raise RecorderError(
-                f"no message of the contract comes for {silent_s:.0f} s, from "
-                f"{seconds(self._newest_ns - self.first_ns):.3f} s after the beginning on; at most "
-                f"{_LONGEST_SILENCE_S} s may pass: `ibrobot episodes trim` takes the parts before and after"
+                f"no topic of the contract has a message for {silent_s:.0f} s, from "
+                f"{seconds(self._newest_ns - self.first_ns):.3f} s after the beginning; at most {_LONGEST_SILENCE_S} s "
+                "are allowed: `ibrobot episodes trim` extracts the parts before and after"
             )
         self._read.append(recorded)
         self._newest_ns = recorded.received_ns
@@ -273,12 +269,12 @@ class Ticks:
 
     @property
     def skipped(self) -> int:
-        """Ticks left out because something was missing."""
+        """Number of incomplete ticks left out."""
         return sum(count for _, count in self.cuts)
 
     @property
     def resets(self) -> Mapping[str, int]:
-        """How often the stamps of a topic jumped; topics without a jump are left out, and signals, which may pause."""
+        """Topic -> number of jumps of its stamps, where there are any; without signals, which may pause."""
         return {topic: count for topic, count in self._assembler.resets().items() if topic not in self._signals}
 
     def __iter__(self) -> Iterator[dict[str, NDArray[Any]]]:
@@ -324,7 +320,7 @@ class Ticks:
             self._leave_out(sorted(frozenset.union(*late)), leading[0][0], len(leading))
 
     def _leave_out(self, keys: Sequence[str], t_ns: int, count: int) -> None:
-        """Leave out `count` ticks from `t_ns` [ns] on, at an end of the episode, where nothing can be held."""
+        """Leave out `count` ticks from `t_ns` [ns] at the beginning or end, where no value can be held."""
         if self._missing == "refuse":
             self._refuse(keys, t_ns)
         for key in keys:
@@ -356,10 +352,10 @@ class Ticks:
         """Why no tick was complete."""
         absent = frozenset.intersection(*(missing for _, missing in leading)) if leading else frozenset()
         if not absent:
-            return "each time another was missing"
+            return "a different one was missing each time"
         return (
-            f"{', '.join(sorted(absent))} is missing at every one (held values count for {self._contract.max_age:g} s, "
-            "contract.max_age)"
+            f"{', '.join(sorted(absent))} is missing at every tick (contract.max_age limits the age of held values to "
+            f"{self._contract.max_age:g} s)"
         )
 
 

@@ -143,7 +143,7 @@ class _Job:
         return attrs.evolve(report, frames=frames)
 
     def _known(self, summary: EpisodeSummary, digest: str) -> str:
-        """Why it need not be converted: the target is this episode."""
+        """The reason not to convert it: the target exists and is this episode."""
         reader = installed_plugins().open_episode(self._target)
         try:
             there = reader.summary()

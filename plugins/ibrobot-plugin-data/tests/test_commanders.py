@@ -66,5 +66,5 @@ def test_without_messages_the_mode_says_who_commands(mode: dict[str, Any], who: 
 
 
 def test_an_episode_that_does_not_say_who_commanded_is_refused() -> None:
-    with pytest.raises(RecorderError, match="nothing says who commanded: it has no /commander"):
+    with pytest.raises(RecorderError, match="it is unknown who commanded: the episode has no /commander"):
         commanders({})

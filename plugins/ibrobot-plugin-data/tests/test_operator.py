@@ -206,7 +206,7 @@ def test_unattended_episodes_pause_and_end_with_the_count(record: Record):
     run = record(auto=True, count=2, reset_time_s=0.5, prompt="pick")
     run.step(50 + 2)
     assert run.service.saved == 1
-    assert "set up the scene again" in run.operator.line()
+    assert "reset the scene" in run.operator.line()
     run.step(200)
     assert run.finished
     assert run.operator.summary_rows()[0][1].startswith("2 of 2 episodes into")
@@ -297,7 +297,7 @@ def test_without_a_terminal_the_buttons_of_a_device_begin_and_end_episodes(recor
 
 
 def test_nobody_can_begin_an_episode_without_keys_buttons_and_auto(record: Record):
-    message = "without a terminal no key can begin an episode, and no device of mode teleop has a button start"
+    message = "nothing can begin an episode: there is no terminal for keys, and no device of mode teleop has a button"
     with pytest.raises(NotSupported, match=f"{message}: add --auto") as caught:
         record(keys=False)
     assert caught.value.exit_code == 2

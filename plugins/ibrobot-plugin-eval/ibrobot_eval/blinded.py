@@ -1,4 +1,4 @@
-"""Runs blinded trials with an operator, who does not learn which policy acts."""
+"""Blinded trials: an operator judges them without learning which policy acts."""
 
 from __future__ import annotations
 
@@ -40,35 +40,35 @@ from ibrobot_eval.statistics import decided_by
 from ibrobot_eval.trials import FAILURE, OUTCOMES, SEALED, SUCCESS, VOID, Order, Trial
 
 NEEDED = {0.1: 770, 0.2: 164, 0.3: 69}
-"""Difference -> trials of each policy with which it is found with a probability of 80 %, by `episodes_for`."""
+"""Difference of success rates -> trials of each policy that detect it with a power of 80 %, by `decided_by`."""
 LOG = "trials.log"
 _POLL_S = 0.05
 STARTS = "starts"
 """Folder of the pictures of the starts."""
 _KEYS = {outcome[0]: outcome for outcome in OUTCOMES}
 _JUDGE = tuple(Choice(key=key, text=outcome) for key, outcome in _KEYS.items())
-_ENDS = "how does it end"
+_OUTCOME = "outcome"
 _STOP = Choice(key="esc", text="emergency stop", urgent=True)
 
 
 def power(trials: int) -> list[str]:
-    """What so many trials of each policy can show, for the operator."""
+    """Statistical power of this number of trials of each policy, in words for the operator."""
     needed = ", ".join(f"{100 * difference:g} points: {number}" for difference, number in NEEDED.items())
     found = []
     for difference in NEEDED:
         chance = decided_by(0.5 + difference / 2, 0.5 - difference / 2, trials)[-1]
-        found.append(f"{100 * difference:g} points with {100 * chance:.0f} %")
+        found.append(f"{100 * difference:g} points: {100 * chance:.0f} %")
     return [
-        f"trials of each policy that find a difference of success rates with a probability of 80 %: {needed}",
-        f"the number asked for, {trials}, finds {', '.join(found)}",
+        f"trials of each policy that detect a difference of success rates with a probability of 80 %: {needed}",
+        f"probability with {trials} trials of each policy: {', '.join(found)}",
     ]
 
 
 class Blinding:
-    """Replaces words that tell the policies apart.
+    """Replaces words that identify a policy.
 
     Args:
-        words: the words.
+        words: the words to replace.
     """
 
     def __init__(self, words: Iterable[str]) -> None:
@@ -77,7 +77,7 @@ class Blinding:
 
     @classmethod
     def of(cls, policies: Iterable[Policy]) -> Blinding:
-        """For the names of policies, modes and models, and the texts in the models' options, e.g. paths."""
+        """Blind the names of policies, modes and models, and texts in the models' options, e.g. paths."""
         words: set[str] = set()
         for policy in policies:
             options = attrs.asdict(policy.load().models[policy.model].options).values()
@@ -86,12 +86,12 @@ class Blinding:
         return cls(words)
 
     def __call__(self, text: str) -> str:
-        """The text without those words."""
+        """Return the text with each of the words replaced by POLICY."""
         return self._words.sub("POLICY", text)
 
 
 class _BlindFormatter(LogFormatter):
-    """Formats log records without the words that tell the policies apart."""
+    """Formats log records without words that identify a policy."""
 
     def __init__(self, blinding: Blinding) -> None:
         super().__init__("%(levelname).1s %(message)s")
@@ -104,7 +104,7 @@ class _BlindFormatter(LogFormatter):
 
 @contextmanager
 def _blind_log(out: Path, blinding: Blinding) -> Iterator[None]:
-    """Write the log into the folder, and warnings to the screen, without the words that tell the policies apart."""
+    """Log to a file in the folder, and warnings to the screen, without words that identify a policy."""
     file, screen = logging.FileHandler(out / LOG, encoding="utf-8"), logging.StreamHandler(sys.stderr)
     screen.setLevel(logging.WARNING)
     for handler in (file, screen):
@@ -121,12 +121,12 @@ def _blind_log(out: Path, blinding: Blinding) -> Iterator[None]:
 
 
 class Blinded:
-    """The trials of an evaluation, one after another.
+    """Runs the blinded trials of an evaluation.
 
     Args:
-        request: what the user asks for.
-        reset: a command that resets the scene before each trial; empty if the operator does it.
-        operator: who judges them.
+        request: the evaluation.
+        reset: command that resets the scene before each trial; empty if the operator resets it.
+        operator: judges the trials.
     """
 
     def __init__(self, request: Request, reset: Sequence[str], operator: Operator) -> None:
@@ -139,10 +139,10 @@ class Blinded:
         self._robot = request.policies[0].load()
 
     def run(self) -> bool:
-        """Run trials until there are enough, or until they decide; returns whether that is so.
+        """Run trials until all are done or the comparison is decided. Returns False if the operator ends before that.
 
         Raises:
-            IbrobotError: if there is no operator.
+            IbrobotError: if nobody can be asked.
             DatasetError: if the order has been opened.
         """
         if self._enough():
@@ -160,7 +160,7 @@ class Blinded:
         return True
 
     def report(self) -> Report:
-        """Open the order, and report on the trials of the complete blocks. No trial can follow."""
+        """Open the sealed order, and report on the trials of complete blocks. No trial can follow."""
         results = self._results(self._order.open())
         numbers = {(each.block, each.place): each.number for each in self._order.trials if each.outcome != VOID}
         episodes = [
@@ -189,7 +189,7 @@ class Blinded:
         return Result(trial.block, success, trial.time_s, trial.interventions, trial.faults, {}, {})
 
     def _trial(self) -> None:
-        """Run the next trial, and keep the operator's judgement."""
+        """Run the next trial, and store the operator's judgement."""
         block, place, label = self._order.next()
         number = len(self._order.trials) + 1
         operator = self._operator
@@ -199,7 +199,7 @@ class Blinded:
             ran = self._run(self._policies[label], number, block, starts)
         except IbrobotError as error:
             failed = self._blinding(f"trial {number} did not run: {error_line(error)}")
-            operator.ask(failed, (Choice(key="enter", text="try it again"), QUIT))
+            operator.ask(failed, (Choice(key="enter", text="try again"), QUIT))
             return
         outcome = ran.outcome or _KEYS[operator.ask(f"trial {number} has ended", (*_JUDGE, QUIT))]
         reason = ""
@@ -212,7 +212,7 @@ class Blinded:
         operator.say(f"trial {number}: {outcome}")
 
     def _prepare(self, number: int, block: int, starts: StartPictures) -> None:
-        """Have the scene reset, and wait for the operator."""
+        """Reset the scene, and wait for the operator."""
         operator = self._operator
         if self._reset:
             operator.say("resetting the scene …")
@@ -223,7 +223,7 @@ class Blinded:
         with ExitStack() as stack:
             shows = operator.sees and not simulated
             if shows and (problems := stack.enter_context(live_pictures(self._robot, live))):
-                operator.say(f"without live pictures: {problems}")
+                operator.say(f"no live pictures: {problems}")
             sights = starts.sights(live)
             scene = "the simulation resets the scene" if simulated else f"set the scene to start {block + 1}"
             if any(each.wanted for each in sights) and not simulated:
@@ -232,7 +232,7 @@ class Blinded:
             operator.ask(text, (Choice(key="enter", text="begin the trial"), QUIT), sights)
 
     def _run(self, policy: Policy, number: int, block: int, starts: StartPictures) -> _Ran:
-        """Run a policy until the operator judges it, or until its time is over."""
+        """Run a policy until the operator judges it or its time is up."""
         config = policy.load()
         assert config.recording is not None
         scratch = self._request.out / SCRATCH / _name(number)
@@ -244,14 +244,14 @@ class Blinded:
         seed = self._request.seed + block
         session = Session(config, installed_plugins(), LaunchRequest(False, seed, duration_s, episodes))
         runtime = Runtime(session)
-        # The picture is that of the trial before which the scene was set to a new start.
+        # The first trial of a block defines the picture of its start.
         pictures = starts.taken(session.bus) if all(each.outcome == VOID for each in self._order.of(block)) else None
         judged: list[str] = []
         self._operator.say("starting …")
         with _ended_by_signals(session) as came, _listening(self._operator, session, judged):
             runtime.start()
             self._operator.say(f"trial {number} is running")
-            self._operator.put(_ENDS, (*_JUDGE, _STOP))
+            self._operator.put(_OUTCOME, (*_JUDGE, _STOP))
             try:
                 while not runtime.wait(_POLL_S):
                     if pictures is not None:
@@ -268,7 +268,7 @@ class Blinded:
         runtime.raise_failure()
         episode = self._request.out / SEALED / _name(number)
         for bag in recording.folder.glob("episodes/*/"):
-            shutil.rmtree(episode, ignore_errors=True)  # of a trial that was not judged
+            shutil.rmtree(episode, ignore_errors=True)  # left by a trial that was not judged
             episode.parent.mkdir(parents=True, exist_ok=True)
             bag.rename(episode)
         counts = session.counts()["safety"]
@@ -283,17 +283,17 @@ def _name(number: int) -> str:
 
 @attrs.frozen
 class _Ran:
-    """A trial that has run."""
+    """A finished trial."""
 
     outcome: str
-    """As the operator judged it while it ran; empty if it ended by itself."""
+    """The operator's judgement while it ran; empty if it ended by itself."""
     time_s: float
     interventions: dict[str, int]
     faults: tuple[str, ...]
 
 
 def reset_of(options: EvalOptions) -> Sequence[str]:
-    """The command that resets the scene; empty without one.
+    """The command that resets the scene; empty if there is none.
 
     Raises:
         PluginError: if no installed plugin performs tasks.
@@ -307,7 +307,7 @@ def reset_of(options: EvalOptions) -> Sequence[str]:
 
 
 def _failure_of(command: Sequence[str]) -> str:
-    """Run a command; returns why it failed, empty if it did not."""
+    """Run a command. Returns why it failed; empty if it succeeded."""
     try:
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     except OSError as error:
@@ -317,7 +317,7 @@ def _failure_of(command: Sequence[str]) -> str:
 
 
 def _judge(session: Session, judged: list[str], key: str) -> bool:
-    """Judge a running trial, which ends it; False if it does not run."""
+    """Judge a running trial, which ends it. Returns False if none is running."""
     with session.changing:  # a simulated episode may end at the same time
         if not session.episodes.running:
             return False
@@ -329,7 +329,7 @@ def _judge(session: Session, judged: list[str], key: str) -> bool:
 
 @contextmanager
 def _ended_by_signals(session: Session) -> Iterator[list[int]]:
-    """End the run in an orderly way at Ctrl-C, SIGTERM and SIGHUP; gives a list of those that came."""
+    """End the run in order at Ctrl-C, SIGTERM and SIGHUP. Yields the list of signals received so far."""
     came: list[int] = []
 
     def end(number: int, frame: object) -> None:
@@ -346,7 +346,7 @@ def _ended_by_signals(session: Session) -> Iterator[list[int]]:
 
 @contextmanager
 def _listening(operator: Operator, session: Session, judged: list[str]) -> Iterator[None]:
-    """Stop the robot at Esc, from a thread that waits for nothing else; other answers judge."""
+    """Handle answers in a thread that does nothing else: Esc stops the robot, others judge the trial."""
     ended = threading.Event()
 
     def work() -> None:
@@ -361,9 +361,9 @@ def _listening(operator: Operator, session: Session, judged: list[str]) -> Itera
                     session.emergency_stop()
                 except IbrobotError as error:
                     session.log.error("%s", error)
-                operator.put(_ENDS, (*_JUDGE, _STOP))
+                operator.put(_OUTCOME, (*_JUDGE, _STOP))
             elif given is not None and not _judge(session, judged, given):
-                operator.put(_ENDS, (*_JUDGE, _STOP))
+                operator.put(_OUTCOME, (*_JUDGE, _STOP))
 
     thread = threading.Thread(target=work, name="answers to the trial", daemon=True)
     thread.start()

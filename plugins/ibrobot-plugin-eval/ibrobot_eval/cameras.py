@@ -1,4 +1,4 @@
-"""Pictures of the scene for the operator of blinded trials: as it was at a start, and as it is."""
+"""Pictures of the scene for the operator of blinded trials: as it was at the start of a block, and live."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def cameras_of(config: RobotConfig) -> list[str]:
 
 
 def as_jpeg(message: Message) -> bytes | None:
-    """A camera's picture as JPEG; None for what has no colours, e.g. depth."""
+    """A camera's picture as JPEG; None for images without colours, e.g. depth."""
     if isinstance(message, CompressedImage):
         return message.data.tobytes() if is_jpeg(message) else None
     if isinstance(message, Image) and fits_jpeg(message):
@@ -33,18 +33,22 @@ def as_jpeg(message: Message) -> bytes | None:
 
 
 class StartPictures:
-    """The pictures of a start: the first ones of a run, one of each camera.
+    """Pictures of the scene at the start of a block, one of each camera: the first of a run.
 
     Args:
-        folder: where they are.
-        cameras: the cameras.
+        folder: the folder for the pictures.
+        cameras: names of the cameras.
     """
 
     def __init__(self, folder: Path, cameras: list[str]) -> None:
         self._files = {name: folder / f"{name}.jpg" for name in cameras}
 
     def sights(self, live: Path | None) -> list[Sight]:
-        """What the operator sees of the cameras with a picture of the start, or a live one."""
+        """The pictures to show: for each camera that of the start, the live one, or both.
+
+        Args:
+            live: folder of the live pictures; None without them.
+        """
         found = []
         for name, file in self._files.items():
             wanted = str(file) if file.exists() else ""
@@ -55,7 +59,7 @@ class StartPictures:
         return found
 
     def taken(self, bus: Bus) -> TakenPictures:
-        """Takes them in a run, instead of the present ones."""
+        """Take new pictures from a run, in place of the old ones."""
         return TakenPictures(bus, self._files)
 
 
@@ -68,7 +72,7 @@ class TakenPictures:
         }
 
     def take(self) -> None:
-        """Write what has come by now."""
+        """Write the pictures that have arrived."""
         for file, images in tuple(self._todo.items()):
             for each in images.drain():
                 if (content := as_jpeg(each.message)) is not None:
@@ -79,9 +83,10 @@ class TakenPictures:
 
 @contextmanager
 def live_pictures(config: RobotConfig, folder: Path) -> Iterator[str]:
-    """Write the present pictures of the cameras of a robot that does not run, each again and again into one file.
+    """Keep one file per camera up to date with its newest picture, while the robot does not run.
 
-    Yields what went wrong with cameras; empty if nothing did.
+    Yields:
+        The faults of cameras, in words; empty without faults.
     """
     registry, clock = installed_plugins(), RealClock()
     problems: list[str] = []
@@ -105,7 +110,7 @@ def live_pictures(config: RobotConfig, folder: Path) -> Iterator[str]:
 def _follow(
     sensor: Sensor, name: str, file: Path, ready: threading.Event, ended: threading.Event, problems: list[str]
 ) -> None:
-    """Write the pictures of a camera until the end; `ready` once there is one, or none will come."""
+    """Write the pictures of a camera until `ended`; set `ready` after the first one or a fault."""
     staged = file.with_suffix(".new")
     try:
         sensor.open()

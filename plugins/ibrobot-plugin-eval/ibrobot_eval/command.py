@@ -1,4 +1,4 @@
-"""`ibrobot eval`: counts the successes of policies on the same seeds, and says whether they differ."""
+"""`ibrobot eval`: count the successes of policies on the same seeds, and say whether they differ."""
 
 from __future__ import annotations
 
@@ -68,15 +68,15 @@ def evaluate(
             sys.exit(_INTERRUPTED)
     if report is None:
         if events:
-            emit(EVAL, Told(text="to be continued: start the same evaluation again"))
+            emit(EVAL, Told(text="not finished: start the same evaluation again to continue"))
         else:
-            echo("to be continued: run the same command again")
+            echo("not finished: run the same command again to continue")
     else:
         _tell(request, report, events=events, as_json=as_json)
 
 
 def _checked(options: EvalOptions, policies: Sequence[Policy]) -> bool:
-    """Whether the evaluation consists of blinded trials.
+    """Return whether the evaluation consists of blinded trials.
 
     Raises:
         UsageError: for options that do not fit together.
@@ -92,10 +92,10 @@ def _checked(options: EvalOptions, policies: Sequence[Policy]) -> bool:
     if options.shard and (trials or options.until_decided):
         raise click.UsageError("--shard has a fixed number of episodes; give neither --until-decided nor --trials")
     if not options.seeds:
-        raise click.UsageError(f"--shard {options.shard}: {options.episodes} episodes are fewer than its parts")
+        raise click.UsageError(f"--shard {options.shard}: there are more shards than episodes ({options.episodes})")
     for given, flag in ((options.reset, "--reset"), (options.reset_task, "--reset-task"), (options.open, "--open")):
         if given and not trials:
-            raise click.UsageError(f"{flag} is for blinded trials; episodes are simulated")
+            raise click.UsageError(f"{flag} is for blinded trials, not for episodes in simulation")
     if options.reset and options.reset_task:
         raise click.UsageError("--reset and --reset-task exclude each other")
     return trials
@@ -114,7 +114,7 @@ def _tell(request: Request, report: Report, *, events: bool, as_json: bool) -> N
 
 
 def _evaluated(request: Request, evaluation: Evaluation, videos: int, *, events: bool, quiet: bool) -> Report:
-    """Run the episodes that are missing, and write the report."""
+    """Run the missing episodes, and write the report."""
     with (_events if events else _lines)(evaluation, quiet) as watch:
         results = evaluation.run(watch)
 
@@ -129,7 +129,7 @@ def _evaluated(request: Request, evaluation: Evaluation, videos: int, *, events:
 
 
 def _judged(request: Request, reset: Sequence[str], operator: Operator, *, open_: bool) -> Report | None:
-    """Run blinded trials, and write the report when there are enough; None if the operator goes on another day."""
+    """Run blinded trials, and write the report. Returns None if the operator stops before the last trial."""
     blinded = Blinded(request, reset, operator)
     if not open_ and not blinded.run():
         return None
@@ -140,7 +140,7 @@ def _judged(request: Request, reset: Sequence[str], operator: Operator, *, open_
 
 @contextmanager
 def _events(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
-    """A function that prints an event for each episode."""
+    """Yield a function that prints an event for each episode."""
     begin = time.monotonic()
     request = evaluation.request
     emit(EVAL, Begin(of=request.episodes * len(request.policies), done=evaluation.resumed))
@@ -158,9 +158,9 @@ def _events(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
 
 @contextmanager
 def _lines(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
-    """A function that shows the progress: a bar on a terminal, otherwise one line per episode."""
+    """Yield a function that shows the progress: a bar on a terminal, otherwise one line per episode."""
     if evaluation.resumed and not quiet:
-        echo(f"continuing: {evaluation.resumed} episodes are there already", err=True)
+        echo(f"continuing: {evaluation.resumed} episodes are done already", err=True)
     if not sys.stderr.isatty():
 
         def line(done: int, total: int, policy: Policy, result: Result) -> None:

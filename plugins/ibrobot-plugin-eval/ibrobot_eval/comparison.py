@@ -1,4 +1,4 @@
-"""What the results of an evaluation say: each policy by itself, and each pair of policies in words."""
+"""Summaries of single policies, and comparisons of pairs of policies with a verdict in words."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _POINTS = 200
 
 @attrs.frozen
 class Summary:
-    """A policy by itself."""
+    """Results of one policy."""
 
     label: str
     episodes: int
@@ -39,7 +39,7 @@ class Summary:
     median_time_s: float | None
     """Median time to success [s]; None without a success."""
     interventions: Mapping[str, int]
-    """Interventions of the safety layer, in all episodes together."""
+    """Kind of intervention of the safety layer -> number over all episodes."""
     disturbed: int
     """Number of episodes with a fault."""
 
@@ -66,20 +66,20 @@ class Comparison:
     second: str
     pairs: Pairs
     fixed_interval: Interval
-    """Of the difference, valid if the number of episodes was fixed beforehand."""
+    """Interval of the difference, valid if the number of episodes was fixed beforehand."""
     mcnemar_p: float
-    """Of the exact test, valid likewise; corrected for the number of pairs."""
+    """p-value of McNemar's exact test, valid under the same condition; corrected for the number of pairs."""
     interval: Interval
-    """Of the difference, valid however often one looks and whenever one stops."""
+    """Interval of the difference, valid however often one looks and whenever one stops."""
     p_value: float
-    """Valid likewise; corrected for the number of pairs."""
+    """p-value, valid under the same conditions as `interval`; corrected for the number of pairs."""
     verdict: str
     """Whether the first policy is `better`, `worse`, `no more different` than the margin, or `undecided`."""
     more_episodes: int | None
-    """If undecided, about how many more episodes decide; None if that exceeds 100,000."""
+    """If undecided, a projection of the number of further episodes that decide; None above 100,000."""
     margin: float
     course: tuple[tuple[int, float, float, float], ...]
-    """Number of episodes, difference, and the ends of `interval` after them; at most 200 of them."""
+    """At most 200 points: number of episodes, and the difference and the ends of `interval` after them."""
 
     @property
     def words(self) -> str:
@@ -96,13 +96,13 @@ class Comparison:
 
 
 def _rounded(number: int) -> int:
-    """A projection to two digits, since it is an estimate."""
+    """Round a projection up to two digits."""
     size = int(10 ** max(0, len(str(number)) - 2))
     return -(-number // size) * size
 
 
 def compare(results: Mapping[str, Sequence[Result]], margin: float) -> list[Comparison]:
-    """Compare each pair of policies on the seeds that both have, in the order of the seeds.
+    """Compare each pair of policies on their common seeds, in the order of the seeds.
 
     Args:
         results: label -> results, in the order of their seeds.
@@ -143,10 +143,10 @@ def _verdict(test: PairedTest, p_value: float, margin: float) -> str:
 class Decision:
     """Finds the smallest number of episodes after which every pair of policies is decided.
 
-    It checks every episode, in the order of the seeds, whatever the order in which processes finish them.
+    The result does not depend on the order in which processes finish the episodes.
 
     Attributes:
-        after: that number; None if some pair is undecided so far.
+        after: that number; None while some pair is undecided.
     """
 
     def __init__(self, labels: Sequence[str], margin: float) -> None:
@@ -157,7 +157,11 @@ class Decision:
         self.after: int | None = None
 
     def look(self, results: Mapping[str, Sequence[Result]]) -> None:
-        """Add the episodes that all policies have by now: label -> results, in the order of their seeds."""
+        """Add episodes that all policies have finished.
+
+        Args:
+            results: label -> results, in the order of their seeds.
+        """
         while self._tests and self.after is None and self._episodes < min(map(len, results.values())):
             for (first, second), test in self._tests.items():
                 test.add(results[first][self._episodes].success, results[second][self._episodes].success)

@@ -1,4 +1,4 @@
-"""The contents of the report of an evaluation, which a file and a page show."""
+"""Contents of an evaluation's report, for its HTML file and for `ibrobot ui`."""
 
 from __future__ import annotations
 
@@ -25,37 +25,37 @@ _AXES = (("_x", "_y"), (".x", ".y"))
 
 
 def lines_of(out: Path) -> Sequence[str]:
-    """The result of an evaluation, as a terminal shows it.
+    """The result of an evaluation, as lines for a terminal.
 
     Raises:
         DatasetError: if its report is damaged.
     """
     file = out / REPORT
     if not file.exists():
-        return ["not finished; the same evaluation, started again, continues it"]
+        return ["not finished; start the same evaluation again to continue"]
     try:
         return [str(each) for each in json.loads(file.read_text(encoding="utf-8"))["lines"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{file}: is no report of an evaluation: {error}") from None
+        raise DatasetError(f"{file}: is not a report of an evaluation: {error}") from None
 
 
 def read_contents(out: Path) -> Sequence[ReportSection]:
-    """The contents of the report in the folder of an evaluation.
+    """Read the contents of the report in the folder of an evaluation.
 
     Raises:
-        DatasetError: if there is none, or it is damaged.
+        DatasetError: if the report is missing or damaged.
     """
     file = out / REPORT
     if not file.exists():
-        raise DatasetError(f"{out}: has no report yet; the same evaluation, started again, continues it")
+        raise DatasetError(f"{out}: has no report yet; start the same evaluation again to continue it")
     try:
         return contents_of(out, Report.read(file))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DatasetError(f"{file}: is no report of an evaluation: {error}") from None
+        raise DatasetError(f"{file}: is not a report of an evaluation: {error}") from None
 
 
 def contents_of(out: Path, report: Report) -> list[ReportSection]:
-    """The contents of a report; videos are those in the folder of the evaluation."""
+    """Contents of a report, with the videos in the folder of the evaluation."""
     rates = [(each.label, each.successes, each.episodes) for each in report.summaries]
     verdicts = (Text(f"{each.words}.", "verdict") for each in report.comparisons)
     table = Table(SUMMARY_HEAD, tuple(map(summary_row, report.summaries)))
@@ -73,7 +73,7 @@ def contents_of(out: Path, report: Report) -> list[ReportSection]:
 
 
 def _comparison(report: Report) -> ReportSection:
-    """The pairs of policies, and their differences over the episodes."""
+    """Compare the pairs of policies: a table, and the differences over the episodes."""
     blocks: list[Text | Table | Plots] = [
         Table(COMPARISON_HEAD, tuple(map(comparison_row, report.comparisons))),
         Text(NOTE, "note"),
@@ -86,7 +86,7 @@ def _comparison(report: Report) -> ReportSection:
 
 
 def _outcomes(report: Report) -> ReportSection:
-    """Outcomes and times by seed."""
+    """Plot outcomes and times by seed."""
     by_policy = [(each.label, _episodes(report, each.label)) for each in report.summaries]
     outcomes = [
         (label, [(e.result.seed, e.result.success, e.result.time_s) for e in found]) for label, found in by_policy
@@ -105,7 +105,7 @@ def _episodes(report: Report, label: str) -> list[Episode]:
 
 
 def _panels(report: Report) -> Iterator[str]:
-    """Plots of the outcomes over what the scene has drawn."""
+    """Plot outcomes over the scene's random factors."""
     values_of = {name: {each.result.factors.get(name) for each in report.episodes} for name in report.factors}
     names = [name for name, values in values_of.items() if len(values) > 1]
     ends = [(x, x.removesuffix(a) + b) for a, b in _AXES for x in names if x.endswith(a)]
@@ -129,7 +129,7 @@ def _panels(report: Report) -> Iterator[str]:
 
 
 def _case(out: Path, episode: Episode) -> Case:
-    """A failure: why, its recording, its video if there is one, and the command that repeats it."""
+    """A failure: its reason, recording, video if any, and the command that repeats it."""
     result = episode.result
     ended = "; ".join(result.faults) or f"no success within {result.time_s:.1f} s"
     video = out / episode.video

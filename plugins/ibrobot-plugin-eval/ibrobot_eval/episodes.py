@@ -1,9 +1,8 @@
-"""One episode of an evaluation: a pure function of files and a seed; its result is written as a whole or not at all."""
+"""One episode of an evaluation: a pure function of files and a seed, whose result is written atomically."""
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +10,7 @@ from uuid import uuid4
 
 import attrs
 
-from ibrobot_core.api import RecorderError, seconds
+from ibrobot_core.api import RecorderError, replace_file, seconds
 from ibrobot_core.app import ComponentFailed, LaunchRequest, Runtime, Session, installed_plugins
 from ibrobot_eval.policies import Policy, document_hash
 
@@ -31,7 +30,7 @@ class Result:
     """Kind of intervention of the safety layer -> number of interventions, for those that occurred."""
     faults: tuple[str, ...]
     factors: Mapping[str, float]
-    """What the scene has drawn from the seed, e.g. the position of an object, and what varies."""
+    """Values drawn by the scene from the seed, e.g. the position of an object, and those of varied keys."""
     acting: Mapping[str, str]
     """Model, weights and fingerprint of the policy that acted, as recordings state them."""
 
@@ -44,7 +43,7 @@ class Result:
 
 @attrs.frozen
 class Place:
-    """Where the result, the recording and the video of an episode are, in the folder of the evaluation."""
+    """Paths of an episode's result, recording and video in the folder of the evaluation."""
 
     result: Path
     episode: Path
@@ -52,12 +51,12 @@ class Place:
     unfinished: Path
 
     def scratch(self) -> Path:
-        """A new folder for the episode until it is complete: another process may run it at the same time."""
+        """A new folder for the unfinished episode, since another process may run it at the same time."""
         return self.unfinished.with_name(f"{self.unfinished.name}-{uuid4().hex}")
 
     @classmethod
     def of(cls, out: Path, policy: Policy, seed: int) -> Place:
-        """The place of an episode."""
+        """Return the place of an episode."""
         name = f"seed_{seed:06d}"
         folder = policy.folder
         return cls(
@@ -69,7 +68,7 @@ class Place:
 
 
 def run_episode(out: Path, policy: Policy, seed: int, document: str) -> Result:
-    """Run an episode in lockstep, and write recording and result.
+    """Run an episode in lockstep, and write its recording and result.
 
     Args:
         out: the folder of the evaluation.
@@ -83,11 +82,11 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str) -> Result:
     place = Place.of(out, policy, seed)
     registry = installed_plugins()
     if document_hash(policy.load()) != document:
-        raise ComponentFailed(f"{policy.config}: was changed during the evaluation")
+        raise ComponentFailed(f"{policy.config}: changed during the evaluation")
     config = policy.load(seed)
     assert config.recording is not None
     scratch = place.scratch()
-    # The recording does not state where it is, so that equal episodes have equal bytes.
+    # The recording does not contain its path, so that equal episodes have equal bytes.
     recording = attrs.evolve(config.recording, root=str(scratch), dataset="one")
     config = attrs.evolve(config, recording=recording, viewer=None)
     request = LaunchRequest(lockstep=True, seed=seed, episodes=1)
@@ -95,7 +94,7 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str) -> Result:
     session = runtime.session
     run_to_end(runtime)
     if session.state is None or session.state.success is None:
-        raise ComponentFailed(f"{config.source}: the scene has no task, so nothing tells a success from a failure")
+        raise ComponentFailed(f"{config.source}: the scene has no task, so success is not defined")
     time_s = seconds(session.clock.now_ns() - session.episodes.begun_ns)
     bags = list(recording.folder.glob("episodes/*/"))
     metadata = _checked(bags, "success" if session.outcome.successes else "failure", session.outcome.faults)
@@ -112,14 +111,14 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str) -> Result:
     except OSError:
         if not place.episode.is_dir():
             raise
-        # It was run before by a process that was killed, or is run twice: the recordings are equal.
+        # A process that was killed, or one beside this, has made the same recording.
     write(place.result, json.dumps(attrs.asdict(result), indent=1) + "\n")
     shutil.rmtree(scratch)
     return result
 
 
 NO_INTERVENTION = ("missing", "estop")
-"""Counts of the safety layer that are no interventions: ticks without a request, and emergency stops."""
+"""Counts of the safety layer that are not interventions: ticks without a request, and emergency stops."""
 
 
 def run_to_end(runtime: Runtime) -> None:
@@ -138,7 +137,7 @@ def run_to_end(runtime: Runtime) -> None:
 
 
 def _checked(bags: list[Path], outcome: str, faults: list[str]) -> Mapping[str, str]:
-    """The metadata of the recording of an episode, which must be complete."""
+    """Check that the recording of an episode is complete, and return its metadata."""
     what = f": {'; '.join(faults)}" if faults else ""
     if len(bags) != 1:
         raise RecorderError(f"the episode was not recorded{what}")
@@ -153,16 +152,6 @@ def _checked(bags: list[Path], outcome: str, faults: list[str]) -> Mapping[str, 
 
 
 def write(path: Path, content: str | bytes) -> None:
-    """Write a file as a whole or not at all, whatever dies meanwhile."""
+    """Write a file atomically, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{uuid4().hex}")
-    with unfinished.open("wb") as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())
-    unfinished.replace(path)
-    descriptor = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    replace_file(path, content)

@@ -1,4 +1,4 @@
-"""The folder of an evaluation, and the episodes that are run into it by worker processes."""
+"""An evaluation's folder, and the episodes that worker processes run for it."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from ibrobot_eval.options import SETTINGS
 from ibrobot_eval.policies import Identity, Policy, identify
 
 ASKED = "asked"
-"""Key of the settings for the policies as the user named them, which may be in other words when it is continued."""
+"""Key of the settings for the policies as the user named them; a later call may name them differently."""
 _FORMAT = 1
 Watch = Callable[[int, int, Policy, Result], None]
-"""Receives the number of episodes done, the number of all, and the episode just done."""
+"""Receives the number of finished episodes, the total, and the policy and result of the episode just finished."""
 
 
 @attrs.frozen
@@ -34,13 +34,13 @@ class Request:
     out: Path
     policies: tuple[Policy, ...]
     episodes: int
-    """Number of episodes of each policy; with `until_decided` the largest number."""
+    """Number of episodes of each policy; the maximum with `until_decided`."""
     seed: int
     """Seed of the first episode; later ones add 1."""
     until_decided: bool
     margin: float
     jobs: int | None
-    """Number of episodes at a time; None for as many as the pool has room for."""
+    """Number of parallel episodes; None for as many as fit into the pool."""
     on: str = ""
     """The pool; see `Registry.pool`."""
     trials: bool = False
@@ -48,12 +48,12 @@ class Request:
 
 
 class Evaluation:
-    """An evaluation and its folder, which nobody else changes while the context of `opened` lasts.
+    """An evaluation in its folder, which is locked by the context of `opened`.
 
     Attributes:
-        request: what the user asks for.
-        identities: policy -> what its results depend on.
-        resumed: number of episodes that were there already.
+        request: the evaluation that the user asks for.
+        identities: label of a policy -> what its results depend on.
+        resumed: number of episodes that earlier calls have finished.
     """
 
     def __init__(self, request: Request, identities: Mapping[str, Identity]) -> None:
@@ -86,10 +86,10 @@ class Evaluation:
         return found
 
     def run(self, watch: Watch) -> dict[str, list[Result]]:
-        """Run the episodes that are missing; returns label -> results in the order of their seeds.
+        """Run the missing episodes. Returns label -> results in the order of their seeds.
 
         Raises:
-            IbrobotError: if an episode cannot be run; the others are kept.
+            IbrobotError: if an episode fails; finished ones are kept.
         """
         request = self.request
         todo = [
@@ -106,8 +106,8 @@ class Evaluation:
                     file = Place.of(request.out, job.policy, job.seed).result
                     if not file.exists():
                         raise DatasetError(
-                            f"{file}: was written, but is not there: --out must be in a folder that all machines of "
-                            "the pool share"
+                            f"{file}: not found after a machine of the pool wrote it: --out must be in a folder that "
+                            "all machines of the pool share"
                         )
                     self._check_policy(job.policy, result)
                     self._results[job.policy.label, job.seed] = result
@@ -118,7 +118,13 @@ class Evaluation:
         return self._kept()
 
     def film(self, results: Mapping[str, Sequence[Result]], most: int, begin: Callable[[int], None]) -> None:
-        """Film failures that have no video yet, at most `most` of each policy; `begin` gets their number, if any."""
+        """Film failures without a video.
+
+        Args:
+            results: label -> results in the order of their seeds.
+            most: maximum number of videos for each policy.
+            begin: receives the number of failures to film, if there are any.
+        """
         todo = []
         for policy in self.request.policies:
             failed = [each.seed for each in results[policy.label] if not each.success][:most]
@@ -135,7 +141,7 @@ class Evaluation:
     def _running[J: (EpisodeJob, FilmJob), R](
         self, function: Callable[[J, Callable[[int], None]], R], orders: Sequence[J]
     ) -> Iterator[Iterator[tuple[J, R]]]:
-        """Do jobs in the pool; gives each with its result when it is done."""
+        """Run jobs in the pool. Yields an iterator over each finished job and its result."""
         jobs = (Job(function, order) for order in orders)
         with (
             closing(installed_plugins().pool(self.request.on, self.request.jobs)) as pool,
@@ -144,13 +150,13 @@ class Evaluation:
             yield map(_result, finished)
 
     def _check_policy(self, policy: Policy, result: Result) -> None:
-        """Refuse results of other weights, e.g. those of a training that goes on meanwhile."""
+        """Refuse results of other weights, e.g. while a training overwrites them."""
         before = next((r for (label, _), r in self._results.items() if label == policy.label), result)
         if before.acting != result.acting:
-            raise ComponentFailed(f"{policy.label}: the policy's weights were changed during the evaluation")
+            raise ComponentFailed(f"{policy.label}: the policy's weights changed during the evaluation")
 
     def _kept(self) -> dict[str, list[Result]]:
-        """The results that count; those that processes have run beyond a decision are removed."""
+        """Return the results up to the decision, and remove those beyond it."""
         found, decided = self.results(), self._decision.after
         if decided is None:
             return found
@@ -163,7 +169,7 @@ class Evaluation:
 
 
 def _result[R](done: Done[R]) -> tuple[Any, R]:
-    """A job that is done, and its result; raise the error if it failed."""
+    """A finished job and its result. Raises its error if it failed."""
     job = done.job.argument
     if done.error is not None:
         which = f"{job.policy.label}, seed {job.seed}"
@@ -175,11 +181,11 @@ def _result[R](done: Done[R]) -> tuple[Any, R]:
 
 @contextmanager
 def opened(request: Request) -> Iterator[Evaluation]:
-    """An evaluation in its folder: a new one, or one that an earlier call has begun.
+    """Begin an evaluation in its folder, or continue that of an earlier call.
 
     Raises:
-        InUse: if another process evaluates into it.
-        DatasetError: if the folder has something else, or was made with other settings or files, or cannot be written.
+        InUse: if another process writes to the folder.
+        DatasetError: if the folder contains anything else, was begun with other settings or files, or is read-only.
     """
     out = request.out
     registry = installed_plugins()
@@ -215,7 +221,7 @@ def opened(request: Request) -> Iterator[Evaluation]:
 
 
 def _begin(request: Request, settings: Mapping[str, Any]) -> None:
-    """Write the settings into a new folder, or compare them to the settings of an evaluation that was begun."""
+    """Write the settings into a new folder, or compare them with those of the evaluation in it."""
     out, file = request.out, request.out / SETTINGS
     if file.is_file():
         try:
@@ -226,15 +232,15 @@ def _begin(request: Request, settings: Mapping[str, Any]) -> None:
             raise DatasetError(f"{out}: was begun with other settings: {'; '.join(differing)}; choose a new folder")
         done = max((len(list(each.glob("seed_*.json"))) for each in (out / "results").glob("*")), default=0)
         if done > request.episodes and not request.until_decided:
-            raise DatasetError(f"{out}: has {done} episodes of a policy already; --episodes must not be smaller")
+            raise DatasetError(f"{out}: already has {done} episodes of a policy; --episodes must not be smaller")
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DatasetError(f"{out}: exists already, and is not an evaluation to continue; choose a new folder")
+        raise DatasetError(f"{out}: exists and is not an evaluation; choose a new folder")
     write(file, json.dumps(settings, indent=1) + "\n")
 
 
 def differences(known: Mapping[str, Any], now: Mapping[str, Any], where: str = "") -> Iterator[str]:
-    """What differs between two nested mappings, in words."""
+    """Describe the differences between two nested mappings."""
     for key in {**known, **now}:
         old, new = known.get(key), now.get(key)
         if old == new:

@@ -1,4 +1,4 @@
-"""Films an episode: runs it again with a camera that sees the whole scene. A camera changes nothing in lockstep."""
+"""Film an episode: run it again with a camera that sees the whole scene. In lockstep, a camera changes nothing."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def can_film(policy: Policy) -> bool:
 
 
 def _filmed(policy: Policy, seed: int | None) -> RobotConfig | None:
-    """The robot with the camera; None if its simulation has none."""
+    """The robot with the film camera; None if its simulation has none."""
     registry = installed_plugins()
     path = find_config(policy.config, registry)
     plain = load_config(path, overrides=policy.overrides_of(seed), mode=policy.mode, sim=True, registry=registry)
@@ -51,10 +51,10 @@ def _filmed(policy: Policy, seed: int | None) -> RobotConfig | None:
 
 
 def film(file: Path, policy: Policy, result: Result) -> None:
-    """Run an episode again, and write it as a video.
+    """Run an episode again, and write a video of it.
 
     Raises:
-        ComponentFailed: if it does not end as before.
+        ComponentFailed: if it ends differently.
     """
     config = _filmed(policy, result.seed)
     assert config is not None
@@ -64,7 +64,7 @@ def film(file: Path, policy: Policy, result: Result) -> None:
     run_to_end(runtime)
     time_s = round(seconds(session.clock.now_ns() - session.episodes.begun_ns), 6)
     if (bool(session.outcome.successes), time_s) != (result.success, result.time_s):
-        raise ComponentFailed("the episode did not end as before when it was run again for its video")
+        raise ComponentFailed("the episode ended differently when it was repeated for its video")
     frames = images.drain()
     lasted_s = seconds(frames[-1].received_ns - frames[0].received_ns) if len(frames) > 1 else 1.0
     pictures = [each.message.data.tobytes() for each in frames if isinstance(each.message, CompressedImage)]
@@ -72,7 +72,7 @@ def film(file: Path, policy: Policy, result: Result) -> None:
 
 
 def encode(pictures: list[bytes], rate_hz: float) -> bytes:
-    """A video (MP4, H.264) of pictures in JPEG. Equal pictures give equal bytes."""
+    """Encode JPEG pictures as a video (MP4, H.264). Equal pictures give equal bytes."""
     import av
 
     buffer = io.BytesIO()

@@ -27,7 +27,7 @@ class EpisodeJob:
 
 @attrs.frozen
 class FilmJob:
-    """An episode that has been run, to film."""
+    """A finished episode to film."""
 
     out: str
     """The folder of the evaluation."""
@@ -49,5 +49,5 @@ def film_in_pool(job: FilmJob, progress: Callable[[int], None]) -> None:
 
 
 def _quiet() -> None:
-    """What a run says of itself is not that of the evaluation."""
+    """Keep the messages of runs out of the evaluation's log."""
     logging.getLogger("ibrobot").setLevel(logging.ERROR)

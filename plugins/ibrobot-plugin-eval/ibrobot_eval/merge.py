@@ -1,4 +1,4 @@
-"""`ibrobot eval merge`: joins evaluations of the same policies on other seeds, and reports on all episodes."""
+"""`ibrobot eval merge`: join evaluations of the same policies on other seeds, and report on all episodes."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ class _Part:
         """Read an evaluation.
 
         Raises:
-            DatasetError: if the folder has none, or one that cannot be merged.
+            DatasetError: if the folder has no evaluation, or one that cannot be merged.
         """
         file = folder / SETTINGS
         try:
             settings = json.loads(file.read_text(encoding="utf-8"))
         except FileNotFoundError:
-            raise DatasetError(f"{folder}: is no evaluation: it has no {SETTINGS}") from None
+            raise DatasetError(f"{folder}: is not an evaluation: it has no {SETTINGS}") from None
         except ValueError as error:
             raise DatasetError(f"{file}: cannot be read: {error}") from None
         asked = settings.pop(ASKED, None)
         if settings.get("trials") or settings.get("until_decided") or asked is None:
-            raise DatasetError(f"{folder}: only simulated episodes of a fixed number can be merged")
+            raise DatasetError(f"{folder}: only simulated evaluations of a fixed number of episodes can be merged")
         lists = ("overrides", "vary")
         policies = tuple(Policy(**each | {name: tuple(each[name]) for name in lists}) for each in asked)
         results = {
@@ -79,7 +79,7 @@ def merge_evaluations(folders: Sequence[Path], out: Path) -> Report:
         for label, results in part.results.items():
             for seed in results:
                 if (label, seed) in where:
-                    raise DatasetError(f"{part.folder}: has {label}, seed {seed}, as {where[label, seed]} has")
+                    raise DatasetError(f"{part.folder}: has {label}, seed {seed}, which {where[label, seed]} has too")
                 where[label, seed] = part.folder
     seeds = sorted({seed for _, seed in where})
     labels = [policy.label for policy in first.policies]
@@ -115,8 +115,8 @@ def _result(parts: Sequence[_Part], label: str, seed: int) -> Result:
 def merge(folders: tuple[Path, ...], out: Path) -> None:
     """Join evaluations of the same policies on other seeds, e.g. of --shard.
 
-    The parts must agree in all else, and no episode may be in two of them. The result is the evaluation that one
-    command would have made. The command without --shard can continue it.
+    The parts must agree in everything else, and no episode may be in two of them. The result equals that of one
+    evaluation of all episodes, and the command without --shard can continue it.
     """
     report = merge_evaluations(folders, out)
     for line in report.lines():

@@ -1,4 +1,4 @@
-"""The operator of blinded trials: at a terminal, or at a page that has started the command."""
+"""The operator of blinded trials: at a terminal, or at the page that started the command."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from ibrobot_core.app import Choice, KeyReader, Questions, Sight, echo, emit
 from ibrobot_eval import EVAL
 from ibrobot_eval.options import Told
 
-QUIT = Choice(key="q", text="end for today")
+QUIT = Choice(key="q", text="stop for now")
 _POLL_S = 0.5
 _GONE = ""
 
 
 class Quit(Exception):
-    """The operator ends the trials for today."""
+    """The operator interrupts the trials."""
 
 
 class Operator(ABC):
@@ -38,29 +38,29 @@ class Operator(ABC):
 
     @abstractmethod
     def put(self, text: str, choices: Sequence[Choice] = (), sights: Sequence[Sight] = ()) -> None:
-        """Ask a question, instead of the one before; without choices, the answer is typed."""
+        """Ask a question in place of the previous one; without choices, the answer is a text."""
 
     @abstractmethod
     def answer(self, timeout_s: float) -> str | None:
-        """The key of the choice, or the text; None if there is no answer within a time [s].
+        """The key of the choice, or the text; None if there is no answer within `timeout_s` [s].
 
         Raises:
-            IbrobotError: if the operator is gone.
+            IbrobotError: if the terminal or page has closed.
         """
 
     @abstractmethod
     def present(self) -> AbstractContextManager[object]:
-        """The time in which there are questions.
+        """A context in which the operator can be asked.
 
         Raises:
-            IbrobotError: if there is nobody to ask.
+            IbrobotError: if nobody can be asked.
         """
 
     def ask(self, text: str, choices: Sequence[Choice] = (), sights: Sequence[Sight] = ()) -> str:
         """Ask a question, and wait for the answer.
 
         Raises:
-            Quit: if the operator ends the trials.
+            Quit: if the operator interrupts the trials.
         """
         self.put(text, choices, sights)
         while (given := self.answer(_POLL_S)) is None:
@@ -71,20 +71,20 @@ class Operator(ABC):
 
 
 class AtTerminal(Operator):
-    """Answers are keys."""
+    """An operator at a terminal, who answers with keys."""
 
     def __init__(self) -> None:
         self._keys = KeyReader()
         self._pressed: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._possible: set[str] = set()
-        """Keys that answer; none if a text is typed."""
+        """Keys that answer; empty if the answer is a text."""
         self._line = ""
 
     @contextmanager
     @override
     def present(self) -> Iterator[None]:
         if not sys.stdin.isatty():
-            raise TeleopError("blinded trials need a terminal, whose keys begin and judge them")
+            raise TeleopError("blinded trials need a terminal, since the operator begins and judges them by key")
         self._pressed = self._keys.subscribe()
         self._keys.gone = lambda: self._pressed.put(_GONE)
         with self._keys:
@@ -126,12 +126,12 @@ class AtTerminal(Operator):
     def _check(self, key: str) -> str:
         if key == _GONE:
             self._pressed.put(_GONE)
-            raise TeleopError("the terminal is gone")
+            raise TeleopError("the terminal has closed")
         return key
 
 
 class AtPage(Operator):
-    """Questions are events of the command; answers come by standard input."""
+    """An operator at a page: questions are events of the command, answers arrive on standard input."""
 
     sees = True
 

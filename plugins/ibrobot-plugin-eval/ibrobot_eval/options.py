@@ -1,4 +1,4 @@
-"""What `ibrobot eval` takes, and the events that it prints: its command line and forms for it derive from these."""
+"""Options of `ibrobot eval`, and the events that it prints. Its command line and forms derive from these."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ibrobot_core.api import option
 from ibrobot_core.app import Ask, Event, Shown, on_option, shard_of, shard_option
 
 SETTINGS = "evaluation.json"
-"""File in the folder of an evaluation with what it was begun with."""
+"""File in the folder of an evaluation with its settings."""
 REPORT = "report.json"
 KIND = "evaluation"
 """The kind of report, for pages."""
 MARGIN = 0.1
-"""By default, a difference below this counts as none."""
+"""Default of the margin: a smaller difference of success rates counts as none."""
 
 
 @attrs.frozen(kw_only=True)
@@ -66,7 +66,7 @@ class EvalOptions:
 
     @property
     def seeds(self) -> range:
-        """The seeds of the episodes: all, or those of the shard."""
+        """Seeds of the episodes: all, or those of the shard."""
         part = shard_of(self.shard, self.episodes)
         return range(self.seed + part.start, self.seed + part.stop)
 
@@ -76,7 +76,7 @@ class Begin(Event):
     """The evaluation begins."""
 
     of: int = option(help="number of episodes of all policies")
-    done: int = option(help="episodes that an interrupted evaluation has run")
+    done: int = option(help="episodes that earlier calls have finished")
 
     @override
     def shown(self) -> Shown:
@@ -85,15 +85,15 @@ class Begin(Event):
 
 @attrs.frozen(kw_only=True)
 class Progress(Event):
-    """An episode is done."""
+    """An episode has finished."""
 
-    done: int = option(help="episodes that are done")
+    done: int = option(help="finished episodes")
     of: int = option(help="number of episodes of all policies")
     policy: str = option(help="the policy")
     seed: int = option(help="seed of the episode")
     success: bool = option(help="whether it succeeded")
     time_s: float = option(unit="s", help="its duration in simulated time")
-    seconds: float = option(unit="s", help="time since the begin")
+    seconds: float = option(unit="s", help="time since the evaluation began")
 
     @override
     def shown(self) -> Shown:

@@ -1,4 +1,4 @@
-"""The report of an evaluation as one HTML file, which needs nothing else and no network."""
+"""The report of an evaluation as one HTML file that needs no other file and no network."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ a { color: var(--ok); } p { max-width: 75ch; }
 
 
 def as_page(out: Path, report: Report) -> str:
-    """The page; videos are those in the folder of the evaluation."""
+    """Render the page, with the videos in the folder of the evaluation."""
     body = ""
     for number, section in enumerate(contents_of(out, report)):
         body += tag("h2" if number else "h1", escape(section.title))
@@ -72,7 +72,7 @@ def _block(out: Path, block: Text | Table | Plots | Cases) -> str:
 
 
 def _case(out: Path, case: Case) -> str:
-    """Video, recording, seed and command of a failure."""
+    """Render the video, recording, seed and command of a failure."""
     lines = [tag("h3", escape(case.title))]
     if case.video is not None:
         source = f"data:video/mp4;base64,{base64.b64encode(case.video.read_bytes()).decode()}"
@@ -85,6 +85,6 @@ def _case(out: Path, case: Case) -> str:
 
 
 def write_all(out: Path, report: Report) -> None:
-    """Write a report into the folder of its evaluation, and its page."""
+    """Write a report and its page into the folder of the evaluation."""
     write_report(out, report)
     write(out / "report.html", as_page(out, report))

@@ -1,4 +1,4 @@
-"""Plots as SVG, in the colours of the page: `--ok` and `--bad` for outcomes, which also differ by their marks."""
+"""SVG plots in the colours of the page: `--ok` and `--bad` for outcomes, which also differ by their marks."""
 
 from __future__ import annotations
 
@@ -42,26 +42,26 @@ class Axis:
 
 
 def axis_of(values: Sequence[float], begin: float, end: float) -> Axis:
-    """An axis with all values, and some room around them."""
+    """An axis that contains all values, with a margin."""
     low, high = min(values), max(values)
     room = 0.05 * (high - low) or 0.5
     return Axis(low - room, high + room, begin, end)
 
 
 def tag(name: str, text: str = "", **attributes: Any) -> str:
-    """An element; underscores in names of attributes stand for hyphens."""
+    """An SVG or HTML element; underscores in attribute names stand for hyphens."""
     given = "".join(f' {key.rstrip("_").replace("_", "-")}="{escape(str(each))}"' for key, each in attributes.items())
     return f"<{name}{given}>{text}</{name}>"
 
 
 def svg(width: float, height: float, parts: Sequence[str], title: str) -> str:
-    """A picture that is as wide as the page permits, with a title for screen readers."""
+    """A picture that scales with the page, with a title for screen readers."""
     inner = tag("title", escape(title)) + "".join(parts)
     return tag("svg", inner, viewBox=f"0 0 {width} {height}", style=f"max-width:{width}px", role="img")
 
 
 def mark(x: float, y: float, success: bool, tip: str) -> str:
-    """The outcome of an episode: a dot for a success, a cross for a failure."""
+    """Mark of an episode's outcome: a dot for a success, a cross for a failure."""
     if success:
         return tag("circle", tag("title", escape(tip)), cx=x, cy=y, r=3.5, class_="ok")
     path = f"M{x - 3.5:.1f},{y - 3.5:.1f}l7,7m0,-7l-7,7"
@@ -96,7 +96,11 @@ def _beside(axis: Axis, left: float, right: float) -> list[str]:
 
 
 def rates(rows: Sequence[tuple[str, int, int]]) -> str:
-    """Success rates with their intervals: label, successes and episodes of each policy."""
+    """Plot success rates with intervals.
+
+    Args:
+        rows: label, number of successes and number of episodes of each policy.
+    """
     left = 24 + 7 * max(len(label) for label, _, _ in rows)
     height = _TOP + 30 * len(rows) + _BOTTOM
     axis = Axis(0, 100, left, WIDTH - _RIGHT)
@@ -113,7 +117,13 @@ def rates(rows: Sequence[tuple[str, int, int]]) -> str:
 
 
 def course(points: Sequence[tuple[int, float, float, float]], margin: float, title: str) -> str:
-    """Difference over the number of episodes: number, difference, and the ends of the interval that is always valid."""
+    """Plot the difference of success rates over the number of episodes.
+
+    Args:
+        points: number of episodes, difference, and the ends of the anytime-valid interval.
+        margin: drawn as dashed lines.
+        title: for screen readers.
+    """
     height = 230
     across = Axis(0, max(points[-1][0], 1), _LEFT, WIDTH - _RIGHT)
     up = Axis(-100, 100, height - _BOTTOM, _TOP)
@@ -129,7 +139,11 @@ def course(points: Sequence[tuple[int, float, float, float]], margin: float, tit
 
 
 def strips(rows: Sequence[tuple[str, Sequence[tuple[int, bool, float]]]]) -> str:
-    """Outcomes by seed: label, and seed, success and duration [s] of each episode."""
+    """Plot outcomes by seed.
+
+    Args:
+        rows: label of each policy, with seed, success and duration [s] of each episode.
+    """
     left = 24 + 7 * max(len(label) for label, _ in rows)
     count = max(len(episodes) for _, episodes in rows)
     step = min(24.0, (WIDTH - left - _RIGHT) / count)
@@ -150,7 +164,11 @@ def strips(rows: Sequence[tuple[str, Sequence[tuple[int, bool, float]]]]) -> str
 
 
 def times(rows: Sequence[tuple[str, Sequence[tuple[int, float]]]]) -> str:
-    """Times to success: label, and seed and time [s] of each success."""
+    """Plot times to success.
+
+    Args:
+        rows: label of each policy, with seed and time [s] of each success.
+    """
     left = 24 + 7 * max(len(label) for label, _ in rows)
     found = [time_s for _, successes in rows for _, time_s in successes]
     axis = Axis(0, 1.05 * max(found), left, WIDTH - _RIGHT)
@@ -167,7 +185,13 @@ def times(rows: Sequence[tuple[str, Sequence[tuple[int, float]]]]) -> str:
 
 
 def map_of(points: Sequence[tuple[float, float, bool, str]], names: tuple[str, str], title: str) -> str:
-    """Outcomes over two factors, e.g. a position: x, y, success and text of each episode. Both axes have one scale."""
+    """Plot outcomes over two factors, e.g. a position, on axes of equal scale.
+
+    Args:
+        points: x, y, success and tooltip of each episode.
+        names: the factors.
+        title: shown above the plot.
+    """
     width, height = 350, 320
     across = axis_of([x for x, _, _, _ in points], _LEFT, width - _RIGHT)
     up = axis_of([y for _, y, _, _ in points], height - _BOTTOM, _TOP + 16)
@@ -187,7 +211,13 @@ def _widened(axis: Axis, scale: float) -> Axis:
 
 
 def by_factor(points: Sequence[tuple[float, bool]], name: str, title: str) -> str:
-    """Success rate over a factor, in bins of equal numbers of episodes, with intervals: value and success."""
+    """Plot the success rate over a factor, in bins of equal numbers of episodes, with intervals.
+
+    Args:
+        points: value of the factor and success of each episode.
+        name: the factor.
+        title: shown above the plot.
+    """
     width, height = 350, 190
     ordered = sorted(points)
     across = axis_of([value for value, _ in ordered], _LEFT, width - _RIGHT)

@@ -1,4 +1,4 @@
-"""The policies of an evaluation: robot YAML, mode and model, and what identifies their files."""
+"""Policies of an evaluation: robot YAML, mode and model, and hashes of their files."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Variation:
 
 @attrs.frozen
 class Policy:
-    """A policy to evaluate: a mode of a robot."""
+    """A policy to evaluate: a mode of a robot with a model."""
 
     label: str
     """Its name in the report, unique in the evaluation."""
@@ -67,7 +67,7 @@ class Policy:
     model: str
     """The name of the model that the mode uses."""
     overrides: tuple[str, ...]
-    """Overrides of the YAML, those for the model included."""
+    """Overrides of the YAML, including that of the model."""
     sim: bool = True
     """Whether it runs in simulation."""
     vary: tuple[str, ...] = ()
@@ -75,11 +75,11 @@ class Policy:
 
     @property
     def folder(self) -> str:
-        """The label as the name of a folder."""
+        """Name of the policy's folders."""
         return re.sub(r"[^\w.,=+-]+", "_", self.label)
 
     def varied(self, seed: int) -> dict[str, float]:
-        """Key -> its value in the episode of a seed. So many seeds as there are combinations in a row have them all."""
+        """Key -> its value in the episode of a seed. Consecutive seeds go through all combinations."""
         found = {}
         for text in self.vary:
             variation = Variation.of(text)
@@ -88,18 +88,18 @@ class Policy:
         return found
 
     def overrides_of(self, seed: int | None) -> tuple[str, ...]:
-        """The overrides for the episode of a seed; None for those that all episodes have."""
+        """Overrides for the episode of a seed; None for those common to all episodes."""
         varied = self.varied(seed) if seed is not None else {}
         return (*self.overrides, *(f"{key}={value!r}" for key, value in varied.items()))
 
     def load(self, seed: int | None = None) -> RobotConfig:
-        """The robot of an episode. It records, as a robot does that `ibrobot record` runs.
+        """Load the robot of an episode. It records, as with `ibrobot record`.
 
         Args:
-            seed: that of the episode; None for the YAML before keys vary.
+            seed: seed of the episode; None for the YAML without varied keys.
 
         Raises:
-            ConfigError: with all faults of the YAML.
+            ConfigError: for faults of the YAML.
         """
         registry = installed_plugins()
         path = find_config(self.config, registry)
@@ -119,7 +119,7 @@ class Policy:
 
 @attrs.frozen
 class Identity:
-    """What a policy's results depend on beside the seed."""
+    """Hashes of what a policy's results depend on besides the seed."""
 
     document: str
     """Hash of the robot YAML with its overrides."""
@@ -127,14 +127,14 @@ class Identity:
     policy: str
     """The policy's own fingerprint."""
     files: str
-    """Hash of the files that the model's options and the robot's description name; empty if there are none."""
+    """Hash of the files named by the model's options and the robot's description; empty if there are none."""
 
 
 def find_policies(
     configs: Sequence[str], modes: Sequence[str], models: Sequence[str], overrides: Sequence[str],
     vary: Sequence[str] = (), *, sim: bool,
 ) -> list[Policy]:  # fmt: skip
-    """The policies that a command line means: each robot YAML in each mode with each model.
+    """Find the policies of a command line: each robot YAML in each mode with each model.
 
     Raises:
         ConfigError: for faults of a YAML, a mode without a model, an unknown model, or policies that are the same.
@@ -165,7 +165,7 @@ def _fault(path: Path, key: str, message: str) -> ConfigError:
 
 
 def labelled(policies: Sequence[Policy]) -> list[Policy]:
-    """The policies with the shortest labels that tell them apart: of mode, robot YAML and model."""
+    """Label policies by as few of mode, robot YAML and model as distinguish them."""
     names = [(each.mode, Path(each.config).stem, each.model) for each in policies]
     parts = [chosen for size in (1, 2, 3) for chosen in itertools.combinations(range(3), size)]
     labels = [[" ".join(each[part] for part in chosen) for each in names] for chosen in parts]

@@ -1,4 +1,4 @@
-"""The report of an evaluation, as JSON, CSV and Markdown. Equal results give equal bytes."""
+"""Report of an evaluation as JSON, CSV and Markdown. Equal results give equal bytes."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Episode:
     policy: str
     result: Result
     recording: str
-    """Its recording, relative to the folder of the evaluation."""
+    """Path of its recording, relative to the folder of the evaluation."""
     video: str
-    """Its video, likewise; empty without one."""
+    """Path of its video, relative likewise; empty if there is none."""
     command: str
     """The command that repeats it; empty for a trial on a real arm."""
 
@@ -48,7 +48,14 @@ class Report:
     def of(
         cls, results: Mapping[str, Sequence[Result]], episodes: Sequence[Episode], margin: float, *, until_decided: bool
     ) -> Report:
-        """The report on results: label -> results in the order of their seeds."""
+        """Make a report.
+
+        Args:
+            results: label -> results in the order of their seeds.
+            episodes: the episodes to list.
+            margin: a difference below it counts as none.
+            until_decided: whether the evaluation ended with a decision.
+        """
         summaries = tuple(Summary.of(label, found) for label, found in results.items())
         return cls(summaries, tuple(compare(results, margin)), tuple(episodes), margin, until_decided)
 
@@ -56,7 +63,7 @@ class Report:
     def of_simulation(
         cls, policies: Sequence[Policy], results: Mapping[str, Sequence[Result]], margin: float, *, until_decided: bool
     ) -> Report:
-        """The report on episodes in simulation, each with the command that repeats it."""
+        """Make a report on episodes in simulation, each with the command that repeats it."""
         episodes = []
         for each in policies:
             for result in results[each.label]:
@@ -67,11 +74,11 @@ class Report:
 
     @classmethod
     def read(cls, file: Path) -> Report:
-        """Read a report that `facts` describes.
+        """Read a report from a file with `facts`.
 
         Raises:
             OSError: if the file cannot be read.
-            ValueError, KeyError, TypeError: if it is not such a report.
+            ValueError, KeyError, TypeError: if the file is not a report.
         """
         facts = json.loads(file.read_text(encoding="utf-8"))
         results: dict[str, list[Result]] = {each["label"]: [] for each in facts["policies"]}
@@ -85,7 +92,7 @@ class Report:
 
     @property
     def factors(self) -> list[str]:
-        """The names of the factors of the episodes, in the order of the scene."""
+        """Names of the episodes' factors, in the order of the scene."""
         return list(dict.fromkeys(name for each in self.episodes for name in each.result.factors))
 
     @property
@@ -94,7 +101,7 @@ class Report:
         return [each for each in self.episodes if not each.result.success]
 
     def facts(self) -> dict[str, Any]:
-        """The report as values of JSON."""
+        """The report as a JSON object."""
         return {
             "margin": self.margin,
             "until_decided": self.until_decided,
@@ -192,17 +199,17 @@ def comparison_row(each: Comparison) -> tuple[str, ...]:
 
 
 def percent(interval: Interval) -> str:
-    """An interval of a rate."""
+    """Format an interval of a rate, in percent."""
     return f"{100 * interval.low:.1f} to {100 * interval.high:.1f} %"
 
 
 def points(interval: Interval) -> str:
-    """An interval of a difference of rates, in percentage points."""
+    """Format an interval of a difference of rates, in percentage points."""
     return f"{100 * interval.low:+.1f} to {100 * interval.high:+.1f}"
 
 
 def p_value(value: float) -> str:
-    """A p-value."""
+    """Format a p-value."""
     return f"{value:.3f}" if value >= 0.001 else "< 0.001"
 
 

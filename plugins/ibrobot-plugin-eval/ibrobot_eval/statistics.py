@@ -1,4 +1,4 @@
-"""The statistics of an evaluation: intervals of success rates, and tests of two policies on the same episodes.
+"""Statistics of an evaluation: intervals of success rates, and tests of two policies on the same episodes.
 
 Sources:
 - Wilson's and Clopper and Pearson's intervals: Brown, Cai and DasGupta, "Interval estimation for a binomial
@@ -9,7 +9,7 @@ Sources:
   proportions for the paired-sample design", Statistics in Medicine 17 (1998).
 - Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6 (1979).
 - Betting against a mean: Waudby-Smith and Ramdas, "Estimating means of bounded random variables by betting", JRSS B 86
-  (2024). That a mixture of bets is a martingale, so that its inverse is a p-value whenever one looks: Robbins,
+  (2024). On mixtures of bets as martingales, whose inverse is a p-value at all times: Robbins,
   "Statistical methods related to the law of the iterated logarithm", Annals of Mathematical Statistics 41 (1970);
   Ramdas, Grünwald, Vovk and Shafer, "Game-theoretic statistics and safe anytime-valid inference", Statistical Science
   38 (2023).
@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
 
 import attrs
 import numpy as np
@@ -28,15 +27,13 @@ from numpy.typing import NDArray
 
 ALPHA = 0.05
 """Probability of a wrong statement: intervals have a level of 95 %."""
-POWER = 0.8
-"""Probability of finding a difference with the number of episodes that `episodes_for` returns."""
 _NODES = 256
 """Number of bets in the mixture."""
 _EDGE = 1e-9
 _TOLERANCE = 1e-6
 """Accuracy of the ends of intervals."""
 _MOST = 100_000
-"""Projections end at this number of episodes."""
+"""Maximum number of episodes in projections."""
 
 Array = NDArray[np.float64]
 
@@ -59,13 +56,6 @@ class Pairs:
     """Number of episodes in which only the second policy succeeded."""
     same: int
     """Number of episodes in which both succeeded, or both failed."""
-
-    @classmethod
-    def of(cls, first: Sequence[bool], second: Sequence[bool]) -> Pairs:
-        """Count the outcomes of two policies, episode by episode."""
-        ahead = sum(a and not b for a, b in zip(first, second, strict=True))
-        behind = sum(b and not a for a, b in zip(first, second, strict=True))
-        return cls(ahead, behind, len(first) - ahead - behind)
 
     @property
     def episodes(self) -> int:
@@ -118,8 +108,8 @@ def tango(pairs: Pairs, alpha: float = ALPHA) -> Interval:
     quantile = float(norm.isf(alpha / 2))
 
     def score(difference: float) -> float:
-        """The standardised distance between the observed difference and a supposed one."""
-        # The likeliest rate of episodes that only the second policy wins, under the supposed difference.
+        """Standardised distance between the observed and a supposed difference."""
+        # Maximum-likelihood rate of episodes that only the second policy wins, given the supposed difference.
         linear = -b - c + (2 * n - b + c) * difference
         square = linear**2 + 8 * n * c * difference * (1 - difference)
         rate = (math.sqrt(max(square, 0.0)) - linear) / (4 * n)
@@ -141,7 +131,7 @@ def tango(pairs: Pairs, alpha: float = ALPHA) -> Interval:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """p-values corrected for their number, by the method of Holm."""
+    """Correct p-values for their number, by Holm's method."""
     if not p_values:
         return []
     from statsmodels.stats.multitest import multipletests
@@ -151,7 +141,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 @cache
 def _bets() -> tuple[Array, Array]:
-    """The mixture of bets: the stake of each as a fraction of the capital, and the logarithm of its weight.
+    """Stake of each bet in the mixture, as a fraction of the capital, and the logarithm of its weight.
 
     Stakes follow a Beta(2, 2) distribution, which needs the fewest episodes over a range of differences
     (`benchmarks/evaluation_statistics.py`). Any weights that do not depend on the outcomes are valid.
@@ -168,7 +158,7 @@ def _log_mean(exponents: Array) -> float:
 
 
 def log_capital(first: float, second: float, same: float, difference: float) -> float:
-    """Logarithm of the capital that bets against a supposed difference of success rates have won, from a capital of 1.
+    """Logarithm of the capital won by betting against a supposed difference of success rates, from a capital of 1.
 
     Half of the capital bets that the true difference is larger, half that it is smaller. With every episode a bet
     multiplies its capital by 1 + stake * (x / mean - 1), where x is 1, 1/2 or 0 if the first policy, neither or the
@@ -194,19 +184,19 @@ def log_capital(first: float, second: float, same: float, difference: float) -> 
 
 
 class PairedTest:
-    """A test of two policies on the same episodes that stays valid however often one looks, and whenever one stops.
+    """Anytime-valid test of two policies on the same episodes: valid however often one looks and whenever one stops.
 
-    It assumes that episodes are drawn independently, as those of different seeds are.
+    It assumes independent episodes, as those of different seeds are.
 
     Args:
         alpha: the probability that `interval` ever misses the true difference.
 
     Attributes:
         pairs: the outcomes so far.
-        p_value: the smallest so far: the probability of a value at most that small, ever, is at most that small if the
-            policies do not differ.
+        p_value: the smallest so far. If the policies do not differ, the probability that it ever falls to p or below
+            is at most p.
         sign: 1 if the first policy was ahead when `p_value` was reached, -1 if it was behind.
-        interval: the differences that were never refuted. It holds at all times at once.
+        interval: the differences that have never been refuted. It is valid at all times simultaneously.
     """
 
     def __init__(self, alpha: float = ALPHA) -> None:
@@ -233,9 +223,9 @@ class PairedTest:
         return self._log_capital(difference) >= self._log_limit
 
     def _narrowed(self) -> Interval:
-        """The interval without the differences that the outcomes so far refute."""
-        # The capital is a log-convex function of the difference, so those that are not refuted are an interval around
-        # the observed difference. If that is outside of the interval so far, nothing can be said with certainty.
+        """Remove the differences that the outcomes so far refute from the interval."""
+        # The capital is a log-convex function of the difference, so the differences that are not refuted form an
+        # interval around the observed one. If the observed one is outside the interval so far, the latter stays.
         low, high = self.interval.low, self.interval.high
         middle = self.pairs.difference
         if not low <= middle <= high:
@@ -257,15 +247,15 @@ class PairedTest:
 
 
 def episodes_to_decide(pairs: Pairs, margin: float, alpha: float = ALPHA) -> int | None:
-    """About how many more episodes decide, if outcomes keep their present frequencies.
+    """Project how many more episodes decide, if outcomes keep their present frequencies.
 
     Args:
-        pairs: the outcomes so far, of which there is at least one.
+        pairs: the outcomes so far; at least one.
         margin: differences below it count as none.
         alpha: as for `PairedTest`.
 
     Returns:
-        The number; None if it exceeds 100,000.
+        The number of episodes; None if it exceeds 100,000.
     """
     limit = -math.log(alpha)
 
@@ -282,7 +272,7 @@ def episodes_to_decide(pairs: Pairs, margin: float, alpha: float = ALPHA) -> int
 
 
 def _first(holds: Callable[[int], bool], low: int, most: int) -> int | None:
-    """The first number above `low` for which something holds that then goes on to hold; None if above `most`."""
+    """The smallest number above `low` for which a monotonic condition holds; None if above `most`."""
     high = low + 1
     while not holds(high):
         if high >= most:
@@ -299,7 +289,7 @@ def _first(holds: Callable[[int], bool], low: int, most: int) -> int | None:
 
 @cache
 def _wins_needed(losses: int, alpha: float) -> tuple[int, ...]:
-    """The number of wins that refutes equal success rates, for 0 to `losses` losses."""
+    """Smallest number of wins that refutes equal success rates, for 0 to `losses` losses."""
     needed: list[int] = []
     wins = 0
     for lost in range(losses + 1):
@@ -310,14 +300,12 @@ def _wins_needed(losses: int, alpha: float) -> tuple[int, ...]:
 
 
 def decided_by(first: float, second: float, episodes: int, alpha: float = ALPHA) -> Array:
-    """The probability that `PairedTest` finds a difference within n episodes, for n from 0 to `episodes`.
-
-    It is computed exactly, for policies with these success rates and independent outcomes.
+    """Exact probability that `PairedTest` finds a difference within n episodes, for n from 0 to `episodes`.
 
     Args:
         first: success rate of the first policy.
-        second: success rate of the second one.
-        episodes: the largest number of episodes.
+        second: success rate of the second policy, with outcomes independent of the first.
+        episodes: maximum number of episodes.
         alpha: as for `PairedTest`.
 
     Returns:
@@ -332,9 +320,9 @@ def decided_by(first: float, second: float, episodes: int, alpha: float = ALPHA)
     needed = np.array(_wins_needed(episodes, alpha))
     share = ahead / differing
     after = np.zeros(episodes + 1)
-    """Probability of a decision within so many episodes with different outcomes."""
+    """Index: number of episodes with different outcomes. Probability of a decision within them."""
     undecided = np.array([1.0])
-    """Probability of being undecided with 0, 1, … wins."""
+    """Index: number of wins. Probability of being undecided with them."""
     for number in range(1, episodes + 1):
         wins = np.arange(number + 1)
         going = np.zeros(number + 1)
@@ -346,38 +334,3 @@ def decided_by(first: float, second: float, episodes: int, alpha: float = ALPHA)
         undecided = going
     numbers = np.arange(episodes + 1)
     return np.array([float(binom.pmf(numbers[: n + 1], n, differing) @ after[: n + 1]) for n in numbers])
-
-
-def mcnemar_power(first: float, second: float, episodes: int, alpha: float = ALPHA) -> float:
-    """The probability that the exact test of McNemar finds a difference after a fixed number of episodes.
-
-    For policies with these success rates and independent outcomes.
-    """
-    from scipy.stats import binom
-
-    ahead, behind = first * (1 - second), second * (1 - first)
-    numbers = np.arange(episodes + 1)
-    found: Any = np.zeros(episodes + 1)
-    for number in numbers:
-        wins = np.arange(number + 1)
-        p_values = np.minimum(1.0, 2 * binom.cdf(np.minimum(wins, number - wins), number, 0.5))
-        found[number] = binom.pmf(wins, number, ahead / (ahead + behind))[p_values <= alpha].sum()
-    return float(binom.pmf(numbers, episodes, ahead + behind) @ found)
-
-
-def episodes_for(difference: float, power: float = POWER, alpha: float = ALPHA, most: int = 2000) -> int | None:
-    """The number of episodes of each policy with which `PairedTest` finds a difference with probability `power`.
-
-    The success rates are 0.5 plus and minus half the difference, for which most episodes are needed.
-
-    Returns:
-        The number; None if it exceeds `most`.
-    """
-    size = 64
-    while True:
-        found = np.flatnonzero(decided_by(0.5 + difference / 2, 0.5 - difference / 2, size, alpha) >= power)
-        if len(found):
-            return int(found[0])
-        if size >= most:
-            return None
-        size = min(2 * size, most)

@@ -1,7 +1,7 @@
-"""Blinded trials on a real arm: the sealed order of the policies, and what the operator has judged.
+"""Blinded trials on a real arm: the sealed order of the policies, and the operator's judgements.
 
 Trials come in blocks. In each block every policy has one trial, in random order, from the same start. The order is
-sealed: until it is opened, the files beside it do not say which policy acted in which trial.
+sealed: until it is opened, no other file says which policy acted in which trial.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ibrobot_eval.episodes import write
 ORDER = "order.sealed"
 OPENED = "order_opened.json"
 SEALED = ".sealed"
-"""Folder of the recordings, which say what acted, until the order is opened."""
+"""Folder of the recordings until the order is opened, since they name the policy."""
 SUCCESS, FAILURE, VOID = "success", "failure", "void"
 OUTCOMES = (SUCCESS, FAILURE, VOID)
 
@@ -34,7 +34,7 @@ class Trial:
     """A trial that the operator has judged."""
 
     number: int
-    """From 1, in the order in which they were run."""
+    """Its number from 1, in the order of execution."""
     block: int
     """Number of the block, from 0."""
     place: int
@@ -43,11 +43,11 @@ class Trial:
     reason: str
     """Why it is void; empty otherwise."""
     time_s: float
-    """From its beginning to the operator's key, or to its end [s]."""
+    """Time from its beginning to the operator's key, or to its end [s]."""
     interventions: dict[str, int]
     faults: tuple[str, ...]
     seal: str
-    """Hash of the order that was sealed when it was run."""
+    """Hash of the sealed order under which it ran."""
 
     @classmethod
     def read(cls, file: Path) -> Trial:
@@ -61,11 +61,11 @@ class Order:
 
     Args:
         out: the folder of the evaluation.
-        labels: the policies.
+        labels: labels of the policies.
 
     Attributes:
         seal: hash of the sealed order.
-        trials: the trials that the operator has judged, in the order in which they were run.
+        trials: the judged trials, in the order of execution.
     """
 
     def __init__(self, out: Path, labels: Sequence[str]) -> None:
@@ -88,7 +88,7 @@ class Order:
         return self._labels[int(order[place])]
 
     def next(self) -> tuple[int, int, str]:
-        """Block, place and policy of the next trial: one that was void is repeated at the end of its block."""
+        """Block, place and policy of the next trial. A void trial is repeated at the end of its block."""
         judged = {(each.block, each.place) for each in self.trials if each.outcome != VOID}
         block = 0
         while all((block, place) in judged for place in range(len(self._labels))):
@@ -104,11 +104,11 @@ class Order:
 
     @property
     def blocks(self) -> int:
-        """Number of blocks that are complete."""
+        """Number of complete blocks."""
         return self.next()[0]
 
     def add(self, trial: Trial) -> None:
-        """Keep a trial that the operator has judged.
+        """Store a judged trial.
 
         Raises:
             DatasetError: if the order has been opened.
@@ -121,7 +121,7 @@ class Order:
         """Refuse further trials once the order has been opened.
 
         Raises:
-            DatasetError: if it has been.
+            DatasetError: if the order has been opened.
         """
         if (self._out / OPENED).exists():
             raise DatasetError(
@@ -130,7 +130,7 @@ class Order:
             )
 
     def outcomes(self) -> dict[str, list[Trial]]:
-        """Policy -> its trials of the complete blocks, for a decision within the program; nobody sees it."""
+        """Policy -> its trials of complete blocks. For decisions within the program; never show it."""
         complete = self.blocks
         found: dict[str, list[Trial]] = {label: [] for label in self._labels}
         judged = {(each.block, each.place): each for each in self.trials if each.outcome != VOID}
@@ -140,10 +140,10 @@ class Order:
         return found
 
     def open(self) -> dict[str, list[Trial]]:
-        """Open the order: policy -> its trials of the complete blocks. No trial can follow.
+        """Open the order. No trial can follow. Returns policy -> its trials of complete blocks.
 
         Raises:
-            DatasetError: if trials are not blind: run under another order, or after this one was opened.
+            DatasetError: if a trial was not blind: it ran under another order, or after the order was opened.
         """
         file = self._out / OPENED
         if wrong := [each.number for each in self.trials if each.seal != self.seal]:
@@ -171,5 +171,5 @@ def _numbers(trials: Sequence[int]) -> str:
 
 
 def _sealed(content: dict[str, Any]) -> bytes:
-    """A text that nobody reads by accident. It is a seal, not a secret."""
+    """Encode so that nobody reads it by accident. It is a seal, not a secret."""
     return base64.b85encode(zlib.compress(json.dumps(content).encode()))

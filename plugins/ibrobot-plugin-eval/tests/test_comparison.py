@@ -5,7 +5,7 @@ from ibrobot_eval.comparison import BETTER, SAME, UNDECIDED, WORSE, Decision, Su
 from .made_results import result, results, spread
 
 
-def test_25_and_29_of_50_are_undecided_and_say_how_many_more():
+def test_25_and_29_of_50_are_undecided_with_a_projection():
     (found,) = compare({"a": spread(29, 50, 7), "b": spread(25, 50, 11)}, 0.1)
     assert found.verdict == UNDECIDED
     assert found.words.startswith("undecided between a and b; about ")
@@ -29,7 +29,7 @@ def test_equal_outcomes_differ_by_no_more_than_the_margin_after_enough_episodes(
     assert (found.verdict, found.words) == (SAME, "a and b differ by no more than 10 points")
 
 
-def test_of_policy_against_itself_with_other_seeds_at_most_ten_of_200_are_called_different():
+def test_at_most_ten_of_200_comparisons_of_a_policy_with_itself_find_a_difference():
     rng = np.random.default_rng(0)
     different = 0
     for _ in range(200):
@@ -49,7 +49,7 @@ def test_three_policies_are_corrected_for_three_pairs():
     assert of_three[0].mcnemar_p == pytest.approx(3 * pair.mcnemar_p)
 
 
-def test_decision_is_that_of_looking_after_every_episode_in_order():
+def test_decision_does_not_depend_on_how_often_one_looks():
     good, bad = results(*[True] * 20), results(*[False] * 20)
     at_once, one_by_one = Decision(["a", "b"], 0.1), Decision(["a", "b"], 0.1)
     at_once.look({"a": good, "b": bad})
@@ -64,7 +64,7 @@ def test_single_policy_is_never_decided():
     assert decision.after is None
 
 
-def test_summary_of_a_policy_counts_what_happened():
+def test_summary_counts_successes_interventions_and_faults():
     made = [
         result(0, True, time_s=2.0, interventions={"velocity": 3}),
         result(1, True, time_s=4.0, interventions={"velocity": 1, "position": 2}),

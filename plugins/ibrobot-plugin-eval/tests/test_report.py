@@ -126,7 +126,7 @@ def test_plots_have_only_classes_that_pages_colour(tmp_path):
 
 
 def test_evaluation_without_a_report_can_be_continued(tmp_path):
-    assert lines_of(tmp_path) == ["not finished; the same evaluation, started again, continues it"]
+    assert lines_of(tmp_path) == ["not finished; start the same evaluation again to continue"]
     with pytest.raises(IbrobotError, match="has no report yet"):
         read_contents(tmp_path)
 
@@ -135,7 +135,7 @@ def test_evaluation_without_a_report_can_be_continued(tmp_path):
 def test_damaged_report_is_an_error_that_names_it(tmp_path, text):
     (tmp_path / REPORT).write_text(text)
     for read in (lines_of, read_contents):
-        with pytest.raises(IbrobotError, match=r"report\.json: is no report of an evaluation"):
+        with pytest.raises(IbrobotError, match=r"report\.json: is not a report of an evaluation"):
             read(tmp_path)
 
 
@@ -144,7 +144,7 @@ def test_wrong_values_in_a_report_are_an_error_that_names_it(tmp_path):
     facts = json.loads((tmp_path / REPORT).read_text())
     facts["episodes"][0]["time_s"] = "soon"
     (tmp_path / REPORT).write_text(json.dumps(facts))
-    with pytest.raises(IbrobotError, match=r"report\.json: is no report of an evaluation"):
+    with pytest.raises(IbrobotError, match=r"report\.json: is not a report of an evaluation"):
         read_contents(tmp_path)
 
 

@@ -2,7 +2,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from evaluation_statistics import covered, decided_at, reached, significant
+from evaluation_statistics import covered, decided_at, mcnemar_power, reached, significant
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_eval.statistics import (
@@ -11,12 +11,10 @@ from ibrobot_eval.statistics import (
     Pairs,
     clopper_pearson,
     decided_by,
-    episodes_for,
     episodes_to_decide,
     holm,
     log_capital,
     mcnemar_exact,
-    mcnemar_power,
     tango,
     wilson,
 )
@@ -25,6 +23,13 @@ from scipy.stats import binom
 EPISODES = 50
 RATES = (0.02, 0.1, 0.25, 0.5, 0.7, 0.9, 0.95, 0.99)
 COUNTS = st.builds(Pairs, *[st.integers(0, 60)] * 3).filter(lambda pairs: pairs.episodes > 0)
+
+
+def counted(outcomes):
+    """Pairs of outcomes, shape (n, 2) -> their counts."""
+    return Pairs(
+        sum(a and not b for a, b in outcomes), sum(b and not a for a, b in outcomes), sum(a == b for a, b in outcomes)
+    )
 
 
 def mirrored(pairs):
@@ -109,12 +114,12 @@ def test_interval_only_narrows_and_excludes_zero_exactly_when_the_test_rejects(o
     assert away > -1e-5 if test.p_value <= ALPHA else away < 1e-5
 
 
-def test_test_with_counted_pairs_sees_what_they_say():
+def test_test_counts_its_pairs():
     outcomes = [(True, False)] * 9 + [(False, True)] + [(True, True)] * 5
     test = PairedTest()
     for first, second in outcomes:
         test.add(first, second)
-    assert test.pairs == Pairs.of([a for a, _ in outcomes], [b for _, b in outcomes]) == Pairs(9, 1, 5)
+    assert test.pairs == counted(outcomes) == Pairs(9, 1, 5)
     assert test.sign == 1
 
 
@@ -152,7 +157,7 @@ def test_exact_probability_of_a_decision_agrees_with_simulation():
     for _ in range(300):
         outcomes = rng.random((60, 2)) < (0.9, 0.5)
         for n in range(1, 61):
-            pairs = Pairs.of(*outcomes[:n].T.tolist())
+            pairs = counted(outcomes[:n].tolist())
             if capital(pairs.first, pairs.second, 0, 0.0) >= -np.log(ALPHA):
                 decided[n:] += 1
                 break
@@ -168,7 +173,7 @@ def test_true_difference_is_seldom_refuted_under_peeking():
     assert 0 < refuted / 200 <= ALPHA
 
 
-def test_projection_is_what_the_present_frequencies_need():
+def test_projection_is_the_smallest_number_that_decides_at_the_present_frequencies():
     pairs = Pairs(4, 1, 5)
     more = episodes_to_decide(pairs, 0.05)
     assert more is not None
@@ -178,17 +183,12 @@ def test_projection_is_what_the_present_frequencies_need():
     assert log_capital(4 * scale, scale, 5 * scale, 0.0) < -np.log(ALPHA)
 
 
-def test_equal_outcomes_will_be_called_no_more_different_than_the_margin():
+def test_equal_outcomes_are_projected_to_differ_by_less_than_the_margin():
     wide, narrow = (episodes_to_decide(Pairs(0, 0, 20), margin) for margin in (0.1, 0.02))
     assert wide is not None
     assert narrow is not None
     assert 0 < wide < narrow
     assert episodes_to_decide(Pairs(500, 500, 0), 1e-4) is None
-
-
-def test_larger_differences_need_fewer_episodes():
-    assert [episodes_for(each) for each in (0.3, 0.2)] == [69, 164]
-    assert episodes_for(0.01, most=100) is None
 
 
 def test_sequential_test_needs_about_as_many_episodes_as_a_fixed_one():

@@ -4,7 +4,7 @@ from collections import Counter
 import attrs
 import pytest
 from ibrobot_eval.blinded import NEEDED, Blinding, power
-from ibrobot_eval.statistics import episodes_for
+from ibrobot_eval.statistics import decided_by
 from ibrobot_eval.trials import FAILURE, OPENED, ORDER, SUCCESS, VOID, Order, Trial
 
 from ibrobot_core.api import IbrobotError
@@ -32,7 +32,7 @@ def test_each_block_has_every_policy_once_in_random_order(tmp_path):
     assert order.blocks == 20
 
 
-def test_order_goes_on_where_a_crash_left_it(tmp_path):
+def test_order_continues_after_a_crash(tmp_path):
     acted = run(Order(tmp_path, LABELS), 7)
     again = Order(tmp_path, LABELS)
     assert (len(again.trials), again.seal) == (7, Order(tmp_path, LABELS).seal)
@@ -111,14 +111,16 @@ def test_damaged_order_is_an_error(tmp_path):
         Order(tmp_path, LABELS)
 
 
-def test_stated_numbers_of_trials_are_those_that_are_needed():
-    assert {difference: episodes_for(difference) for difference in (0.2, 0.3)} == {0.2: NEEDED[0.2], 0.3: NEEDED[0.3]}
+def test_stated_numbers_of_trials_have_a_power_of_80_percent():
+    for difference in (0.2, 0.3):
+        power_of = decided_by(0.5 + difference / 2, 0.5 - difference / 2, NEEDED[difference])
+        assert power_of[-2] < 0.8 <= power_of[-1]
     lines = power(69)
     assert "10 points: 770, 20 points: 164, 30 points: 69" in lines[0]
-    assert "30 points with 80 %" in lines[1]
+    assert "30 points: 80 %" in lines[1]
 
 
-def test_blinding_replaces_names_but_no_parts_of_words():
+def test_blinding_replaces_names_but_not_parts_of_words():
     blind = Blinding(["act", "act_2", "runs/act_2/last"])
     text = "mode act_2 failed: runs/act_2/last is missing, active; mode act acts"
     assert blind(text) == "mode POLICY failed: POLICY is missing, active; mode POLICY acts"

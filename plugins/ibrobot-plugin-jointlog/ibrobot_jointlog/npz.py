@@ -12,8 +12,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import DatasetError, DatasetWriter, Feature
-from ibrobot_jointlog.files import replace_file
+from ibrobot_core.api import DatasetError, DatasetWriter, Feature, replace_file
 
 Values = Mapping[str, NDArray[np.generic]]
 TASK = "task"
@@ -65,7 +64,7 @@ class NpzDatasetWriter(DatasetWriter):
             "metadata": dict(metadata),
         }
         try:
-            content = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False).encode()
+            content = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise DatasetError(f"metadata cannot be written as JSON: {error}") from error
         try:

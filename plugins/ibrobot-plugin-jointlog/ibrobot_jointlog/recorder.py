@@ -11,8 +11,17 @@ from typing import Any, override
 
 import attrs
 
-from ibrobot_core.api import NS_PER_S, Context, EpisodeEnd, EpisodeStart, JointState, Message, Recorder, RecorderError
-from ibrobot_jointlog.files import replace_file
+from ibrobot_core.api import (
+    NS_PER_S,
+    Context,
+    EpisodeEnd,
+    EpisodeStart,
+    JointState,
+    Message,
+    Recorder,
+    RecorderError,
+    replace_file,
+)
 from ibrobot_jointlog.log import header, row
 
 TOPIC = "/joint_states"
@@ -155,6 +164,6 @@ class JointLogRecorder(Recorder):
             **closing,
         }
         try:
-            replace_file(start.directory / "metadata.json", json.dumps(facts, indent=2, ensure_ascii=False).encode())
+            replace_file(start.directory / "metadata.json", json.dumps(facts, indent=2, ensure_ascii=False))
         except OSError as error:
             raise RecorderError(f"{start.directory / 'metadata.json'}: {error}") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ibrobot_core.api import DatasetError
+from ibrobot_core.api import DatasetError, sync
 from ibrobot_core.app import Ownership
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.arrow import table_of, to_array, to_numpy
@@ -129,7 +128,7 @@ def _complete(root: Path) -> None:
             path.replace(target)
             folders |= {folder for folder in target.parents if folder.is_relative_to(root)}
         for folder in folders:
-            _fsync(folder)
+            sync(folder)
         shutil.rmtree(merged)
     except OSError as error:
         raise DatasetError(f"{root}: the merge cannot be completed: {error}") from error
@@ -138,15 +137,7 @@ def _complete(root: Path) -> None:
 def _sync(folder: Path) -> None:
     """Flush a folder with all its files to the disk."""
     for path in (folder, *folder.rglob("*")):
-        _fsync(path)
-
-
-def _fsync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        sync(path)
 
 
 @attrs.define

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,8 @@ from typing import Any
 import attrs
 import yaml
 from ibrobot_ros2 import type_hash
+
+from ibrobot_core.api import replace_file
 
 METADATA = "metadata.yaml"
 INFORMATION = "rosbag2_bagfile_information"
@@ -157,14 +158,4 @@ def write_metadata(directory: Path, info: dict[str, Any]) -> None:
     Raises:
         OSError: if it cannot be written.
     """
-    temporary = directory / f".{METADATA}"
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(dump({INFORMATION: info}))
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(directory / METADATA)
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    replace_file(directory / METADATA, dump({INFORMATION: info}))

@@ -1,4 +1,4 @@
-"""A camera in the simulated scene: draws the newest physics state on the bus, at its own rate in simulated time."""
+"""A camera in the simulated scene: renders the newest physics state on the bus, at its rate in simulated time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FURTHEST_M = 10.0
 
 
 class MujocoCamera(Sensor):
-    """Renders in the thread of `open` and `read`; images for which there is no time are counted, not queued."""
+    """Renders in the thread of `open` and `read`. Images that are due too soon are counted, not queued."""
 
     def __init__(self, options: CameraOptions, ctx: Context) -> None:
         self._is_depth = options.stream == "depth"

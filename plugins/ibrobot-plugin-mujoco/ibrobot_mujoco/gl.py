@@ -69,8 +69,8 @@ def check_asked() -> str:
     Raises:
         MissingDependency: if there is no such backend, or it does not work on this machine.
     """
-    # Mesa's software renderer draws in the thread that asks for a picture. In threads of its own it would have neither
-    # that thread's priority nor, beside a busy program, a picture in time.
+    # Make Mesa's software renderer draw in the calling thread: threads of its own would lack that thread's priority,
+    # and be late beside a busy program.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     asked = os.environ.get("MUJOCO_GL", "").strip().lower()
     known = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa", "glfw")

@@ -36,7 +36,7 @@ type AnyScene = Scene[mujoco.MjSpec, World]
 
 
 def build_world(options: MujocoOptions, robot: Robot, *, visual: bool) -> tuple[World, AnyScene]:
-    """The compiled world, for rendering if `visual`, otherwise for physics; and its scene.
+    """Compile a world for rendering (`visual`) or for physics. Returns it with its scene.
 
     Raises:
         HardwareError: e.g. if there is no MJCF, or it has no position actuator for a joint.
@@ -61,7 +61,7 @@ def build_model(options: MujocoOptions, robot: Robot, *, visual: bool) -> mujoco
 
 
 def build_spec(options: MujocoOptions, robot: Robot) -> tuple[mujoco.MjSpec, AnyScene]:
-    """The editable model, with the MJCF's full meshes, and the scene that it has.
+    """Build the editable model, with the MJCF's full meshes. Returns it with its scene.
 
     Raises:
         HardwareError: e.g. if there is no MJCF, or it has no position actuator for a joint.
@@ -98,7 +98,7 @@ def _load(path: Path) -> mujoco.MjSpec:
 
 
 def _several(path: Path, arms: Mapping[str, tuple[float, float, float, float]]) -> mujoco.MjSpec:
-    """An MJCF once for each arm: prefix of its names -> x, y, z [m] and yaw [rad] of its base."""
+    """Attach an MJCF once for each arm: prefix of its names -> x, y, z [m] and yaw [rad] of its base."""
     spec = mujoco.MjSpec()
     for prefix, (x, y, z, yaw) in arms.items():
         arm = _load(path)

@@ -120,7 +120,7 @@ class CameraOptions:
 
 
 def _unusable(options: MujocoOptions, robot: Robot) -> Iterator[OptionFault]:
-    """Faults that MuJoCo reports: an invalid MJCF, missing joints and actuators, wrong cameras in the options."""
+    """Faults found by MuJoCo: an invalid MJCF, missing joints and actuators, wrong cameras in the options."""
     # Building the scene imports MuJoCo, so do it only if a run would simulate.
     from ibrobot_core.api import HardwareError, MissingDependency
     from ibrobot_mujoco.gl import check_asked

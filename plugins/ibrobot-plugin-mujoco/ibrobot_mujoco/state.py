@@ -15,7 +15,7 @@ PHYSICS_TOPIC = "/simulation/physics"
 """Stamp as whole seconds and remaining nanoseconds (2, each exact as a float), MuJoCo's state (nq), and the factors of
 the episode."""
 SCENE_TOPIC = "/simulation/scene"
-"""The ground truth of the scene, as its `values` say."""
+"""Ground truth of the scene; see its `values`."""
 OBJECTS_TOPIC = "/simulation/objects"
 """Of each object of `simulation.objects` that has a mass, in file order: position [m] (3), quaternion wxyz (4)."""
 POSE_SIZE = 7
@@ -56,7 +56,7 @@ class DrawnWorld:
         return cls(*build_world(options, robot, visual=visual))
 
     def follow(self, vector: Vector) -> None:
-        """Take over a physics state, as far as rendering needs it: bodies, cameras, lights, colours and sizes.
+        """Adopt a physics state, as far as rendering needs it: bodies, cameras, lights, colours and sizes.
 
         Raises:
             SensorError: if the state is from another scene.

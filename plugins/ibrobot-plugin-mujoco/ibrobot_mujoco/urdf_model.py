@@ -1,4 +1,4 @@
-"""An MJCF that can be simulated and planned with, made from a URDF: every value that a URDF lacks is a stated guess."""
+"""Convert a URDF to an MJCF for simulation and planning. Values that a URDF lacks are guessed, and reported."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _ARMATURE = 1e-3
 """Guessed inertia of a drive, for each N m (or N) of its effort [kg m^2, kg]."""
 _LEAST_ARMATURE = 5e-3
 _EFFORT, _VELOCITY = 20.0, 1.0
-"""Of joints for which the URDF states none [N m or N; rad/s or m/s]."""
+"""Effort and velocity of joints without them in the URDF [N m or N; rad/s or m/s]."""
 _TURN_RAD = 2 * math.pi
 _DRAWS = 300
 _OFTEN = 0.95
-"""Share of random poses in which two bodies touch that always do: their meshes overlap."""
+"""Two bodies that touch in a larger fraction of random poses always touch: their meshes overlap."""
 _FINGER = re.compile(r"finger|gripper|knuckle|jaw|claw", re.IGNORECASE)
 _TIP = re.compile(r"tcp|tool|tip|grasp|ee_|_ee|hand", re.IGNORECASE)
 
@@ -54,15 +54,15 @@ class DrivenJoint:
 
 @attrs.frozen
 class UrdfModel:
-    """What was made from a URDF."""
+    """A model made from a URDF."""
 
     mjcf: Path
     name: str
     joints: tuple[DrivenJoint, ...]
     home: tuple[float, ...]
-    """A pose without contacts, in the order of the joints."""
+    """A pose without contacts [rad or m], in the order of the joints."""
     notes: tuple[str, ...]
-    """The guesses, a sentence each."""
+    """The guesses, one sentence each."""
 
 
 def make_model(urdf: Path, folder: Path, packages: Mapping[str, Path], tip: str | None = None) -> UrdfModel:
@@ -72,7 +72,7 @@ def make_model(urdf: Path, folder: Path, packages: Mapping[str, Path], tip: str 
         urdf: a URDF or xacro file.
         folder: a new folder.
         packages: ROS package -> folder, for `package://` in the file; others are looked for in the folders above it.
-        tip: link whose frame is the tool's; by default the last one whose name says so, or the last of the arm.
+        tip: link whose frame is that of the tool; by default the last one named like a tool, or the last of the arm.
 
     Raises:
         HardwareError: if the file cannot be read or lacks a mesh, or describes no arm.
@@ -127,7 +127,7 @@ def _find_mesh(name: str, urdf: Path, packages: Mapping[str, Path]) -> Path:
 
 
 def _take_meshes(root: Element, urdf: Path, folder: Path, packages: Mapping[str, Path], notes: list[str]) -> None:
-    """Copy the collision meshes, converted where MuJoCo cannot read them; drop what is only for the eye."""
+    """Copy the collision meshes, converted where MuJoCo cannot read them; drop visual ones."""
     converted = False
     for link in root.iter("link"):
         solids = link.findall("collision")

@@ -195,7 +195,7 @@ def test_a_reset_forgets_the_episode(policy: Policy) -> None:
 
 
 def test_a_cube_out_of_reach_is_named(policy: Policy) -> None:
-    message = r"scripted_pick cannot do its task: gripperframe cannot reach \(0.600, 0.000, 0.083\) m"
+    message = r"scripted_pick cannot plan its task: gripperframe cannot reach \(0.600, 0.000, 0.083\) m"
     with pytest.raises(PolicyError, match=message):
         chunk(policy, 0.0, (0.6, 0.0, 0.0125))
 

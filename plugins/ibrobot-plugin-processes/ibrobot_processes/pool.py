@@ -1,4 +1,4 @@
-"""The pool `processes`: jobs in processes of this machine, each of which does one after another."""
+"""The pool `processes`: jobs in worker processes on this machine."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class _Task:
 
 
 class ProcessPool(Pool):
-    """Processes forked from one that has imported what this one has, so that they start at once.
+    """Worker processes, forked from one with this process's imports, so that they start quickly.
 
     Args:
         jobs: number of processes; None for one for each core.
@@ -103,7 +103,7 @@ class _Worker:
 
     @property
     def signs(self) -> tuple[Any, ...]:
-        """What `connection.wait` waits for: a message, or the end of the process."""
+        """Objects for `connection.wait`: a message, and the end of the process."""
         return self._connection, self._process.sentinel
 
     @property
@@ -115,7 +115,7 @@ class _Worker:
             self._connection.send(job)
 
     def outcome(self, task: _Task) -> Any:
-        """Result and error of its job, if it is done; sets the progress of the task."""
+        """Result and error of its job if it is done; updates the progress of the task."""
         with suppress(EOFError, OSError):  # it has died
             while self._connection.poll():
                 task.progress, outcome = self._connection.recv()
@@ -124,7 +124,7 @@ class _Worker:
         return None
 
     def end(self) -> str:
-        """Kill the process; returns why it had ended."""
+        """Kill the process. Returns why it had ended."""
         self._process.kill()
         self._process.join()
         status = self._process.exitcode or 0
@@ -134,7 +134,7 @@ class _Worker:
 
 
 def _work(channel: connection.Connection, environment: Mapping[str, str]) -> None:
-    """Do the jobs that the parent sends, until it has none left or dies."""
+    """Run the jobs sent by the parent, until none are left or the parent dies."""
     os.environ.clear()
     os.environ.update(environment)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -146,7 +146,7 @@ def _work(channel: connection.Connection, environment: Mapping[str, str]) -> Non
 
 
 class _Counter:
-    """Adds up the progress of a job, and reports it now and then."""
+    """Adds up the progress of a job, and reports it at intervals."""
 
     def __init__(self, channel: connection.Connection) -> None:
         self.count = 0

@@ -1,4 +1,4 @@
-"""The pool `ray`: each job is a task of Ray, which chooses its machine, and runs it again if its process dies."""
+"""The pool `ray`: each job is a Ray task. Ray chooses its machine, and repeats it if its process dies."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import ComponentFailed, Done, Job, Pool, installed_plugins
 
 RETRIES = 4
-"""Times that a job is run again after its process or machine was lost."""
+"""Maximum number of retries of a job whose process or machine was lost."""
 _POLL_S = 0.5
 _REPORT_S = 0.5
-"""Least time between two reports of progress of a job."""
+"""Minimum time between two progress reports of a job."""
 _AHEAD = 2
-"""Jobs that wait at Ray for each that runs, so that no machine waits for this one."""
+"""Jobs queued at Ray for each running job, so that no machine has to wait for this one."""
 
 
 def _versions() -> dict[str, str]:
-    """What must be equal on all machines."""
+    """Versions that must be equal on all machines."""
     return {"Python": platform.python_version(), **installed_plugins().versions()}
 
 
@@ -51,7 +51,7 @@ class _Counts:
 
 
 def _do(job: Job[Any], number: int, counts: Any, folder: str, versions: Mapping[str, str]) -> Any:
-    """Run a job as a task of Ray; returns its progress and its outcome."""
+    """Run a job as a Ray task. Returns its progress and its outcome."""
     here = socket.gethostname()
     mine = _versions()
     differ = [name for name, version in versions.items() if mine.get(name) != version]

@@ -1,4 +1,4 @@
-"""`ibrobot serve`: the cloud side of `execution_mode: distributed`; loads a model and answers robots."""
+"""`ibrobot serve`: load a model, and answer robots with `execution_mode: distributed`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _PANEL_PERIOD_S = 0.5
 
 
 def _share(ctx: click.Context, param: click.Parameter, value: str) -> float:
-    """The number for a share in percent."""
+    """Parse a percentage."""
     try:
         share = float(value.removesuffix("%")) / 100
     except ValueError:

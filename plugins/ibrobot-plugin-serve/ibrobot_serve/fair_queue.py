@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 
 class FairQueue[T]:
-    """The newest item of each robot, taken in turn: a robot that asks often does not keep the others waiting.
+    """The newest item of each robot, taken in turn, so that frequent requests of one robot do not delay the others.
 
     Args:
-        depth: how many robots may wait.
+        depth: maximum number of waiting robots.
     """
 
     def __init__(self, depth: int) -> None:
@@ -41,12 +41,12 @@ class FairQueue[T]:
         """The next items, in turn; waits for the first.
 
         Args:
-            most: how many items.
-            alike: whether an item may go with the first.
-            patience_s: how long to wait until `most` items are queued [s].
+            most: maximum number of items.
+            alike: whether an item may join a batch with the first one.
+            patience_s: maximum time to wait for `most` items [s].
 
         Returns:
-            Nothing after `end`, once the queue is empty.
+            The items; empty after `end`, once the queue is empty.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._ended)

@@ -1,6 +1,6 @@
-"""Which of a model's servers a robot uses.
+"""Choice among the servers of a model.
 
-Each robot decides for itself, from what all servers offer. No server knows the others, and none of them is special.
+Each robot decides by itself, from the offers of all servers. Servers are equal and do not know one another.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from ibrobot_core.api import Payload, PolicyError
 LARGEST_CANARY = 0.5
 """Largest share of the robots that a canary may ask for."""
 SETTLED_S = 5.0
-"""A robot leaves a working server only for one that has been up for so long [s]."""
+"""A robot leaves a working server only for one with at least this uptime [s]."""
 _AVOIDED_S = 5.0
-"""How long a robot tries all other servers before one that failed it [s]."""
+"""Time for which a robot prefers all other servers to one that failed [s]."""
 _OFFER_SIZE, _TEXT_SIZE = 1 << 20, 128
 
 
@@ -39,7 +39,7 @@ def _number(instance: object, attribute: attrs.Attribute[Any], value: object) ->
 
 @attrs.frozen
 class Offer:
-    """What a server says of itself. It comes from the network, so everything is checked."""
+    """A server's description of itself. It comes from the network, so everything is checked."""
 
     server: str
     """Id of the server, new after each start."""

@@ -19,7 +19,7 @@ _Rows = Mapping[tuple[str, ...], Mapping[str, Any]]
 
 
 def probes(service: InferenceService) -> Probes:
-    """The answers of a service's HTTP port."""
+    """Answers of a service's monitoring port."""
     return Probes(
         lambda: generate_latest(ServiceCollector(service)),
         lambda: "the model hangs" if service.state == "hangs" else "",

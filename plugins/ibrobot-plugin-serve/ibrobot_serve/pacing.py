@@ -10,21 +10,20 @@ from statistics import median
 from ibrobot_core.api import NS_PER_S
 
 _TARGET = 0.8
-"""Share of the model's time that requests may take. At 0.8, random arrivals wait for two requests' time on average."""
+"""Maximum load of the model. At 0.8, random arrivals wait for the time of two requests on average."""
 _GROWTH = 1.25
-"""Assumed growth of each robot's demand: a robot that keeps its pace may want to ask more often."""
+"""Assumed growth of each robot's demand, since a robot held to its pace may want to ask more often."""
 _WINDOW_NS = 5 * NS_PER_S
 _RENEWED_NS = NS_PER_S // 5
 _BATCHES_KEPT = 64
 
 
 class Pacing:
-    """The time that each robot of a server should leave between its requests.
+    """Minimum time between requests of each robot of a server.
 
-    Max-min fairness divides the model's time: a robot that asks seldom gets what it wants, and the others share the
-    rest. As long as the total demand is below the model's capacity, no robot is limited. Demand is
-    measured over 5 s, and the cost of a request by the median batch of the cheapest size, so that neither grows
-    because the model stood still for a while. May be used by several threads.
+    Max-min fairness divides the model's time: robots with a low demand get all of it, and the others share the rest.
+    Below the model's capacity, no robot is limited. Demand is measured over 5 s, and the cost of a request by the
+    median batch of the most efficient size, so that pauses of the model affect neither. Thread-safe.
     """
 
     def __init__(self) -> None:
@@ -75,7 +74,7 @@ class Pacing:
 
 
 def fair_pace_ns(counts: Iterable[int], cost_ns: float) -> int:
-    """The pace of the robots that ask most, with which all robots together stay within the model's target load.
+    """Pace of the most demanding robots with which all robots together keep to the model's target load.
 
     Args:
         counts: number of requests of each robot within the window.

@@ -1,4 +1,4 @@
-"""Execution mode `process`: `infer` in a child process, so that a model can neither starve nor crash the host."""
+"""Execution mode `process`: run `infer` in a child process, which can neither starve nor crash the host."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _GLANCE_S = 0.1
 
 
 class ProcessEngine(Engine):
-    """The model in a process of its own, which loads the weights; tensors go through shared memory.
+    """The model in a process of its own, which loads the weights; tensors pass through shared memory.
 
-    A process that dies is restarted: at once the first time, then after pauses that double until it answers. Meanwhile
-    requests fail, and the arm holds. A process that hangs is killed and restarted too.
+    A process that dies or hangs is restarted: at once the first time, then after pauses that double until it answers.
+    Meanwhile requests fail, and the arm holds.
 
     Args:
         config: the robot YAML.
         model: the model's name there.
-        fingerprint: of the policy on this side.
-        seed: the run's.
+        fingerprint: fingerprint of the host's policy.
+        seed: seed of the run.
         given_up: set when the run ends, e.g. while the model loads.
-        hang_timeout_s: a process that works on one request for longer hangs [s].
+        hang_timeout_s: a process that works longer on one request counts as hanging [s].
         accept_new_weights: continue, with a warning, if the process restarts with other weights.
     """
 

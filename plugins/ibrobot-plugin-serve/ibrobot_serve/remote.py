@@ -45,16 +45,16 @@ from ibrobot_serve.wire import (
 )
 
 _OFFER_TIMEOUT_S = 0.3
-"""How long a robot that chooses a server waits for an offer [s]."""
+"""Maximum time that a robot waits for the offers of servers [s]."""
 _REASON_TIMEOUT_S = 2.0
 _RETRY_S = 0.2
 _PARALLEL = 8
-"""Concurrent requests to a server whose model does not remember them."""
+"""Maximum number of concurrent requests to a server with a stateless model."""
 
 
 @attrs.frozen
 class _Session:
-    """A robot's time with a server. Requests of another session may have other weights."""
+    """The period in which a robot uses one server. Other sessions may have other weights."""
 
     server: str
     fingerprint: str
@@ -68,18 +68,18 @@ class _OtherServerError(PolicyError):
 class RemoteEngine(Engine):
     """The model on a server; the robot's side has no weights.
 
-    A robot stays with the server that it has chosen. It chooses another when that one dies, fails, or takes no robots
-    any more; also at the start of an episode, when another has more room. While no server is reachable, requests fail
-    and the arm holds. Each request contains everything that a server needs. The transport reconnects by itself.
+    A robot keeps its server until that one dies, fails, or stops taking robots; it may also change at the start of an
+    episode, if another server has more room. While no server is reachable, requests fail and the arm holds. Each
+    request contains everything that a server needs. The transport reconnects by itself.
 
     Args:
-        policy: the robot's side; its fingerprint must equal that of the server's.
+        policy: the robot's side; must have the fingerprint of the server's policy.
         transport: the connection to the servers; its owner closes it.
         model: name of the model on the servers.
         robot: this robot's name; a suffix makes it unique among all robots.
         start_timeout_s: how long `start` waits for a server [s].
         codec: encodes camera images as JPEG, for slow links.
-        limits: the server's.
+        limits: limits of the server.
         accept_new_weights: continue, with a warning, if only servers with other weights are left.
         canary: take part if a server offers other weights to a share of the robots.
     """
@@ -103,13 +103,13 @@ class RemoteEngine(Engine):
         self._buffers = [Buffer() for _ in range(self.parallel)]
         """Free buffers."""
         self._episode = time.time_ns()
-        """Starts at the time, so that a restart with the same certificate does not repeat an episode's number."""
+        """Begins at the present time, so that a restarted robot with the same name does not repeat a number."""
         self._choosing = threading.Lock()
         self._session: _Session | None = None
         self._last_server = ""
-        """The one that answered last, or was to."""
+        """The session of the last request."""
         self._weights: str | None = None
-        """Hash of the weights of all servers but canaries; None before the first was chosen."""
+        """Hash of the weights of the servers, except canaries; None before the first was chosen."""
         self._reconsider = False
         """Whether an episode has begun since the server was chosen."""
         self._log = logging.getLogger("ibrobot.inference")
@@ -266,7 +266,7 @@ class RemoteEngine(Engine):
         return self._begin(next(offer for offer in offers if offer.server == server))
 
     def _begin(self, offer: Offer) -> _Session:
-        """A session with a server. If it is not the last one, its model must not remember this robot."""
+        """Begin a session with a server. If its model is stateful, it must forget this robot's earlier episodes."""
         if self._last_server not in ("", offer.server):
             self._episode += 1
             self._log.info(

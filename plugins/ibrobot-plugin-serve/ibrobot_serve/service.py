@@ -1,4 +1,4 @@
-"""The cloud side of inference: one model, loaded once, answers many robots over a transport."""
+"""The server side of inference: one model, loaded once, answers many robots over a transport."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from ibrobot_serve.wire import (
 )
 
 _ROBOTS_KEPT = 256
-"""Number of robots whose counts are kept: the most recent ones."""
+"""Number of most recent robots whose counts are kept."""
 _LATENCIES_KEPT = 1000
 _LEASE_NS = 5 * NS_PER_S
-"""How long a stateful model stays with a silent robot while another asks."""
+"""Time for which a stateful model stays reserved for a silent robot while another asks [s]."""
 _LONGEST_WAIT_S = 600.0
 _GLANCE_S = 1.0
 """Maximum sleep of the watchdog."""
@@ -57,7 +57,7 @@ class ServiceOptions:
     hang_timeout_s: float = 30.0
     """A model that works on one batch for longer counts as hanging [s]."""
     canary: float = 0.0
-    """Share of all robots that may use this server although its weights differ; 0: as any other server."""
+    """Fraction of all robots that may use this server although its weights differ; 0: an ordinary server."""
     limits: WireLimits = WIRE_LIMITS
 
 
@@ -141,7 +141,7 @@ class InferenceService:
         self._transport = transport
         self._model = model
         self.id = uuid.uuid4().hex[:12]
-        """Tells this server from the others of the model; another one after each start."""
+        """Identifies this server among those of the model; new after each start."""
         self._options = options or ServiceOptions()
         self._decoder, self._encoder = WireDecoder(self._options.limits, codec), WireEncoder(self._options.limits)
         self._weights = policy.weights()
@@ -171,13 +171,13 @@ class InferenceService:
         self._watchdog = threading.Thread(target=self._watch, name=f"watchdog of {model}", daemon=True)
 
     def start(self) -> None:
-        """Begin to answer.
+        """Start answering requests.
 
         Raises:
-            TransportError: when another server has this name.
+            TransportError: if another server has this name.
         """
         options = self._options
-        # Each waiting request holds a worker; one more must be left to answer that the queue is full.
+        # Each waiting request occupies a worker; one more answers that the queue is full.
         workers = options.queue + options.batch + 1
         self._ends.append(self._transport.serve(health_name(self._model), self._health, workers=1))
         for name in (service_name(self._model), server_name(self._model, self.id)):
@@ -187,10 +187,10 @@ class InferenceService:
         self._watchdog.start()
 
     def drain(self, timeout_s: float) -> bool:
-        """Send robots to other servers, and wait until all pending requests are answered.
+        """Redirect robots to other servers, and wait until all pending requests are answered.
 
         Args:
-            timeout_s: how long to wait at most [s].
+            timeout_s: maximum waiting time [s].
 
         Returns:
             Whether all were answered in time.
@@ -238,7 +238,7 @@ class InferenceService:
         return json.dumps(self.statistics()).encode()
 
     def _offer(self, payload: Payload, sender: str | None) -> Payload:
-        """What a robot has to know to choose among servers."""
+        """Information for robots that choose among servers."""
         now_ns = time.monotonic_ns()
         owned = self._owner is not None and now_ns - self._owner_heard_ns < _LEASE_NS
         robots = int(owned) if self._policy.spec.stateful else self._pacing.robots(now_ns)

@@ -1,4 +1,4 @@
-"""Whether a model that comes back is still the one that acted."""
+"""Check that a restarted model has the same weights."""
 
 from __future__ import annotations
 

@@ -82,9 +82,9 @@ class WireKind(enum.IntEnum):
     ANSWER = 2
     """Its outputs."""
     FAILURE = 3
-    """Why there are none, in `text`."""
+    """The reason for the lack of outputs, in `text`."""
     REFUSAL = 4
-    """Why this server does not take the request, in `text`; another server may."""
+    """The reason why this server refuses the request, in `text`; another server may take it."""
 
 
 _KINDS = {kind.value: kind for kind in WireKind}
@@ -123,16 +123,16 @@ class WireMessage:
     stamp_ns: int = 0
     """When the robot sent the request, by its own clock; the answer repeats it."""
     deadline_ns: int = 0
-    """In a request: how long after its arrival the answer is useful [ns]. The clocks of both sides need not agree."""
+    """In a request: deadline of the answer after the request's arrival [ns]. Needs no common clock."""
     episode: int = 0
-    """In a request: counts the robot's episodes; a policy that remembers is reset with `seed` where it changes."""
+    """In a request: number of the robot's episode; a change resets a stateful policy with `seed`."""
     seed: int = 0
     latency_ms: float = 0.0
     """In an answer: from the request's arrival at the server to its answer."""
     queued_ns: int = 0
-    """In an answer: for how much of it the request waited for its turn [ns]."""
+    """In an answer: the part of `latency_ns` for which the request waited for its turn [ns]."""
     pace_ns: int = 0
-    """In an answer or a failure: the time that the robot should leave from one request to the next [ns]; 0: any."""
+    """In an answer or a failure: minimum time between the robot's requests [ns]; 0: none."""
 
 
 class NoPictures(PictureCodec):
@@ -174,7 +174,7 @@ class _MessageLayout:
 
 
 class _Layouts[K: Hashable]:
-    """The layouts that were used last. May be used by several threads."""
+    """Cache of the most recent layouts. Thread-safe."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[K, _MessageLayout] = OrderedDict()
@@ -273,13 +273,13 @@ def _fresh(size: int) -> memoryview:
 
 
 class Buffer:
-    """Memory reused for consecutive frames: allocating memory for a large frame costs more than filling it."""
+    """Memory reused for consecutive frames, since allocating a large frame takes longer than filling it."""
 
     def __init__(self) -> None:
         self._memory = bytearray()
 
     def allocate(self, size: int) -> memoryview:
-        """`size` bytes, usually of the same memory as before: a frame is valid until the next one is made."""
+        """Return `size` bytes, usually of the same memory as before: a frame is valid until the next one is made."""
         try:
             if size < len(self._memory):
                 del self._memory[size:]
@@ -291,10 +291,10 @@ class Buffer:
 
 
 class WireEncoder:
-    """Encodes messages. Messages that differ from earlier ones only in numbers and values are encoded faster.
+    """Encodes messages, faster if they differ from earlier ones only in numbers and values.
 
     Args:
-        limits: those of the receiver.
+        limits: limits of the receiver.
         codec: encodes camera pictures as JPEG, which changes their pixels.
     """
 
@@ -304,14 +304,14 @@ class WireEncoder:
         self._layouts: _Layouts[Hashable] = _Layouts()
 
     def encode(self, message: WireMessage, allocate: Callable[[int], memoryview] = _fresh) -> memoryview:
-        """A frame; every tensor is copied once, to where it is sent from. May be called by several threads at a time.
+        """Encode a frame, copying each tensor once. Thread-safe.
 
         Args:
-            message: what to say.
-            allocate: returns writable memory of at least so many bytes.
+            message: the message.
+            allocate: returns writable memory of at least the given number of bytes.
 
         Raises:
-            WireError: for what has no place in a frame, e.g. a tensor of objects, or more than the limits allow.
+            WireError: for contents that a frame cannot hold, e.g. a tensor of objects, or that exceed the limits.
         """
         jpegs = _jpegs(message.tensors, self._codec) if self._codec is not None else {}
         key = (
@@ -339,7 +339,7 @@ def decode(payload: Payload, *, limits: WireLimits = WIRE_LIMITS, codec: Picture
 
 
 class WireDecoder:
-    """Decodes frames. Frames that differ from earlier ones only in numbers and values are decoded faster.
+    """Decodes frames, faster if they differ from earlier ones only in numbers and values.
 
     Args:
         limits: a frame beyond them is refused.
@@ -353,9 +353,7 @@ class WireDecoder:
         """By their heads."""
 
     def decode(self, payload: Payload) -> WireMessage:
-        """A message whose tensors are read-only views of `payload`; only JPEG pictures have memory of their own.
-
-        May be called by several threads at a time.
+        """Decode a frame. Tensors are read-only views of `payload`, except for JPEG pictures. Thread-safe.
 
         Raises:
             WireError: for anything but a whole frame within the limits.

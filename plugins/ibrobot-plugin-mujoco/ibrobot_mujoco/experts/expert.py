@@ -1,4 +1,4 @@
-"""Scripted experts: policies that do the tasks of scenes, by inverse kinematics and the scene's ground truth."""
+"""Scripted experts: policies that solve scenes by inverse kinematics and the scene's ground truth."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ class _Episode:
 
 
 class ScriptedExpert(Policy):
-    """Plans the whole motion on an episode's first frame; chunks are time windows of it, so they agree exactly.
+    """Plans the whole motion at an episode's first frame. Chunks are time windows of it, so they agree exactly.
 
-    If something is not as the plan expects it (an object was pushed away, dropped, or put beside its place), it plans
-    again, from the next waypoint that is clear of all objects and not yet part of a chunk.
+    If the scene deviates from the plan (e.g. an object was pushed away, dropped, or misplaced), it replans from the
+    next waypoint that is clear of all objects and not yet part of a chunk.
 
     Args:
         task: makes the plans.
@@ -160,12 +160,12 @@ class ScriptedExpert(Policy):
         try:
             plan = self._task.plan(kept[-1].end, scene, home)
         except UnreachableError as error:
-            raise PolicyError(f"{self._name} cannot do its task: {error}") from error
+            raise PolicyError(f"{self._name} cannot plan its task: {error}") from error
         return Trajectory([*kept, *plan]), len(kept)
 
     @staticmethod
     def _failed(episode: _Episode, now_s: float, state: Vector, scene: Vector) -> bool:
-        """Whether the scene is not as the plan expects it at this time."""
+        """Whether the scene deviates from the plan at this time."""
         index = max(int(episode.trajectory.index(np.array([now_s]))[0]), episode.first)
         return not episode.trajectory.segments[index].expects(state, scene)
 

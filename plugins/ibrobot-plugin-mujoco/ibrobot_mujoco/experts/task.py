@@ -1,4 +1,4 @@
-"""What an expert does in one scene: a plan from the scene's ground truth."""
+"""Interface of an expert for one scene: plans from the scene's ground truth."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from ibrobot_mujoco.experts.way import Hand
 
 @attrs.frozen(eq=False)
 class Task(ABC):
-    """Plans with the robot's hands: one, or the left and the right one."""
+    """Plans for one hand, or for the left and the right one."""
 
     hands: tuple[Hand, ...]
     options: ExpertOptions
     limits: Limits
 
     sides: ClassVar[tuple[str, ...]] = ("",)
-    """Prefixes of the groups of joints that the hands are made of."""
+    """Prefixes of the joint groups of the hands."""
 
     @property
     def hand(self) -> Hand:
@@ -31,7 +31,7 @@ class Task(ABC):
 
     @abstractmethod
     def plan(self, start: Vector, scene: Vector, home: Vector) -> list[Segment]:
-        """The segments that do the task from `start` and end at `home`; both shape (J,) [rad].
+        """Plan the task. Returns segments from `start` to `home`, both shape (J,) [rad].
 
         Raises:
             UnreachableError: if an object is out of reach.

@@ -19,11 +19,11 @@ _ACCELERATION = 10 / np.sqrt(3)
 
 
 type Expectation = Callable[[Vector, Vector], bool]
-"""Measured joints [rad], shape (J,), and the scene's ground truth, shape (V,) -> whether all goes as planned."""
+"""Measured joints [rad], shape (J,), and the scene's ground truth, shape (V,) -> whether the plan still holds."""
 
 
 def anything(state: Vector, scene: Vector) -> bool:
-    """The expectation that is always met."""
+    """Expect nothing."""
     return True
 
 
@@ -36,9 +36,9 @@ class Segment:
     end: Vector
     duration_s: float
     clear: bool = False
-    """Whether it ends clear of all objects, so that another plan can begin there."""
+    """Whether it ends clear of all objects, so that a new plan can begin there."""
     expects: Expectation = anything
-    """Has to be met during the segment; otherwise another plan is made."""
+    """Must hold during the segment; otherwise the expert replans."""
 
 
 @attrs.frozen(eq=False)

@@ -1,4 +1,4 @@
-"""Waypoints of the experts: hands that reach for poses, and a way that is built from one waypoint to the next."""
+"""Waypoints of the experts: hands that reach poses, and paths built waypoint by waypoint."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SETTLE_S = 0.2
 GRASP_TURN_RAD, HOVER_TURN_RAD = 0.35, 1.2
 """Allowed deviation of the gripper from vertical, if the arm cannot reach vertical [rad]."""
 MOVED_M = 0.01
-"""An object further than this from where the plan has it has moved [m]."""
+"""An object further than this from its planned position has moved [m]."""
 LOST_M = 0.03
 """An object further than this from the tip is not held [m]."""
 UP = np.array([0.0, 0.0, 1.0])
@@ -41,7 +41,7 @@ class Hand:
     base: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     def reach(self, position: Vector, rotation: Vector, start: Vector, gripper: float, turn: float) -> Vector:
-        """Joints with the tip at a pose in the robot's frame, shape (J,) [rad]; other joints as in `start`.
+        """Joints with the tip at a pose in the robot's frame, shape (J,) [rad]; others as in `start`.
 
         Raises:
             UnreachableError: if it is out of reach.
@@ -53,7 +53,7 @@ class Hand:
         return self.grip(result, gripper)
 
     def grip(self, joints: Vector, gripper: float) -> Vector:
-        """The joints with another position of the gripper."""
+        """Return the joints with another position of the gripper."""
         result = joints.copy()
         result[self.gripper] = gripper
         return result
@@ -73,7 +73,7 @@ class Hand:
 
 @attrs.define(eq=False)
 class Way:
-    """Segments, each from where the last one ended."""
+    """A path of segments, each beginning where the previous one ends."""
 
     at: Vector
     """Joints [rad], shape (J,)."""
@@ -85,7 +85,7 @@ class Way:
         self._add(name, joints, duration(self.at, joints, self.limits), clear, expects)
 
     def rest(self, name: str, duration_s: float, *, clear: bool = False, expects: Expectation = anything) -> None:
-        """Stay where it is."""
+        """Stay in place."""
         self._add(name, self.at, duration_s, clear, expects)
 
     def _add(self, name: str, end: Vector, duration_s: float, clear: bool, expects: Expectation) -> None:
@@ -119,10 +119,10 @@ def across(pose: Vector, near: float) -> float:
 
 
 def is_at(first: int, position: Vector) -> Expectation:
-    """Expects the object whose position begins at index `first` of the ground truth to be at `position` [m]."""
+    """Expect the object whose position begins at index `first` of the ground truth to be at `position` [m]."""
     return lambda state, scene: bool(np.linalg.norm(scene[first : first + 3] - position) <= MOVED_M)
 
 
 def is_held(first: int, hand: Hand, within: float = LOST_M) -> Expectation:
-    """Expects the object whose position begins at index `first` of the ground truth to be in a hand."""
+    """Expect the object whose position begins at index `first` of the ground truth to be in a hand."""
     return lambda state, scene: bool(np.linalg.norm(scene[first : first + 3] - hand.tip(state)) <= within)

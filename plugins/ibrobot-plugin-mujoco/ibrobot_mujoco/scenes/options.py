@@ -15,7 +15,7 @@ _TURN = 3.14159
 @documented
 @attrs.frozen(kw_only=True)
 class SceneOptions:
-    """Options of every scene. A range `[lowest, highest]` is drawn from in each episode; a number fixes the value."""
+    """Options of every scene. Each episode draws from a range `[lowest, highest]`; a number fixes the value."""
 
     friction: Span = span(1.0, ge=0.05, le=3.0, help="sliding friction of objects, table and jaws, relative to 1")
     light: Span = span(1.0, ge=0.0, le=3.0, help="brightness of all lamps, relative to the usual one")

@@ -1,4 +1,4 @@
-"""What all scenes have: light, friction and cameras by factors, distractors, and places clear of everything else."""
+"""Base of all scenes: light, friction and cameras by factors, distractors, and clear placement of objects."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ type Draw = Callable[[], tuple[float, float, float, float]]
 
 @attrs.frozen(eq=False)
 class _Original:
-    """A model as it was compiled; factors change it from there."""
+    """Values of the compiled model, which factors modify."""
 
     model: mujoco.MjModel
     friction: Vector
