@@ -11,12 +11,12 @@ from ibrobot_kinematics.rotations import from_quaternion, rpy
 
 from ibrobot_core.api import NotSupported, PlanCode, PlanningError, Pose, PoseStamped, Quaternion, Vector3
 from ibrobot_planning.client.node import BaseNode
+from ibrobot_planning.goals.grammar import check_frame
 
 type Position = Vector3 | Sequence[float]
 type Orientation = Quaternion | Sequence[float]
 type AnyPose = Pose | PoseStamped
 
-_BASE_FRAMES = ("", "base", "base_link")
 _PRIMITIVES = {1: ("box", ()), 2: ("sphere", ("radius",)), 3: ("cylinder", ("height", "radius"))}
 """Type of shape_msgs/msg/SolidPrimitive -> the shape, and the keys of its dimensions."""
 
@@ -203,20 +203,13 @@ class CollisionObjects:
             frame_id, pose = frame_id or pose.header.frame_id, pose.pose
         if pose is not None:
             position, quat_xyzw = pose.position, pose.orientation
-        self._check_frame(frame_id)
+        check_frame(frame_id or "")
         if position is None:
             raise PlanningError(
                 "the object needs a place: pose, or position and quat_xyzw", PlanCode.INVALID_OBJECT_NAME
             )
         turn = numbers(quat_xyzw, "xyzw") if quat_xyzw is not None else (0.0, 0.0, 0.0, 1.0)
         return {"position": numbers(position, "xyz"), "rpy": rpy(from_quaternion(turn)).tolist()}
-
-    def _check_frame(self, frame_id: str | None) -> None:
-        if frame_id is not None and frame_id not in _BASE_FRAMES:
-            raise PlanningError(
-                f"frame {frame_id!r} is not the base; it is called {', '.join(filter(None, _BASE_FRAMES))}",
-                PlanCode.FRAME_TRANSFORM_FAILURE,
-            )
 
 
 def numbers(values: Vector3 | Quaternion | Sequence[float], names: str) -> list[float]:

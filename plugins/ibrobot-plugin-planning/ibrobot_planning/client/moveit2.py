@@ -21,6 +21,7 @@ from ibrobot_planning.client.motion import (
 )
 from ibrobot_planning.client.node import BaseNode
 from ibrobot_planning.execution.source import EXECUTE
+from ibrobot_planning.goals.grammar import check_frame
 
 __all__ = ["MoveIt2", "MoveIt2State", "MoveItErrorCodes"]
 
@@ -99,7 +100,7 @@ class MoveIt2(CollisionObjects):
         known = self._scene["joint_state"]["name"]
         if unknown := [name for name in self.joint_names if name not in known]:
             raise PlanningError(f"no joint {unknown[0]!r}; the joints are: {', '.join(known)}")
-        self._check_frame(base_link_name)
+        check_frame(base_link_name)
         self._check_link(end_effector_name)
 
     num_planning_attempts = _WithoutEffect(5, _BY_YAML)
@@ -239,7 +240,7 @@ class MoveIt2(CollisionObjects):
         weight: float = 1.0,
     ) -> None:
         """Set the position of the next goal [m]."""
-        self._check_frame(frame_id)
+        check_frame(frame_id or "")
         self._check_link(target_link)
         self._goals[-1] |= {"xyz": numbers(position, "xyz"), "position_tolerance": float(tolerance)}
 
@@ -248,7 +249,7 @@ class MoveIt2(CollisionObjects):
         tolerance: float | Sequence[float] = 0.001, weight: float = 1.0, parameterization: int = 0,
     ) -> None:  # fmt: skip
         """Set the orientation of the next goal; of three tolerances [rad] the least counts."""
-        self._check_frame(frame_id)
+        check_frame(frame_id or "")
         self._check_link(target_link)
         least = tolerance if isinstance(tolerance, int | float) else min(tolerance)
         self._goals[-1] |= {"quaternion": numbers(quat_xyzw, "xyzw"), "angle_tolerance": float(least)}

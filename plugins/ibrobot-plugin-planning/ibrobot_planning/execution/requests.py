@@ -50,13 +50,10 @@ class MoveRequest:
 
 @documented
 @attrs.frozen
-class PlanQuery:
+class PlanQuery(MoveRequest):
     """A request to `/plan_kinematic_path`: plan to the first of several goals that can be reached, without moving."""
 
-    goals: tuple[GoalOptions, ...] = option(validator=_few(20), help="alternatives, in order of preference")
     start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints: the present position")
-    velocity_scaling: float = _scaling("velocity")
-    acceleration_scaling: float = _scaling("acceleration")
 
 
 @documented

@@ -35,6 +35,7 @@ from ibrobot_planning.execution.plans import GoalPlans
 from ibrobot_planning.execution.requests import Execute, GoTo, MoveRequest, MoveToConfiguration, MoveToPose, Numbered
 from ibrobot_planning.execution.results import MoveResult, Outcome, results_of
 from ibrobot_planning.execution.services import PlanningServices
+from ibrobot_planning.goals.grammar import check_frame
 from ibrobot_planning.goals.text import Target, target
 from ibrobot_planning.goals.tool import pose_matrix
 
@@ -74,8 +75,6 @@ CMD_POSE = "/cmd_pose"
 """geometry_msgs/msg/PoseStamped or Pose: a goal."""
 MOTION_STATUS = "/moveit_gateway/motion_status"
 """std_msgs/msg/String: `idle`, `executing`, `succeeded` or `failed`, as in IB-Robot's gateway."""
-FRAMES = ("", "base", "base_link")
-"""Names of the base frame in `/cmd_pose`."""
 _STATUS_NS = ns(0.1)
 _GLANCE_S = 0.5
 _BUSY_S = 0.01
@@ -319,12 +318,7 @@ class PlannerSource(SourceWorker):
         message = received.message
         try:
             if isinstance(message, PoseStamped):
-                if message.header.frame_id not in FRAMES:
-                    names = ", ".join(filter(None, FRAMES))
-                    raise PlanningError(
-                        f"frame {message.header.frame_id!r} is not the base; it is called {names}",
-                        PlanCode.FRAME_TRANSFORM_FAILURE,
-                    )
+                check_frame(message.header.frame_id)
                 message = message.pose
             if not isinstance(message, Pose):
                 raise PlanningError(

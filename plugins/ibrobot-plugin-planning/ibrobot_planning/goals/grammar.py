@@ -35,6 +35,7 @@ DIRECTIONS: Mapping[str, Triple] = {"down": (0.0, 0.0, -1.0), "up": (0.0, 0.0, 1
 POLICIES: tuple[str, ...] = get_args(OrientationPolicy)
 LEAST_SCALING = 0.01
 """Least fraction of the velocity and acceleration limits that a goal may ask for."""
+_BASE_FRAMES = ("", "base", "base_link")
 _NEARLY_ONE = 1e-3
 """Allowed deviation of a quaternion's length from 1."""
 _UPRIGHT = math.cos(math.radians(45.0))
@@ -196,6 +197,17 @@ def object_pose(world: World, name: str) -> Pose:
             PlanCode.INVALID_OBJECT_NAME,
         )
     return thing.pose
+
+
+def check_frame(frame: str) -> None:
+    """Check that a frame is that of the base, which is also meant by an empty name.
+
+    Raises:
+        PlanningError: if it is not.
+    """
+    if frame not in _BASE_FRAMES:
+        names = ", ".join(filter(None, _BASE_FRAMES))
+        raise PlanningError(f"frame {frame!r} is not the base; it is called {names}", PlanCode.FRAME_TRANSFORM_FAILURE)
 
 
 def scaling_fault(name: str, scaling: float) -> str:

@@ -9,8 +9,19 @@ from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.srdf import GroupState, read_srdf
 from ibrobot_kinematics.urdf import read_urdf
 
-from ibrobot_core.api import AnyGoal, Goal, JointGoal, NamedGoal, Robot, Vector
+from ibrobot_core.api import (
+    AnyGoal,
+    Goal,
+    JointGoal,
+    NamedGoal,
+    PlanCode,
+    PlanningError,
+    PlanRequest,
+    Robot,
+    Vector,
+)
 from ibrobot_planning.goals.errors import invalid_goal
+from ibrobot_planning.goals.grammar import scaling_fault
 
 
 def pose_names(robot: Robot) -> list[str]:
@@ -66,6 +77,32 @@ def without_names(goal: Goal, robot: Robot, joints: Sequence[str]) -> Goal:
         return goal
     positions = {joint: value for joint, value in named_pose(robot, goal.name).items() if joint in joints}
     return JointGoal(tuple(positions), np.array(list(positions.values())))
+
+
+def checked_start(request: PlanRequest, robot: Robot) -> Vector:
+    """Check the joints, the start and the scalings of a request. Returns the start [rad], shape (J,).
+
+    Raises:
+        PlanningError: for unknown joints, a start of another shape or that is not finite, and invalid scalings.
+    """
+    for name in (*request.joints, *request.others):
+        if name not in robot.joint_names:
+            raise PlanningError(
+                f"no joint {name!r}; the joints are: {', '.join(robot.joint_names)}", PlanCode.INVALID_GROUP_NAME
+            )
+    start = np.array(request.start, dtype=float)
+    if start.shape != (len(request.joints),):
+        raise PlanningError(
+            f"start has shape {start.shape}, must be ({len(request.joints)},): one per joint",
+            PlanCode.INVALID_ROBOT_STATE,
+        )
+    for name, scaling in (("velocity", request.velocity_scaling), ("acceleration", request.acceleration_scaling)):
+        if fault := scaling_fault(f"{name}_scaling", scaling):
+            raise PlanningError(fault)
+    for name, value in zip(request.joints, start.tolist(), strict=True):
+        if not np.isfinite(value):
+            raise PlanningError(f"start of joint {name} is {value}, must be finite", PlanCode.INVALID_ROBOT_STATE)
+    return start
 
 
 def joint_target(goal: JointGoal | NamedGoal, robot: Robot, joints: Sequence[str], start: Vector) -> Vector:

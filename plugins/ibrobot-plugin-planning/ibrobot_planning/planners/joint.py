@@ -12,7 +12,6 @@ import numpy as np
 from ibrobot_core.api import (
     Context,
     Header,
-    Joint,
     JointGoal,
     JointTrajectory,
     JointTrajectoryPoint,
@@ -25,8 +24,7 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_planning.goals.grammar import scaling_fault
-from ibrobot_planning.goals.joints import joint_target
+from ibrobot_planning.goals.joints import checked_start, joint_target
 from ibrobot_planning.planners.options import JointPlannerOptions
 from ibrobot_planning.planners.timing import check_duration
 
@@ -46,67 +44,43 @@ class JointPlanner(Planner):
     def __init__(self, options: JointPlannerOptions, ctx: Context) -> None:
         self._options = options
         self._robot = ctx.robot
-        self._joints = {joint.name: joint for joint in ctx.robot.joints}
         self._clock = ctx.clock
         self._period_ns = ctx.period_ns
 
     @override
     def plan(self, request: PlanRequest) -> PlanResult:
-        joints = self._check_start(request)
+        # A start outside the limits is allowed: an arm at rest may sag beyond them, and must be able to return.
+        start, order = checked_start(request, self._robot), self._robot.indices(request.joints)
         if not isinstance(request.goal, JointGoal | NamedGoal):
             raise PlanningError(
                 "planner type 'joint' knows joint goals only, not poses of the tool: "
                 "name a pose of robot.description.poses, or use another type of planner, one for Cartesian goals",
                 PlanCode.UNRECOGNIZED_GOAL_TYPE,
             )
-        delta = joint_target(request.goal, self._robot, request.joints, request.start) - request.start
-        velocity = self._options.velocity_scaling * _fraction("velocity_scaling", request.velocity_scaling)
-        acceleration = self._options.acceleration_scaling * _fraction(
-            "acceleration_scaling", request.acceleration_scaling
+        delta = joint_target(request.goal, self._robot, request.joints, start) - start
+        velocity = self._options.velocity_scaling * request.velocity_scaling * self._robot.max_velocity[order]
+        acceleration = (
+            self._options.acceleration_scaling * request.acceleration_scaling * self._robot.max_acceleration[order]
         )
         header = Header(stamp_ns=self._clock.now_ns())
         distance = float(np.max(np.abs(delta), initial=0.0))
         if distance < _AT_GOAL:
-            rest = np.zeros(len(joints))
+            rest = np.zeros(len(start))
             # Two points: the last one must be after time 0.
-            stay = tuple(JointTrajectoryPoint(stamp, request.start, rest, rest) for stamp in (0, self._period_ns))
+            stay = tuple(JointTrajectoryPoint(stamp, start, rest, rest) for stamp in (0, self._period_ns))
             return PlanResult(JointTrajectory(header, request.joints, stay))
         # Limits along the line, in terms of the joint that moves farthest: the others move by a fraction of its way.
         share = np.abs(delta) / distance
         moving = share > _AT_GOAL
-
-        def along(values: list[float]) -> float:
-            return float(np.min(np.array(values)[moving] / share[moving]))
-
-        profile = RestToRest(
-            distance,
-            along([joint.max_velocity * velocity for joint in joints]),
-            along([joint.max_acceleration * acceleration for joint in joints]),
-            self._options.max_jerk,
-        )
+        fastest, strongest = (float((limits[moving] / share[moving]).min()) for limits in (velocity, acceleration))
+        profile = RestToRest(distance, fastest, strongest, self._options.max_jerk)
         check_duration(profile.ends[-1])
         direction = delta / distance
         points = tuple(
-            JointTrajectoryPoint(stamp, request.start + way * direction, speed * direction, rate * direction)
+            JointTrajectoryPoint(stamp, start + way * direction, speed * direction, rate * direction)
             for stamp, way, speed, rate in _points(profile, self._options.step)
         )
         return PlanResult(JointTrajectory(header, request.joints, points))
-
-    def _check_start(self, request: PlanRequest) -> list[Joint]:
-        """Check the request, and return its joints."""
-        joints = [self._joint(name) for name in request.joints]
-        if np.shape(request.start) != (len(joints),):
-            raise PlanningError(f"start has shape {np.shape(request.start)}, must be ({len(joints)},): one per joint")
-        # A start outside the limits is allowed: an arm at rest may sag beyond them, and must be able to return.
-        for joint, value in zip(joints, request.start, strict=True):
-            if not math.isfinite(value):
-                raise PlanningError(f"start of joint {joint.name} is {value}, must be finite")
-        return joints
-
-    def _joint(self, name: str) -> Joint:
-        if name not in self._joints:
-            raise PlanningError(f"no joint {name!r}; the joints are: {', '.join(self._joints)}")
-        return self._joints[name]
 
 
 class RestToRest:
@@ -158,12 +132,6 @@ def _peak_speed(distance: float, max_acceleration: float, max_jerk: float) -> fl
         return math.cbrt(distance**2 * max_jerk / 4)
     # From distance = speed * (speed / max_acceleration + ramp).
     return max_acceleration * (math.sqrt(ramp**2 / 4 + distance / max_acceleration) - ramp / 2)
-
-
-def _fraction(name: str, value: float) -> float:
-    if fault := scaling_fault(name, value):
-        raise PlanningError(fault)
-    return value
 
 
 def _points(profile: RestToRest, step: float) -> list[tuple[int, float, float, float]]:

@@ -32,8 +32,7 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_planning.goals.errors import invalid_goal
-from ibrobot_planning.goals.grammar import scaling_fault
-from ibrobot_planning.goals.joints import joint_target
+from ibrobot_planning.goals.joints import checked_start, joint_target
 from ibrobot_planning.goals.tool import Candidate, Tool
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.planners.options import RrtConnectOptions
@@ -144,24 +143,9 @@ class RrtConnectPlanner(Planner):
 
     def _check_start(self, request: PlanRequest) -> Vector:
         robot = self._ctx.robot
-        for name in (*request.joints, *request.others):
-            if name not in robot.joint_names:
-                raise PlanningError(
-                    f"no joint {name!r}; the joints are: {', '.join(robot.joint_names)}", PlanCode.INVALID_GROUP_NAME
-                )
-        start = np.array(request.start, dtype=float)
-        if start.shape != (len(request.joints),):
-            raise PlanningError(
-                f"start has shape {start.shape}, must be ({len(request.joints)},): one per joint",
-                PlanCode.INVALID_ROBOT_STATE,
-            )
-        for name, scaling in (("velocity", request.velocity_scaling), ("acceleration", request.acceleration_scaling)):
-            if fault := scaling_fault(f"{name}_scaling", scaling):
-                raise PlanningError(fault)
+        start = checked_start(request, robot)
         for name, value in zip(request.joints, start.tolist(), strict=True):
             joint = robot.joints[robot.joint_names.index(name)]
-            if not np.isfinite(value):
-                raise PlanningError(f"start of joint {name} is {value}, must be finite", PlanCode.INVALID_ROBOT_STATE)
             beyond = max(joint.lower - value, value - joint.upper)
             if beyond > self._options.start_beyond_limits:
                 raise PlanningError(

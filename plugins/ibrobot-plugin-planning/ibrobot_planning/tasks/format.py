@@ -176,14 +176,7 @@ class Step:
         return next(action for action in self._actions().values() if action is not None)
 
     def _actions(self) -> dict[str, Action | None]:
-        return {
-            "move": self.move,
-            "gripper": self.gripper,
-            "wait": self.wait,
-            "run_policy": self.run_policy,
-            "look": self.look,
-            "record": self.record,
-        }
+        return attrs.asdict(self, recurse=False, filter=lambda field, _: field.name != "name")
 
 
 def _some(instance: object, attribute: attrs.Attribute[Any], value: Sequence[object]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +23,6 @@ class Reach:
 
     def __init__(self, robot: Robot, start: Vector | None) -> None:
         self._robot, self._start = robot, start
-        self._tool: Tool | None = None
 
     def check(self, goal: Goal) -> None:
         """Check that all waypoints of a goal, or one of its alternatives, can be reached.
@@ -43,18 +43,16 @@ class Reach:
             if len(errors) == len(goal.goals):
                 raise errors[0]
         elif isinstance(goal, PositionGoal | PoseGoal):
-            tool, start = self._kinematics(), self._start
-            model = tool.model
-            tool.candidates(goal, np.clip(0.0, model.lower, model.upper) if start is None else start)
+            model, start = self._tool.model, self._start
+            self._tool.candidates(goal, np.clip(0.0, model.lower, model.upper) if start is None else start)
 
-    def _kinematics(self) -> Tool:
-        if self._tool is None:
-            from ibrobot_kinematics import KinematicsError, robot_model
+    @cached_property
+    def _tool(self) -> Tool:
+        from ibrobot_kinematics import KinematicsError, robot_model
 
-            from ibrobot_planning.goals.tool import Tool
+        from ibrobot_planning.goals.tool import Tool
 
-            try:
-                self._tool = Tool(robot_model(self._robot))
-            except KinematicsError as error:
-                raise PlanningError(str(error)) from error
-        return self._tool
+        try:
+            return Tool(robot_model(self._robot))
+        except KinematicsError as error:
+            raise PlanningError(str(error)) from error
