@@ -298,6 +298,6 @@ def test_without_a_terminal_the_buttons_of_a_device_begin_and_end_episodes(recor
 
 def test_nobody_can_begin_an_episode_without_keys_buttons_and_auto(record: Record):
     message = "nothing can begin an episode: there is no terminal for keys, and no device of mode teleop has a button"
-    with pytest.raises(NotSupported, match=f"{message}: add --auto") as caught:
+    with pytest.raises(NotSupported, match=f"{message} `start`; add --auto") as caught:
         record(keys=False)
     assert caught.value.exit_code == 2

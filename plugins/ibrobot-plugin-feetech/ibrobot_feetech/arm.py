@@ -119,8 +119,7 @@ def find_servos(bus: FeetechBus, arm: Arm) -> None:
         if model != MODEL_STS3215:
             found = f"it is model {model}; an STS3215 is {MODEL_STS3215}"
             raise HardwareError(f"{bus.place(servo, 'model_number')}: {found}; check that it is the right arm")
-        major, minor = (bus.read_faulty(servo, f"firmware_{part}") for part in ("major", "minor"))
-        firmware[servo] = f"{major}.{minor}"
+        firmware[servo] = bus.firmware(servo)
         check_supply(bus, servo)
     if len(missing) > 1:
         names = ", ".join(f"{servo} ({arm.names[servo]})" for servo in missing)
@@ -140,7 +139,7 @@ def calibration_differences(bus: FeetechBus, arm: Arm) -> list[tuple[int, str, i
     """
     differences = []
     for servo in arm.servos:
-        for name, value in _calibrated(arm, servo).items():
+        for name, value in calibrated_registers(arm.calibration.joints[arm.names[servo]]).items():
             if (found := bus.read_faulty(servo, name)) != value:
                 differences.append((servo, name, found, value))
     return differences
@@ -153,7 +152,7 @@ def write_calibration(bus: FeetechBus, arm: Arm, servos: Sequence[int] | None = 
         FeetechError: if a servo does not accept it.
     """
     for servo in arm.servos if servos is None else servos:
-        write_eprom(bus, servo, _calibrated(arm, servo))
+        write_eprom(bus, servo, calibrated_registers(arm.calibration.joints[arm.names[servo]]))
 
 
 def write_eprom(bus: FeetechBus, servo: int, values: Mapping[str, int]) -> None:
@@ -231,9 +230,8 @@ def relax(bus: FeetechBus, servos: Sequence[int]) -> None:
     raise last
 
 
-def _calibrated(arm: Arm, servo: int) -> dict[str, int]:
-    """The registers that calibration sets."""
-    joint = arm.calibration.joints[arm.names[servo]]
+def calibrated_registers(joint: JointCalibration) -> dict[str, int]:
+    """Register -> value that the calibration of a joint sets."""
     return {
         "homing_offset": joint.homing_offset,
         "min_position_limit": joint.range_min,

@@ -138,6 +138,14 @@ class FeetechBus:
         """As `read`, but also accepts replies of a servo that reports an error."""
         return self._retried(lambda: self._read_once(servo, register(name), faulty=True))
 
+    def firmware(self, servo: int) -> str:
+        """The firmware version of a servo, also of one that reports an error.
+
+        Raises:
+            FeetechError: if no valid reply arrived after all retries.
+        """
+        return ".".join(str(self.read_faulty(servo, f"firmware_{part}")) for part in ("major", "minor"))
+
     def write(self, servo: int, name: str, value: int, *, faulty: bool = False) -> None:
         """Set a register and wait for the acknowledgement.
 

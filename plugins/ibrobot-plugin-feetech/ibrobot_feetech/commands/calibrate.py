@@ -11,7 +11,7 @@ import click
 
 from ibrobot_core.api import Calibration, HardwareError, IbrobotError, JointCalibration, calibration_path
 from ibrobot_core.app import Declined, Guide
-from ibrobot_feetech.arm import relax, write_eprom
+from ibrobot_feetech.arm import calibrated_registers, relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.calibration import ZERO_AT, save_calibration
 from ibrobot_feetech.commands.dialogue import TerminalGuide
@@ -140,12 +140,7 @@ def _write(bus: FeetechBus, guide: Guide, found: dict[str, JointCalibration], na
     done: list[str] = []
     try:
         for joint, numbers in found.items():
-            values = {
-                "homing_offset": numbers.homing_offset,
-                "min_position_limit": numbers.range_min,
-                "max_position_limit": numbers.range_max,
-            }
-            write_eprom(bus, numbers.id, values)
+            write_eprom(bus, numbers.id, calibrated_registers(numbers))
             done.append(joint)
     except (IbrobotError, KeyboardInterrupt):
         left = ", ".join(joint for joint in found if joint not in done)

@@ -10,7 +10,7 @@ import click
 
 from ibrobot_core.api import Calibration, load_calibration
 from ibrobot_core.app import Declined, Guide
-from ibrobot_feetech.arm import write_eprom
+from ibrobot_feetech.arm import calibrated_registers, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import joints_of
@@ -107,14 +107,8 @@ def differences(bus: FeetechBus, calibration: Calibration) -> Iterator[Differenc
         if not power.fits:
             measured = f"{power.measured:.1f} V"
             yield Difference(joint, servo, "present_voltage", measured, power.limits, power.remedy)
-        versions[joint] = ".".join(str(bus.read_faulty(servo, f"firmware_{part}")) for part in ("major", "minor"))
-        wanted = {
-            "homing_offset": numbers.homing_offset,
-            "min_position_limit": numbers.range_min,
-            "max_position_limit": numbers.range_max,
-            "operating_mode": 0,
-        }
-        for register, value in wanted.items():
+        versions[joint] = bus.firmware(servo)
+        for register, value in {**calibrated_registers(numbers), "operating_mode": 0}.items():
             if (found := bus.read_faulty(servo, register)) != value:
                 yield Difference(joint, servo, register, str(found), str(value), "")
         for register in _TUNING:

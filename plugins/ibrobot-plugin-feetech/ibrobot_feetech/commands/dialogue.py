@@ -32,44 +32,12 @@ def interactive() -> bool:
     return sys.stdin.isatty()
 
 
-def agree(question: str, *, flag: str, default: bool = False) -> bool:
-    """Ask a yes/no question.
-
-    Args:
-        question: e.g. `Overwrite it?`.
-        flag: the option that answers it without a terminal.
-        default: the answer if the user only presses Enter.
-
-    Raises:
-        Unanswered: if there is no terminal.
-    """
-    if not interactive():
-        raise Unanswered(f"{question} There is no terminal to ask; run the command in one, or give {flag}")
-    return click.confirm(question, default=default)
-
-
-def wait_for_enter(request: str, *, flag: str) -> None:
-    """Ask the user to do something and press Enter.
-
-    Raises:
-        Unanswered: if there is no terminal.
-    """
-    if not interactive():
-        raise Unanswered(f"{request} There is no terminal to press Enter in; run the command in one, or give {flag}")
-    click.prompt(f"{request} Then press Enter", default="", show_default=False, prompt_suffix=" ")
-
-
 def table(*columns: str) -> Table:
     """An empty table. Columns whose names begin with `>` are right-aligned."""
     made = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for column in columns:
         made.add_column(column.lstrip(">"), justify="right" if column.startswith(">") else "left", no_wrap=True)
     return made
-
-
-def show(made: Table) -> None:
-    """Print a table, in colour if the output is a terminal."""
-    Screen().print(made)
 
 
 class TerminalGuide(Guide):
@@ -81,22 +49,25 @@ class TerminalGuide(Guide):
 
     @override
     def show(self, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        show(_filled(columns, rows))
+        Screen().print(_filled(columns, rows))
 
     @override
     def confirm(self, question: str, *, flag: str = "", default: bool = False) -> bool:
-        return agree(question, flag=flag, default=default)
+        if not interactive():
+            raise Unanswered(f"{question} There is no terminal to ask; run the command in one, or give {flag}")
+        return click.confirm(question, default=default)
 
     @override
     def wait(
         self, request: str, *, flag: str = "", columns: Sequence[str] = (),
         rows: Callable[[], Sequence[Sequence[str]]] | None = None, seconds: float | None = None,
     ) -> None:  # fmt: skip
-        if rows is None:
-            wait_for_enter(request, flag=flag)
-            return
         if seconds is None and not interactive():
-            raise Unanswered(f"There is no terminal to press Enter in; run the command in one, or give {flag}")
+            done = f"{request} " if rows is None else ""
+            raise Unanswered(f"{done}There is no terminal to press Enter in; run the command in one, or give {flag}")
+        if rows is None:
+            click.prompt(f"{request} Then press Enter", default="", show_default=False, prompt_suffix=" ")
+            return
         end = "Enter ends it" if seconds is None else f"for {seconds:g} s"
         echo(f"{request.removesuffix('.')} ({end}).")
         until = time.monotonic() + (seconds if seconds is not None else float("inf"))

@@ -15,6 +15,7 @@ import click
 
 from ibrobot_core.api import Calibration, JointCalibration, calibration_path, load_calibration
 from ibrobot_core.app import echo, on_signals
+from ibrobot_feetech.arm import Arm, calibrated_registers
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.commands.joints import SO101
 from ibrobot_feetech.ticks import MIDDLE_TICK, TICKS_PER_RADIAN, TICKS_PER_TURN
@@ -125,7 +126,6 @@ def _config(name: str) -> RobotConfig:
 
 def _physics(config: RobotConfig, calibration: Calibration, emulator: Emulator, seed: int) -> PhysicsArm:
     from ibrobot_core.app import installed_plugins
-    from ibrobot_feetech.arm import Arm
     from ibrobot_feetech.emulator.physics import PhysicsArm
 
     robot = config.robot
@@ -154,10 +154,8 @@ def _calibrate(emulator: Emulator, name: str | None, joints: Sequence[str], robo
             echo(f"calibration saved in {save_calibration(calibration, name)}", err=True)
     with emulator.lock:
         for joint in calibration.joints.values():
-            servo = emulator.servos[joint.id]
-            servo.set("homing_offset", joint.homing_offset)
-            servo.set("min_position_limit", joint.range_min)
-            servo.set("max_position_limit", joint.range_max)
+            for register, value in calibrated_registers(joint).items():
+                emulator.servos[joint.id].set(register, value)
     return calibration
 
 

@@ -9,7 +9,7 @@ from ibrobot_core.api import HardwareError, calibration_path, load_calibration
 from ibrobot_core.app import Declined, echo
 from ibrobot_feetech.calibration import ZERO_AT, save_calibration
 from ibrobot_feetech.commands.calibrate import backup
-from ibrobot_feetech.commands.dialogue import agree
+from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import joints_of
 from ibrobot_feetech.commands.zero import zero_text
 from ibrobot_feetech.usb import usb_port
@@ -38,7 +38,7 @@ def import_calibration(
     """
     path = calibration_path(name or file)
     found = load_calibration(file, [joint.name for joint in joints_of(robot, name)], zero_at=zero_at)
-    if path.exists() and not yes and not agree(f"{path} exists already. Overwrite it?", flag="--yes"):
+    if path.exists() and not yes and not TerminalGuide().confirm(f"{path} exists already. Overwrite it?", flag="--yes"):
         raise Declined
     adapter = found.adapter if port is None else _adapter(port)
     joints = {f"{prefix}{joint}": numbers for joint, numbers in found.joints.items()}

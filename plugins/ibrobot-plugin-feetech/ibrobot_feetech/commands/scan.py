@@ -8,7 +8,7 @@ import click
 
 from ibrobot_core.api import HardwareError
 from ibrobot_feetech.bus import FeetechBus
-from ibrobot_feetech.commands.dialogue import show, table
+from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import by_servo, joints_of
 from ibrobot_feetech.commands.ports import opened, port_argument
 from ibrobot_feetech.errors import PortError
@@ -37,21 +37,20 @@ class BaudRates(click.ParamType):  # type: ignore[type-arg]  # generic in newer 
 def scan(port: str | None, baud: tuple[int, ...]) -> None:
     """List the servos that answer: id, model, firmware, baud rate. Exit with 1 if there are none."""
     names = by_servo(joints_of())
-    found = table(">id", "joint of an SO-101", "model", "firmware", ">baud")
+    rows = []
     with opened(port, baud[0], patience_s=0.0) as bus:  # most ids have no servo
         for (servo, rate), model in search(bus, baud).items():
             bus.port.set_baud_rate(rate)
-            firmware = ".".join(str(bus.read_faulty(servo, f"firmware_{part}")) for part in ("major", "minor"))
             kind = "STS3215" if model == MODEL_STS3215 else str(model)
-            found.add_row(str(servo), names.get(servo, ""), kind, firmware, str(rate))
-        if not found.row_count:
+            rows.append((str(servo), names.get(servo, ""), kind, bus.firmware(servo), str(rate)))
+        if not rows:
             at = f"{baud[0]} baud" if len(baud) == 1 else "any baud rate"
             more = " and other rates (--baud all)" if len(baud) == 1 else ""
             raise HardwareError(
                 f"{bus.port.path}: no servo answers at {at}; check the arm's power supply, the cable to its first "
                 f"servo, the jumpers of the board (USB){more}"
             )
-    show(found)
+    TerminalGuide().show((">id", "joint of an SO-101", "model", "firmware", ">baud"), rows)
 
 
 def search(bus: FeetechBus, rates: Sequence[int]) -> dict[tuple[int, int], int]:

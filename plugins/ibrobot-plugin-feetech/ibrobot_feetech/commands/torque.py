@@ -6,7 +6,7 @@ import click
 
 from ibrobot_core.app import Declined, echo
 from ibrobot_feetech.arm import hold, relax
-from ibrobot_feetech.commands.dialogue import agree
+from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of
 from ibrobot_feetech.commands.ports import opened, port_argument
 from ibrobot_feetech.protocol import MAX_ID
@@ -32,7 +32,7 @@ def torque(
                 hold(bus, joint.servo)
         else:
             echo("Without torque the arm falls: hold it, or check that it rests on something.")
-            if not (yes or agree("Torque off?", flag="--yes")):
+            if not (yes or TerminalGuide().confirm("Torque off?", flag="--yes")):
                 raise Declined
             relax(bus, [joint.servo for joint in joints])
     echo(f"torque {state}: {', '.join(joint.name for joint in joints)}")
