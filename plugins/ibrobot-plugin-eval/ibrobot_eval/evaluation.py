@@ -221,7 +221,7 @@ def opened(request: Request) -> Iterator[Evaluation]:
 
 
 def _begin(request: Request, settings: Mapping[str, Any]) -> None:
-    """Write the settings into a new folder, or compare them with those of the evaluation in it."""
+    """Write the settings into a new folder, or compare them to the present ones."""
     out, file = request.out, request.out / SETTINGS
     if file.is_file():
         try:
