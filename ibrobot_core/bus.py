@@ -162,6 +162,11 @@ class Bus:
                     subscription._put(item)
             return subscription
 
+    def has_subscribers(self, topic: str) -> bool:
+        """Whether anybody receives the messages of a topic; if not, there is no need to compute them."""
+        with self._lock:
+            return bool(self._subscriptions.get(topic) or self._subscriptions.get(""))
+
     def _unsubscribe(self, subscription: Subscription) -> None:
         with self._lock:
             if subscription in self._subscriptions[subscription.topic]:

@@ -239,11 +239,24 @@ class Registry:
         Raises:
             IbrobotError: e.g. if its package is not installed, which the error names, or it cannot be reached.
         """
+        descriptor, address = self._pool_type(where)
+        return descriptor.make(address, jobs)
+
+    def check_pool(self, where: str) -> None:
+        """Check, before long work is planned, that a pool's package is installed.
+
+        Raises:
+            IbrobotError: if it is not.
+        """
+        self._pool_type(where)
+
+    def _pool_type(self, where: str) -> tuple[descriptors.PoolDescriptor, str]:
+        """The descriptor and the address of a pool."""
         type_, _, address = (where or self.default("pool")).partition("://")
         descriptor = self.find("pool", type_)
         assert isinstance(descriptor, descriptors.PoolDescriptor)
         descriptor.check()
-        return descriptor.make(address, jobs)
+        return descriptor, address
 
     def decode(self, picture: CompressedImage) -> Image:
         """Decode a compressed image.

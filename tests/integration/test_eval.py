@@ -220,6 +220,16 @@ def test_policy_beside_itself_is_no_different(folder: Path) -> None:
     assert comparison["more_episodes"] > 10
 
 
+def test_policies_of_several_yamls_are_compared(folder: Path, whole: Path) -> None:
+    with chdir(folder):
+        Path("wide.yaml").write_text(Path("picks.yaml").read_text().replace("gripper_closed: 0.6", "gripper_closed: 0.7"))
+        command = ("eval", "picks.yaml", "wide.yaml", "--mode", "faulty", "--episodes", 1, "--out", "yamls", "--json")
+        done = run_here(*command)
+    assert done.returncode == 0, done.stderr
+    (comparison,) = json.loads(done.stdout)["comparisons"]
+    assert (comparison["first"], comparison["second"]) == ("picks", "wide")
+
+
 def test_folder_of_other_settings_is_refused(folder: Path, whole: Path, tmp_path: Path) -> None:
     before = digests(whole)
     for more, said in (
@@ -250,6 +260,7 @@ def test_wrong_command_lines_name_the_remedy(folder: Path) -> None:
         (("--mode", "planned"), "control_modes.planned: has no inference; only policies can be evaluated"),
         (("--mode", "script"), "script"),
         (("--model", "other"), "has no model 'other'; the models are:"),
+        (("--on", "slurm"), "unknown pool type 'slurm'"),
         (("--until-decided",), "--until-decided compares policies: give at least two"),
         (("--mode", "scripted", "--mode", "scripted"), "control_modes.scripted: is given twice"),
     ):

@@ -83,14 +83,14 @@ def statistics(seed: int = 0) -> dict[str, dict[str, NDArray[np.float32]]]:
     return found
 
 
-def save(config: PreTrainedConfig, path: Path) -> Path:
+def save(config: PreTrainedConfig, path: Path, stats: Mapping[str, Any] | None = None) -> Path:
     """A checkpoint of random weights, as lerobot-train saves it."""
     torch.manual_seed(7)
     policy = get_policy_class(config.type)(config)
     if config.type == "vqbet":
         policy.vqbet.action_head.vqvae_model.discretized.fill_(True)
     policy.save_pretrained(path)
-    for processor in make_pre_post_processors(config, dataset_stats=statistics()):
+    for processor in make_pre_post_processors(config, dataset_stats=dict(stats or statistics())):
         processor.save_pretrained(path)
     return path
 

@@ -127,6 +127,7 @@ def _to_dataset(options: ConvertOptions, type_: str | None, overrides: Sequence[
     from ibrobot_data.run import convert as run
     from ibrobot_data.run import find_episodes
 
+    installed_plugins().check_pool(options.on)
     type_ = type_ or installed_plugins().default("dataset")
     request = ConversionRequest(
         options.out, _options("dataset", type_, overrides), type_, append=options.append, outcomes=options.outcome,

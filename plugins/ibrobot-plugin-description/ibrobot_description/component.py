@@ -21,7 +21,7 @@ def _text(path: Path) -> str:
 
 
 class DescriptionPublisher(SessionWorker):
-    """Publishes the moving links with every joint state; fixed links, mounts and the description once, latched."""
+    """Publishes the moving links with every joint state if anybody subscribes; the rest once, latched."""
 
     def __init__(self, session: RunView) -> None:
         urdf = session.config.robot.description.urdf
@@ -55,15 +55,14 @@ class DescriptionPublisher(SessionWorker):
     def work(self, timeout_s: float) -> None:
         assert self._states is not None
         received = self._states.get(timeout_s)
-        if received is None:
+        if received is None or not self._moving or not self.session.bus.has_subscribers("/tf"):
             return
         state = received.message
         assert isinstance(state, JointState)
         positions = state.position.tolist()
         stamp_ns = state.header.stamp_ns
         transforms = tuple(transform(joint, positions[i], stamp_ns) for joint, i in self._moving)
-        if transforms:
-            self.session.bus.publish("/tf", TFMessage(transforms))
+        self.session.bus.publish("/tf", TFMessage(transforms))
 
     @override
     def teardown(self) -> None:

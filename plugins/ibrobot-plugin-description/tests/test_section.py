@@ -108,6 +108,16 @@ def test_moving_links_follow_the_joint_states(tmp_path: Path) -> None:
     frames.close()
 
 
+def test_moving_links_are_not_computed_for_nobody(tmp_path: Path) -> None:
+    session = session_of(tmp_path)
+    component = DescriptionPublisher(session)
+    component.start()
+    session.bus.publish("/joint_states", JointState(Header(9), session.config.robot.joint_names, np.ones(6)))
+    component.step(0)
+    assert "/tf" not in session.bus.topics()
+    component.stop()
+
+
 def test_robot_without_urdf_and_mounts_needs_no_component(tmp_path: Path) -> None:
     (descriptor,) = ibrobot_sections()
     assert not descriptor.without_section(make_session().config)

@@ -9,8 +9,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, ClassVar
 
+import ibrobot_processes.pool
 import pytest
 from ibrobot_testing import PoolSuite
+from ibrobot_testing.pool_jobs import Order, wait
 
 from ibrobot_core.app import ComponentFailed, Done, Job, Pool, RequestError, installed_plugins
 
@@ -142,3 +144,16 @@ def test_wrong_processes_fail(kind: Any, tmp_path: Path, monkeypatch: pytest.Mon
 def test_processes_have_no_address() -> None:
     with pytest.raises(RequestError, match="processes://here: processes run on this machine"):
         installed_plugins().pool("processes://here")
+
+
+def test_pool_uses_every_core_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many jobs run at once as there are cores, and no more."""
+    monkeypatch.setattr(ibrobot_processes.pool, "cores", lambda: 3)
+
+    def watch(_: int) -> None:
+        if len(list(tmp_path.glob("began_*"))) == 3:
+            (tmp_path / "go").touch()
+
+    with closing(installed_plugins().pool("")) as pool:
+        done = list(pool.run([Job(wait, Order(number, str(tmp_path))) for number in range(3)], watch))
+    assert sorted(each.result() for each in done) == [0, 1, 2]

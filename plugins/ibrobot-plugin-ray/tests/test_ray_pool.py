@@ -1,0 +1,69 @@
+"""The pool on a cluster of three nodes, which Ray simulates on this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ibrobot_ray.pool import RayPool
+from ibrobot_testing import LeakCheck, PoolSuite
+from ibrobot_testing.pool_jobs import Order, square, wait
+from ray.cluster_utils import Cluster
+
+from ibrobot_core.app import ComponentFailed, Job, installed_plugins
+
+NODES = 3
+PATIENCE_S = 240.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cluster() -> Iterator[Any]:
+    """Nodes of one core each, without dashboard, on the loopback."""
+    node: dict[str, Any] = {"num_cpus": 1, "include_dashboard": False, "node_ip_address": "127.0.0.1"}
+    found: Any = Cluster()
+    with pytest.MonkeyPatch.context() as patched:
+        try:
+            for _ in range(NODES):
+                found.add_node(**node, object_store_memory=80 << 20, include_log_monitor=False)
+            patched.setenv("RAY_ADDRESS", found.address)
+            yield found
+        finally:
+            found.shutdown()
+
+
+class TestRayPool(PoolSuite):
+    leak_check = LeakCheck(
+        allow={
+            "thread": "Ray's threads end some time after the connection",
+            "file": "Ray keeps its log files and sockets until the process ends",
+            "port": "as its files",
+        }
+    )
+    patience_s = PATIENCE_S
+
+    def pool(self, jobs):
+        return RayPool("", jobs)
+
+
+def test_jobs_of_a_removed_node_are_run_again(cluster: Any, tmp_path: Path) -> None:
+    """All nodes have a job; the one of a node that is removed begins again on another."""
+    orders = [Order(number, str(tmp_path)) for number in range(NODES)]
+    with closing(installed_plugins().pool("ray")) as pool:
+        running = pool.run([Job(wait, order) for order in orders] + [Job(square, Order(5))], lambda count: step())
+
+        def step() -> None:
+            """When all run, remove a node; then let them end."""
+            if len(list(tmp_path.glob("began_*"))) == NODES and len(cluster.worker_nodes) == NODES - 1:
+                cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+                (tmp_path / "go").touch()
+
+        assert sorted(done.result() for done in running) == [0, 1, 2, 25]
+    assert len(cluster.worker_nodes) == NODES - 2
+
+
+def test_cluster_that_cannot_be_reached_is_an_error() -> None:
+    with pytest.raises(ComponentFailed, match=r"the Ray cluster 127\.0\.0\.1:1 cannot be used"):
+        installed_plugins().pool("ray://127.0.0.1:1")
