@@ -265,7 +265,8 @@ def plugin(session: nox.Session, name: str) -> None:
     system_libraries(session)
     # A report without a threshold shows code that the package's own tests do not reach. It takes half as long again.
     measured = (f"--cov=ibrobot_{name.replace('-', '_')}", "--cov-report=term:skip-covered") if NAMED else ()
-    session.run(*PYTEST, *measured, str(FOLDERS[name] / "tests"), *session.posargs)
+    chosen = () if NAMED else ("-m", "not cluster")
+    session.run(*PYTEST, *chosen, *measured, str(FOLDERS[name] / "tests"), *session.posargs)
 
 
 @nox.session

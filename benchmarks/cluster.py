@@ -3,8 +3,8 @@
     python benchmarks/cluster.py [--bags 12] [--episodes 8]
 
 The cluster is simulated on this machine. While a command runs, a process that does one of its jobs is killed every 5 s.
-After its first episode a node is removed, and after its third one the command is killed and run again. Prints whether
-all files are there once, with the bytes of `--jobs 1` without Ray.
+After its first episode a node is removed, and after its third one the command is killed and run again, and again while
+an episode has lost five processes. Prints whether all files are there once, with the bytes of `--jobs 1` without Ray.
 """
 
 from __future__ import annotations
@@ -32,8 +32,11 @@ from recordings import record
 
 PROGRAM = "from ibrobot_core.cli.command import main; main()"
 KILL_S = 5.0
+MOST = 4
+"""Times that a command is run again."""
+LOOPBACK = "127.0.0.2"  # Ray replaces 127.0.0.1 by the address of the network when it connects
 NODE: dict[str, Any] = dict(
-    num_cpus=1, include_dashboard=False, node_ip_address="127.0.0.1", object_store_memory=80 << 20
+    num_cpus=1, include_dashboard=False, node_ip_address=LOOPBACK, object_store_memory=80 << 20
 )
 
 
@@ -109,9 +112,12 @@ def disturbed(arguments: Sequence[str], folder: Path, rng: random.Random) -> str
                 if seen == 3:
                     first.kill()
                     break
-        again = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+        codes: list[int] = []
+        while len(codes) < MOST and 0 not in codes:
+            again = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+            codes.append(again.returncode)
         lost = f"{len(killed)} processes and 1 node lost"
-        return f"{lost}, command killed after {seen} episodes, then exit {again.returncode}"
+        return f"{lost}, command killed after {seen} episodes, then exit {', '.join(map(str, codes))}"
 
 
 def compare(name: str, arguments: Sequence[str], folder: Path, rng: random.Random) -> bool:

@@ -15,14 +15,17 @@ from ray.cluster_utils import Cluster
 
 from ibrobot_core.app import ComponentFailed, Job, installed_plugins
 
+pytestmark = pytest.mark.cluster
 NODES = 3
+LOOPBACK = "127.0.0.2"
+"""Ray replaces 127.0.0.1 by the address of the network when it connects."""
 PATIENCE_S = 240.0
 
 
 @pytest.fixture(scope="module", autouse=True)
 def cluster() -> Iterator[Any]:
     """Nodes of one core each, without dashboard, on the loopback."""
-    node: dict[str, Any] = {"num_cpus": 1, "include_dashboard": False, "node_ip_address": "127.0.0.1"}
+    node: dict[str, Any] = {"num_cpus": 1, "include_dashboard": False, "node_ip_address": LOOPBACK}
     found: Any = Cluster()
     with pytest.MonkeyPatch.context() as patched:
         try:
@@ -34,14 +37,23 @@ def cluster() -> Iterator[Any]:
             found.shutdown()
 
 
+LEAKS = LeakCheck(
+    allow={
+        "thread": "Ray's threads end some time after the connection",
+        "file": "Ray keeps its log files and sockets until the process ends",
+        "port": "as its files",
+    }
+)
+
+
+@pytest.fixture(autouse=True)
+def no_leaks() -> Iterator[None]:
+    with LEAKS.watch():
+        yield
+
+
 class TestRayPool(PoolSuite):
-    leak_check = LeakCheck(
-        allow={
-            "thread": "Ray's threads end some time after the connection",
-            "file": "Ray keeps its log files and sockets until the process ends",
-            "port": "as its files",
-        }
-    )
+    leak_check = LEAKS
     patience_s = PATIENCE_S
 
     def pool(self, jobs):
@@ -64,6 +76,7 @@ def test_jobs_of_a_removed_node_are_run_again(cluster: Any, tmp_path: Path) -> N
     assert len(cluster.worker_nodes) == NODES - 2
 
 
+@pytest.mark.filterwarnings("ignore:Ray Client connection timed out")
 def test_cluster_that_cannot_be_reached_is_an_error() -> None:
     with pytest.raises(ComponentFailed, match=r"the Ray cluster 127\.0\.0\.1:1 cannot be used"):
         installed_plugins().pool("ray://127.0.0.1:1")
