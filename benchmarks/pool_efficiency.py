@@ -13,6 +13,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from typing import Any
 
 from ibrobot_core.app import Job, Pool, installed_plugins
 
@@ -51,16 +52,17 @@ def cluster(on: str) -> Iterator[None]:
     if on != "ray":
         yield
         return
-    import ray
+    from ray.cluster_utils import Cluster
 
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    ray.init(num_cpus=max(WORKERS), include_dashboard=False, log_to_driver=False)
-    os.environ["RAY_ADDRESS"] = ray.get_runtime_context().gcs_address
+    found: Any = Cluster()
+    loopback = "127.0.0.2"  # Ray replaces 127.0.0.1 by the address of the network when it connects
     try:
+        found.add_node(num_cpus=max(WORKERS), include_dashboard=False, node_ip_address=loopback)
+        os.environ["RAY_ADDRESS"] = found.address
         yield
     finally:
-        del os.environ["RAY_ADDRESS"]
-        ray.shutdown()
+        os.environ.pop("RAY_ADDRESS", None)
+        found.shutdown()
 
 
 def main() -> None:
