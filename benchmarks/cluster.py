@@ -35,9 +35,7 @@ KILL_S = 5.0
 MOST = 4
 """Times that a command is run again."""
 LOOPBACK = "127.0.0.2"  # Ray replaces 127.0.0.1 by the address of the network when it connects
-NODE: dict[str, Any] = dict(
-    num_cpus=1, include_dashboard=False, node_ip_address=LOOPBACK, object_store_memory=80 << 20
-)
+NODE: dict[str, Any] = dict(num_cpus=1, include_dashboard=False, node_ip_address=LOOPBACK, object_store_memory=80 << 20)
 
 
 def job_processes() -> list[int]:

@@ -222,7 +222,8 @@ def test_policy_beside_itself_is_no_different(folder: Path) -> None:
 
 def test_policies_of_several_yamls_are_compared(folder: Path, whole: Path) -> None:
     with chdir(folder):
-        Path("wide.yaml").write_text(Path("picks.yaml").read_text().replace("gripper_closed: 0.6", "gripper_closed: 0.7"))
+        text = Path("picks.yaml").read_text()
+        Path("wide.yaml").write_text(text.replace("gripper_closed: 0.6", "gripper_closed: 0.7"))
         command = ("eval", "picks.yaml", "wide.yaml", "--mode", "faulty", "--episodes", 1, "--out", "yamls", "--json")
         done = run_here(*command)
     assert done.returncode == 0, done.stderr

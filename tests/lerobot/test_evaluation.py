@@ -53,12 +53,12 @@ def ours(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def lerobot_eval(checkpoint: Path, out: Path, episodes: int, *more: str) -> Path:
+def lerobot_eval(checkpoint: Path, out: Path, episodes: int, seed: int, *more: str) -> Path:
     """Run LeRobot's command; returns its folder."""
     command = (
         str(Path(sys.executable).with_name("lerobot-eval")), f"--policy.path={checkpoint}", "--policy.device=cpu",
         "--env.type=ibrobot", "--env.task=Push-v0", f"--env.overrides={json.dumps(OVERRIDES)}",
-        f"--eval.n_episodes={episodes}", "--eval.batch_size=1", f"--seed={SEED}", f"--output_dir={out}", *more,
+        f"--eval.n_episodes={episodes}", "--eval.batch_size=1", f"--seed={seed}", f"--output_dir={out}", *more,
     )  # fmt: skip
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -66,7 +66,7 @@ def lerobot_eval(checkpoint: Path, out: Path, episodes: int, *more: str) -> Path
 
 
 def test_successes_are_equal_seed_by_seed(checkpoint: Path, ours: Path, tmp_path: Path) -> None:
-    theirs = json.loads((lerobot_eval(checkpoint, tmp_path / "theirs", EPISODES) / "eval_info.json").read_text())
+    theirs = json.loads((lerobot_eval(checkpoint, tmp_path / "theirs", EPISODES, SEED) / "eval_info.json").read_text())
     (task,) = theirs["per_task"]
     episodes = json.loads((ours / "report.json").read_text())["episodes"]
     outcomes = [each["success"] for each in episodes]
@@ -76,10 +76,12 @@ def test_successes_are_equal_seed_by_seed(checkpoint: Path, ours: Path, tmp_path
 
 
 def test_observations_are_equal_bit_by_bit(checkpoint: Path, ours: Path, tmp_path: Path) -> None:
-    out = lerobot_eval(checkpoint, tmp_path / "theirs", 1, "--eval.recording=true")
+    episodes = json.loads((ours / "report.json").read_text())["episodes"]
+    seed = next(each["seed"] for each in episodes if not each["success"])  # a success ends its episode at once
+    out = lerobot_eval(checkpoint, tmp_path / "theirs", 1, seed, "--eval.recording=true")
     rows = pq.read_table(next(out.rglob("data/**/*.parquet")))
     state, scene = (np.stack(rows[name].to_numpy()) for name in ("agent_pos", "environment_state"))
-    reader = installed_plugins().open_episode(ours / "episodes" / "push" / f"seed_{SEED:06d}")
+    reader = installed_plugins().open_episode(ours / "episodes" / "push" / f"seed_{seed:06d}")
     messages = [each.message for each in reader.messages(("/joint_states", "/simulation/scene"))]
     reader.close()
     joints = {m.header.stamp_ns: np.float32(m.position) for m in messages if isinstance(m, JointState)}
