@@ -1,0 +1,351 @@
+"""A policy that runs on a server of another project: the mapping, and what makes a server's answers safe to use."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any, override
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.api import Context, Frame, Policy, PolicyError, PolicySpec, Tensors, did_you_mean
+from ibrobot_policy_servers.connection import Connection
+from ibrobot_policy_servers.options import ActionMap, ObservationMap, ServerOptions
+
+ACTION = "action"
+REFERENCE = "reference"
+"""Positions to which relative actions are added, shape (A,), in the order of the action."""
+TASK = "task"
+"""The prompt in UTF-8, shape (L,)."""
+
+
+class ServedPolicy(Policy):
+    """A policy on a server. `load` connects, compares what the server states, and makes one request.
+
+    A request that fails closes the connection, so that a late answer reaches no later request. The next request
+    connects again, and fails if the server's metadata has changed.
+
+    Args:
+        options: the mapping.
+        ctx: provides the robot's joints and the log.
+        connection: the protocol.
+        stateful: whether the server remembers the requests of an episode.
+
+    Raises:
+        PolicyError: if the mapping does not fit the robot.
+    """
+
+    def __init__(self, options: ServerOptions, ctx: Context, connection: Connection, *, stateful: bool = False) -> None:
+        self._options, self._log, self._connection = options, ctx.log, connection
+        self._joints = _joints(options, ctx.robot.joint_names)
+        self._reference = _reference(options)
+        self.spec = PolicySpec(
+            observations={each.observation: each.shape for each in options.observations},
+            actions=self._joints,
+            action_size=len(self._joints),
+            chunk_size=min(options.horizon, options.use_actions or options.horizon),
+            rate_hz=options.rate_hz,
+            prompt=bool(options.prompt),
+            stateful=stateful,
+        )
+        self._turn = threading.Lock()
+        """Held during a request."""
+        self._connected = False
+        self._metadata: Mapping[str, Any] | None = None
+        """What the server stated at first."""
+
+    @override
+    def load(self) -> None:
+        with self._turn:
+            self._disconnect()
+            self._metadata = None
+            self._connect(self._options.start_timeout)
+            self._log.info("%s states: %s", self._connection.address, _shown(self._metadata or {}))
+            self._request(self.preprocess(self._zeros()), self._options.start_timeout)
+
+    @override
+    def reset(self, seed: int) -> None:
+        with self._turn:
+            if self._connected:
+                try:
+                    self._connection.reset(self._options.timeout)
+                except PolicyError:
+                    self._disconnect()
+                    raise
+
+    @override
+    def close(self) -> None:
+        self._connection.interrupt()
+        with self._turn:
+            self._disconnect()
+
+    @override
+    def fingerprint(self) -> str:
+        mapping = attrs.asdict(self._options, filter=lambda field, _: field.name in _MAPPING)
+        return hashlib.sha256(json.dumps([mapping, attrs.asdict(self.spec)], sort_keys=True).encode()).hexdigest()[:16]
+
+    @override
+    def weights(self) -> str:
+        """Hash of the server's metadata, the only thing known of its model."""
+        return "" if self._metadata is None else _hash(self._metadata)
+
+    @override
+    def preprocess(self, frame: Frame) -> Tensors:
+        if self.spec.prompt and not frame.prompt:
+            raise PolicyError("the server's model needs a prompt that describes the task")
+        tensors: dict[str, NDArray[Any]] = {}
+        for each in self._options.observations:
+            value = _observation(frame, each)
+            if each is self._reference:
+                order = [each.joints.index(joint) for joint in self._joints if joint in each.joints]
+                positions = dict(
+                    zip([each.joints[i] for i in order], np.asarray(value, np.float64)[order], strict=True)
+                )
+                tensors[REFERENCE] = np.array([positions.get(joint, 0.0) for joint in self._joints])
+            tensors[each.observation] = _converted(value, each)
+        if self.spec.prompt:
+            tensors[TASK] = np.frombuffer(frame.prompt.encode(), np.uint8)
+        return tensors
+
+    @override
+    def infer(self, tensors: Tensors) -> Tensors:
+        with self._turn:
+            if not self._connected:
+                if self._metadata is None:
+                    raise PolicyError(f"{self._connection.address}: is not loaded: call load() first")
+                self._connect(self._options.timeout)
+            return self._request(tensors, self._options.timeout)
+
+    @override
+    def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
+        values, joints = np.asarray(tensors[ACTION], np.float64), []
+        columns, start = [], 0
+        for each in self._options.actions:
+            part = values[:, start : start + len(each.joints)]
+            start += len(each.joints)
+            part = part * np.array(each.scale or 1.0) + np.array(each.offset or 0.0)
+            columns.append(part)
+            joints += each.joints
+        actions = np.concatenate(columns, axis=1)[:, [joints.index(joint) for joint in self._joints]]
+        if REFERENCE in tensors:
+            relative = {joint for each in self._options.actions for joint in each.relative}
+            moved = np.array([joint in relative for joint in self._joints], np.float64)
+            actions = actions + moved * np.asarray(tensors[REFERENCE], np.float64)
+        return actions[: self.spec.chunk_size]
+
+    def _request(self, tensors: Tensors, timeout_s: float) -> Tensors:
+        """One request; any error closes the connection."""
+        request: dict[str, Any] = {}
+        for each in self._options.observations:
+            _put(request, each.key, _tensor(tensors, each))
+        if self._options.prompt:
+            _put(request, self._options.prompt, _task(tensors))
+        try:
+            answer = self._connection.ask(request, timeout_s)
+            outputs: dict[str, NDArray[Any]] = {ACTION: self._actions(answer)}
+        except PolicyError:
+            self._disconnect()
+            raise
+        if REFERENCE in tensors:
+            outputs[REFERENCE] = np.array(tensors[REFERENCE])
+        return outputs
+
+    def _actions(self, answer: Mapping[str, Any]) -> NDArray[np.float64]:
+        """The actions of an answer, shape (N, joints), in the server's order.
+
+        Raises:
+            PolicyError: if they have another shape than the mapping states, or are not finite.
+        """
+        columns = []
+        for each in self._options.actions:
+            name, size = "/".join(each.key), each.size or len(each.joints)
+            value = _get(answer, each.key)
+            expected = (self._options.horizon, size)
+            if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf":
+                raise PolicyError(
+                    f"{self._connection.address}: the answer has no numbers under {name!r}; it has: {_names(answer)}"
+                )
+            if value.shape != expected:
+                raise PolicyError(
+                    f"{self._connection.address}: the server's {name!r} has shape {value.shape}, the robot YAML states "
+                    f"{expected}: horizon, and the size of the action"
+                )
+            if not np.isfinite(value).all():
+                raise PolicyError(f"{self._connection.address}: the server's {name!r} has values that are not finite")
+            columns.append(value[:, : len(each.joints)].astype(np.float64))
+        return np.concatenate(columns, axis=1)
+
+    def _connect(self, timeout_s: float) -> None:
+        try:
+            metadata = self._connection.open(timeout_s)
+            self._check_metadata(metadata)
+        except PolicyError:
+            self._disconnect()
+            raise
+        self._metadata, self._connected = metadata, True
+
+    def _check_metadata(self, metadata: Mapping[str, Any]) -> None:
+        wrong = []
+        for each in self._options.expect:
+            name, _, value = each.partition("=")
+            if (stated := str(metadata.get(name, "nothing"))) != value:
+                wrong.append(f"  {name}\n      server: {stated}\n      robot: {value}")
+        if wrong:
+            raise PolicyError(
+                "\n".join([f"{self._connection.address}: is not the server that the robot expects:", *wrong])
+            )
+        if self._metadata is not None and _hash(metadata) != _hash(self._metadata):
+            change = (
+                f"{self._connection.address}: the server restarted with another model: it states {_shown(metadata)}, "
+                f"previously {_shown(self._metadata)}"
+            )
+            if not self._options.accept_new_model:
+                raise PolicyError(f"{change}; start the run again, or set the model's accept_new_model: true")
+            self._log.warning("%s", change)
+
+    def _disconnect(self) -> None:
+        self._connected = False
+        self._connection.close()
+
+    def _zeros(self) -> Frame:
+        values: dict[str, NDArray[np.generic]] = {
+            each.observation: np.zeros(each.shape, np.uint8 if len(each.shape) == 3 else np.float32)
+            for each in self._options.observations
+        }
+        return Frame(0, values, prompt="hold still" if self.spec.prompt else "")
+
+
+_MAPPING = frozenset({"observations", "actions", "horizon", "rate_hz", "prompt", "use_actions"})
+"""Options on which both sides of `infer` must agree."""
+
+
+def _joints(options: ServerOptions, robot: Sequence[str]) -> tuple[str, ...]:
+    """The joints of the action, in the robot's order.
+
+    Raises:
+        PolicyError: for a joint that the robot lacks, that stands twice, or that is relative but not in the action.
+    """
+    moved = [joint for each in options.actions for joint in each.joints]
+    for joint in (*moved, *(joint for each in options.observations for joint in each.joints)):
+        if joint not in robot:
+            raise PolicyError(f"the robot has no joint {joint!r}{did_you_mean(joint, robot, 'it has')}")
+    if twice := sorted({joint for joint in moved if moved.count(joint) > 1}):
+        raise PolicyError(f"actions: {', '.join(twice)} stand twice")
+    for each in options.actions:
+        if others := [joint for joint in each.relative if joint not in each.joints]:
+            raise PolicyError(
+                f"actions: relative names {', '.join(others)}, not among the joints {', '.join(each.joints)}"
+            )
+        if each.size is not None and each.size < len(each.joints):
+            raise PolicyError(f"actions: size is {each.size}, less than the {len(each.joints)} joints")
+        _check_numbers("actions", each, len(each.joints))
+    for seen in options.observations:
+        if seen.scale or seen.offset:
+            _check_numbers(seen.observation, seen, seen.shape[0] if len(seen.shape) == 1 else 0)
+        if seen.joints and seen.shape != (len(seen.joints),):
+            raise PolicyError(f"{seen.observation}: has shape {list(seen.shape)}, but {len(seen.joints)} joints")
+    return tuple(joint for joint in robot if joint in moved)
+
+
+def _check_numbers(where: str, each: ObservationMap | ActionMap, size: int) -> None:
+    for name, numbers in (("scale", each.scale), ("offset", each.offset)):
+        if numbers and len(numbers) != size:
+            raise PolicyError(f"{where}: {name} has {len(numbers)} numbers, must have {size}")
+
+
+def _reference(options: ServerOptions) -> ObservationMap | None:
+    """The observation with the positions to which actions are relative; None without relative actions.
+
+    Raises:
+        PolicyError: if there is none.
+    """
+    relative = {joint for each in options.actions for joint in each.relative}
+    if not relative:
+        return None
+    for each in options.observations:
+        if relative <= set(each.joints):
+            return each
+    raise PolicyError(
+        f"actions: {', '.join(sorted(relative))} are relative, but no observation names these joints: add joints to "
+        "the observation with their positions"
+    )
+
+
+def _observation(frame: Frame, each: ObservationMap) -> NDArray[Any]:
+    """An observation as the contract has it."""
+    value = frame.values.get(each.observation)
+    if value is None:
+        raise PolicyError(f"the policy needs {each.observation}, which the frame at {frame.stamp_ns} ns lacks")
+    if value.shape != each.shape:
+        raise PolicyError(f"the policy needs {each.observation} of shape {each.shape}, got {value.shape}")
+    if len(each.shape) == 3 and value.dtype != np.uint8:
+        raise PolicyError(f"the policy needs {each.observation} with 8-bit pixels, got {value.dtype}")
+    return value
+
+
+def _converted(value: NDArray[Any], each: ObservationMap) -> NDArray[Any]:
+    """An observation in the server's layout and units."""
+    if value.ndim == 3:
+        return np.ascontiguousarray(value.transpose(2, 0, 1)) if each.layout == "chw" else np.array(value)
+    return (value * np.array(each.scale or 1.0) + np.array(each.offset or 0.0)).astype(np.float32)
+
+
+def _tensor(tensors: Tensors, each: ObservationMap) -> NDArray[Any]:
+    """A tensor of a request, which may be from another machine."""
+    shape = each.shape
+    if len(shape) == 3 and each.layout == "chw":
+        shape = (shape[2], shape[0], shape[1])
+    dtype = np.dtype(np.uint8 if len(shape) == 3 else np.float32)
+    array = tensors.get(each.observation)
+    if array is None or (array.dtype, array.shape) != (dtype, shape):
+        got = "is missing" if array is None else f"is {array.dtype} {array.shape}"
+        raise PolicyError(f"the request's tensors: {each.observation} {got}, must be {dtype} {shape}")
+    return array
+
+
+def _task(tensors: Tensors) -> str:
+    array = tensors.get(TASK)
+    if array is None or array.dtype != np.uint8:
+        raise PolicyError(f"the request's tensors: {TASK} must be UTF-8 text")
+    return array.tobytes().decode(errors="replace")
+
+
+def _put(request: dict[str, Any], key: Sequence[str], value: Any) -> None:
+    for name in key[:-1]:
+        request = request.setdefault(name, {})
+    request[key[-1]] = value
+
+
+def _get(answer: Mapping[str, Any], key: Sequence[str]) -> Any:
+    value: Any = answer
+    for name in key:
+        value = value.get(name) if isinstance(value, Mapping) else None
+    return value
+
+
+def _names(answer: Mapping[str, Any]) -> str:
+    return ", ".join(str(name)[:40] for name in [*answer][:20]) or "nothing"
+
+
+def _plain(value: Any) -> Any:
+    """A server's value with arrays as lists, for comparison and display."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    return value if isinstance(value, str | bool | int | float | None) else repr(value)
+
+
+def _hash(metadata: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(_plain(metadata), sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _shown(metadata: Mapping[str, Any]) -> str:
+    text = json.dumps(_plain(metadata))
+    return text if len(text) < 300 else f"{text[:300]}…"
