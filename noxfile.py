@@ -302,10 +302,11 @@ def types(session: nox.Session) -> None:
     for module in {path.stem for each in shared for path in Path(each).iterdir() if path.suffix in (".py", "")}:
         untyped += [module, f"{module}.*"] if module.isidentifier() else []
     # One run, so that mypy reads everything once. All plugins have a package `tests`: here each has another name.
-    for name in TESTED:
-        (folder / f"{name}_tests").unlink(missing_ok=True)
-        (folder / f"{name}_tests").symlink_to((FOLDERS[name] / "tests").absolute())
-        untyped.append(f"{name}_tests.*")
+    packages_of_tests = {name: f"{name.replace('-', '_')}_tests" for name in TESTED}
+    for name, package in packages_of_tests.items():
+        (folder / package).unlink(missing_ok=True)
+        (folder / package).symlink_to((FOLDERS[name] / "tests").absolute())
+        untyped.append(f"{package}.*")
     options = "".join(f"{option} = false\n" for option in UNTYPED)
     config = Path("pyproject.toml").read_text(encoding="utf-8")
     config += f"\n[[tool.mypy.overrides]]\nmodule = {json.dumps(sorted(untyped))}\n{options}"
@@ -315,7 +316,7 @@ def types(session: nox.Session) -> None:
         "tests",
         "benchmarks",
         *map(str, Path("docs").glob("*.py")),
-        *(str(folder / f"{n}_tests") for n in TESTED),
+        *(str(folder / package) for package in packages_of_tests.values()),
     )
     bases = {"MYPYPATH": ":".join((*shared, *map(str, FOLDERS.values()), str(folder)))}
     given = (f"--config-file={folder / 'pyproject.toml'}", "--explicit-package-bases")
