@@ -17,10 +17,9 @@ from ibrobot_policy_servers.options import ActionMap, ObservationMap, OpenpiOpti
 from ibrobot_policy_servers.served import ServedPolicy
 from ibrobot_testing import PolicySuite, check_descriptor, host_context
 from ibrobot_testing.contexts import ARM, GRIPPER
+from openpi_server import HORIZON, SIZE, OpenpiServer, ramp
 
 from ibrobot_core.api import Context, Frame, Policy, PolicyError
-
-from .openpi_server import HORIZON, SIZE, OpenpiServer, ramp
 
 STATE, CAMERA = "observation.state", "observation.images.top"
 IMAGE = (8, 10, 3)

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from openpi_server import OpenpiServer, towards_a_goal
 
 from ibrobot_core.app import ComponentFailed
-
-from .openpi_server import OpenpiServer
 
 if TYPE_CHECKING:
     from fake_runs import Runs
@@ -24,11 +23,6 @@ MODEL = (
     "start_timeout: 30}}"
 )
 ENDLESS = "contract.max_duration_s=1000"
-
-
-def towards_a_goal(request: dict[str, Any]) -> dict[str, Any]:
-    """Ten small steps from the state."""
-    return {"actions": request["state"] + np.linspace(0.002, 0.02, 10, dtype=np.float32)[:, None]}
 
 
 @pytest.fixture
