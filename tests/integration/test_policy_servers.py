@@ -1,4 +1,4 @@
-"""`ibrobot serve` in front of another project's server: robots reach an openpi model by `execution_mode: distributed`."""
+"""`ibrobot serve` in front of an openpi server: robots reach its model by `execution_mode: distributed`."""
 
 from __future__ import annotations
 
