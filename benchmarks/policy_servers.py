@@ -23,10 +23,10 @@ from contextlib import closing, contextmanager
 from typing import Any
 
 import numpy as np
-from ibrobot_policy_servers.arrays import pack
 from ibrobot_policy_servers.openpi import OpenpiConnection
 from ibrobot_policy_servers.options import ActionMap, ObservationMap, OpenpiOptions
 from ibrobot_policy_servers.served import ServedPolicy
+from ibrobot_policy_wire import pack
 from ibrobot_testing import host_context
 from ibrobot_testing.contexts import ARM, GRIPPER
 
@@ -38,7 +38,7 @@ IMAGE = (224, 224, 3)
 START_S = 60.0
 OURS = """
 import sys
-from ibrobot_policy_servers.arrays import pack, unpack
+from ibrobot_policy_wire import pack, unpack
 from websockets.sync.server import serve
 def handle(connection):
     connection.send(pack({"server": "ours"}))

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from ibrobot_policy_servers.arrays import pack, unpack
+from ibrobot_policy_wire import pack, unpack
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 

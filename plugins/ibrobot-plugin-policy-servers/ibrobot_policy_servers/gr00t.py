@@ -9,9 +9,9 @@ from typing import Any, override
 
 import numpy as np
 import zmq
+from ibrobot_policy_wire import MAX_MESSAGE, pack_npy, unpack_npy
 
 from ibrobot_core.api import PolicyError
-from ibrobot_policy_servers.arrays import MAX_MESSAGE, pack_npy, unpack_npy
 from ibrobot_policy_servers.connection import Connection, one_line
 from ibrobot_policy_servers.options import Gr00tOptions
 

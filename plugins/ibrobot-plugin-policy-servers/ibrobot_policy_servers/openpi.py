@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from typing import Any, override
 from urllib.parse import urlsplit
 
+from ibrobot_policy_wire import pack, unpack
+
 from ibrobot_core.api import PolicyError
-from ibrobot_policy_servers.arrays import pack, unpack
 from ibrobot_policy_servers.connection import one_line
 from ibrobot_policy_servers.options import OpenpiOptions
 from ibrobot_policy_servers.websocket import WebsocketConnection

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any, override
 
 import numpy as np
+from ibrobot_policy_wire import pack_named, unpack_named
 
 from ibrobot_core.api import PolicyError
-from ibrobot_policy_servers.arrays import pack_named, unpack_named
 from ibrobot_policy_servers.connection import one_line
 from ibrobot_policy_servers.options import VlaEvalOptions
 from ibrobot_policy_servers.websocket import WebsocketConnection

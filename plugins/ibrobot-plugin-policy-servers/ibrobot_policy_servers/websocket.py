@@ -9,11 +9,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, override
 
+from ibrobot_policy_wire import MAX_MESSAGE
 from websockets.exceptions import InvalidHandshake, InvalidStatus, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from ibrobot_core.api import PolicyError
-from ibrobot_policy_servers.arrays import MAX_MESSAGE
 from ibrobot_policy_servers.connection import Connection
 
 _CLOSE_S = 0.5

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 import zmq
-from ibrobot_policy_servers.arrays import pack_npy, unpack_npy
+from ibrobot_policy_wire import pack_npy, unpack_npy
 
 HORIZON = 5
 ARM_SIZE = 5

@@ -11,10 +11,10 @@ import msgpack
 import numpy as np
 import pytest
 from ibrobot_policy_servers import ibrobot_policies
-from ibrobot_policy_servers.arrays import pack_npy, unpack_npy
 from ibrobot_policy_servers.gr00t import Gr00tConnection
 from ibrobot_policy_servers.options import ActionMap, Gr00tOptions, ObservationMap
 from ibrobot_policy_servers.served import ServedPolicy
+from ibrobot_policy_wire import pack_npy, unpack_npy
 from ibrobot_testing import PolicySuite, check_descriptor, host_context
 from ibrobot_testing.contexts import ARM, GRIPPER
 

@@ -11,10 +11,10 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_policy_servers import ibrobot_policies
-from ibrobot_policy_servers.arrays import pack
 from ibrobot_policy_servers.openpi import OpenpiConnection
 from ibrobot_policy_servers.options import ActionMap, ObservationMap, OpenpiOptions
 from ibrobot_policy_servers.served import ServedPolicy
+from ibrobot_policy_wire import pack
 from ibrobot_testing import PolicySuite, check_descriptor, host_context
 from ibrobot_testing.contexts import ARM, GRIPPER
 from openpi_server import HORIZON, SIZE, OpenpiServer, ramp

@@ -11,10 +11,10 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_policy_servers import ibrobot_policies
-from ibrobot_policy_servers.arrays import pack_named, unpack_named
 from ibrobot_policy_servers.options import ActionMap, ObservationMap, VlaEvalOptions
 from ibrobot_policy_servers.served import ServedPolicy
 from ibrobot_policy_servers.vla_eval import VlaEvalConnection
+from ibrobot_policy_wire import pack_named, unpack_named
 from ibrobot_testing import PolicySuite, check_descriptor, host_context
 from ibrobot_testing.contexts import ARM, GRIPPER
 from websockets.exceptions import ConnectionClosed

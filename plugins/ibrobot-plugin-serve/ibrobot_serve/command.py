@@ -23,6 +23,7 @@ from ibrobot_core.app import (
     Override,
     Problem,
     Registry,
+    RobotConfig,
     apply_overrides,
     build_policy,
     echo,
@@ -120,17 +121,28 @@ def _share(ctx: click.Context, param: click.Parameter, value: str) -> float:
     metavar="S",
     help="How long to wait for pending requests at the end.",
 )
+@click.option(
+    "--protocol",
+    type=click.Choice(["ibrobot", "openpi"]),
+    default="ibrobot",
+    show_default=True,
+    help="Whose clients are answered; for openpi, --listen is HOST:PORT, by default 127.0.0.1:8000.",
+)
 def serve(what: str, **options: Any) -> None:
     """Run a model for robots on other machines.
 
     CONFIG is a robot YAML, which names model and transport; MODEL_DIR is a folder with a model, for --type.
     Robots use it by `execution_mode: distributed`. Ctrl-C or SIGTERM answers pending requests, then ends.
+    With --protocol openpi, clients of openpi use it, and need the key in the environment variable IBROBOT_API_KEY.
     """
     registry = installed_plugins()
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("ibrobot").setLevel(logging.INFO)
+    if options["protocol"] == "openpi":
+        _serve_openpi(what, registry, options)
+        return
     with wrong_input():
         name, policy, make_transport = (
             _from_folder(Path(what), registry, options) if options["type_"] else _from_config(what, registry, options)
@@ -198,11 +210,7 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
     given = [Override.of(f"--transport {each}", f"transport.{each}") for each in options["transport_options"]]
     changes = (*options["overrides"], *listening, *given)
     config = load_config(path, overrides=changes, sim=options["sim"], registry=registry, communicates=True)
-    model: str = options["model"] or (next(iter(config.models)) if len(config.models) == 1 else "")
-    if model not in config.models:
-        raise click.UsageError(
-            f"--model: one of {', '.join(config.models) or 'none'} in {path}, got {options['model']}"
-        )
+    model = _chosen(config, path, options)
     section = config.transport
     if section is None or section.type == "local":
         raise click.UsageError(
@@ -221,14 +229,7 @@ def _from_folder(
     folder: Path, registry: Registry, options: dict[str, Any]
 ) -> tuple[str, Policy, Callable[[], Transport]]:
     """Name, policy and transport of a folder with a model."""
-    if not folder.is_dir():
-        raise click.UsageError(f"{folder}: no such folder; with --type, give a folder with a model")
-    if options["model"]:
-        raise click.UsageError("--model selects a model of CONFIG; MODEL_DIR has only one, which --name names")
-    context = _context(Robot("server", ()))
-    policies = registry.find("policy", options["type_"])
-    overrides = [f"path={folder.absolute()}", *options["overrides"]]
-    policy: Policy = policies.make(single_options(policies.options, overrides, str(folder)), context)
+    policy, context = _policy_of_folder(folder, registry, options)
     transport = registry.default("transport")
     transports = registry.find("transport", transport)
     settings = single_options(
@@ -243,6 +244,79 @@ def _from_folder(
         return made
 
     return options["name"] or folder.absolute().name, policy, make_transport
+
+
+def _policy_of_folder(folder: Path, registry: Registry, options: dict[str, Any]) -> tuple[Policy, Context]:
+    if not folder.is_dir():
+        raise click.UsageError(f"{folder}: no such folder; with --type, give a folder with a model")
+    if options["model"]:
+        raise click.UsageError("--model selects a model of CONFIG; MODEL_DIR has only one, which --name names")
+    context = _context(Robot("server", ()))
+    policies = registry.find("policy", options["type_"])
+    overrides = [f"path={folder.absolute()}", *options["overrides"]]
+    return policies.make(single_options(policies.options, overrides, str(folder)), context), context
+
+
+def _chosen(config: RobotConfig, path: Path, options: dict[str, Any]) -> str:
+    """The name of the model to serve."""
+    model: str = options["model"] or (next(iter(config.models)) if len(config.models) == 1 else "")
+    if model not in config.models:
+        raise click.UsageError(
+            f"--model: one of {', '.join(config.models) or 'none'} in {path}, got {options['model']}"
+        )
+    return model
+
+
+def _serve_openpi(what: str, registry: Registry, options: dict[str, Any]) -> None:
+    """Answer openpi's clients until a signal."""
+    from ibrobot_serve.openpi_server import OpenpiServer
+
+    key = os.environ.get("IBROBOT_API_KEY") or None
+    host, port = _host_and_port(options["listen"], key)
+    with wrong_input():
+        if options["type_"]:
+            policy, _ = _policy_of_folder(Path(what), registry, options)
+            name = options["name"] or Path(what).absolute().name
+        else:
+            path = find_config(what, registry)
+            config = load_config(path, overrides=options["overrides"], sim=options["sim"], registry=registry)
+            model = _chosen(config, path, options)
+            name, policy = options["name"] or model, build_policy(config, registry, model)
+    try:
+        policy.load()
+        stopping = threading.Event()
+        on_signals(stopping.set)
+        with wrong_input():
+            try:
+                server = OpenpiServer(policy, name, host, port, key)
+            except OSError as error:
+                raise click.UsageError(f"--listen: {host}:{port} cannot be used: {error.strerror}") from None
+        try:
+            echo(f"serving {name} to openpi's clients on ws://{host}:{server.port}; Ctrl-C ends")
+            stopping.wait()
+        finally:
+            server.close()
+        echo(f"{server.answered} answered, {server.failed} failed")
+    finally:
+        policy.close()
+
+
+def _host_and_port(listen: Sequence[str], key: str | None) -> tuple[str, int]:
+    """The address of an openpi server.
+
+    Raises:
+        click.UsageError: if it is not one HOST:PORT, or others could use the model without a key.
+    """
+    given = listen or ("127.0.0.1:8000",)
+    host, _, port = given[0].rpartition(":")
+    if len(given) != 1 or not host or not port.isdecimal() or int(port) > 65535:
+        raise click.UsageError(f"--listen: {' '.join(given)!r} must be one HOST:PORT, e.g. 127.0.0.1:8000")
+    if key is None and host not in ("127.0.0.1", "localhost", "::1"):
+        raise click.UsageError(
+            f"--listen: other machines could use the model at {host} without a password: set IBROBOT_API_KEY, which "
+            "clients then need as their api_key"
+        )
+    return host, int(port)
 
 
 def _transport_type(path: Path, overrides: Sequence[str]) -> str:

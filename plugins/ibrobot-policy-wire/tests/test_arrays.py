@@ -7,7 +7,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from ibrobot_policy_servers.arrays import pack, unpack
+from ibrobot_policy_wire import pack, unpack
 
 from ibrobot_core.api import PolicyError
 
