@@ -122,7 +122,8 @@ class ServedPolicy(Policy):
 
     @override
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
-        values, joints = np.asarray(tensors[ACTION], np.float64), []
+        values = np.asarray(tensors[ACTION], np.float64)
+        joints: list[str] = []
         columns, start = [], 0
         for each in self._options.actions:
             part = values[:, start : start + len(each.joints)]
@@ -130,7 +131,7 @@ class ServedPolicy(Policy):
             part = part * np.array(each.scale or 1.0) + np.array(each.offset or 0.0)
             columns.append(part)
             joints += each.joints
-        actions = np.concatenate(columns, axis=1)[:, [joints.index(joint) for joint in self._joints]]
+        actions = np.concatenate(columns, axis=1)[:, np.array([joints.index(joint) for joint in self._joints])]
         if REFERENCE in tensors:
             relative = {joint for each in self._options.actions for joint in each.relative}
             moved = np.array([joint in relative for joint in self._joints], np.float64)
@@ -291,7 +292,8 @@ def _converted(value: NDArray[Any], each: ObservationMap) -> NDArray[Any]:
     """An observation in the server's layout and units."""
     if value.ndim == 3:
         return np.ascontiguousarray(value.transpose(2, 0, 1)) if each.layout == "chw" else np.array(value)
-    return (value * np.array(each.scale or 1.0) + np.array(each.offset or 0.0)).astype(np.float32)
+    scaled: NDArray[Any] = value * np.array(each.scale or 1.0) + np.array(each.offset or 0.0)
+    return scaled.astype(np.float32)
 
 
 def _tensor(tensors: Tensors, each: ObservationMap) -> NDArray[Any]:

@@ -7,12 +7,12 @@ import logging
 import threading
 import time
 from collections.abc import Mapping
+from http import HTTPStatus
 from typing import Any
 
 import numpy as np
 from ibrobot_policy_wire import MAX_MESSAGE, pack, unpack
 from numpy.typing import NDArray
-from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
@@ -81,10 +81,10 @@ class OpenpiServer:
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         if request.path == "/healthz":
-            return connection.respond(200, "OK\n")  # type: ignore[arg-type]  # an HTTPStatus is one
+            return connection.respond(HTTPStatus.OK, "OK\n")
         given = request.headers.get("Authorization", "")
         if self._key is not None and not hmac.compare_digest(given.encode(), f"Api-Key {self._key}".encode()):
-            return Response(401, "Unauthorized", Headers())
+            return connection.respond(HTTPStatus.UNAUTHORIZED, "the API key is missing or wrong\n")
         return None
 
     def _handle(self, connection: ServerConnection) -> None:
