@@ -109,7 +109,7 @@ from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
 from ibrobot_core.interfaces.policy import copied_tensors as copied_tensors
 
 # Episodes and datasets
-from ibrobot_core.ownership import Ownership as Ownership
+from ibrobot_core.ownership import Ownership as Ownership, owned as owned
 from ibrobot_core.interfaces import find_episode as find_episode
 from ibrobot_core.contract.metadata import robot_metadata as robot_metadata
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, FrameSampler as FrameSampler

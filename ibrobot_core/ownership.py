@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from ibrobot_core.errors import InUse
+from ibrobot_core.errors import IbrobotError, InUse
 
 _LONGEST = 200
 """Longer names are replaced by a hash, since the name of the lock file would be too long [bytes]."""
@@ -110,6 +110,24 @@ class Ownership:
             lines = [line for line in self._file.read_text(encoding="utf-8", errors="replace").splitlines() if line]
         here = [line for line in lines if _runs(line.rpartition(" ")[2])]  # others may have been killed
         return (here or lines or ["is being changed by another process"])[-1]
+
+
+def owned(
+    path: Path, doing: str, error: type[IbrobotError], *, file: Path | None = None, shared: bool = False,
+    wait_s: float = 0.5,
+) -> Ownership:  # fmt: skip
+    """Own a folder, and create the missing folders above its lock file; the other arguments are those of `Ownership`.
+
+    Raises:
+        InUse: if it has another owner.
+        IbrobotError: of type `error`, if it cannot be locked, e.g. on a read-only disk.
+    """
+    try:
+        if not shared:
+            (file or path).parent.mkdir(parents=True, exist_ok=True)
+        return Ownership(path, doing, file=file, shared=shared, wait_s=wait_s)
+    except OSError as failed:
+        raise error(f"{path}: cannot be {'locked' if shared else 'written'}: {failed.strerror}") from failed
 
 
 def lock_file(path: Path) -> Path:

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from ibrobot_core.errors import InUse, wrong_input
-from ibrobot_core.ownership import Ownership, lock_file
+from ibrobot_core.errors import DatasetError, InUse, wrong_input
+from ibrobot_core.ownership import Ownership, lock_file, owned
 
 HOLD = """
 import sys
@@ -134,3 +134,13 @@ def test_what_nobody_can_change_needs_no_owner_to_be_read(tmp_path: Path, monkey
         monkeypatch.setattr(os, "open", read_only)
         with pytest.raises(InUse, match="is being recorded"):
             Ownership(tmp_path / "episode", "is being converted", shared=True, wait_s=0.0)
+
+
+def test_owned_creates_the_folders_above_and_raises_the_given_error(tmp_path: Path) -> None:
+    with owned(tmp_path / "new" / "folder", "is being written", DatasetError):
+        assert (tmp_path / "new").is_dir()
+    (tmp_path / "file").touch()
+    with pytest.raises(DatasetError, match=r"file/folder: cannot be written: (Not a directory|File exists)"):
+        owned(tmp_path / "file" / "folder", "is being written", DatasetError)
+    with pytest.raises(DatasetError, match=r"none/folder: cannot be locked: No such file"):
+        owned(tmp_path / "none" / "folder", "is being read", DatasetError, shared=True)

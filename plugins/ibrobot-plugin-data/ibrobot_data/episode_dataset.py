@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -11,7 +9,7 @@ from typing import Any
 import yaml
 
 from ibrobot_core.api import Contract, RecorderError, replace_file
-from ibrobot_core.app import Ownership
+from ibrobot_core.app import Ownership, owned
 
 _WAIT_S = 10.0
 """Time to wait for another process, which changes `dataset.yaml` within milliseconds."""
@@ -90,16 +88,10 @@ class EpisodeDataset:
                 f"recording.root: {self._folder} cannot be written: {folder}: {error.strerror}; choose another root"
             ) from None
 
-    @contextmanager
-    def _owned(self) -> Iterator[None]:
+    def _owned(self) -> Ownership:
         """Lock `dataset.yaml` for a change."""
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            owned = Ownership(self._file, "is being changed", file=self._folder / ".dataset.lock", wait_s=_WAIT_S)
-        except OSError as error:
-            raise RecorderError(f"{self._file}: cannot be written: {error.strerror}") from None
-        with owned:
-            yield
+        lock = self._folder / ".dataset.lock"
+        return owned(self._file, "is being changed", RecorderError, file=lock, wait_s=_WAIT_S)
 
     def _read(self) -> dict[str, Any]:
         try:

@@ -12,7 +12,7 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import ComponentFailed, Done, Job, Ownership, installed_plugins
+from ibrobot_core.app import ComponentFailed, Done, Job, installed_plugins, owned
 from ibrobot_eval.comparison import Decision
 from ibrobot_eval.episodes import SCRATCH, Place, Result, write
 from ibrobot_eval.film import can_film
@@ -204,12 +204,7 @@ def opened(request: Request) -> Iterator[Evaluation]:
         "versions": registry.versions(),
         ASKED: [attrs.asdict(each) for each in request.policies],
     }
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        owned = Ownership(out, "is being evaluated")
-    except OSError as error:
-        raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
-    with owned:
+    with owned(out, "is being evaluated", DatasetError):
         try:
             _begin(request, settings)
         except OSError as error:

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ibrobot_core.api import DatasetError, sync
-from ibrobot_core.app import Ownership
+from ibrobot_core.app import Ownership, owned
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.arrow import table_of, to_array, to_numpy
 from ibrobot_lerobot.episode import counter_stats, plain
@@ -94,24 +94,13 @@ def reading(root: Path, doing: str) -> Iterator[None]:
         DatasetError: if an interrupted merge cannot be finished, or the dataset cannot be locked.
     """
     complete(root)
-    try:
-        owned = Ownership(root, doing, file=root / _LOCK, shared=True, wait_s=_WAIT_S)
-    except OSError as error:
-        raise DatasetError(f"{root}: cannot be locked: {error.strerror}") from error
-    with owned:
+    with owned(root, doing, DatasetError, file=root / _LOCK, shared=True, wait_s=_WAIT_S):
         yield
 
 
-@contextmanager
-def _owning(root: Path) -> Iterator[None]:
+def _owning(root: Path) -> Ownership:
     """A context in which no other process merges into the dataset."""
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        owned = Ownership(root, "is being merged", file=root / _LOCK, wait_s=_WAIT_S)
-    except OSError as error:
-        raise DatasetError(f"{root}: cannot be written: {error.strerror}") from error
-    with owned:
-        yield
+    return owned(root, "is being merged", DatasetError, file=root / _LOCK, wait_s=_WAIT_S)
 
 
 def _complete(root: Path) -> None:

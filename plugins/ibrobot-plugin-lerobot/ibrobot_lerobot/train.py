@@ -12,13 +12,13 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import click
 
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import Failed, Ownership, declared, echo, emit, wrong_input
+from ibrobot_core.app import Failed, declared, echo, emit, owned, wrong_input
 from ibrobot_lerobot import TRAIN
 from ibrobot_lerobot.pretrained import check_policy
 from ibrobot_lerobot.training import AUTO, SMALL, Begin, Phase, Progress, Report, TrainOptions, find_trainer
@@ -100,7 +100,7 @@ def run_training(options: TrainOptions, follow: Follow | None) -> tuple[int, Tra
     program = find_trainer()
     given = (*arguments(options), *options.lerobot_options)
     chosen = list({each.partition("=")[0]: each for each in given}.values())  # of two for one option, the last counts
-    with reading(dataset, "is being trained on"), _owning(out):
+    with reading(dataset, "is being trained on"), owned(out, "is being trained", DatasetError):
         newest = _begun(out, chosen)
         if newest is None:
             if policy != SMALL:
@@ -125,23 +125,6 @@ def _environment(policy: str, *, download: bool) -> dict[str, str]:
     if policy == SMALL:  # one thread is the fastest for so small a network
         environment |= {"OMP_NUM_THREADS": "1"}
     return environment
-
-
-@contextlib.contextmanager
-def _owning(out: Path) -> Iterator[None]:
-    """A context in which no other training writes into `out`.
-
-    Raises:
-        InUse: if one does.
-        DatasetError: if `out` cannot be locked.
-    """
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        owned = Ownership(out, "is being trained")
-    except OSError as error:
-        raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
-    with owned:
-        yield
 
 
 def _begun(out: Path, chosen: Sequence[str]) -> TrainingCheckpoint | None:
