@@ -51,7 +51,7 @@ def _share(ctx: click.Context, param: click.Parameter, value: str) -> float:
     except ValueError:
         share = math.nan
     if not value.endswith("%") or not 0 <= share <= LARGEST_CANARY:
-        raise click.BadParameter(f"{value!r} is no share from 0% to {LARGEST_CANARY:.0%}, e.g. 10%")
+        raise click.BadParameter(f"{value!r} is not a percentage from 0% to {LARGEST_CANARY:.0%}, e.g. 10%")
     return share
 
 

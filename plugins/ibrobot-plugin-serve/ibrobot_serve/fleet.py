@@ -27,7 +27,7 @@ _OFFER_SIZE, _TEXT_SIZE = 1 << 20, 128
 
 def _text(instance: object, attribute: attrs.Attribute[str], value: object) -> None:
     if not isinstance(value, str) or len(value) > _TEXT_SIZE:
-        raise ValueError(f"{attribute.name} is no text of up to {_TEXT_SIZE} characters")
+        raise ValueError(f"{attribute.name} is not a text of at most {_TEXT_SIZE} characters")
 
 
 def _number(instance: object, attribute: attrs.Attribute[Any], value: object) -> None:

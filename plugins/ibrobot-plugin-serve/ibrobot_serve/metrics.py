@@ -48,7 +48,7 @@ class ServiceCollector(Collector):
         each: _Rows = {(model, name[:_LABEL_SIZE]): counts for name, counts in statistics["robots"].items()}
         return [
             _gauge("uptime_seconds", "time since the start", model, statistics["uptime_s"]),
-            _gauge("waiting", "robots whose requests wait", model, statistics["waiting"]),
+            _gauge("waiting", "robots with waiting requests", model, statistics["waiting"]),
             _gauge("pace_seconds", "time between the requests of a robot", model, statistics["pace_ms"] / 1e3),
             malformed,
             batches,

@@ -300,14 +300,14 @@ class RemoteEngine(Engine):
         if not offers:
             if failure is None:  # the transport states the reason, e.g. a missing connection
                 self._transport.request(health_name(self._model), b"", _REASON_TIMEOUT_S)
-                failure = TransportError(f"the servers of {self._model} take no robots")
+                failure = TransportError(f"no server of {self._model} accepts robots at present")
             raise failure
         return offers
 
     def _groups(self, offers: Sequence[Offer]) -> list[list[Offer]]:
         """The servers that this robot may use, by weights: those of a canary that it is to try, and the others."""
         if not offers:
-            raise TransportError(f"no other server of {self._model} takes robots")
+            raise TransportError(f"no other server of {self._model} accepts robots")
         ours = self._policy.fingerprint()
         same = [offer for offer in offers if offer.fingerprint == whole_fingerprint(ours, offer.weights)]
         if not same:
@@ -340,7 +340,7 @@ class RemoteEngine(Engine):
             check_weights(self._weights, chosen, f"the server of {self._model}", accept=self._accept_new_weights)
         elif len(known) > 1 and not self._accept_new_weights:
             raise PolicyError(
-                f"the servers of {self._model} have different weights: {', '.join(sorted(known))}; end those that are "
+                f"the servers of {self._model} have different weights: {', '.join(sorted(known))}; stop those that are "
                 "not wanted, start them with --canary SHARE, or set inference.accept_new_weights: true"
             )
         self._weights = chosen

@@ -291,9 +291,9 @@ class InferenceService:
         self._pacing.ask(message.robot, arrived_ns)
         replaced = self._queue.put(message.robot, ticket)
         if replaced is ticket:
-            ticket.refuse(f"the server is full: {self._options.queue} requests wait")
+            ticket.refuse(f"the server is full: {self._options.queue} requests are waiting")
         elif replaced is not None:
-            replaced.fail(f"not begun: the newer request {message.id} of this robot replaced it")
+            replaced.fail(f"dropped: replaced by the newer request {message.id} of this robot")
         try:
             return ticket.outcomes.get(timeout=max(0.0, (ticket.deadline_ns - time.monotonic_ns()) / NS_PER_S))
         except queue.Empty:
@@ -342,7 +342,7 @@ class InferenceService:
             live = [ticket for ticket in batch if ticket.deadline_ns > now_ns]
             for ticket in batch:
                 if ticket not in live:
-                    ticket.fail("expired before its turn; it was not begun", expired=True)
+                    ticket.fail("expired while it waited for its turn", expired=True)
             if live:
                 self._work = (now_ns, live)
                 self._run(live, now_ns)
@@ -403,7 +403,7 @@ class InferenceService:
         """
         message = ticket.message
         if self._owner is not None and self._owner[0] != message.robot and now_ns - self._owner_heard_ns < _LEASE_NS:
-            ticket.refuse(f"this policy remembers its requests, so it serves one robot, now {self._owner[0]!r}")
+            ticket.refuse(f"this policy is stateful, so it serves one robot at a time, at present {self._owner[0]!r}")
             return False
         try:
             self._policy.check(message.tensors)

@@ -225,7 +225,7 @@ def _lay_out(message: WireMessage, jpegs: Mapping[str, bytes], limits: WireLimit
         dtype, jpeg = array.dtype.newbyteorder("<"), jpegs.get(name)
         code = _CODES.get(dtype) if jpeg is None else _JPEG
         if code is None:
-            raise WireError(f"tensor {name!r} has dtype {dtype}; only numbers and booleans of 1 to 8 bytes travel")
+            raise WireError(f"tensor {name!r} has dtype {dtype}; only numbers and booleans of 1 to 8 bytes can be sent")
         offset, nbytes = _aligned(cursor), array.nbytes if jpeg is None else len(jpeg)
         places.append(_Place(name, dtype, array.shape, offset, nbytes, jpeg is not None))
         table += _ENTRY.pack(offset, nbytes, code, array.ndim, len(row) - 4 * array.ndim) + row
@@ -248,7 +248,7 @@ def _fill(frame: memoryview, layout: _MessageLayout, message: WireMessage, jpegs
             message.latency_ms,
         )  # fmt: skip
     except struct.error as error:
-        raise WireError(f"a number of request {message.id} has no place in a frame: {error}") from None
+        raise WireError(f"a number of request {message.id} does not fit into a frame: {error}") from None
     end = _NUMBERS.size + len(layout.head)
     frame[_NUMBERS.size : end] = layout.head
     for place in layout.places:
@@ -363,7 +363,7 @@ class WireDecoder:
             raise WireError(f"{len(frame)} bytes; a frame has {_HEAD_SIZE} to {self._limits.size}")
         magic, version, kind, reserved, request, stamp_ns, *times, seed, latency_ms = _NUMBERS.unpack_from(frame)
         if magic != MAGIC:
-            raise WireError(f"no frame: it begins with {magic!r}, not {MAGIC!r}")
+            raise WireError(f"not a frame: it begins with {magic!r}, not {MAGIC!r}")
         if version != VERSION:
             raise WireError(f"a frame of version {version}; this side speaks version {VERSION}")
         if kind not in _KINDS:
@@ -391,7 +391,7 @@ class WireDecoder:
         if reserved or zeros != _ZEROS:
             raise WireError("a frame whose reserved bytes are not 0")
         if size != len(frame):
-            raise WireError(f"a frame that says {size} bytes has {len(frame)}")
+            raise WireError(f"a frame of {len(frame)} bytes states a size of {size}")
         if count > limits.tensors or max(robot_size, fingerprint_size) > limits.name or text_size > limits.text:
             raise WireError(
                 f"{count} tensors, texts of {robot_size}, {fingerprint_size}, {text_size} bytes: over the limits"
@@ -422,7 +422,7 @@ class WireDecoder:
             raise WireError(f"picture {place.name!r}: {type(error).__name__}: {error}") from error
         if picture.shape != place.shape or picture.dtype != _BYTE:
             raise WireError(
-                f"picture {place.name!r} is {picture.dtype} {picture.shape}, not the {place.shape} that was announced"
+                f"picture {place.name!r} is {picture.dtype} {picture.shape}, not {place.shape} as announced"
             )
         picture.flags.writeable = False
         return picture
@@ -462,7 +462,7 @@ def _places(reader: _Reader, count: int, limits: WireLimits) -> Sequence[_Place]
         if name in places:
             raise WireError(f"two tensors named {name!r}")
         if offset != _aligned(cursor) or offset + nbytes > len(reader.frame):
-            raise WireError(f"tensor {name!r}: {nbytes} bytes at {offset} are not where they belong")
+            raise WireError(f"tensor {name!r}: {nbytes} bytes at the wrong offset {offset}")
         cursor = offset + nbytes
         if code != _JPEG and not 0 < code <= len(_DTYPES):
             raise WireError(f"tensor {name!r} of the unknown dtype {code}")
@@ -479,5 +479,5 @@ def _places(reader: _Reader, count: int, limits: WireLimits) -> Sequence[_Place]
             raise WireError(f"tensor {name!r} of shape {shape} and dtype {dtype} in {nbytes} bytes")
         places[name] = _Place(name, dtype, shape, offset, nbytes, code == _JPEG)
     if cursor != len(reader.frame):
-        raise WireError(f"{len(reader.frame) - cursor} bytes that belong to nothing")
+        raise WireError(f"{len(reader.frame) - cursor} bytes after the last tensor")
     return list(places.values())

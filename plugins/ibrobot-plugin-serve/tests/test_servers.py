@@ -252,7 +252,7 @@ def test_server_with_other_weights_gets_no_robots(fleet: Fleet) -> None:
 def test_robot_begins_with_no_servers_that_disagree(fleet: Fleet) -> None:
     fleet.server("a1")
     fleet.server("b2")
-    with pytest.raises(PolicyError, match=r"have different weights: a1, b2; end those .* --canary SHARE"):
+    with pytest.raises(PolicyError, match=r"have different weights: a1, b2; stop those .* --canary SHARE"):
         fleet.robot().engine.start()
     assert fleet.robot(accept_new_weights=True).ask() in (0, 1)
 

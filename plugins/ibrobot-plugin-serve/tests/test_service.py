@@ -228,7 +228,7 @@ def test_the_newest_request_of_a_robot_takes_the_place_of_one_that_waits():
         older = cloud.asked("greedy", 20)
         others = [cloud.asked(f"robot {i}", i) for i in (1, 2)]
         newer = cloud.ask("greedy", 21, id=6)
-        assert failure(older) == "not begun: the newer request 6 of this robot replaced it"
+        assert failure(older) == "dropped: replaced by the newer request 6 of this robot"
         cloud.policy.gate.release(10)
         assert [outputs(future) for future in (newer, *others)] == [[42], [2], [4]]
         assert cloud.policy.batches == [[0], [21], [1], [2]]
@@ -277,7 +277,7 @@ def test_a_full_queue_turns_away_what_comes():
     with served(queue=2, batch=1) as cloud:
         cloud.busy()
         waiting = [cloud.asked(f"robot {i}", i) for i in (1, 2)]
-        assert failure(cloud.ask("robot 3", 3)) == "refused: the server is full: 2 requests wait"
+        assert failure(cloud.ask("robot 3", 3)) == "refused: the server is full: 2 requests are waiting"
         newer = cloud.ask("robot 2", 4)
         assert "replaced it" in failure(waiting[1]), "it needs no further place"
         cloud.policy.gate.release(10)
@@ -388,7 +388,7 @@ def test_a_request_that_a_policy_cannot_take_keeps_nobody_else_away(
         assert outputs(cloud.ask("robot", 1, seed=3)) == [2]
         assert (
             failure(cloud.ask("stranger", x))
-            == "refused: this policy remembers its requests, so it serves one robot, now 'robot'"
+            == "refused: this policy is stateful, so it serves one robot at a time, at present 'robot'"
         )
         assert cloud.policy.seeds[-1] == 3
 
