@@ -279,7 +279,7 @@ def test_a_full_queue_turns_away_what_comes():
         waiting = [cloud.asked(f"robot {i}", i) for i in (1, 2)]
         assert failure(cloud.ask("robot 3", 3)) == "refused: the server is full: 2 requests are waiting"
         newer = cloud.ask("robot 2", 4)
-        assert "replaced it" in failure(waiting[1]), "it needs no further place"
+        assert "replaced by" in failure(waiting[1]), "it needs no further place"
         cloud.policy.gate.release(10)
         assert [outputs(future) for future in (waiting[0], newer)] == [[2], [8]]
 
@@ -318,7 +318,7 @@ def test_garbage_is_counted_reported_and_harmless():
     with served() as cloud:
         cloud.policy.gate.release(10)
         answer = WireEncoder().encode(WireMessage(WireKind.ANSWER, 1))
-        for payload, said in ((b"", "0 bytes"), (b"GET / HTTP/1.1" * 10, "no frame"), (answer, "kind ANSWER")):
+        for payload, said in ((b"", "0 bytes"), (b"GET / HTTP/1.1" * 10, "not a frame"), (answer, "kind ANSWER")):
             assert said in failure(cloud.send(bytes(payload)))
         assert outputs(cloud.ask("robot", 3)) == [6]
         health = cloud.health()
@@ -361,7 +361,7 @@ def test_a_policy_that_remembers_serves_one_robot_and_is_reset_for_each_episode(
         for episode, seed in ((1, 7), (1, 7), (2, 8)):
             outputs(cloud.ask("first", 1, episode=episode, seed=seed))
         assert cloud.policy.seeds == [7, 8]
-        assert "serves one robot, now 'first'" in failure(cloud.ask("second", 1))
+        assert "serves one robot at a time, at present 'first'" in failure(cloud.ask("second", 1))
         assert "reset failed: ValueError: a negative seed" in failure(cloud.ask("first", 1, episode=3, seed=-1))
 
 
