@@ -90,7 +90,7 @@ def test_this_machine_may_be_called_by_its_names(server: ProbeServer, host: str)
     assert ask(server, "/metrics", Host=host)[0] == 200
 
 
-def test_metrics_that_fail_end_nothing(server: ProbeServer, state: State, caplog: pytest.LogCaptureFixture):
+def test_failing_metrics_do_not_end_the_server(server: ProbeServer, state: State, caplog: pytest.LogCaptureFixture):
     state.broken = True
     status, text, _ = ask(server, "/metrics")
     assert status == 500

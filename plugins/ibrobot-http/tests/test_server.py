@@ -119,7 +119,7 @@ def test_roles_have_links_of_their_own(folder: Path) -> None:
             assert role in CLIENT.ask(served, "/api/role", cookie=cookie).body
 
 
-def test_session_of_another_server_is_worth_nothing(folder: Path) -> None:
+def test_session_of_another_server_is_refused(folder: Path) -> None:
     with small_page(folder) as one, small_page(folder) as other:
         name = CLIENT.cookie(other).partition("=")[0]
         value = CLIENT.cookie(one).partition("=")[2]
@@ -199,7 +199,7 @@ def test_failures_are_logged_and_say_nothing_to_clients(folder: Path, caplog: py
     assert "one over nothing" in caplog.text
 
 
-def test_clients_that_send_garbage_are_no_news(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_clients_that_send_garbage_are_not_logged(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     for tls in (False, True):
         with small_page(folder, tls=tls) as served:
             port = int(served.host.rpartition(":")[2])
@@ -282,7 +282,9 @@ def test_client_that_does_not_read_its_answer_is_ended(
         assert received < 50 << 20
 
 
-def test_crowd_is_turned_away_until_some_leave(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connections_beyond_the_limit_are_refused_until_others_end(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "_CLIENTS", 3)
     monkeypatch.setattr("ibrobot_http.guard.REQUEST_S", 3600.0)
     with small_page(folder) as served, contextlib.ExitStack() as crowd:

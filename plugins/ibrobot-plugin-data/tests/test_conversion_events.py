@@ -27,7 +27,7 @@ def test_progress_has_its_share_and_names_episodes_that_are_left_out() -> None:
     assert attrs.evolve(progress, total_frames=0).shown().progress == 1.0
 
 
-def test_the_result_counts_what_is_not_in_the_dataset() -> None:
+def test_the_result_counts_episodes_and_ticks_left_out() -> None:
     found = report(
         EpisodeReport("a", frames=50, skipped=3, prompt="pick"),
         EpisodeReport("b", error="no contract"),

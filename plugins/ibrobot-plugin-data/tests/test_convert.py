@@ -151,7 +151,7 @@ def test_a_silent_topic(convert: Converter, tmp_path: Path, missing: str, ticks:
         assert len(rows(tmp_path)[0]) == ticks
 
 
-def test_what_cannot_be_read_is_left_out_and_named(convert: Converter, tmp_path: Path) -> None:
+def test_unreadable_episodes_are_left_out_and_named(convert: Converter, tmp_path: Path) -> None:
     record(tmp_path / "good")
     record(tmp_path / "bad", seed=5.0, damaged=True)
     record(tmp_path / "bare", seed=6.0, contract=None)
@@ -162,7 +162,7 @@ def test_what_cannot_be_read_is_left_out_and_named(convert: Converter, tmp_path:
     assert "contract" in done.stderr + done.stdout
 
 
-def test_only_the_outcomes_asked_for(convert: Converter, tmp_path: Path) -> None:
+def test_only_requested_outcomes_are_converted(convert: Converter, tmp_path: Path) -> None:
     for i, outcome in enumerate(("success", "failure", "unknown")):
         record(tmp_path / "all" / outcome, seed=i, outcome=outcome)
     assert convert(tmp_path / "all", "--outcome", "failure").returncode == 0
@@ -170,7 +170,7 @@ def test_only_the_outcomes_asked_for(convert: Converter, tmp_path: Path) -> None
     assert found[0]["observation.state"][0] >= 1.0
 
 
-def test_appending_adds_what_is_new_and_refuses_what_does_not_fit(convert: Converter, tmp_path: Path) -> None:
+def test_append_adds_new_episodes_and_refuses_misfits(convert: Converter, tmp_path: Path) -> None:
     record(tmp_path / "all/a")
     assert convert(tmp_path / "all").returncode == 0
     record(tmp_path / "all/b", seed=1.0)
@@ -193,7 +193,7 @@ def test_a_copy_is_converted_once(convert: Converter, tmp_path: Path) -> None:
     assert "copy" in done.stdout + done.stderr
 
 
-def test_only_what_an_operator_commanded(convert: Converter, tmp_path: Path) -> None:
+def test_only_rows_commanded_by_the_operator_are_kept(convert: Converter, tmp_path: Path) -> None:
     record(tmp_path / "a", seconds=4.0, commanders={0.0: "policy", 2.0: "operator", 3.0: "policy"})
     done = convert(tmp_path / "a", "--only", "interventions", "--context", 0)
     assert done.returncode == 0, done.stderr
@@ -204,7 +204,7 @@ def test_only_what_an_operator_commanded(convert: Converter, tmp_path: Path) -> 
     assert len(pan) in (9, 10, 11)
 
 
-def test_what_was_converted_before_the_disk_was_full_is_kept(convert: Converter, tmp_path: Path) -> None:
+def test_converted_episodes_are_kept_when_the_disk_is_full(convert: Converter, tmp_path: Path) -> None:
     full = tmp_path / "full"
     full.touch()
     record(tmp_path / "all/a")

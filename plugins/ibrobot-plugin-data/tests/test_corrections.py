@@ -99,7 +99,7 @@ def test_a_button_takes_the_robot_and_gives_it_back(begin) -> None:
     episode.check_steps()
 
 
-def test_the_operator_moves_the_robot_from_where_it_is(begin) -> None:
+def test_the_operator_takes_over_at_the_present_pose(begin) -> None:
     episode = begin()
     episode.moves()
     episode.press()

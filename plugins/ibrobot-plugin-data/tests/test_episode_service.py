@@ -55,7 +55,7 @@ def test_a_list_of_topics_must_have_the_contracts(runs: Runs):
         ("file/below", r"recording.root: .*/file is a file, not a folder"),
     ],
 )
-def test_a_root_that_cannot_be_written_is_found_before_anything_starts(runs: Runs, root: str, message: str):
+def test_unwritable_root_is_an_error_before_anything_starts(runs: Runs, root: str, message: str):
     (runs.folder / "file").write_text("")
     with pytest.raises((RecorderError, ConfigError), match=message):
         runs.make(RECORDING, f"recording.root={root}", mode="teleop", by_operator=True)
@@ -98,7 +98,7 @@ def test_services_begin_end_and_discard_episodes(run: Runtime, runs: Runs):
     assert folders(runs) == ["episode_000001"]
 
 
-def test_metadata_say_how_the_episode_was_made(run: Runtime, runs: Runs):
+def test_metadata_describe_how_the_episode_was_made(run: Runtime, runs: Runs):
     run.session.bus.call(START, "pick")
     ticks(run, 2)
     run.session.bus.call(STOP, "success")
@@ -114,7 +114,7 @@ def test_metadata_say_how_the_episode_was_made(run: Runtime, runs: Runs):
     assert dataset["fingerprint"] == metadata["fingerprint"]
 
 
-def test_what_cannot_be_is_refused(run: Runtime):
+def test_invalid_requests_are_refused(run: Runtime):
     bus = run.session.bus
     with pytest.raises(RecorderError, match="no episode is being recorded"):
         bus.call(STOP, "success")
@@ -175,7 +175,7 @@ def test_a_dataset_of_another_contract_is_refused_before_anything_starts(run: Ru
     assert runs.parts.MADE == {}
 
 
-def test_buttons_without_a_meaning_in_a_run_are_reported(runs: Runs, caplog: pytest.LogCaptureFixture):
+def test_buttons_without_effect_are_reported(runs: Runs, caplog: pytest.LogCaptureFixture):
     runtime = runs.start(mode="teleop")
     runs.parts.MADE["stick"].events = ("start", "intervention")
     ticks(runtime, 3)

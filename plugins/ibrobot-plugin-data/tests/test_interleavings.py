@@ -287,7 +287,7 @@ class Story:
 
 
 @pytest.mark.parametrize("part", range(PARTS))
-def test_after_a_stop_nothing_moves_before_a_reset_that_saw_it(runs: Runs, levers: None, part: int) -> None:
+def test_nothing_moves_after_a_stop_until_a_later_reset(runs: Runs, levers: None, part: int) -> None:
     seen: Counter[str] = Counter()
     for seed in range(part, INTERLEAVINGS, PARTS):
         draw = random.Random(seed)

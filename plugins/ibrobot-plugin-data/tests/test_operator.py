@@ -149,7 +149,7 @@ def test_the_arm_holds_while_a_prompt_is_typed(record: Record):
     assert source.active
 
 
-def test_a_program_hears_of_the_session_whenever_it_changes(record: Record):
+def test_changes_of_the_session_are_reported(record: Record):
     heard: list[Any] = []
     run = record(prompt="pick", count=3, report=heard.append)
     run.step(3)
@@ -193,7 +193,7 @@ def test_a_button_without_an_episode_to_end_says_so(record: Record):
     assert ("", "failure: no episode is being recorded") in run.operator.rows()
 
 
-def test_buttons_leave_episodes_alone_that_end_by_themselves(record: Record, caplog: pytest.LogCaptureFixture):
+def test_buttons_do_not_end_automatic_episodes(record: Record, caplog: pytest.LogCaptureFixture):
     run = record(continuous=True, keys=False, prompt="watch")
     run.step(3)
     run.press("discard")
@@ -226,7 +226,7 @@ def test_an_unattended_episode_with_an_emergency_stop_is_replaced(record: Record
     assert run.runtime.summary()["disturbed"] == 1
 
 
-def test_why_it_does_not_begin_is_shown(record: Record):
+def test_reason_for_not_beginning_is_shown(record: Record):
     run = record("idle", auto=True, prompt="")
     run.step(3)
     rows = run.operator.rows()
@@ -282,7 +282,7 @@ def test_continuous_is_one_episode_to_the_end_of_the_run(record: Record):
     assert [path.name for path in Path("kept/pick/episodes").iterdir()] == ["episode_000001"]
 
 
-def test_continuous_means_nothing_where_the_mode_has_episodes(record: Record):
+def test_continuous_is_refused_where_the_mode_has_episodes(record: Record):
     with pytest.raises(NotSupported, match="mode policy begins and ends its episodes itself") as caught:
         record("policy", continuous=True)
     assert caught.value.exit_code == 2

@@ -122,7 +122,7 @@ def test_before_its_first_command_a_joint_has_its_recorded_position() -> None:
     np.testing.assert_allclose(column(playback, "grip")[:300], 0.3)
 
 
-def test_commands_that_end_early_do_not_end_those_of_others() -> None:
+def test_commands_that_end_early_do_not_shorten_those_of_other_joints() -> None:
     playback = play(*dense(ARM, 0, 2000, 2), *dense(GRIPPER, 0, 5000, 1))
     assert playback.duration == pytest.approx(4.99)
     np.testing.assert_allclose(column(playback, "pan")[199:], 1.99)

@@ -148,7 +148,7 @@ def test_whatever_a_recorder_raises_is_a_fault_of_the_episode(runs: Runs, monkey
 
 
 @pytest.mark.parametrize(("topics", "kept"), [("all", True), ("[/late]", True), ("contract", False)])
-def test_a_topic_that_appears_during_the_episode_is_recorded(
+def test_topic_that_appears_during_the_episode_is_recorded(
     runs: Runs, monkeypatch: pytest.MonkeyPatch, topics: str, kept: bool
 ):
     runtime, notes = note(runs, monkeypatch, topics)
@@ -162,7 +162,7 @@ def test_a_topic_that_appears_during_the_episode_is_recorded(
     assert "/late" not in start.topics
 
 
-def test_an_episode_begins_with_what_is_latched(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+def test_an_episode_begins_with_the_latched_messages(runs: Runs, monkeypatch: pytest.MonkeyPatch):
     runtime, notes = note(runs, monkeypatch, "all")
     runtime.session.bus.publish("/description", String("old"), latched=True)
     runtime.session.bus.publish("/description", String("arm"), latched=True)
@@ -184,7 +184,7 @@ def test_an_episode_knows_its_contract(runs: Runs, monkeypatch: pytest.MonkeyPat
     assert contract.difference(json.loads(kept["contract"])) == ""
 
 
-def test_messages_that_were_lost_on_the_way_are_reported_by_topic(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+def test_lost_messages_are_reported_by_topic(runs: Runs, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(recording, "_DEPTH", 50)
     runtime, notes = note(runs, monkeypatch, "[/many, /few]")
     ticks(runtime, 1)

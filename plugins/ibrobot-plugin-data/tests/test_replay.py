@@ -88,7 +88,7 @@ def report(runtime: Runtime) -> dict[str, Any]:
     return found
 
 
-def test_the_commands_are_those_of_the_episode_after_a_slow_way_to_the_first(replay: Make):
+def test_commands_follow_a_slow_approach_to_the_first(replay: Make):
     commanded = commands(replay())
     first = next(
         i for i, command in enumerate(commanded) if np.allclose(command, WAVE.commands.positions[0], atol=1e-9)
@@ -116,7 +116,7 @@ def test_speed_scales_the_times(replay: Make, speed: float):
     np.testing.assert_allclose(commanded[-1], WAVE.commands.positions[-1], atol=0.01)
 
 
-def test_the_safety_layer_bounds_it(replay: Make):
+def test_the_safety_layer_limits_the_replay(replay: Make):
     far = attrs.evolve(WAVE, commands=Track(TIMES, np.stack([0.4 + 3 * TIMES, 0 * TIMES], axis=1)))
     commanded = commands(replay(far))
     assert commanded.max() <= 1.0
@@ -151,7 +151,7 @@ def test_tracking_is_the_difference_to_the_recorded_states(replay: Make):
     assert report(other)["tracking"] == {"pan": pytest.approx({"rms_rad": 0.25, "max_rad": 0.25}, abs=1e-6)}
 
 
-def test_a_fault_ends_it(replay: Make):
+def test_a_fault_ends_the_replay(replay: Make):
     runtime = replay()
     runtime.start()
     for _ in range(20):
@@ -164,7 +164,7 @@ def test_a_fault_ends_it(replay: Make):
     assert runtime.summary()["episodes"] == 0
 
 
-def test_a_host_that_is_held_up_cuts_nothing_out(replay: Make, monkeypatch: pytest.MonkeyPatch):
+def test_a_delayed_host_skips_no_setpoints(replay: Make, monkeypatch: pytest.MonkeyPatch):
     runtime = replay(attrs.evolve(WAVE, commands=Track(TIMES * 4, WAVE.commands.positions)))
     source = source_of(runtime)
     work, units = source.work, iter(range(1000))
@@ -187,7 +187,7 @@ def test_a_host_that_is_held_up_cuts_nothing_out(replay: Make, monkeypatch: pyte
     np.testing.assert_allclose(commanded[-1], WAVE.commands.positions[-1], atol=1e-9)
 
 
-def test_in_real_time_a_motion_longer_than_what_control_is_given_at_once_is_played_whole(replay: Make):
+def test_motion_longer_than_one_plan_is_played_in_full(replay: Make):
     # It ends with seconds at rest: a process that is held up on the way has the time to catch up.
     times: Vector = np.append(TIMES * 1.5, 6.0)
     positions = WAVE.commands.positions[[*range(len(TIMES)), -1]]

@@ -38,5 +38,5 @@ def test_the_identity_of_an_episode() -> None:
 
 
 @pytest.mark.parametrize("calibration", ["no JSON", "[1]", '{"hardware": 3}', "null"])
-def test_a_foreign_calibration_is_none(calibration: str) -> None:
+def test_a_calibration_of_another_program_is_ignored(calibration: str) -> None:
     assert Identity.of_episode({"calibration": calibration}) == Identity()

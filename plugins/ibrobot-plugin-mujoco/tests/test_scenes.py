@@ -242,7 +242,7 @@ def test_no_place_for_an_object_is_an_error() -> None:
         begun("drawer", handle_distance=(0.05, 0.06))
 
 
-def test_resized_cube_is_as_if_built_so() -> None:
+def test_resized_cube_equals_one_built_with_that_size() -> None:
     drawn, _ = begun("pick_cube", cube_size=(0.015, 0.035))
     size = 2 * float(drawn.model.geom("cube").size[0])
     built, _ = begun("pick_cube", cube_size=size)

@@ -23,7 +23,7 @@ def paced(counts: list[int], took_ms: float = 20.0, size: int = 1) -> int:
 
 
 @given(st.lists(st.integers(0, 200), max_size=40), st.floats(1e5, 1e9))
-def test_together_they_take_no_more_than_there_is(counts: list[int], cost_ns: float):
+def test_total_demand_stays_within_the_capacity(counts: list[int], cost_ns: float):
     pace_ns = fair_pace_ns(counts, cost_ns)
     if pace_ns:
         most = 5 * S / pace_ns
@@ -34,7 +34,7 @@ def test_together_they_take_no_more_than_there_is(counts: list[int], cost_ns: fl
 
 
 @given(st.lists(st.integers(0, 200), min_size=2, max_size=40), st.floats(1e5, 1e9), st.randoms())
-def test_the_order_of_robots_is_of_no_consequence(counts: list[int], cost_ns: float, random):
+def test_pace_does_not_depend_on_the_order_of_robots(counts: list[int], cost_ns: float, random):
     shuffled = random.sample(counts, len(counts))
     assert fair_pace_ns(shuffled, cost_ns) == pytest.approx(fair_pace_ns(counts, cost_ns), abs=1, rel=1e-9)
 
@@ -45,7 +45,7 @@ def test_forty_robots_at_half_a_chunk_are_held_back_and_thirty_are_not():
     assert paced([6] * 20) == 0
 
 
-def test_one_that_asks_often_does_not_slow_down_those_that_ask_seldom():
+def test_frequent_requests_of_one_robot_do_not_slow_down_others():
     """29 robots take 0.58 of the 0.8; the thirtieth gets the rest."""
     pace_ns = paced([4] * 29 + [100])
     assert 5 * S / pace_ns == pytest.approx(0.8 * 5 / 0.02 - 29 * 1.25 * 4, rel=1e-3)
@@ -59,7 +59,7 @@ def test_a_robot_alone_and_a_model_of_unknown_speed_have_no_pace():
     assert pacing.pace_ns(S) == 0
 
 
-def test_requests_that_go_together_cost_less():
+def test_batched_requests_cost_less():
     assert paced([6] * 40, size=8) == 0
 
 

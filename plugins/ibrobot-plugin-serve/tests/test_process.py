@@ -110,7 +110,7 @@ def test_a_process_that_dies_is_reported_and_starts_again(
     assert engine.stats.restarts == 1
 
 
-def test_one_that_keeps_dying_is_started_less_and_less_often(
+def test_pauses_before_restarts_of_a_dying_process_grow(
     engine: ProcessEngine, ask: Callable[..., Any], caplog: pytest.LogCaptureFixture
 ):
     for pause_s in (0, 1, 2):
@@ -123,7 +123,7 @@ def test_one_that_keeps_dying_is_started_less_and_less_often(
         engine._start_again_s = 0.0
 
 
-def test_one_that_was_killed_between_requests_is_noticed(engine: ProcessEngine, ask: Callable[..., Any]):
+def test_process_killed_between_requests_is_detected(engine: ProcessEngine, ask: Callable[..., Any]):
     assert engine.pid is not None
     os.kill(engine.pid, signal.SIGKILL)
     with pytest.raises(PolicyError, match="killed by SIGKILL"):
@@ -131,7 +131,7 @@ def test_one_that_was_killed_between_requests_is_noticed(engine: ProcessEngine, 
     assert ask()["twice"].tolist() == [0, 2, 4]
 
 
-def test_a_late_answer_is_nobody_elses(engine: ProcessEngine, ask: Callable[..., Any]):
+def test_late_answer_is_not_taken_for_the_next_request(engine: ProcessEngine, ask: Callable[..., Any]):
     assert engine.pid is not None
     os.kill(engine.pid, signal.SIGSTOP)
     for number in range(3):

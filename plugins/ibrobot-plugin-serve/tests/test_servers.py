@@ -211,7 +211,7 @@ def test_canary_gets_its_share_of_the_robots_and_no_other(fleet: Fleet, caplog: 
     assert {robot.engine.stats.weights for robot in robots} == {"old"}
 
 
-def test_canary_is_no_refuge_for_the_robots_that_do_not_try_it(fleet: Fleet) -> None:
+def test_robots_outside_the_share_of_a_canary_never_use_it(fleet: Fleet) -> None:
     fleet.server("old")
     fleet.server("new", canary=0.3)
     others = [robot for robot in fleet.robots(10) if robot.ask() == 0]
@@ -249,7 +249,7 @@ def test_server_with_other_weights_gets_no_robots(fleet: Fleet) -> None:
     assert robots[0].ask() == 2
 
 
-def test_robot_begins_with_no_servers_that_disagree(fleet: Fleet) -> None:
+def test_robot_does_not_start_with_servers_of_different_weights(fleet: Fleet) -> None:
     fleet.server("a1")
     fleet.server("b2")
     with pytest.raises(PolicyError, match=r"have different weights: a1, b2; stop those .* --canary SHARE"):

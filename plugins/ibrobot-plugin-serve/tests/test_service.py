@@ -191,7 +191,7 @@ def failure(future: Future[WireMessage]) -> str:
     return f"refused: {message.text}" if message.kind is WireKind.REFUSAL else message.text
 
 
-def test_what_waits_goes_together_up_to_the_limit_and_each_gets_its_own():
+def test_waiting_requests_are_batched_up_to_the_limit():
     with served(batch=3) as cloud:
         first = cloud.busy()
         futures = [cloud.asked(f"robot {i}", i) for i in range(1, 5)]
@@ -251,7 +251,7 @@ def test_unlike_requests_are_not_put_together():
         assert cloud.policy.batches == [[0], [1, 4], [2]]
 
 
-def test_one_that_the_policy_cannot_take_does_not_spoil_its_batch(caplog: pytest.LogCaptureFixture):
+def test_faulty_request_does_not_fail_its_batch(caplog: pytest.LogCaptureFixture):
     with served() as cloud:
         cloud.busy()
         futures = [cloud.asked("a", 1), cloud.asked("b", 13), cloud.asked("c", 3)]
@@ -413,7 +413,7 @@ def test_a_model_that_hangs_fails_all_requests_at_once_and_says_so(caplog: pytes
         assert caplog.messages == [said.removeprefix("refused: ")]
 
 
-def test_what_waits_behind_a_model_that_hangs_fails_with_it():
+def test_requests_behind_a_hanging_model_fail():
     with served(hang_timeout_s=1.5) as cloud:
         stuck, waiting = cloud.busy(), cloud.asked("robot", 1)
         assert "the model hangs" in failure(waiting)
@@ -616,7 +616,7 @@ def test_server_that_comes_back_with_another_policy_is_refused_whatever_its_weig
         ),
     ],
 )
-def test_the_engine_believes_no_answer_but_its_own(answer: bytes, said: str):
+def test_the_engine_rejects_answers_to_other_requests(answer: bytes, said: str):
     transport = FakeTransport()
     serve_fake(transport, lambda payload, sender: answer)
     remote = RemoteEngine(Net(), transport, "net", "so101")

@@ -226,7 +226,7 @@ def test_booleans_are_zero_or_one():
         ({"seed": 2**63}, "does not fit into a frame"),
     ],
 )
-def test_what_has_no_place_in_a_frame_is_not_sent(changed: dict[str, Any], said: str):
+def test_contents_that_do_not_fit_into_a_frame_are_refused(changed: dict[str, Any], said: str):
     with pytest.raises(WireError, match=said):
         encode(attrs.evolve(EXAMPLE, **changed))
 
@@ -280,7 +280,7 @@ def test_pictures_travel_as_their_codec_says_and_all_else_as_it_is():
         np.testing.assert_array_equal(decoded[name], PICTURES.tensors[name])
 
 
-def test_who_speaks_no_jpeg_says_so():
+def test_jpeg_without_a_codec_is_refused():
     with pytest.raises(WireError, match="'top': JPEG, which this side does not support"):
         decode(encode(PICTURES, codec=Halves()))
 
@@ -293,7 +293,7 @@ def test_who_speaks_no_jpeg_says_so():
         (np.zeros((4, 4, 3), np.float32), "as announced"),
     ],
 )
-def test_a_picture_that_is_none_is_a_wire_error(answer: object, said: str):
+def test_undecodable_picture_is_a_wire_error(answer: object, said: str):
     codec = Halves()
     frame = encode(PICTURES, codec=codec)
     codec.answer = answer
