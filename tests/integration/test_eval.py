@@ -187,7 +187,7 @@ def test_merged_shards_are_the_whole_evaluation(folder: Path, whole: Path) -> No
         contract = run_here("eval", "merge", "part1", "other", "--out", "merged")
         assert not Path("merged").exists()
         merged = run_here("eval", "merge", "part2", "part1", "--out", "merged")
-    assert "part1: has scripted, seed 0, as part1 has" in twice.stderr
+    assert "part1: has scripted, seed 0, which part1 has too" in twice.stderr
     assert "is not an evaluation: it has no evaluation.json" in other.stderr
     assert "other: differs from part1: policies faulty contract changed" in contract.stderr
     assert (merged.returncode, "scripted  3 of 3 succeeded" in merged.stdout) == (0, True), merged.stderr
@@ -245,7 +245,7 @@ def test_folder_of_other_settings_is_refused(folder: Path, whole: Path, tmp_path
     assert digests(whole) == before
     (tmp_path / "else").write_text("something else")
     done = evaluate(folder, "--out", tmp_path)
-    assert (done.returncode, "is not an evaluation to continue" in done.stderr) == (2, True), done.stderr
+    assert (done.returncode, "is not an evaluation; choose a new folder" in done.stderr) == (2, True), done.stderr
 
 
 def test_folder_has_one_owner(start: Any, folder: Path) -> None:
