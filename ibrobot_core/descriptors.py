@@ -160,7 +160,8 @@ class ExecutorDescriptor(Descriptor["interfaces.Executor"]):
     streams: bool = False
     goals: Literal["trajectory", "position"] = "trajectory"
     """The goals of an executor that does not stream: `trajectory`, made by `trajectory_goal`, or `position`,
-    `{"position": q}`, with the position of its first joint [rad]."""
+    `{"position": q}`, with the position of its first joint [rad]. The result of an aborted trajectory has the key
+    `exceeded` if a tolerance was: `path` or `goal`."""
 
 
 @attrs.frozen

@@ -95,10 +95,11 @@ class ActiveExecutors:
             # A goal comes from outside, and an executor from a plugin: neither may end the loop.
             raise GoalRejected(f"{executor}: the goal is malformed: {type(error).__name__}: {error}") from error
 
-    def cancel(self, measured: JointReading) -> None:
-        """Cancel all goals; the executors then hold."""
+    def cancel(self, measured: JointReading, executor: str = "") -> None:
+        """Cancel the goal of an executor, or all goals if it is empty; the executors then hold."""
         for owned in self._active:
-            owned.executor.cancel(owned.reading(measured))
+            if executor in ("", owned.name):
+                owned.executor.cancel(owned.reading(measured))
 
     def counters(self) -> dict[str, dict[str, int]]:
         """The counters of all executors, including inactive ones."""

@@ -554,5 +554,5 @@ class ControlCore:
         self._executors.set_goal(executor, goal_id, goal, self._at_tick)
         self._commanded_ns = self._clock.now_ns()
 
-    def _cancel(self) -> None:
-        self._executors.cancel(self._at_tick)
+    def _cancel(self, executor: str = "") -> None:
+        self._executors.cancel(self._at_tick, executor)

@@ -120,7 +120,8 @@ class ControlComponent(Component):
     def _take(self, event: Mapping[str, Any]) -> None:
         session = self._session
         if event["event"] == "goal":
-            session.command_source.take_goal(event)
+            for call in (session.command_source.take_goal, *session.on_goal):
+                call(event)
         elif event["event"] == "fault":
             fault = str(event["fault"])
             session.add_fault(fault, int(event["generation"]))

@@ -170,6 +170,7 @@ class Session:
         bus: topics and services within the host process.
         state: the newest state of the joints and of control; None before the first. Set by `take_state`.
         on_state: called with each state before its messages are published, in the thread that receives states.
+        on_goal: called with each change of an executor's goal, whoever sent it, in the same thread.
         mode: name of the active control mode.
         generation: counts mode switches and resets; plans of an earlier generation are ignored.
         factors: what the present episode of a simulation has drawn; see `Scene.factors`.
@@ -215,6 +216,7 @@ class Session:
         self.start_failed = False
         self.state: ControlState | None = None
         self.on_state: list[Callable[[ControlState], None]] = []
+        self.on_goal: list[Callable[[Mapping[str, Any]], None]] = []
         self.plan: PlanRecord | None = None
         self.acting: ActingPolicy | None = None
         self.sensors: dict[str, SensorFigures] = {}

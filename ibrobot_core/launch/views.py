@@ -108,6 +108,7 @@ class RunAccess(RunView, Protocol):
 
     commander: str
     on_state: list[Callable[[ControlState], None]]
+    on_goal: list[Callable[[Mapping[str, Any]], None]]
 
     @property
     def devices(self) -> SharedDevices: ...

@@ -184,7 +184,7 @@ class TrajectoryExecutor(Executor):
             if beyond.any():
                 why = self._deviation(beyond, error, running.goal.path_tolerance, "off its path")
                 why += f", beyond a lag of {LAG_S} s"
-                return self._stop(GoalState.ABORTED, why, measured)
+                return self._stop(GoalState.ABORTED, why, measured, {"exceeded": "path"})
             return setpoint
         beyond = _exceeds(error, running.goal.goal_tolerance)
         if not beyond.any():
@@ -193,7 +193,7 @@ class TrajectoryExecutor(Executor):
         elif running.goal.goal_time_ns and self._now_ns >= running.spline.end_ns + running.goal.goal_time_ns:
             why = self._deviation(beyond, error, running.goal.goal_tolerance, "off its goal")
             late = f"{why} {seconds(running.goal.goal_time_ns):.6g} s after the end"
-            return self._stop(GoalState.ABORTED, late, measured)
+            return self._stop(GoalState.ABORTED, late, measured, {"exceeded": "goal"})
         return setpoint.copy()
 
     @override
@@ -263,20 +263,22 @@ class TrajectoryExecutor(Executor):
             None if accelerations is None else np.vstack((acceleration, accelerations)),
         )
 
-    def _stop(self, state: GoalState, why: str, measured: JointReading) -> Vector:
+    def _stop(
+        self, state: GoalState, why: str, measured: JointReading, result: Mapping[str, Any] | None = None
+    ) -> Vector:
         """End the goal and hold the measured position [rad], shape (J,)."""
         setpoint, _, _ = self._sample(self._now_ns)
         self._held = np.where(np.isfinite(measured.position), measured.position, setpoint)
-        self._end(state, why)
+        self._end(state, why, result)
         return self._held.copy()
 
-    def _end(self, state: GoalState, message: str) -> None:
+    def _end(self, state: GoalState, message: str, result: Mapping[str, Any] | None = None) -> None:
         """End the running goal, and the one that is to take over from it."""
         if self._next is not None:
             self._statuses.append(GoalStatus(self._next.goal_id, GoalState.CANCELED, message))
             self._next = None
         if self._running is not None:
-            self._statuses.append(GoalStatus(self._running.goal_id, state, message))
+            self._statuses.append(GoalStatus(self._running.goal_id, state, message, result or {}))
             self._running = None
 
     def _deviation(self, beyond: NDArray[np.bool_], error: Vector, tolerance: Vector, what: str) -> str:

@@ -1,0 +1,35 @@
+"""The plugin's hooks: section `ros`, its panel, and what `ibrobot doctor` says of the ROS of this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from ibrobot_core.api import Check, hookimpl
+from ibrobot_core.app import SectionDescriptor
+from ibrobot_ros.options import RosOptions
+
+if TYPE_CHECKING:
+    from ibrobot_core.app import Component, RunAccess
+
+
+def _node(options: RosOptions, session: RunAccess) -> Component:
+    from ibrobot_ros.section import RosNode
+
+    return RosNode(options, session)
+
+
+@hookimpl
+def ibrobot_sections() -> Iterable[SectionDescriptor]:
+    """The node beside a run."""
+    yield SectionDescriptor(
+        type="ros", options=RosOptions, make=_node, summary="a ROS 2 node beside the run: topics, services and actions"
+    )
+
+
+@hookimpl
+def ibrobot_doctor() -> Iterable[Check]:
+    """The ROS of this machine."""
+    from ibrobot_ros.doctor import checks
+
+    yield from checks()

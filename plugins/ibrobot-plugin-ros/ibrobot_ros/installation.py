@@ -1,0 +1,93 @@
+"""Where the ROS of this machine is, and how its interpreter is started."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+
+import attrs
+
+from ibrobot_core.api import MissingDependency
+from ibrobot_ros.options import RosInstallation
+
+DISTROS = Path("/opt/ros")
+PREFERRED = "jazzy"
+REMEDY = (
+    "source a ROS 2 (. /opt/ros/jazzy/setup.bash), or set ros.python or ros.setup; on x86-64 with Python 3.12 "
+    "`uv pip install ros-jazzy-rclpy ros-jazzy-rmw-fastrtps-cpp` brings one without an installation"
+)
+
+
+@attrs.frozen
+class Interpreter:
+    """An interpreter that has rclpy."""
+
+    command: tuple[str, ...]
+    """Runs a script, with what follows as its arguments."""
+    found: str
+    """How it was found."""
+    environment: Mapping[str, str] = attrs.field(factory=dict)
+    """Variables that the packages beside it need."""
+
+
+def find_interpreter(options: RosInstallation) -> Interpreter:
+    """The interpreter of the options, or that of the ROS of this machine.
+
+    Raises:
+        MissingDependency: if there is none.
+    """
+    if options.setup is not None:
+        if not options.setup.is_file():
+            raise MissingDependency(f"ros.setup: no such file: {options.setup}", remedy=REMEDY)
+        return _sourced(options.setup, options.python or "python3", "ros.setup")
+    if options.python is not None:
+        found = shutil.which(options.python)
+        if found is None:
+            raise MissingDependency(f"ros.python: no such program: {options.python}", remedy=REMEDY)
+        return Interpreter((found,), "ros.python", beside(found))
+    if find_spec("rclpy") is not None:
+        return Interpreter((sys.executable,), "the interpreter of ibrobot", beside(sys.executable))
+    if os.environ.get("AMENT_PREFIX_PATH") and (found := shutil.which("python3")) is not None:
+        return Interpreter((found,), "the sourced ROS")
+    for setup in sorted(DISTROS.glob("*/setup.bash"), key=lambda path: path.parent.name != PREFERRED):
+        return _sourced(setup, "python3", str(setup))
+    raise MissingDependency("no ROS 2 was found", remedy=REMEDY)
+
+
+def _sourced(setup: Path, python: str, found: str) -> Interpreter:
+    """The interpreter of an environment that a script sets up."""
+    script = 'set +u; . "$0" && exec "$@"'
+    return Interpreter(("bash", "-c", script, str(setup), python), found)
+
+
+def beside(python: str) -> dict[str, str]:
+    """The variables of ROS packages that are installed beside an interpreter, as from wheels."""
+    # A virtual environment's interpreter is a link: its packages are beside the link.
+    prefix = Path(python).absolute().parent.parent
+    if not (prefix / "share/ament_index").is_dir():
+        return {}
+    found = {}
+    for name, folder in (("AMENT_PREFIX_PATH", prefix), ("LD_LIBRARY_PATH", prefix / "lib")):
+        others = [each for each in os.environ.get(name, "").split(os.pathsep) if each and Path(each) != folder]
+        found[name] = os.pathsep.join([str(folder), *others])
+    return found
+
+
+def environment(options: RosInstallation, interpreter: Interpreter) -> dict[str, str]:
+    """The environment of the node."""
+    found = {**os.environ, **interpreter.environment}
+    if options.domain is not None:
+        found["ROS_DOMAIN_ID"] = str(options.domain)
+    if options.discovery != "system_default":
+        found["ROS_AUTOMATIC_DISCOVERY_RANGE"] = options.discovery.upper()
+        found.pop("ROS_LOCALHOST_ONLY", None)
+        if options.discovery == "localhost":
+            found["ROS_LOCALHOST_ONLY"] = "1"  # the variable of ROS before Jazzy
+            found.pop("ROS_STATIC_PEERS", None)
+    if options.rmw is not None:
+        found["RMW_IMPLEMENTATION"] = options.rmw
+    return found

@@ -1,0 +1,118 @@
+"""The node's process: opens ROS, says what it found, and does what the run asks until it ends."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from ibrobot_ros.wire import Wire
+
+INTERFACES = ("std_srvs", "control_msgs", "tf2_msgs", "ibrobot_msgs")
+"""Packages of message types that not every ROS has."""
+_POLL_S = 0.2
+_POOL = 64
+"""Most actions and services that can wait for the run at a time."""
+
+
+def run(descriptor: int) -> None:
+    """Run the node over an inherited socket."""
+    wire = Wire(socket.socket(fileno=descriptor))
+    order = _order(wire)
+    if order is None:
+        return
+    try:
+        rclpy = importlib.import_module("rclpy")
+    except ImportError as error:
+        wire.send({"op": "missing", "what": f"{type(error).__name__}: {error}", "python": sys.executable})
+        wire.flush(1.0)
+        return
+    if order["niceness"]:
+        os.nice(order["niceness"])
+    # Threads that take messages must not delay those of stops by the interpreter's usual 5 ms.
+    sys.setswitchinterval(0.001)
+    rclpy.init(args=["--ros-args", "--log-level", "error"])
+    wire.send({"op": "hello", **_found(rclpy)})
+    if not order["probe"]:
+        Process(wire, order["name"]).serve()
+    wire.flush(1.0)
+    wire.close()
+    rclpy.try_shutdown()
+    # Executors leave threads behind that Python would wait for.
+    os._exit(0)
+
+
+def _order(wire: Wire) -> dict[str, Any] | None:
+    while not wire.closed:
+        for head, _ in wire.wait(_POLL_S):
+            return head
+    return None
+
+
+def _found(rclpy: Any) -> dict[str, Any]:
+    return {
+        "python": sys.executable,
+        "version": sys.version.split()[0],
+        "rclpy": str(rclpy.__file__),
+        "distro": os.environ.get("ROS_DISTRO", ""),
+        "rmw": rclpy.get_rmw_implementation_identifier(),
+        "domain": os.environ.get("ROS_DOMAIN_ID", "0"),
+        "range": os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", ""),
+        "interfaces": [name for name in INTERFACES if importlib.util.find_spec(name) is not None],
+    }
+
+
+class Process:
+    """Passes frames of the run to the parts of the node."""
+
+    def __init__(self, wire: Wire, name: str) -> None:
+        from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+
+        from ibrobot_ros.node.actions import Actions
+        from ibrobot_ros.node.services import Services
+        from ibrobot_ros.node.topics import Topics
+
+        self._wire = wire
+        rclpy: Any = importlib.import_module("rclpy")
+
+        def node(suffix: str, executor: Any) -> Any:
+            made = rclpy.create_node(f"{name}{suffix}", start_parameter_services=False)
+            executor.add_node(made)
+            thread = threading.Thread(target=executor.spin, name=f"ros{suffix}", daemon=True)
+            threads.append(thread)
+            return made
+
+        threads: list[threading.Thread] = []
+        # Three executors: neither a flood of messages nor slow services keep an emergency stop waiting.
+        calls = node("", MultiThreadedExecutor(_POOL))
+        urgent = node("_stop", SingleThreadedExecutor())
+        topics = Topics(node("_topics", SingleThreadedExecutor()), wire)
+        actions, services = Actions(calls, wire), Services(calls, urgent, wire)
+        self._does: dict[str, Callable[[dict[str, Any], bytes], None]] = {
+            "publisher": topics.add_publisher,
+            "message": topics.publish,
+            "subscriber": topics.add_subscriber,
+            "action": actions.add,
+            "decided": actions.decide,
+            "feedback": actions.give_feedback,
+            "ended": actions.end,
+            "service": services.add,
+            "answer": services.answer,
+            "ping": lambda head, payload: wire.send({"op": "pong"}),
+        }
+        self._watch = topics.watch
+        for thread in threads:
+            thread.start()
+
+    def serve(self) -> None:
+        """Do what the run asks until it closes the socket."""
+        while not self._wire.closed:
+            for head, payload in self._wire.wait(_POLL_S):
+                if head["op"] == "end":
+                    return
+                self._does[head["op"]](head, payload)
+            self._watch()

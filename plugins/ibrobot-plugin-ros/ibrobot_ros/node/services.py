@@ -1,0 +1,59 @@
+"""Services of the run, as ROS services of std_srvs."""
+
+from __future__ import annotations
+
+import itertools
+import queue
+from typing import Any
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+
+from ibrobot_ros.node.types import find_type
+from ibrobot_ros.wire import Wire
+
+_PATIENCE_S = 120.0
+"""Longest wait for the run's answer: some services answer when a motion has ended [s]."""
+
+
+class Services:
+    """Passes calls to the run, and its answers back. A service answers one call at a time."""
+
+    def __init__(self, node: Any, urgent: Any, wire: Wire) -> None:
+        self._nodes = {False: node, True: urgent}
+        self._wire = wire
+        self._numbers = itertools.count(1)
+        self._waiting: dict[int, queue.SimpleQueue[dict[str, Any]]] = {}
+
+    def add(self, head: dict[str, Any], payload: bytes) -> None:
+        """Offer a service."""
+        name = head["name"]
+
+        def call(request: Any, response: Any) -> Any:
+            fields = {field: getattr(request, field) for field in request.get_fields_and_field_types()}
+            answer = self._ask(name, fields)
+            response.success, response.message = answer["success"], answer["message"]
+            return response
+
+        try:
+            self._nodes[head["urgent"]].create_service(
+                find_type(head["type"]), name, call, callback_group=MutuallyExclusiveCallbackGroup()
+            )
+        except LookupError as error:
+            self._wire.send({"op": "trouble", "topic": name, "what": f"not in ROS: {error}"})
+
+    def answer(self, head: dict[str, Any], payload: bytes) -> None:
+        """Take the run's answer to a call."""
+        waiting = self._waiting.get(head["call"])
+        if waiting is not None:
+            waiting.put(head)
+
+    def _ask(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
+        number = next(self._numbers)
+        waiting = self._waiting[number] = queue.SimpleQueue()
+        self._wire.send({"op": "call", "service": name, "call": number, "request": request})
+        try:
+            return waiting.get(timeout=_PATIENCE_S)
+        except queue.Empty:
+            return {"success": False, "message": f"{name} did not answer within {_PATIENCE_S:g} s"}
+        finally:
+            del self._waiting[number]

@@ -1,0 +1,136 @@
+"""Topics: serialised messages, which the node passes on as they are."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from ibrobot_ros.node.types import find_type
+from ibrobot_ros.wire import Wire
+
+BACKLOG = 16 << 20
+"""Bytes that the run may leave unread before messages for it are dropped."""
+_WATCH_S = 1.0
+
+
+def profile(name: str) -> QoSProfile:
+    """The QoS profile of a name: as ROS's own tables, `default`, `sensor_data` or `latched`."""
+    reliable, volatile = ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE
+    if name == "latched":
+        return QoSProfile(depth=1, reliability=reliable, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    if name == "sensor_data":
+        return QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT, durability=volatile)
+    return QoSProfile(depth=10, reliability=reliable, durability=volatile)
+
+
+class _Input:
+    """A subscribed topic, of which at most `rate_hz` messages per second are passed on."""
+
+    def __init__(self, topic: str, type_name: str, rate_hz: float) -> None:
+        self.topic = topic
+        self.type_name = type_name
+        self.dropped = 0
+        self._rate_hz = rate_hz
+        self._burst = max(10.0, rate_hz / 10)
+        self._left = self._burst
+        self._last_s = time.monotonic()
+
+    def passes(self) -> bool:
+        """Whether the next message is within the rate; short bursts are."""
+        now_s = time.monotonic()
+        self._left = min(self._left + (now_s - self._last_s) * self._rate_hz, self._burst)
+        self._last_s = now_s
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
+
+
+class Topics:
+    """Publishes messages of the run in ROS, and passes those of ROS to the run."""
+
+    def __init__(self, node: Any, wire: Wire) -> None:
+        self._node = node
+        self._wire = wire
+        self._publishers: dict[str, Any] = {}
+        self._inputs: list[_Input] = []
+        self._watched_s = 0.0
+        self._reported: set[str] = set()
+
+    def add_publisher(self, head: dict[str, Any], payload: bytes) -> None:
+        """Declare a topic of the run."""
+        topic = head["topic"]
+
+        def matched(event: Any) -> None:
+            self._wire.send({"op": "matched", "topic": topic, "subscribers": event.current_count})
+
+        self._try(
+            topic,
+            lambda: self._publishers.setdefault(
+                topic,
+                self._node.create_publisher(
+                    find_type(head["type"]), topic, profile(head["qos"]),
+                    event_callbacks=PublisherEventCallbacks(matched=matched),
+                ),
+            ),
+        )  # fmt: skip
+
+    def publish(self, head: dict[str, Any], payload: bytes) -> None:
+        """Publish a message of the run."""
+        publisher = self._publishers.get(head["topic"])
+        if publisher is not None:
+            publisher.publish(payload)
+
+    def add_subscriber(self, head: dict[str, Any], payload: bytes) -> None:
+        """Subscribe to a topic for the run."""
+        found = _Input(head["topic"], head["type"], head["rate_hz"])
+
+        def take(message: bytes) -> None:
+            if self._wire.backlog < BACKLOG and found.passes():
+                self._wire.send({"op": "message", "topic": found.topic}, message)
+            else:
+                found.dropped += 1
+
+        def incompatible(event: Any) -> None:
+            self._report(found.topic, "a publisher offers another QoS than this subscriber asks for; set qos")
+
+        def make() -> None:
+            self._node.create_subscription(
+                find_type(found.type_name), found.topic, take, profile(head["qos"]), raw=True,
+                event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
+            )  # fmt: skip
+            self._inputs.append(found)
+
+        self._try(found.topic, make)
+
+    def watch(self) -> None:
+        """Report, once a second, what was dropped, and publishers of another type."""
+        now_s = time.monotonic()
+        if now_s - self._watched_s < _WATCH_S:
+            return
+        self._watched_s = now_s
+        for each in self._inputs:
+            dropped, each.dropped = each.dropped, 0
+            if dropped:
+                self._wire.send({"op": "dropped", "topic": each.topic, "count": dropped})
+            for publisher in self._node.get_publishers_info_by_topic(each.topic):
+                if publisher.topic_type != each.type_name:
+                    self._report(
+                        each.topic, f"node {publisher.node_name} publishes {publisher.topic_type}, not {each.type_name}"
+                    )
+
+    def _report(self, topic: str, what: str) -> None:
+        if f"{topic} {what}" not in self._reported:
+            self._reported.add(f"{topic} {what}")
+            self._wire.send({"op": "trouble", "topic": topic, "what": what})
+
+    def _try(self, topic: str, make: Callable[[], Any]) -> None:
+        try:
+            make()
+        except (LookupError, InvalidTopicNameException) as error:
+            self._wire.send({"op": "trouble", "topic": topic, "what": f"not in ROS: {error}"})

@@ -1,0 +1,238 @@
+"""The component of the section: a node beside the run, which it starts, feeds, watches and starts again."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, override
+
+from ibrobot_core.api import NS_PER_S, DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
+from ibrobot_core.app import CONTROL, Component, ComponentFailed, RunAccess, error_line
+from ibrobot_ros.actions import Actions
+from ibrobot_ros.options import RosOptions
+from ibrobot_ros.process import NodeProcess
+from ibrobot_ros.services import Services
+from ibrobot_ros.topics import Topics
+from ibrobot_ros.wire import Wire
+
+DIAGNOSTICS = "/diagnostics"
+_NICE = 5
+"""The node comes after the run itself where the processor is short."""
+_GLANCE_S = 0.1
+_PING_S = 0.5
+_SILENT_S = 2.0
+"""Silence after which the node counts as stopped, and its goals are canceled [s]."""
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 1.0, 30.0
+_STATUS_NS = NS_PER_S
+_STOP_S = 5.0
+
+
+class RosNode(Component):
+    """Runs the node. Its death does not end the run: goals from ROS are canceled, and a new node is started."""
+
+    sends_stops = True
+
+    def __init__(self, options: RosOptions, session: RunAccess) -> None:
+        super().__init__("ros", f"node /{options.name} in a process of its own", (CONTROL,))
+        if session.request.lockstep and (options.subscribe):
+            raise NotSupported("ros.subscribe: a lockstep run cannot receive topics of ROS")
+        self._options = options
+        self._session = session
+        self._lockstep = session.request.lockstep
+        self.topics = Topics(options, session)
+        self._actions = Actions(options, session)
+        self._services = Services(options, session)
+        self._node: NodeProcess | None = None
+        self._wire: Wire | None = None
+        self._ending = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._restarts = 0
+        self._trouble = ""
+        """What is wrong with the node now; empty while it works."""
+        self._pinged_s = self._heard_s = 0.0
+        self._status_ns = 0
+
+    @property
+    def pid(self) -> int | None:
+        """The process id of the node; None while there is none."""
+        return self._node.pid if self._node is not None else None
+
+    @property
+    def state(self) -> str:
+        """What the node does, on one line."""
+        if self._trouble:
+            return self._trouble
+        return str(self._node.hello) if self._node is not None else "not started"
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What was lost, and how often the node was started again."""
+        return {"restarts": self._restarts, **self.topics.counts}
+
+    @override
+    def start(self) -> None:
+        session = self._session
+        self._ending.clear()
+        self._node = NodeProcess(
+            self._options, self._options.name, niceness=_NICE, given_up=session.finished.is_set
+        )  # fmt: skip
+        self._trouble = ""
+        session.log.info("ros: node /%s: %s", self._options.name, self._node.hello)
+        self.topics.open()
+        self._services.open()
+        self._declare(self._node.wire)
+        if self._lockstep:
+            return
+        session.on_goal.append(self._actions.take_event)
+        session.on_state.append(self._actions.take_state)
+        for name, work in (("ros", self._receive), ("ros topics", self._send)):
+            thread = threading.Thread(target=work, name=name, daemon=True)
+            self._threads.append(thread)
+            thread.start()
+
+    @override
+    def step(self, now_ns: int) -> None:
+        wire = self._wire
+        if wire is None:
+            return
+        while self.topics.send_next(wire, 0.0):
+            pass
+        for head, payload in wire.wait(0.0):
+            self._take(wire, head, payload)
+        if not wire.flush(_STOP_S):
+            raise ComponentFailed(f"the ROS node is gone: {self._cause()}")
+
+    @override
+    def stop(self) -> None:
+        session = self._session
+        self._ending.set()
+        if self._wire is not None and not self._wire.closed:
+            self._wire.wake()
+        for thread in self._threads:
+            thread.join(_STOP_S)
+        self._threads.clear()
+        for calls, call in ((session.on_goal, self._actions.take_event), (session.on_state, self._actions.take_state)):
+            if call in calls:
+                calls.remove(call)  # type: ignore[arg-type]
+        self.topics.close()
+        self._services.close()
+        wire, self._wire = self._wire, None
+        if wire is not None:
+            wire.send({"op": "end"})
+            wire.flush(1.0)
+        node, self._node = self._node, None
+        if node is not None:
+            node.end()
+
+    def _declare(self, wire: Wire) -> None:
+        """Tell a new node what the run has."""
+        self._pinged_s = self._heard_s = time.monotonic()
+        self.topics.declare(wire)
+        self._services.declare(wire)
+        if not self._lockstep:
+            self._actions.declare(wire)
+        self._wire = wire
+
+    def _send(self) -> None:
+        """Send messages of the bus, in a thread of its own."""
+        while not self._ending.is_set():
+            wire = self._wire
+            if wire is None or wire.closed:
+                self._ending.wait(_GLANCE_S)
+            else:
+                self.topics.send_next(wire, _GLANCE_S)
+
+    def _receive(self) -> None:
+        """Take what the node sends, watch it, and start it again, in a thread of its own."""
+        wait_s = _FIRST_WAIT_S
+        while not self._ending.is_set():
+            wire = self._wire
+            if wire is not None and not wire.closed:
+                for head, payload in wire.wait(_GLANCE_S):
+                    self._take(wire, head, payload)
+                self._watch(wire)
+                if self._restarts and time.monotonic() - self._begun_s > _LONGEST_WAIT_S:
+                    wait_s = _FIRST_WAIT_S
+            else:
+                self._lose(self._cause() if self._node is not None else "", wait_s)
+                if not self._ending.wait(wait_s):
+                    wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+                    self._restart()
+            self._publish_status()
+
+    def _watch(self, wire: Wire) -> None:
+        """Ask the node for a sign of life, and offer services that are new."""
+        now_s = time.monotonic()
+        if now_s - self._pinged_s >= _PING_S:
+            self._pinged_s = now_s
+            wire.send({"op": "ping"})
+            self._services.refresh(wire)
+        silent_s = now_s - self._heard_s
+        if silent_s > _SILENT_S and not self._trouble:
+            assert self._node is not None
+            self._trouble = f"the ROS node {self._node.pid} does not answer"
+            self._session.log.error("ros: %s; the robot does not depend on it", self._trouble)
+            self._actions.abandon(self._trouble)
+        elif silent_s <= _SILENT_S and self._trouble:
+            self._trouble = ""
+            self._session.log.warning("ros: the node answers again")
+
+    def _lose(self, cause: str, wait_s: float) -> None:
+        """Report the death of the node."""
+        if not cause:
+            return
+        self._node = self._wire = None
+        self._trouble = f"the ROS node died ({cause.splitlines()[-1] if cause else ''})"
+        self._session.log.error("ros: %s; starting it again in %g s", self._trouble, wait_s)
+        self._actions.abandon(self._trouble)
+
+    def _restart(self) -> None:
+        self._restarts += 1
+        try:
+            self._node = NodeProcess(
+                self._options, self._options.name, niceness=_NICE, given_up=self._ending.is_set
+            )  # fmt: skip
+        except Exception as error:  # noqa: BLE001 - reported, and tried again
+            self._trouble = f"the ROS node does not start: {error_line(error)}"
+            self._session.log.error("ros: %s", self._trouble)
+            return
+        self._begun_s = time.monotonic()
+        self._trouble = ""
+        self._session.log.warning("ros: the node was started again")
+        self._declare(self._node.wire)
+
+    def _cause(self) -> str:
+        assert self._node is not None
+        return self._node.cause()
+
+    def _take(self, wire: Wire, head: dict[str, Any], payload: bytes) -> None:
+        self._heard_s = time.monotonic()
+        takes: dict[str, Callable[[], None]] = {
+            "message": lambda: self.topics.take(head["topic"], payload),
+            "matched": lambda: self.topics.take_subscribers(head["topic"], head["subscribers"]),
+            "dropped": lambda: self._note_flood(head["topic"], head["count"]),
+            "trouble": lambda: self.topics.tell(f"{head['topic']}: {head['what']}"),
+            "goal": lambda: self._services.submit(
+                self._actions.take_goal, wire, head, payload, self._session.stops
+            ),
+            "cancel": lambda: self._services.submit(self._actions.cancel, wire, head["goal"]),
+            "call": lambda: self._services.take_call(wire, head),
+            "pong": lambda: None,
+        }  # fmt: skip
+        takes[head["op"]]()
+
+    def _note_flood(self, topic: str, count: int) -> None:
+        self.topics.counts[f"dropped {topic}"] += count
+        self.topics.tell(f"{topic}: messages come faster than rate_hz, {self._options.rate_hz:g}; the rest is dropped")
+
+    def _publish_status(self) -> None:
+        """Publish the node's state on /diagnostics, once a second."""
+        now_ns = self._session.clock.now_ns()
+        if now_ns - self._status_ns < _STATUS_NS:
+            return
+        self._status_ns = now_ns
+        level = DiagnosticStatus.WARN if self._trouble else DiagnosticStatus.OK
+        values = tuple(KeyValue(name, str(count)) for name, count in sorted(self.counts.items()))
+        status = DiagnosticStatus(level, "ros", self.state, self._session.config.robot.name, values)
+        self._session.bus.publish(DIAGNOSTICS, DiagnosticArray(Header(now_ns), (status,)))

@@ -1,0 +1,160 @@
+"""Topics between the bus of a run and ROS: which, under which names, and with which quality of service."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Mapping
+
+from ibrobot_ros2 import decode, encode
+
+from ibrobot_core.api import NS_PER_S, IbrobotError, JointState
+from ibrobot_core.app import Received, RunView, Subscription
+from ibrobot_ros.options import NAME, RosOptions
+from ibrobot_ros.wire import Wire
+
+CLOCK = "/clock"
+_CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+_CLOCK_CDR = struct.Struct("<4xiI")
+_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+GLOBAL = ("/tf", "/tf_static", CLOCK)
+"""Topics that have the same name in every namespace."""
+SENSOR_DATA = (
+    "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu",
+)  # fmt: skip
+"""Types with ROS's profile for sensor data: best effort, so that a slow subscriber gets the newest."""
+LATCHED = ("/tf_static", "/robot_description", "/robot_description_semantic")
+"""Topics that ROS latches."""
+LARGE = SENSOR_DATA[:3]
+"""Types that are not sent to the node while nobody subscribes."""
+DEPTH = 200
+"""Messages that wait for the thread that sends them."""
+BACKLOG = 16 << 20
+"""Bytes that the node may leave unread before messages for it are dropped."""
+
+
+def profile(topic: str, type_name: str, qos: Mapping[str, str], *, latched: bool = False) -> str:
+    """The QoS profile of a topic: that of the options, else that of ROS's tables."""
+    if topic in qos:
+        return qos[topic]
+    if latched or topic in LATCHED:
+        return "latched"
+    return "sensor_data" if type_name in SENSOR_DATA else "default"
+
+
+def ros_name(name: str, namespace: str) -> str:
+    """The name of a topic or service in ROS."""
+    prefix = namespace.strip("/")
+    return name if name in GLOBAL or not prefix else f"/{prefix}{name}"
+
+
+class Topics:
+    """Passes messages both ways, and counts what is lost.
+
+    Attributes:
+        counts: what happened -> how often, e.g. `dropped /image`.
+    """
+
+    def __init__(self, options: RosOptions, session: RunView) -> None:
+        self._options = options
+        self._session = session
+        self.clock = session.config.simulated if options.clock is None else options.clock
+        self.counts: Counter[str] = Counter()
+        self._queue: Subscription | None = None
+        self._declared: dict[str, str] = {}
+        """Published topic -> its type."""
+        self._subscribers: dict[str, int] = {}
+        self._received = {ros_name(topic, options.namespace): topic for topic in options.subscribe}
+        self._told: set[str] = set()
+
+    def open(self) -> None:
+        """Subscribe to the bus, and state the types of what is received."""
+        for topic, type_name in self._options.subscribe.items():
+            self._session.bus.expect(topic, type_name)
+        self._queue = self._session.bus.subscribe(None, DEPTH)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        queue, self._queue = self._queue, None
+        if queue is not None:
+            queue.close()
+
+    def declare(self, wire: Wire) -> None:
+        """Tell a new node which topics it has, with the newest message of those that are latched."""
+        self._subscribers.clear()
+        self._declared.clear()
+        for topic, type_name in self._options.subscribe.items():
+            qos = profile(topic, type_name, self._options.qos)
+            name = ros_name(topic, self._options.namespace)
+            wire.send(
+                {"op": "subscriber", "topic": name, "type": type_name, "qos": qos, "rate_hz": self._options.rate_hz}
+            )
+        for received in self._session.bus.latched().values():
+            self._send(wire, received)
+
+    def send_next(self, wire: Wire, timeout_s: float) -> bool:
+        """Send the next message of the bus; returns whether there was one within `timeout_s` [s]."""
+        queue = self._queue
+        received = queue.get(timeout_s) if queue is not None else None
+        if received is None:
+            return False
+        self._send(wire, received)
+        if self.clock and isinstance(received.message, JointState):
+            self._send_clock(wire, received.message.header.stamp_ns)
+        return True
+
+    def take(self, name: str, payload: bytes) -> None:
+        """Publish a message of ROS on the bus."""
+        topic = self._received[name]
+        try:
+            self._session.bus.publish(topic, decode(self._options.subscribe[topic], payload))
+        except IbrobotError as error:
+            self.counts[f"refused {topic}"] += 1
+            self.tell(f"a message from ROS was refused: {error}")
+
+    def take_subscribers(self, name: str, count: int) -> None:
+        """Note how many subscribers a topic has in ROS."""
+        self._subscribers[name] = count
+
+    def tell(self, what: str) -> None:
+        """Log a warning once."""
+        if what not in self._told:
+            self._told.add(what)
+            self._session.log.warning("ros: %s", what)
+
+    def _is_shared(self, topic: str) -> bool:
+        if topic in self._options.subscribe:
+            return False
+        return self._options.publish == "all" or topic in self._options.publish
+
+    def _send(self, wire: Wire, received: Received) -> None:
+        topic, type_name = received.topic, received.message.ros_type
+        if not self._is_shared(topic):
+            return
+        name = ros_name(topic, self._options.namespace)
+        if topic not in self._declared:
+            self._declared[topic] = type_name
+            if not NAME.fullmatch(name):
+                self.tell(f"{topic} is no ROS 2 name, so that it is not published")
+            else:
+                latched = topic in self._session.bus.latched()
+                qos = profile(topic, type_name, self._options.qos, latched=latched)
+                wire.send({"op": "publisher", "topic": name, "type": type_name, "qos": qos})
+        if type_name in LARGE and not self._subscribers.get(name):
+            return
+        if wire.backlog > BACKLOG:
+            self.counts[f"dropped {topic}"] += 1
+            return
+        try:
+            wire.send({"op": "message", "topic": name}, encode(received.message).tobytes())
+        except IbrobotError as error:
+            self.counts[f"refused {topic}"] += 1
+            self.tell(f"{topic}: {error}")
+
+    def _send_clock(self, wire: Wire, now_ns: int) -> None:
+        if CLOCK not in self._declared:
+            self._declared[CLOCK] = _CLOCK_TYPE
+            wire.send({"op": "publisher", "topic": CLOCK, "type": _CLOCK_TYPE, "qos": "sensor_data"})
+        text = bytearray(_CLOCK_CDR.pack(*divmod(now_ns, NS_PER_S)))
+        text[:4] = _LITTLE_ENDIAN
+        wire.send({"op": "message", "topic": CLOCK}, bytes(text))
