@@ -338,6 +338,22 @@ def lint(session: nox.Session) -> None:
     session.run("ruff", "format", "--no-cache", "--check", ".")
 
 
+@nox.session(default=False)
+def ros(session: nox.Session) -> None:
+    """A run beside a real ROS 2 Jazzy: rclpy and Fast DDS from wheels, which only x86-64 Linux has.
+
+    Its full counts, e.g. of goals, take IBROBOT_ROS_SHARE=1; without it a tenth.
+    """
+    tests = FOLDERS["ros"] / "tests"
+    folder = Path(session.create_tmp()).absolute() / "jazzy"
+    install(session, "ros", "planning", "mcap", "data")
+    made = session.run("python", str(tests / "make_ros.py"), str(folder), silent=True, success_codes=[0, 3])
+    if not (folder / "bin/python").exists():
+        note_untested(session, f"ROS 2 is not tested: {str(made).strip()}")
+        return
+    session.run(*PYTEST, str(tests / "with_ros"), *session.posargs, env={"IBROBOT_ROS_PYTHON": str(folder / "bin/python")})
+
+
 @nox.session(default=False, venv_backend="none")
 def fresh(session: nox.Session) -> None:
     """README's first two commands on a minimal Debian with nothing installed; or others: `-- [-u] COMMAND…`."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import Check, hookimpl
+from ibrobot_core.api import Check, HardwareDescriptor, hookimpl
 from ibrobot_core.app import SectionDescriptor
-from ibrobot_ros.options import RosOptions
+from ibrobot_ros.options import Ros2ControlOptions, RosOptions
 
 if TYPE_CHECKING:
+    from ibrobot_core.api import Context, Hardware
     from ibrobot_core.app import Component, RunAccess
 
 
@@ -25,6 +26,21 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
     yield SectionDescriptor(
         type="ros", options=RosOptions, make=_node, summary="a ROS 2 node beside the run: topics, services and actions"
     )
+
+
+def _ros2_control(options: Ros2ControlOptions, ctx: Context) -> Hardware:
+    from ibrobot_ros.hardware import Ros2Control
+
+    return Ros2Control(options, ctx)
+
+
+@hookimpl
+def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
+    """Robots whose controllers run in ROS."""
+    yield HardwareDescriptor(
+        type="ros2_control", options=Ros2ControlOptions, make=_ros2_control,
+        summary="joints that controllers in ROS 2 drive",
+    )  # fmt: skip
 
 
 @hookimpl

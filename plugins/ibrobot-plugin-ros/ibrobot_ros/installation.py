@@ -86,7 +86,6 @@ def environment(options: RosInstallation, interpreter: Interpreter) -> dict[str,
         found["ROS_AUTOMATIC_DISCOVERY_RANGE"] = options.discovery.upper()
         found.pop("ROS_LOCALHOST_ONLY", None)
         if options.discovery == "localhost":
-            found["ROS_LOCALHOST_ONLY"] = "1"  # the variable of ROS before Jazzy
             found.pop("ROS_STATIC_PEERS", None)
     if options.rmw is not None:
         found["RMW_IMPLEMENTATION"] = options.rmw

@@ -21,9 +21,19 @@ def _check_namespace(instance: object, attribute: attrs.Attribute[str], value: s
         raise ValueError(f"namespace {value!r} is not a ROS 2 name, e.g. robot1 or lab/robot1")
 
 
-def _check_name(name: str) -> None:
+def check_name(name: str) -> None:
+    """Check that a name is a full name of ROS.
+
+    Raises:
+        ValueError: if it is not.
+    """
     if not NAME.fullmatch(name):
         raise ValueError(f"{name!r} is not a full ROS 2 name: letters, digits and _ after slashes, e.g. /joint_states")
+
+
+def check_topic(instance: object, attribute: attrs.Attribute[str], value: str) -> None:
+    """Check an option that names a topic."""
+    check_name(value)
 
 
 def _check_listed(instance: object, attribute: attrs.Attribute[Any], value: str | tuple[str, ...]) -> None:
@@ -32,12 +42,12 @@ def _check_listed(instance: object, attribute: attrs.Attribute[Any], value: str 
             raise ValueError(f"must be all, or a list of names, got {value!r}")
         return
     for name in value:
-        _check_name(name)
+        check_name(name)
 
 
 def _check_subscribed(instance: object, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
     for topic, type_name in value.items():
-        _check_name(topic)
+        check_name(topic)
         if type_name not in MESSAGE_TYPES:
             known = did_you_mean(type_name, list(MESSAGE_TYPES), "the types are")
             raise ValueError(f"{topic}: unknown message type {type_name!r}{known}")
@@ -45,7 +55,7 @@ def _check_subscribed(instance: object, attribute: attrs.Attribute[Any], value: 
 
 def _check_qos(instance: object, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
     for topic, name in value.items():
-        _check_name(topic)
+        check_name(topic)
         if name not in PROFILES:
             raise ValueError(f"{topic}: unknown profile {name!r}{did_you_mean(name, PROFILES, 'the profiles are')}")
 
@@ -109,4 +119,30 @@ class RosOptions(RosInstallation):
         "GripperCommand",
         choices=("GripperCommand", "ParallelGripperCommand"),
         help="type of the action of executors that take a position",
+    )
+
+
+def _check_controller(instance: object, attribute: attrs.Attribute[str], value: str) -> None:
+    check_name("/" + value.strip("/"))
+
+
+@documented
+@attrs.frozen
+class Ros2ControlOptions(RosInstallation):
+    """Options of `type: ros2_control`."""
+
+    controller: str = option(
+        validator=_check_controller, help="controller that takes the commands, e.g. arm_controller"
+    )
+    command: str = option(
+        "positions",
+        choices=("positions", "trajectory"),
+        help="positions: CONTROLLER/commands, as of forward_command_controller, in the order of these joints; "
+        "trajectory: CONTROLLER/joint_trajectory, as of joint_trajectory_controller",
+    )
+    states: str = option("/joint_states", validator=check_topic, help="topic of the joint states")
+    stamp: str = option(
+        "header",
+        choices=("header", "receive"),
+        help="time of a state: its own stamp, or when it comes, for controllers with another clock",
     )

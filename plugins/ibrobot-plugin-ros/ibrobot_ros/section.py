@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any, override
 
-from ibrobot_core.api import NS_PER_S, DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
+from ibrobot_core.api import DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
 from ibrobot_core.app import CONTROL, Component, ComponentFailed, RunAccess, error_line
 from ibrobot_ros.actions import Actions
 from ibrobot_ros.options import RosOptions
@@ -24,7 +24,7 @@ _PING_S = 0.5
 _SILENT_S = 2.0
 """Silence after which the node counts as stopped, and its goals are canceled [s]."""
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 1.0, 30.0
-_STATUS_NS = NS_PER_S
+_STATUS_S = 1.0
 _STOP_S = 5.0
 
 
@@ -51,7 +51,7 @@ class RosNode(Component):
         self._trouble = ""
         """What is wrong with the node now; empty while it works."""
         self._pinged_s = self._heard_s = 0.0
-        self._status_ns = 0
+        self._published_s = 0.0
 
     @property
     def pid(self) -> int | None:
@@ -228,10 +228,10 @@ class RosNode(Component):
 
     def _publish_status(self) -> None:
         """Publish the node's state on /diagnostics, once a second."""
-        now_ns = self._session.clock.now_ns()
-        if now_ns - self._status_ns < _STATUS_NS:
+        now_s = time.monotonic()
+        if now_s - self._published_s < _STATUS_S:
             return
-        self._status_ns = now_ns
+        self._published_s, now_ns = now_s, self._session.clock.now_ns()
         level = DiagnosticStatus.WARN if self._trouble else DiagnosticStatus.OK
         values = tuple(KeyValue(name, str(count)) for name, count in sorted(self.counts.items()))
         status = DiagnosticStatus(level, "ros", self.state, self._session.config.robot.name, values)

@@ -120,18 +120,24 @@ def _build(name: str, folder: Path, python: Path) -> None:
         finds = "\n".join(f"find_package({each} REQUIRED)" for each in needs)
         build = _BUILD.format(name=name, finds=finds, files=" ".join(files), needs=" ".join(needs))
         (source / "CMakeLists.txt").write_text(build, encoding="utf-8")
-        flags = ("-Wno-dev", "-DBUILD_TESTING=OFF", f"-DCMAKE_INSTALL_PREFIX={folder}", f"-DPython3_EXECUTABLE={python}")
+        flags = (
+            "-Wno-dev",
+            "-DBUILD_TESTING=OFF",
+            f"-DCMAKE_INSTALL_PREFIX={folder}",
+            f"-DPython3_EXECUTABLE={python}",
+        )
         for command in (
             ["cmake", "-S", str(source), "-B", f"{made}/build", "-DCMAKE_BUILD_TYPE=Release", *flags],
             ["cmake", "--build", f"{made}/build", "--parallel", "2"],
             ["cmake", "--install", f"{made}/build"],
         ):
-            done = subprocess.run(command, env=environment(folder), text=True, capture_output=True)
+            done = subprocess.run(command, check=False, env=environment(folder), text=True, capture_output=True)
             if done.returncode:
                 raise SystemExit(f"{name}: {' '.join(command)} failed:\n{(done.stdout + done.stderr)[-4000:]}")
 
 
 if __name__ == "__main__":
     if reason := missing():
-        raise SystemExit(reason)
+        print(reason)
+        raise SystemExit(3)
     print(make(Path(sys.argv[1]).absolute()))

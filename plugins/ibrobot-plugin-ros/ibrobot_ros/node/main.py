@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import os
 import socket
 import sys
@@ -14,6 +15,8 @@ from ibrobot_ros.wire import Wire
 
 INTERFACES = ("std_srvs", "control_msgs", "tf2_msgs", "ibrobot_msgs")
 """Packages of message types that not every ROS has."""
+OLD = ("humble", "iron")
+"""Distributions that know ROS_LOCALHOST_ONLY only; later ones warn of it."""
 _POLL_S = 0.2
 _POOL = 64
 """Most actions and services that can wait for the run at a time."""
@@ -35,6 +38,8 @@ def run(descriptor: int) -> None:
         os.nice(order["niceness"])
     # Threads that take messages must not delay those of stops by the interpreter's usual 5 ms.
     sys.setswitchinterval(0.001)
+    if os.environ.get("ROS_DISTRO") in OLD and os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "LOCALHOST":
+        os.environ["ROS_LOCALHOST_ONLY"] = "1"
     rclpy.init(args=["--ros-args", "--log-level", "error"])
     wire.send({"op": "hello", **_found(rclpy)})
     if not order["probe"]:

@@ -15,6 +15,8 @@ from ibrobot_ros.wire import Wire
 
 BACKLOG = 16 << 20
 """Bytes that the run may leave unread before messages for it are dropped."""
+_DEPTH = 100
+"""Messages that a late reader still gets: a second of joint states."""
 _WATCH_S = 1.0
 
 
@@ -25,7 +27,7 @@ def profile(name: str) -> QoSProfile:
         return QoSProfile(depth=1, reliability=reliable, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     if name == "sensor_data":
         return QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT, durability=volatile)
-    return QoSProfile(depth=10, reliability=reliable, durability=volatile)
+    return QoSProfile(depth=_DEPTH, reliability=reliable, durability=volatile)
 
 
 class _Input:

@@ -1,0 +1,78 @@
+"""A node without ROS: an interpreter that does, instead of `run.py`, what a test says."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import sys
+import textwrap
+from pathlib import Path
+
+from ibrobot_ros.wire import Wire
+
+PACKAGE = Path(sys.modules["ibrobot_ros.wire"].__file__ or "").parent
+HELLO = {
+    "op": "hello", "python": "python", "version": "3.12", "rclpy": "rclpy", "distro": "jazzy", "rmw": "rmw_none",
+    "domain": "0", "range": "LOCALHOST", "interfaces": ["std_srvs"],
+}  # fmt: skip
+
+
+def write(folder: Path, behaviour: str = "") -> Path:
+    """An interpreter that is such a node; it notes every frame in `frames` beside it.
+
+    Args:
+        folder: where.
+        behaviour: `missing`, `dies`: at the start; `silent`: does not answer pings; otherwise frames to send, as JSON,
+            after the first ping.
+    """
+    path = folder / "python"
+    path.write_text(
+        textwrap.dedent(f"""\
+            #!{sys.executable}
+            import sys
+            from types import ModuleType
+            sys.path.insert(0, {str(Path(__file__).parent)!r})
+            package = sys.modules["ibrobot_ros"] = ModuleType("ibrobot_ros")  # as in run.py: without what it imports
+            package.__path__ = [{str(PACKAGE)!r}]
+            from fake_node import serve
+            serve(int(sys.argv[2]), {behaviour!r}, {str(folder / "frames")!r})
+            """)
+    )
+    path.chmod(0o755)
+    return path
+
+
+def serve(descriptor: int, behaviour: str, notes: str) -> None:
+    """The other side's program."""
+    wire = Wire(socket.socket(fileno=descriptor))
+    if behaviour == "dies":
+        print("a library is missing", file=sys.stderr)
+        os._exit(3)
+    with open(notes, "a", encoding="utf-8") as noted:
+        told = False
+        while not wire.closed:
+            for head, payload in wire.wait(0.1):
+                noted.write(json.dumps([head, payload.hex()]) + "\n")
+                noted.flush()
+                if head["op"] == "order":
+                    wire.send({"op": "missing", "what": "no rclpy", "python": "x"} if behaviour == "missing" else HELLO)
+                elif head["op"] == "ping" and behaviour != "silent":
+                    wire.send({"op": "pong"})
+                    if behaviour and not told:
+                        told = True
+                        for frame, body in json.loads(behaviour):
+                            if frame == "die":
+                                os._exit(7)
+                            wire.send(frame, bytes.fromhex(body))
+                elif head["op"] == "end":
+                    wire.flush(1.0)
+                    os._exit(0)
+    os._exit(0)
+
+
+def frames(folder: Path) -> list[tuple[dict, bytes]]:
+    """The frames that it has noted."""
+    path = folder / "frames"
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return [(head, bytes.fromhex(body)) for head, body in map(json.loads, lines)]

@@ -1,0 +1,33 @@
+"""A simulated arm with a gripper, for runs beside ROS. A thing between the fingers stops them at `OBJECT`."""
+
+from __future__ import annotations
+
+import numpy as np
+from ibrobot_testing.fakes import FakeHardware
+
+from ibrobot_core import hookimpl
+from ibrobot_core.descriptors import HardwareDescriptor
+
+OBJECT = 0.3
+
+
+class Arm(FakeHardware):
+    def advance(self, step_ns):
+        grip = self.joints.index("grip")
+        before = self._position[grip]
+        super().advance(step_ns)
+        if self._position[grip] < OBJECT <= before:
+            self._position[grip] = OBJECT
+            self._velocity[grip] = 0.0
+        elif before == OBJECT and self._command[grip] < OBJECT:
+            self._position[grip], self._velocity[grip] = OBJECT, 0.0
+
+    def reset(self, episode):
+        super().reset(episode)
+        self._position = np.array([0.0, 0.0, 0.0, 0.8])[: len(self.joints)]
+        self._command = self._position.copy()
+
+
+@hookimpl
+def ibrobot_hardware():
+    yield HardwareDescriptor("arm", lambda options, ctx: Arm(ctx, 0.03), "an arm with a gripper", simulated=True)
