@@ -127,7 +127,7 @@ def _check_controller(instance: object, attribute: attrs.Attribute[str], value: 
 
 
 @documented
-@attrs.frozen
+@attrs.frozen(kw_only=True)
 class Ros2ControlOptions(RosInstallation):
     """Options of `type: ros2_control`."""
 

@@ -10,7 +10,7 @@ from ibrobot_ros2 import decode, encode
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, JointState
 from ibrobot_core.app import Received, RunView, Subscription
-from ibrobot_ros.options import NAME, RosOptions
+from ibrobot_ros.options import NAME, Ros2ControlOptions, RosOptions
 from ibrobot_ros.wire import Wire
 
 CLOCK = "/clock"
@@ -66,6 +66,9 @@ class Topics:
         self._subscribers: dict[str, int] = {}
         self._received = {ros_name(topic, options.namespace): topic for topic in options.subscribe}
         self._told: set[str] = set()
+        hardware = [each.options for each in session.config.hardware.values()]
+        self._theirs = {each.states for each in hardware if isinstance(each, Ros2ControlOptions)}
+        """Topics of joint states that controllers in ROS publish already."""
 
     def open(self) -> None:
         """Subscribe to the bus, and state the types of what is received."""
@@ -123,7 +126,7 @@ class Topics:
             self._session.log.warning("ros: %s", what)
 
     def _is_shared(self, topic: str) -> bool:
-        if topic in self._options.subscribe:
+        if topic in self._options.subscribe or ros_name(topic, self._options.namespace) in self._theirs:
             return False
         return self._options.publish == "all" or topic in self._options.publish
 

@@ -9,6 +9,7 @@ import sys
 import textwrap
 from pathlib import Path
 
+import numpy as np
 from ibrobot_ros.wire import Wire
 
 PACKAGE = Path(sys.modules["ibrobot_ros.wire"].__file__ or "").parent
@@ -23,8 +24,9 @@ def write(folder: Path, behaviour: str = "") -> Path:
 
     Args:
         folder: where.
-        behaviour: `missing`, `dies`: at the start; `silent`: does not answer pings; otherwise frames to send, as JSON,
-            after the first ping.
+        behaviour: `missing`, `dies`: at the start; `silent`: does not answer pings; `controller STATE OFFSET COUNT`: a
+            controller whose joints are where they are commanded to be, with a serialised JointState (hexadecimal), and
+            where its positions are; otherwise what `sends` makes.
     """
     path = folder / "python"
     path.write_text(
@@ -43,14 +45,21 @@ def write(folder: Path, behaviour: str = "") -> Path:
     return path
 
 
+def sends(**answers: list[tuple[dict, bytes]]) -> str:
+    """The behaviour that sends frames when the first frame of a kind comes, e.g. `order` or `ping`."""
+    return json.dumps({op: [[head, body.hex()] for head, body in frames] for op, frames in answers.items()})
+
+
 def serve(descriptor: int, behaviour: str, notes: str) -> None:
     """The other side's program."""
     wire = Wire(socket.socket(fileno=descriptor))
     if behaviour == "dies":
         print("a library is missing", file=sys.stderr)
         os._exit(3)
+    if behaviour.startswith("controller"):
+        _control(wire, *behaviour.split()[1:])
+    answers = json.loads(behaviour) if behaviour.startswith("{") else {}
     with open(notes, "a", encoding="utf-8") as noted:
-        told = False
         while not wire.closed:
             for head, payload in wire.wait(0.1):
                 noted.write(json.dumps([head, payload.hex()]) + "\n")
@@ -59,15 +68,31 @@ def serve(descriptor: int, behaviour: str, notes: str) -> None:
                     wire.send({"op": "missing", "what": "no rclpy", "python": "x"} if behaviour == "missing" else HELLO)
                 elif head["op"] == "ping" and behaviour != "silent":
                     wire.send({"op": "pong"})
-                    if behaviour and not told:
-                        told = True
-                        for frame, body in json.loads(behaviour):
-                            if frame == "die":
-                                os._exit(7)
-                            wire.send(frame, bytes.fromhex(body))
                 elif head["op"] == "end":
                     wire.flush(1.0)
                     os._exit(0)
+                for answer, body in answers.pop(head["op"], ()):
+                    wire.send(answer, bytes.fromhex(body))
+    os._exit(0)
+
+
+def _control(wire: Wire, state: str, offset: str, count: str) -> None:
+    """Publish states, and follow commands at 3 rad/s."""
+    text, begin, size = bytearray.fromhex(state), int(offset), 8 * int(count)
+    position = np.frombuffer(text, np.float64, int(count), begin).copy()
+    command = position.copy()
+    while not wire.closed:
+        for head, payload in wire.wait(0.002):
+            if head["op"] == "order":
+                wire.send(HELLO)
+                wire.send({"op": "matched", "topic": "", "subscribers": 1})
+            elif head["op"] == "message":
+                command = np.frombuffer(payload[-size:])
+            elif head["op"] == "end":
+                os._exit(0)
+        position += np.clip(command - position, -0.006, 0.006)
+        text[begin : begin + size] = position.tobytes()
+        wire.send({"op": "message", "topic": "/joint_states"}, bytes(text))
     os._exit(0)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 
 import attrs
@@ -68,7 +67,7 @@ def started(tmp_path):
 
 
 def sent(*frames):
-    return json.dumps([[head, body.hex()] for head, body in frames])
+    return fake_node.sends(ping=list(frames))
 
 
 def test_topics_get_the_profiles_of_ros(started):

@@ -39,16 +39,24 @@ ROBOT = textwrap.dedent("""\
       gripper_position: {type: position, group: gripper}
       arm_trajectory: {type: trajectory, group: arm, path_tolerance: 0.5}
       gripper_action: {type: gripper, group: gripper, stall_time: 0.2}
+    models: {net: {type: net}}
+    teleoperation: {stick: {type: stick}}
     control_modes:
       ros: {executors: [arm_trajectory, gripper_action]}
+      plan: {executors: [arm_trajectory, gripper_action], planner: {type: joint}}
+      teleop: {executors: [arm_position, gripper_position], teleop: stick}
+      policy: {executors: [arm_position, gripper_position], inference: {model: net}}
       idle: {executors: [arm_position, gripper_position]}
     default_control_mode: ros
     contract:
       rate_hz: 20
       observations:
-        - {key: observation.state, topic: /joint_states, select: [position.pan, position.lift, position.roll]}
+        - key: observation.state
+          topic: /joint_states
+          select: [position.pan, position.lift, position.roll, position.grip]
       actions:
         - {key: action, executor: arm_position, topic: /arm/commands}
+        - {key: action, executor: gripper_position, topic: /grip/commands}
     control: {rate_hz: 100, stop: hold}
     """)
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from ibrobot_testing.fakes import FakeHardware
+from ibrobot_testing.fakes import FakeHardware, FakePolicy, FakeTeleop
 
 from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import HardwareDescriptor
+from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, TeleopDescriptor
 
 OBJECT = 0.3
 
@@ -31,3 +31,25 @@ class Arm(FakeHardware):
 @hookimpl
 def ibrobot_hardware():
     yield HardwareDescriptor("arm", lambda options, ctx: Arm(ctx, 0.03), "an arm with a gripper", simulated=True)
+
+
+class Stick(FakeTeleop):
+    """Pushed forward: once, then for good."""
+
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self.velocity = -0.1
+
+    def activate(self, measured):
+        super().activate(measured)
+        self.press()
+
+
+@hookimpl
+def ibrobot_teleop():
+    yield TeleopDescriptor("stick", lambda options, ctx: Stick(ctx), "a stick that is pushed forward")
+
+
+@hookimpl
+def ibrobot_policies():
+    yield PolicyDescriptor("net", lambda options, ctx: FakePolicy(ctx), "a policy that moves all joints")

@@ -1,0 +1,59 @@
+"""Services of a run, called by clients of rclpy's."""
+
+from __future__ import annotations
+
+from .conftest import Peer, scaled
+
+TRIGGER = "std_srvs/srv/Trigger"
+
+
+def test_modes_reset_and_stop(start, peer):
+    run = start()
+    assert peer.ask("call", name="/set_mode/idle", type=TRIGGER) == [[True, ""]]
+    assert run.session.mode == "idle"
+    assert peer.ask("call", name="/estop", type=TRIGGER) == [[True, ""]]
+    assert run.session.faults
+    ((refused, why),) = peer.ask("call", name="/set_mode/ros", type=TRIGGER)
+    assert not refused
+    assert "refused before a reset" in why
+    ((done, then),) = peer.ask("call", name="/reset", type=TRIGGER)
+    assert done
+    assert "mode idle starts over" in then
+    assert not run.session.faults
+
+
+def test_calls_of_four_clients(start, peers):
+    start()
+    count = scaled(1000) // 4
+    for _ in range(4):
+        peers.append(Peer())
+    for each in peers:
+        each.send("call", name="/set_mode/idle", type=TRIGGER, count=count)
+    assert [len(each.answer()) for each in peers] == [count] * 4
+
+
+def test_a_stop_does_not_wait_for_slow_calls(start, peers):
+    """A gripper that never arrives keeps its caller waiting, and a stop comes through meanwhile."""
+    for _ in range(2):
+        peers.append(Peer())
+    slow, stopper = peers
+    run = start()
+    slow.send("follow", action="/arm_trajectory/follow_joint_trajectory", joints=["pan", "lift", "roll"],
+              points=[[30.0, [1.0] * 3, [0.0] * 3]])  # fmt: skip
+    assert stopper.ask("call", name="/estop", type=TRIGGER) == [[True, ""]]
+    assert run.session.faults
+    assert slow.answer()["status"] in (None, "ABORTED")
+
+
+def test_services_of_a_mode_appear_with_it(start, peer):
+    start()
+    assert "/planning/cancel" not in peer.ask("services")
+    peer.ask("call", name="/set_mode/plan", type=TRIGGER)
+    assert peer.ask("call", name="/planning/cancel", type=TRIGGER) == [[True, ""]]
+
+
+def test_an_episode_is_recorded_by_services(start, peer):
+    run = start("recording={type: mcap, topics: all}", by_operator=True)
+    assert peer.ask("call", name="/record_episode/start", type=TRIGGER)[0][0]
+    assert peer.ask("call", name="/record_episode/stop", type=TRIGGER)[0][0]
+    assert run.session.outcome.episodes == 1
