@@ -23,6 +23,8 @@ _GLANCE_S = 0.1
 _PING_S = 0.5
 _SILENT_S = 2.0
 """Silence after which the node counts as stopped, and its goals are canceled [s]."""
+_SETUP_S = 10.0
+"""Time that a new node has until its first sign of life, in addition [s]."""
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 1.0, 30.0
 _STATUS_S = 1.0
 _STOP_S = 5.0
@@ -127,7 +129,8 @@ class RosNode(Component):
 
     def _declare(self, wire: Wire) -> None:
         """Tell a new node what the run has."""
-        self._pinged_s = self._heard_s = time.monotonic()
+        self._pinged_s = time.monotonic()
+        self._heard_s = self._pinged_s + _SETUP_S
         self.topics.declare(wire)
         self._services.declare(wire)
         if not self._lockstep:

@@ -147,6 +147,7 @@ def test_a_node_that_dies_is_named_and_started_again(started, caplog, monkeypatc
 
 def test_a_silent_node_is_named(started, caplog, monkeypatch):
     monkeypatch.setattr("ibrobot_ros.section._SILENT_S", 0.2)
+    monkeypatch.setattr("ibrobot_ros.section._SETUP_S", 0.0)
     part = started("silent")
     until(lambda: "does not answer" in caplog.text)
     assert "does not answer" in part.node.state
