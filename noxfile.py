@@ -351,7 +351,8 @@ def ros(session: nox.Session) -> None:
     if not (folder / "bin/python").exists():
         note_untested(session, f"ROS 2 is not tested: {str(made).strip()}")
         return
-    session.run(*PYTEST, str(tests / "with_ros"), *session.posargs, env={"IBROBOT_ROS_PYTHON": str(folder / "bin/python")})
+    python = {"IBROBOT_ROS_PYTHON": str(folder / "bin/python")}
+    session.run(*PYTEST, str(tests / "with_ros"), *session.posargs, env=python)
 
 
 @nox.session(default=False, venv_backend="none")

@@ -11,7 +11,15 @@ import attrs
 import numpy as np
 from ibrobot_ros2 import decode
 
-from ibrobot_core.api import NS_PER_S, GoalRejected, IbrobotError, JointTrajectory, seconds, trajectory_goal
+from ibrobot_core.api import (
+    NS_PER_S,
+    ExecutorDescriptor,
+    GoalRejected,
+    IbrobotError,
+    JointTrajectory,
+    seconds,
+    trajectory_goal,
+)
 from ibrobot_core.app import ControlState, ExecutorConfig, RunAccess
 from ibrobot_ros.options import RosOptions
 from ibrobot_ros.topics import ros_name
@@ -73,12 +81,12 @@ class Actions:
         self._options = options
         self._session = session
         config = session.config
-        takes_goals = {
-            name: executor
-            for name, executor in config.executors.items()
-            if not session.registry.find("executor", executor.type).streams
-        }
-        self._executors: dict[str, ExecutorConfig] = takes_goals if options.actions else {}
+        self._executors: dict[str, ExecutorConfig] = {}
+        for name, executor in config.executors.items() if options.actions else ():
+            descriptor = session.registry.find("executor", executor.type)
+            assert isinstance(descriptor, ExecutorDescriptor)
+            if not descriptor.streams:
+                self._executors[name] = executor
         self._lock = threading.Lock()
         self._goals: dict[str, _Goal] = {}
         """Goals under way, by their name in control."""

@@ -38,6 +38,8 @@ _GLANCE_S = 0.05
 _RATE_HZ = 2000.0
 _OLDEST_NS, _EARLIEST_NS = ns(0.5), ns(0.02)
 """How old a state may be, and how far ahead of the clock its stamp may be [ns]."""
+_OTHER_NS = ns(10.0)
+"""Age from which a stamp is that of another clock [ns]."""
 _BACKLOG = 1 << 20
 """Bytes of commands that a node may leave unread before it counts as stopped."""
 
@@ -218,6 +220,8 @@ class Ros2Control(Hardware):
         if self._options.stamp == "receive":
             return now_ns
         age_ns = now_ns - message.header.stamp_ns
+        if _OLDEST_NS < age_ns < _OTHER_NS:
+            return None  # late: if no other comes, this is silence
         if not -_EARLIEST_NS <= age_ns <= _OLDEST_NS:
             self._fault = (
                 f"{self._options.states}: its stamps are {_seconds(age_ns)} off this machine's clock; if its clock is "

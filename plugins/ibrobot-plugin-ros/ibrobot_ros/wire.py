@@ -68,7 +68,8 @@ class Wire:
         if self.closed:
             return []
         sending = [self._socket] if self.backlog else []
-        ready, writable, _ = select.select([self._socket, self._wake], sending, [], timeout_s)
+        both: list[Any] = [self._socket, self._wake]
+        ready, writable, _ = select.select(both, sending, [], timeout_s)
         if self._wake in ready:
             os.read(self._wake, 4096)
         if writable or self.backlog:

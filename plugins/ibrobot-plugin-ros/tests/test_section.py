@@ -88,7 +88,7 @@ def test_topics_get_the_profiles_of_ros(started):
     assert decode("sensor_msgs/msg/JointState", body).header.stamp_ns == 5
 
 
-def test_images_are_sent_only_while_somebody_subscribes(started):
+def test_images_are_sent_only_to_subscribers(started):
     part = started(sent(({"op": "matched", "topic": "/image", "subscribers": 1}, b"")))
     image = Image(Header(6), 1, 1, "mono8", 1, np.zeros(1, np.uint8))
     part.session.bus.publish("/image", image)

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import textwrap
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,8 +15,7 @@ import numpy as np
 import pytest
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.app import LaunchRequest, Runtime, Session, load_config
-from ibrobot_core.plugins import discover
+from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 
 HERE = Path(__file__).parent
 PYTHON = os.environ.get("IBROBOT_ROS_PYTHON", "")
@@ -71,6 +71,14 @@ def pytest_collection_modifyitems(items):
 def scaled(count: int) -> int:
     """A count of the full test, reduced by IBROBOT_ROS_SHARE."""
     return max(2, round(count * SHARE))
+
+
+def until(ready, patience_s: float = 30.0) -> None:
+    """Wait until something has happened."""
+    deadline = time.monotonic() + patience_s
+    while not ready():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.01)
 
 
 class Peer:
@@ -176,7 +184,7 @@ def start(tmp_path, monkeypatch):
             path = tmp_path / "mini.yaml"
             path.write_text(robot)
             ours = (f"ros.python={PYTHON}", f"ros.domain={DOMAIN}")
-            registry = discover()
+            registry = installed_plugins()
             sim = asked.pop("sim", True)
             mode = asked.pop("mode", None)
             config = load_config(path, overrides=(*ours, *overrides), sim=sim, mode=mode, registry=registry)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from ibrobot_testing.fakes import FakeHardware, FakePolicy, FakeTeleop
 
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, TeleopDescriptor
+from ibrobot_core.api import HardwareDescriptor, PolicyDescriptor, TeleopDescriptor, hookimpl
 
 OBJECT = 0.3
 

@@ -75,6 +75,10 @@ class Peer:
         """What ROS makes of bytes: those of the message that it reads in them."""
         return serialize_message(deserialize_message(bytes.fromhex(raw), find(type))).hex()
 
+    def text(self, type, raw):
+        """What ROS reads in bytes, as text, in which NaN is equal to NaN."""
+        return repr(deserialize_message(bytes.fromhex(raw), find(type)))
+
     def publish(self, topic, type, raw, qos="default", count=1, rate_hz=0.0):
         publisher = self.publishers.get(topic)
         if publisher is None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-import time
 
 import pytest
 
-from ibrobot_core.errors import IbrobotError
+from ibrobot_core.api import IbrobotError
 
-from .conftest import DOMAIN, PYTHON, ROBOT, Peer
+from .conftest import DOMAIN, PYTHON, ROBOT, Peer, until
 
 JOINTS = ["pan", "lift", "roll", "grip"]
 HARDWARE = f"{{type: ros2_control, controller: arm_controller, python: {PYTHON}, domain: {DOMAIN}}}"
@@ -30,13 +29,6 @@ def begin(start, controller):
         return start("ros.actions=true", *overrides, robot=REMOTE, sim=False, **asked)
 
     return begin
-
-
-def until(ready, run, patience_s=20.0):
-    deadline = time.monotonic() + patience_s
-    while not ready():
-        assert time.monotonic() < deadline
-        run.session.watch_states().get(0.05)
 
 
 def position(run):
@@ -60,13 +52,13 @@ def test_a_trajectory_moves_the_other_robot(begin, controller, peers):
 def test_planning_teleoperation_and_a_policy(begin, controller):
     run = begin(mode="plan")
     run.session.bus.call("/planning/go_to", "pan=0.4,lift=0.1,roll=0")
-    until(lambda: abs(position(run)[0] - 0.4) < 0.03, run)
+    until(lambda: abs(position(run)[0] - 0.4) < 0.03)
     run.runtime.switch_mode("teleop")
     before = position(run)[0]
-    until(lambda: position(run)[0] < before - 0.1, run)
+    until(lambda: position(run)[0] < before - 0.1)
     run.runtime.switch_mode("policy")
     before = position(run).copy()
-    until(lambda: abs(position(run) - before).max() > 0.1, run)
+    until(lambda: abs(position(run) - before).max() > 0.1)
     assert not run.session.faults
     run.check_steps()
 
@@ -75,12 +67,10 @@ def test_a_recording_through_it(begin, tmp_path):
     run = begin("recording={type: mcap, topics: all}", mode="teleop", by_operator=True)
     run.session.bus.call("/record_episode/start")
     before = len(run.commands)
-    until(lambda: len(run.commands) > before + 100, run)
+    until(lambda: len(run.commands) > before + 100)
     run.session.bus.call("/record_episode/stop", "success")
     run.runtime.stop()
-    (episode,) = (tmp_path / "episodes").rglob("episode_*")
-    assert episode.is_dir()
-    assert run.session.outcome.episodes == 1
+    assert (tmp_path / "episodes/default/episodes/episode_000001/metadata.yaml").exists()
 
 
 @pytest.mark.parametrize(
@@ -90,17 +80,17 @@ def test_a_recording_through_it(begin, tmp_path):
 def test_a_controller_in_trouble_in_motion(begin, controller, trouble, fault):
     run = begin(mode="plan")
     run.session.bus.call("/planning/go_to", "pan=1.5,lift=1.0,roll=0")
-    until(lambda: position(run)[0] > 0.1, run)
+    until(lambda: position(run)[0] > 0.1)
     if trouble == "killed":
         controller.process.kill()
     else:
         controller.ask("set", trouble=trouble)
-    until(lambda: run.session.faults, run)
+    until(lambda: run.session.faults)
     assert re.search(fault, run.session.faults[-1])
     assert run.session.failure_text == "", "the run goes on, and can be reset"
     if trouble != "killed":
         controller.ask("set", trouble="")
-        until(lambda: not run.session.state.stale, run)
+        until(lambda: not run.session.state.stale)
         assert "starts over" in run.session.bus.call("/reset") or run.session.held
 
 
