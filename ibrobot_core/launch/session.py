@@ -170,7 +170,7 @@ class Session:
         bus: topics and services within the host process.
         state: the newest state of the joints and of control; None before the first. Set by `take_state`.
         on_state: called with each state before its messages are published, in the thread that receives states.
-        on_goal: called with each change of an executor's goal, whoever sent it, in the same thread.
+        on_goal: called with each change of an executor's goal, of any client, in the same thread.
         mode: name of the active control mode.
         generation: counts mode switches and resets; plans of an earlier generation are ignored.
         factors: what the present episode of a simulation has drawn; see `Scene.factors`.

@@ -73,7 +73,7 @@ def action_of(executor: ExecutorConfig, options: RosOptions) -> tuple[str, str]:
 class Actions:
     """Passes goals and cancels of ROS to control, and what becomes of them back.
 
-    Whoever sends a goal replaces the one before, as on ros2_control's controllers: also one of the run's own planner,
+    A goal replaces the one before, of any client, as on ros2_control's controllers: also one of the run's own planner,
     which then reports its motion as replaced.
     """
 

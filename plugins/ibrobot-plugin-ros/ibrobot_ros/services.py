@@ -27,7 +27,7 @@ class _Offer:
     type: str
     service: str
     request: Mapping[str, Any]
-    """What is sent, whoever calls."""
+    """What is sent with every call."""
     field: str = ""
     """The key of the request that SetBool's `data` is."""
     urgent: bool = False

@@ -24,15 +24,13 @@ class Controller:
         self.position = [0.0] * (len(joints) - 1) + [0.8]
         self.command = list(self.position)
         self.trouble = ""
-        self.steps = []
         self.publisher = self.node.create_publisher(JointState, "/joint_states", 10)
         self.node.create_subscription(Float64MultiArray, "/arm_controller/commands", self.take, 10)
         self.node.create_timer(PERIOD_S, self.tick)
         self.last = time.monotonic()
 
     def take(self, message):
-        before, self.command = self.command, list(message.data)
-        self.steps.append(max(abs(new - old) for new, old in zip(self.command, before, strict=True)))
+        self.command = list(message.data)
 
     def tick(self):
         now = time.monotonic()
@@ -54,7 +52,7 @@ class Controller:
         self.trouble = trouble
 
     def state(self):
-        return {"position": self.position, "command": self.command, "largest_step": max(self.steps, default=0.0)}
+        return {"position": self.position, "command": self.command}
 
 
 def main():
