@@ -191,7 +191,7 @@ class Ros2Control(Hardware):
         position = self._part(message.position)
         if not np.isfinite(position).all():
             joint = self.joints[int(np.argmin(np.isfinite(position)))]
-            self._fault = f"{self._options.states}: the position of {joint} is no number"
+            self._fault = f"{self._options.states}: the position of {joint} is not a number"
             return
         stamp_ns = self._stamp_ns(message)
         if stamp_ns is not None:

@@ -103,7 +103,7 @@ def test_states_with_stamps_of_another_clock_are_refused(make):
 def test_positions_that_are_no_numbers_are_a_fault(make):
     _, ctx = make()
     hardware, _ = make(MATCHED, state(ctx, position=np.full(len(ctx.joints), np.nan)), stamp="receive")
-    with pytest.raises(HardwareError, match="is no number"):
+    with pytest.raises(HardwareError, match="is not a number"):
         hardware.connect()
 
 

@@ -83,7 +83,7 @@ def reset(run):
 
 @pytest.mark.parametrize(
     ("trouble", "fault"),
-    [("killed", "no state for|nobody subscribes"), ("silent", "no state for"), ("nan", "is no number")],
+    [("killed", "no state for|nobody subscribes"), ("silent", "no state for"), ("nan", "is not a number")],
 )
 def test_a_controller_in_trouble_in_motion(begin, controller, trouble, fault):
     run = begin(mode="plan")
