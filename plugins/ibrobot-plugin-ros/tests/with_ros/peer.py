@@ -61,10 +61,22 @@ class Peer:
     def await_subscriber(self, topic):
         return until(lambda: bool(self.node.get_subscriptions_info_by_topic(topic)))
 
-    def subscribe(self, topic, type, qos="default"):
+    def subscribe(self, topic, type, qos="default", head=None):
+        """Keep the messages of a topic, or their first bytes, with the time at which they came."""
         got = self.received[topic] = []
-        stamps = lambda raw: got.append((time.time_ns(), raw))  # noqa: E731
-        self.node.create_subscription(find(type), topic, stamps, profile(qos), raw=True)
+        keep = lambda raw: got.append((time.time_ns(), raw[:head]))  # noqa: E731
+        self.node.create_subscription(find(type), topic, keep, profile(qos), raw=True)
+
+    def publish_images(self, topic, count, rate_hz=30.0):
+        """Publish images of 640x480 pixels with their stamps."""
+        message = find("sensor_msgs/msg/Image")(height=480, width=640, encoding="rgb8", step=1920)
+        message.data = bytes(640 * 480 * 3)
+        publisher = self.node.create_publisher(type(message), topic, profile("sensor_data"))
+        begun = time.monotonic()
+        for i in range(count):
+            time.sleep(max(0.0, begun + i / rate_hz - time.monotonic()))
+            message.header.stamp = self.node.get_clock().now().to_msg()
+            publisher.publish(message)
 
     def take(self, topic, count=1, timeout_s=PATIENCE_S):
         """The messages so far, re-serialised by ROS, once there are `count`."""
