@@ -10,7 +10,7 @@ import textwrap
 from pathlib import Path
 
 import numpy as np
-from ibrobot_ros.wire import Wire
+from ibrobot_ros.wire import Frame, Wire
 
 PACKAGE = Path(sys.modules["ibrobot_ros.wire"].__file__ or "").parent
 HELLO = {
@@ -45,7 +45,7 @@ def write(folder: Path, behaviour: str = "") -> Path:
     return path
 
 
-def sends(**answers: list[tuple[dict, bytes]]) -> str:
+def sends(**answers: list[Frame]) -> str:
     """The behaviour that sends frames when the first frame of a kind comes, e.g. `order` or `ping`."""
     return json.dumps({op: [[head, body.hex()] for head, body in frames] for op, frames in answers.items()})
 
@@ -96,7 +96,7 @@ def _control(wire: Wire, state: str, offset: str, count: str) -> None:
     os._exit(0)
 
 
-def frames(folder: Path) -> list[tuple[dict, bytes]]:
+def frames(folder: Path) -> list[Frame]:
     """The frames that it has noted."""
     path = folder / "frames"
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import attrs
 import numpy as np
@@ -13,7 +14,7 @@ from ibrobot_ros2 import decode, encode
 from ibrobot_testing.section import SectionSuite, make_session
 
 from ibrobot_core.api import Bool, Header, Image, JointState, MissingDependency, String
-from ibrobot_core.app import ComponentFailed
+from ibrobot_core.app import ComponentFailed, Session
 
 from . import fake_node
 
@@ -32,8 +33,8 @@ class TestRosNode(SectionSuite):
 @attrs.frozen
 class Part:
     node: RosNode
-    session: object
-    folder: object
+    session: Session
+    folder: Path
 
     def frames(self, op):
         """The frames of a kind so far, but those of the node's own status."""
@@ -85,7 +86,9 @@ def test_topics_get_the_profiles_of_ros(started):
     until(lambda: len(part.frames("message")) == 2)
     (state, body), _ = part.frames("message")
     assert state["topic"] == "/joint_states"
-    assert decode("sensor_msgs/msg/JointState", body).header.stamp_ns == 5
+    decoded = decode("sensor_msgs/msg/JointState", body)
+    assert isinstance(decoded, JointState)
+    assert decoded.header.stamp_ns == 5
 
 
 def test_images_are_sent_only_to_subscribers(started):

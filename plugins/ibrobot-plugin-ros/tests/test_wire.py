@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import struct
+from typing import Any
 
 import pytest
 from ibrobot_ros.wire import Wire
@@ -22,7 +23,7 @@ def test_frames_arrive_in_order(wires):
     here, there = wires
     for i in range(100):
         here.send({"op": "message", "number": i}, bytes([i]) * i)
-    got = []
+    got: list[Any] = []
     while len(got) < 100:
         got += there.wait(1.0)
     assert [head["number"] for head, _ in got] == list(range(100))
@@ -36,7 +37,7 @@ def test_sending_never_waits_for_a_reader(wires):
         here.send({"op": "message"}, picture)
     assert here.backlog > 4_000_000
     assert not here.flush(0.0)
-    got = []
+    got: list[Any] = []
     while len(got) < 8:
         here.wait(0.0)
         got += there.wait(0.01)

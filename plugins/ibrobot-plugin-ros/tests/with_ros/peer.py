@@ -8,6 +8,7 @@ import json
 import sys
 import threading
 import time
+from typing import Any
 
 import rclpy
 from action_msgs.msg import GoalStatus
@@ -161,7 +162,7 @@ class Peer:
         return self._send(action, "control_msgs/action/GripperCommand", goal, after_s, then)
 
     def _send(self, action, type, goal, after_s, then):
-        feedback = []
+        feedback: list[Any] = []
         handle = done(self._client(action, type).send_goal_async(goal, feedback_callback=feedback.append))
         if not handle.accepted:
             return {"accepted": False}
@@ -178,7 +179,7 @@ class Peer:
     def _outcome(self, result, feedback):
         answer = done(result, 60.0)
         names = {getattr(GoalStatus, f"STATUS_{name}"): name for name in ("SUCCEEDED", "CANCELED", "ABORTED")}
-        found = {"accepted": True, "status": names.get(answer.status), "feedback": len(feedback)}
+        found: dict[str, Any] = {"accepted": True, "status": names.get(answer.status), "feedback": len(feedback)}
         for field in answer.result.get_fields_and_field_types():
             value = getattr(answer.result, field)
             if isinstance(value, int | float | str):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from ibrobot_ros2 import encode
@@ -45,7 +47,7 @@ TWIST = Twist(Vector3(1.0, 2.0, 3.0), Vector3(4.0, 5.0, 6.0))
 def made(**types):
     """An example of each type of the vocabulary."""
     layout = MultiArrayLayout((MultiArrayDimension("x", 3, 3),), 1)
-    given = {
+    given: dict[str, Any] = {
         "Bool": {"data": True},
         "Int8": {"data": -7},
         "Int32": {"data": 123456},
@@ -107,7 +109,7 @@ def test_every_type_is_equal_both_ways(start, peer):
             received = queues[name].get(0.2)
         assert encode(received.message).hex() == ours, name
         peer.ask("subscribe", topic=f"/out/{name}", type=example.ros_type, qos=qos)
-        taken = []
+        taken: list[Any] = []
         while not taken:
             run.session.bus.publish(f"/out/{name}", example)
             taken = peer.ask("take", topic=f"/out/{name}", timeout_s=0.1)
