@@ -205,7 +205,8 @@ def minimums(session: nox.Session) -> None:
 @nox.session
 def lerobot(session: nox.Session) -> None:
     """LeRobot itself, unmodified, against what the plugins offer; the one session with torch."""
-    install(session, *PLUGINS, options=("lerobot[dataset,diffusion,evaluation,feetech,smolvla,training]>=0.6.1,<0.7",))
+    lerobot = "lerobot[dataset,diffusion,evaluation,feetech,smolvla,training]>=0.6.1,<0.7"
+    install(session, *PLUGINS, options=(lerobot, "onnxscript"))  # the latter exports policies
     system_libraries(session)
     session.run(*PYTEST, "-m", "lerobot", *marked("lerobot"), *session.posargs)
 

@@ -87,12 +87,19 @@ def _train() -> click.Command:
     return train
 
 
+def _export() -> click.Command:
+    from ibrobot_lerobot.commands import export
+
+    return export
+
+
 INFO = Command("datasets info", "Show what a dataset contains.", _datasets, InfoOptions, (Contents,))
 TRAIN = Command("train", "Train a policy with LeRobot.", _train, TrainOptions, EVENTS, check=check_trainer)
 
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """`ibrobot datasets info` and `ibrobot train`."""
+    """`ibrobot datasets info`, `ibrobot export` and `ibrobot train`."""
     yield Command("datasets", "Show and join LeRobot datasets.", _datasets, commands=(INFO,))
+    yield Command("export", "Convert a checkpoint to run without torch.", _export)
     yield TRAIN

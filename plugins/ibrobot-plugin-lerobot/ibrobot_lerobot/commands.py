@@ -1,4 +1,4 @@
-"""`ibrobot datasets info`: what a dataset contains; `ibrobot datasets merge`: joins datasets."""
+"""`ibrobot datasets info` and `merge`: what a dataset contains, and joining several; `ibrobot export`."""
 
 from __future__ import annotations
 
@@ -66,6 +66,27 @@ def merge(parts: tuple[Path, ...], out: Path) -> None:
 
     episodes = join_datasets(parts, out)
     echo(f"{episodes} episodes of {len(parts)} datasets -> {out}")
+
+
+@click.command()
+@click.argument("checkpoint", metavar="CHECKPOINT", type=click.Path(path_type=Path))
+@click.option("--to", "format_", required=True, type=click.Choice(["onnx"]), help="Format.")
+@click.option("--out", type=click.Path(path_type=Path), help="New folder; by default CHECKPOINT-onnx.")
+@wrong_input()
+def export(checkpoint: Path, format_: str, out: Path | None) -> None:
+    """Convert CHECKPOINT, a folder of LeRobot, to run without torch.
+
+    The new folder has the network as ONNX graphs and a manifest, with the contract and the statistics. A robot runs it
+    with a model of type onnx. ACT, VQ-BeT and Diffusion can be converted.
+    """
+    from ibrobot_lerobot.export import export_onnx
+
+    exported = export_onnx(checkpoint, out or checkpoint.with_name(f"{checkpoint.name}-{format_}"))
+    echo(
+        f"{exported.type}: {exported.bytes / 1e6:.1f} MB in {exported.seconds:.0f} s; outputs differ from torch's by "
+        f"at most {exported.largest_difference:.1e}"
+    )
+    echo(f"exported: {exported.folder}")
 
 
 def _rows(feature: FeatureContents) -> list[tuple[str, ...]]:

@@ -65,6 +65,16 @@ class PolicyModel:
         self._log = log
         log.info("%s on %s, %d threads", checkpoint.type, self._device, threads)
 
+    @property
+    def network(self) -> Any:
+        """LeRobot's policy."""
+        return self._policy
+
+    @property
+    def steps(self) -> Steps:
+        """The preprocessor's steps, on the network's device."""
+        return self._steps
+
     def warm_up(self, tensors: Tensors) -> None:
         """Run the network once and check that it returns an action chunk.
 

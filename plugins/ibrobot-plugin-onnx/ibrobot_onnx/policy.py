@@ -1,0 +1,261 @@
+"""Policy `onnx`: exported graphs on ONNX Runtime, in three pure steps."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.api import Context, Frame, Policy, PolicyError, PolicySpec, Tensors
+from ibrobot_onnx.manifest import NOISE, Manifest, Noise, read_manifest, stacked_shape
+from ibrobot_onnx.options import PROVIDERS, OnnxPolicyOptions
+
+ACTION = "action"
+SEED = "seed"
+"""Seed of a request's noise, shape (2,): the episode's seed and the tick."""
+_SAMPLE, _TIME, _CONDITION = "sample", "time", "condition"
+"""Inputs of the graph of a denoising step; the last one is the output of the graph that encodes observations."""
+
+
+class OnnxPolicy(Policy):
+    """Runs the graphs that `ibrobot export` wrote.
+
+    The graphs normalise observations; the actions are unnormalised here. A policy that draws noise draws it with
+    NumPy, from the seed in the request.
+
+    Args:
+        options: folder, provider and threads.
+        ctx: provides the log and the seed.
+
+    Raises:
+        PolicyError: if the folder has no valid manifest.
+    """
+
+    def __init__(self, options: OnnxPolicyOptions, ctx: Context) -> None:
+        self._options, self._log = options, ctx.log
+        self._manifest = manifest = read_manifest(options.path)
+        self.spec = _spec(manifest, options.n_action_steps)
+        self._expected = {key: (_dtype(key, manifest), stacked_shape(manifest, key)) for key in manifest.observations}
+        """Tensors of a request: dtypes and shapes."""
+        if manifest.noise is not None:
+            self._expected[SEED] = (np.dtype(np.uint64), (2,))
+        self._sessions: list[Any] = []
+        self._seed = ctx.seed
+        self._weights = ""
+
+    @override
+    def check_weights(self) -> None:
+        for name in self._manifest.graphs:
+            path = self._options.path / name
+            if not path.is_file():
+                raise PolicyError(
+                    f"{path}: is missing; copy it from the folder of `ibrobot export` (a robot with distributed "
+                    "inference does not need it)"
+                )
+
+    @override
+    def load(self) -> None:
+        self.check_weights()
+        digest, sessions = hashlib.sha256(), []
+        for name in self._manifest.graphs:
+            graph = (self._options.path / name).read_bytes()
+            digest.update(graph)
+            sessions.append(_session(self._options, self._options.path / name, graph))
+        zeros = {key: np.zeros(shape, dtype) for key, (dtype, shape) in self._expected.items()}
+        self._sessions = sessions
+        try:
+            [chunk] = self._run([zeros])
+        except PolicyError:
+            self._sessions = []
+            raise
+        manifest = self._manifest
+        least = manifest.first + manifest.chunk_size
+        if chunk.ndim != 2 or chunk.shape[0] < least or chunk.shape[1] != manifest.action_size:
+            self._sessions = []
+            raise PolicyError(
+                f"{self._options.path}: the graph returns actions of shape {chunk.shape}; {manifest.path.name} states "
+                f"{manifest.action_size} values in at least {least} actions"
+            )
+        self._weights = digest.hexdigest()[:32]
+        self._log.info("%s on %s", manifest.type, sessions[0].get_providers()[0])
+
+    @override
+    def reset(self, seed: int) -> None:
+        self._seed = seed
+
+    @override
+    def close(self) -> None:
+        self._sessions = []
+
+    @override
+    def fingerprint(self) -> str:
+        return hashlib.sha256(json.dumps(self._manifest.content, sort_keys=True).encode()).hexdigest()[:32]
+
+    @override
+    def weights(self) -> str:
+        return self._weights
+
+    @override
+    def preprocess(self, frame: Frame) -> Tensors:
+        history = self.spec.history
+        frames = [*frame.history[-history:], frame] if history else [frame]
+        # Repeat an episode's first frame to fill the history, as in training.
+        frames = [frames[0]] * (history + 1 - len(frames)) + frames
+        tensors: dict[str, NDArray[Any]] = {}
+        for key in self.spec.observations:
+            values = [self._observation(each, key) for each in frames]
+            tensors[key] = np.stack(values) if history else values[0]
+        if self._manifest.noise is not None:
+            tensors[SEED] = np.array([self._seed % 2**64, frame.stamp_ns % 2**64], np.uint64)
+        return tensors
+
+    @override
+    def infer(self, tensors: Tensors) -> Tensors:
+        return self.infer_batch([tensors])[0]
+
+    @override
+    def infer_batch(self, batch: Sequence[Tensors]) -> list[Tensors]:
+        if not self._sessions:
+            raise PolicyError(f"{self._options.path} is not loaded: call load() first")
+        for tensors in batch:
+            self._check(tensors)
+        return [{ACTION: actions} for actions in self._run(batch)]
+
+    @override
+    def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
+        manifest = self._manifest
+        first = manifest.first
+        chunk = np.asarray(tensors[ACTION], np.float64)[first : first + self.spec.chunk_size]
+        return chunk * manifest.scale + manifest.offset
+
+    def _observation(self, frame: Frame, key: str) -> NDArray[Any]:
+        shape = self.spec.observations[key]
+        if key not in frame.values:
+            raise PolicyError(f"the policy needs {key}, which the frame at {frame.stamp_ns} ns lacks")
+        value = frame.values[key]
+        if value.shape != shape:
+            raise PolicyError(f"the policy needs {key} of shape {shape}, got {value.shape}")
+        dtype = _dtype(key, self._manifest)
+        if dtype == np.uint8 and value.dtype != dtype:
+            raise PolicyError(f"the policy needs {key} with 8-bit pixels, got {value.dtype}")
+        return value.astype(dtype)
+
+    def _check(self, tensors: Tensors) -> None:
+        """Check that a request, which may be from an untrusted client, has the tensors that `preprocess` makes."""
+        wrong = [f"{name} is unknown" for name in tensors if name not in self._expected]
+        for name, (dtype, shape) in self._expected.items():
+            array = tensors.get(name)
+            if array is None:
+                wrong.append(f"{name} is missing, must be {dtype} {shape}")
+            elif (array.dtype, array.shape) != (dtype, shape):
+                wrong.append(f"{name} is {array.dtype} {array.shape}, must be {dtype} {shape}")
+        if wrong:
+            raise PolicyError(f"the request's tensors: {'; '.join(wrong)}")
+
+    def _run(self, batch: Sequence[Tensors]) -> list[NDArray[Any]]:
+        """Outputs of the network, each of shape (N, A), before they are unnormalised."""
+        manifest = self._manifest
+        inputs = {key: np.stack([tensors[key] for tensors in batch]) for key in manifest.observations}
+        noise = manifest.noise
+        if noise is None:
+            return list(_outputs(self._sessions[0], inputs))
+        draws = [np.random.default_rng(np.asarray(tensors[SEED])) for tensors in batch]
+        if not manifest.steps:
+            return list(_outputs(self._sessions[0], {**inputs, NOISE: _drawn(noise, draws)}))
+        encode, denoise = self._sessions
+        condition = _outputs(encode, inputs)
+        x = _drawn(noise, draws)
+        for step in manifest.steps:
+            times = np.full(len(batch), step.time, np.int64)
+            y = _outputs(denoise, {_SAMPLE: x, _TIME: times, _CONDITION: condition})
+            estimate = step.estimate_x * x + step.estimate_y * y
+            if manifest.clip is not None:
+                estimate = estimate.clip(-manifest.clip, manifest.clip)
+            x = (step.next_e * estimate + step.next_x * x + step.next_y * y).astype(np.float32)
+            if step.next_z:
+                x += np.float32(step.next_z) * _drawn(noise, draws)
+        return list(x)
+
+
+def _spec(manifest: Manifest, n_action_steps: int | None) -> PolicySpec:
+    contract = manifest.contract
+    return PolicySpec(
+        observations=manifest.observations,
+        actions=contract.action_joints if contract is not None else None,
+        action_size=manifest.action_size,
+        chunk_size=min(manifest.chunk_size, n_action_steps or manifest.chunk_size),
+        rate_hz=contract.rate_hz if contract is not None else None,
+        history=manifest.history,
+        contract=contract.canonical() if contract is not None else None,
+        norm_mode=manifest.norm_mode,
+    )
+
+
+def _dtype(key: str, manifest: Manifest) -> np.dtype[Any]:
+    return np.dtype(np.uint8 if len(manifest.observations[key]) == 3 else np.float32)
+
+
+def _drawn(noise: Noise, draws: Sequence[np.random.Generator]) -> NDArray[np.float32]:
+    """Noise for each request of a batch."""
+    if noise.distribution == "normal":
+        return np.stack([draw.standard_normal(noise.shape, np.float32) for draw in draws])
+    return np.stack([draw.random(noise.shape, np.float32) for draw in draws])
+
+
+def _session(options: OnnxPolicyOptions, path: Path, graph: bytes) -> Any:
+    """A session of ONNX Runtime for a graph, on the provider of the options and no other.
+
+    Raises:
+        PolicyError: if the provider is not available, or the graph is not valid.
+    """
+    # It would send its use of this machine to its makers.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    import onnxruntime
+
+    wanted = PROVIDERS[options.provider]
+    available = onnxruntime.get_available_providers()
+    if wanted not in available:
+        names = [name for name, theirs in PROVIDERS.items() if theirs in available]
+        raise PolicyError(
+            f"provider {options.provider!r}: the installed ONNX Runtime {onnxruntime.__version__} has only "
+            f"{', '.join(names)}; install a build that has it, e.g. onnxruntime-gpu or onnxruntime-openvino, in place "
+            "of onnxruntime"
+        )
+    settings = onnxruntime.SessionOptions()
+    settings.intra_op_num_threads = options.threads or max(1, _cores() - 1)
+    settings.inter_op_num_threads = 1
+    settings.log_severity_level = 3
+    # Threads that spin between requests would take time from the control loop.
+    settings.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        session = onnxruntime.InferenceSession(graph, settings, providers=[wanted])
+    except Exception as error:  # its exceptions have no common base but Exception
+        raise PolicyError(f"{path}: ONNX Runtime cannot load it: {_first_line(error)}") from error
+    if session.get_providers()[0] != wanted:
+        raise PolicyError(f"provider {options.provider!r}: ONNX Runtime could not start it and would use the CPU")
+    return session
+
+
+def _outputs(session: Any, inputs: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    """The only output of a graph, for a batch."""
+    try:
+        outputs = session.run(None, dict(inputs))
+    except Exception as error:  # as above
+        raise PolicyError(f"ONNX Runtime: {_first_line(error)}") from error
+    if len(outputs) != 1 or not isinstance(outputs[0], np.ndarray):
+        raise PolicyError(f"a graph must have one output, has {len(outputs)}")
+    return outputs[0]
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0] or type(error).__name__
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
