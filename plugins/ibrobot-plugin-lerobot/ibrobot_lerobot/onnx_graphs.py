@@ -38,7 +38,7 @@ class Exportable:
     denoising_steps: Sequence[Sequence[float]] = ()
 
 
-class _Observed(nn.Module):
+class _Observed(nn.Module):  # type: ignore[misc]  # torch is not installed with mypy
     """Base of the graphs that see observations: converts them to the inputs of LeRobot's network.
 
     Args:
@@ -95,7 +95,7 @@ class _DiffusionCondition(_Observed):
         return condition
 
 
-class _DenoisingStep(nn.Module):
+class _DenoisingStep(nn.Module):  # type: ignore[misc]  # as above
     def __init__(self, policy: Any) -> None:
         super().__init__()
         self.unet = policy.diffusion.unet
@@ -164,7 +164,7 @@ def _drawing_with(noise: torch.Tensor) -> Iterator[None]:
         return below.sum(-1, keepdim=True).clamp_max(probabilities.shape[-1] - 1)
 
     own = torch.multinomial
-    torch.multinomial = select  # type: ignore[assignment]
+    torch.multinomial = select
     try:
         yield
     finally:

@@ -196,7 +196,7 @@ def test_denoising_is_the_linear_steps_of_the_manifest(tmp_path: Path) -> None:
     random = np.random.default_rng(np.array([7, seen.stamp_ns], np.uint64))
     x = random.standard_normal((HORIZON, SIZE), np.float32)
     for _, estimate_x, estimate_y, next_e, next_x, next_y, next_z in DENOISING["denoising_steps"]:
-        y = x * np.float32(0.1) + seen.values[STATE]
+        y = x * np.float32(0.1) + np.asarray(seen.values[STATE], np.float32)
         estimate = np.clip(estimate_x * x + estimate_y * y, -1, 1)
         x = next_e * estimate + next_x * x + next_y * y
         if next_z:
