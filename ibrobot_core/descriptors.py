@@ -38,6 +38,8 @@ class Descriptor[T]:
     """The value of `type` in the YAML."""
     make: Callable[[Any, interfaces.Context], T]
     summary: str
+    label: str = attrs.field(default="", kw_only=True)
+    """What it does, in the words of an operator who chooses it, e.g. `follow the leader arm`; empty: its summary."""
     options: builtins.type[Any] = NoOptions
     """A frozen attrs class made with `ibrobot_core.options.option`."""
     check: Callable[[], None] = attrs.field(default=lambda: None, kw_only=True)
@@ -116,6 +118,8 @@ class TeleopDescriptor(Descriptor["interfaces.Teleop"]):
     keys: Callable[[Any, Robot], Mapping[str, str]] = attrs.field(default=lambda options, robot: {}, kw_only=True)
     """Maps the keys that the device reads from the terminal to what they do, e.g. `space` to `deadman`, by its options
     and the robot that it moves. Devices of one mode share a key only if it does the same for all of them."""
+    needs_terminal: Callable[[Any], bool] = attrs.field(default=lambda options: False, kw_only=True)
+    """Whether the device works only in runs with a terminal, by its options."""
 
 
 @attrs.frozen

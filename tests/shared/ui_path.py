@@ -97,13 +97,10 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
     with page.context.expect_page(timeout=_WAIT_MS) as opened:
         link.click()
     run = opened.value
-    until(run, "window.ibrobot?.jogs && ibrobot.status.episode")
-    run.get_by_role("tab", name="Episodes").click()
+    until(run, "window.ibrobot?.jogs.length && ibrobot.status.episode")
     # Joints that meet nothing, however long a busy machine takes to release the button.
-    for number, (joint, index, verdict) in enumerate(
-        [("shoulder_pan", 0, "End: success"), ("wrist_roll", 4, "End: failure")]
-    ):
-        run.get_by_role("button", name="Begin an episode").click()
+    for number, (joint, index, verdict) in enumerate([("shoulder_pan", 0, "Success"), ("wrist_roll", 4, "Failure")]):
+        run.get_by_role("button", name="Begin").click()
         until(run, "ibrobot.status.episode.recording")
         before = run.evaluate("ibrobot.state.position")
         moved = f"Math.abs(ibrobot.state.position[{index}] - {before[index]}) > 0.3"

@@ -120,6 +120,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     yield TeleopDescriptor(
         type="so101_leader", options=LeaderOptions, make=_leader, summary="SO-101 leader arm, moved by hand",
         check_options=check_leader, devices=serial_port, calibration=calibration_of, keys=leader_keys,
+        label="follow the leader arm", needs_terminal=lambda options: options.deadman != "none",
     )  # fmt: skip
 
 

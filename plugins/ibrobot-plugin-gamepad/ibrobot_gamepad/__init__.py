@@ -42,6 +42,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         make=_jog,
         check_options=_check,
         events=_events,
+        label="drive with a gamepad",
         summary="joint and tool jog with an Xbox, PlayStation, Switch, 8BitDo or other pad",
     )
     yield TeleopDescriptor(
@@ -50,6 +51,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         make=_jog,
         check_options=_check,
         events=_events,
+        label="drive with a SpaceMouse",
         summary="joint and tool jog with a SpaceMouse",
     )
 

@@ -28,6 +28,8 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         check_options=check_imu,
         devices=serial_port,
         keys=imu_keys,
+        needs_terminal=lambda options: options.deadman == "key",
+        label="drive by tilting a sensor",
         summary="moves the tool by the tilt of an orientation sensor (BNO08x, WitMotion)",
     )
 

@@ -39,5 +39,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         make=_keyboard,
         check_options=_check,
         keys=_keys,
+        needs_terminal=lambda options: True,
         summary="joint and Cartesian jog from the terminal",
+        label="drive by keys of the terminal",
     )

@@ -65,7 +65,9 @@ def _source(session: RunAccess, mode: ControlMode) -> SourceWorker:
 @hookimpl
 def ibrobot_sources() -> Iterable[SourceDescriptor]:
     """The command source of modes with `planner:`."""
-    yield SourceDescriptor(type="planner", make=_source, summary="moves to goals that a planner of any plugin plans")
+    yield SourceDescriptor(
+        type="planner", make=_source, label="plan motions", summary="moves to goals that a planner of any plugin plans"
+    )
 
 
 def _trajectory(options: Any, ctx: Context) -> Executor:

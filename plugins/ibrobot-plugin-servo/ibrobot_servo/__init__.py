@@ -55,6 +55,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         options=TwistOptions,
         make=_twist,
         check_options=_check_twist,
+        label="follow twists on a topic",
         summary="moves the tool along a topic of twists, as MoveIt Servo does",
     )
 

@@ -170,7 +170,8 @@ def _jog(session: RunView, sent: Sent[Jog]) -> None:
     if now_ms - jog.at > _LATE_MS:
         raise IbrobotError(f"the connection is too slow to jog: {(now_ms - jog.at) / 1e3:.1f} s")
     made_ns, began_ns = _run_times(session, jog.at, jog.press)
-    session.bus.call(JOG, JogRequest(made_ns, began_ns, jog.joints, jog.targets, jog.linear, jog.turn, jog.pose))
+    motion = (jog.joints, jog.targets, jog.linear, jog.turn, jog.pose, jog.device)
+    session.bus.call(JOG, JogRequest(made_ns, began_ns, *motion))
 
 
 def _release(session: RunView, sent: Sent[Release]) -> None:

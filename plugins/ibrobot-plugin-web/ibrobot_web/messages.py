@@ -72,6 +72,7 @@ class Jog:
         (0.0, 0.0, 0.0), validator=within_one, help="fraction of the tool's speed of turning about its own axes"
     )
     pose: str = option("", help="named pose that all joints approach")
+    device: str = option("", help="the device that moves; empty: the only one of the mode")
 
 
 @attrs.frozen

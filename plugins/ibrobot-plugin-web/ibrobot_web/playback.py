@@ -169,10 +169,10 @@ class Playback:
         try:
             found = json.loads(self.summary.metadata["config"])["robot"]["description"]
             texts = {kind: found[kind] for kind in ("mjcf", "urdf") if isinstance(found.get(kind), str)}
-            tip = str(found.get("tip", ""))
+            tip, arms = str(found.get("tip", "")), dict(found.get("arms") or {})
         except (KeyError, TypeError, ValueError, AttributeError):
             raise IbrobotError("the episode does not contain the robot's model") from None
-        return {"tip": tip, **{kind: str(_file(text, find)) for kind, text in texts.items()}}
+        return {"tip": tip, "arms": arms, **{kind: str(_file(text, find)) for kind, text in texts.items()}}
 
     def objects(self, find: Callable[[str], Path]) -> list[dict[str, Any]]:
         """The objects of a simulated scene, as pages draw them, with `times` [s] and `poses` of those that move.

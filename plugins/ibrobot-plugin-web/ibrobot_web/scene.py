@@ -46,19 +46,20 @@ def make_scene(description: Mapping[str, Any]) -> dict[str, Any]:
     """The shapes of a robot, as JSON.
 
     Args:
-        description: `mjcf`, `urdf` and `xml` (paths, or the text of a scene), `tip`, and `mounts` of sensors.
+        description: `mjcf`, `urdf` and `xml` (paths, or the text of a scene), `tip`, the `arms` of which the model is
+            one, and `mounts` of sensors.
 
     Returns:
-        `bodies` (parents first), `meshes` (base64 of float32 vertices and uint32 faces), `tip`, `cameras`, and
-        `problem`: why there are no shapes.
+        `bodies` (parents first), `meshes` (base64 of float32 vertices and uint32 faces), `tips` by the prefix of their
+        arm, `cameras`, and `problem`: why there are no shapes.
     """
     try:
         model = _compiled(description)
     except ValueError as error:
-        return {"bodies": [], "meshes": [], "tip": None, "problem": " ".join(str(error).split())}
+        return {"bodies": [], "meshes": [], "tips": {}, "problem": " ".join(str(error).split())}
     if model is None:
         problem = "the robot has no model: set robot.description.mjcf or robot.description.urdf"
-        return {"bodies": [], "meshes": [], "tip": None, "problem": problem}
+        return {"bodies": [], "meshes": [], "tips": {}, "problem": problem}
     known = [i for i in range(model.ngeom) if int(model.geom_type[i]) in _SHAPES]
     shown = [i for i in known if model.geom_group[i] < _SHOWN_GROUPS] or known
     meshes = sorted({int(model.geom_dataid[i]) for i in shown if model.geom_type[i] == _MESH})
@@ -67,7 +68,7 @@ def make_scene(description: Mapping[str, Any]) -> dict[str, Any]:
         "bodies": [_body(model, body, [i for i in shown if model.geom_bodyid[i] == body], meshes)
                    for body in range(model.nbody)],
         "meshes": [_mesh(model, mesh, grid) for mesh in meshes],
-        "tip": _tip(model, str(description["tip"])),
+        "tips": {prefix: _tip(model, f"{prefix}{description['tip']}") for prefix in description.get("arms") or ("",)},
         "cameras": [
             {"body": int(model.cam_bodyid[i]), "pos": model.cam_pos[i].tolist(), "quat": model.cam_quat[i].tolist(),
              "fovy": float(model.cam_fovy[i])}
@@ -125,7 +126,16 @@ def _compiled(description: Mapping[str, Any]) -> Any:
     if description.get("xml"):
         return mujoco.MjModel.from_xml_string(description["xml"])
     path = description.get("mjcf") or description.get("urdf")
-    return mujoco.MjSpec.from_file(str(Path(path))).compile() if path else None
+    if not path:
+        return None
+    arms = description.get("arms") or {}
+    if not arms:
+        return mujoco.MjSpec.from_file(str(Path(path))).compile()
+    spec = mujoco.MjSpec()
+    for prefix, (x, y, z, yaw) in arms.items():
+        frame = spec.worldbody.add_frame(pos=[x, y, z], quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+        spec.attach(mujoco.MjSpec.from_file(str(Path(path))), prefix=prefix, frame=frame)
+    return spec.compile()
 
 
 def _body(model: Any, body: int, geoms: list[int], meshes: list[int]) -> dict[str, Any]:

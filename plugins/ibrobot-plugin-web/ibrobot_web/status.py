@@ -14,7 +14,9 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S, JointState, Message, Vector
-from ibrobot_core.app import ControlMode, ControlState, RunView, error_text
+from ibrobot_core.app import ControlState, RunView, error_text
+from ibrobot_web.modes import modes_json, page_devices
+from ibrobot_web.teleop import JOG
 
 _TOKEN = re.compile(r"(?<=[?&]token=)[\w-]+")
 _LOG_LINES = 100
@@ -29,7 +31,6 @@ SERVICES = {
     "goal": "/planning/go_to",
     "smoothing": "/action_dispatcher/toggle_smoothing",
     "record": "/record_episode/start",
-    "jog": "/web_teleop/jog",
     "intervene": "/intervene",
     "preview": "/plan_kinematic_path",
 }
@@ -83,25 +84,8 @@ def robot_json(session: RunView) -> dict[str, Any]:
         "groups": {name: list(joints) for name, joints in robot.groups.items()},
         "poses": {name: list(pose) for name, pose in robot.description.poses.items()},
         "tool": robot.description.mjcf is not None,
-        "modes": [
-            {"name": name, "about": _about(session, mode), "planner": bool(mode.planner),
-             "policy": mode.inference is not None, "web": "web" in _devices(session, mode).values()}
-            for name, mode in config.control_modes.items()
-        ],
+        "modes": modes_json(config, session.registry, terminal=session.request.keys is not None),
     }  # fmt: skip
-
-
-def _devices(session: RunView, mode: ControlMode) -> dict[str, str]:
-    """The teleoperation devices of a mode: name -> type."""
-    return {name: session.config.teleoperation[name].type for name in mode.devices.values()}
-
-
-def _about(session: RunView, mode: ControlMode) -> str:
-    if mode.inference is not None:
-        return f"policy {mode.inference.model}"
-    if devices := _devices(session, mode):
-        return "teleoperation by " + " and ".join(f"{name} ({kind})" for name, kind in devices.items())
-    return f"planner {mode.planner.type}" if mode.planner is not None else "no source of commands"
 
 
 def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
@@ -111,7 +95,7 @@ def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
     held = session.held and not session.faults
     return {
         "robot": robot_json(session),
-        "mode": session.mode, "unavailable": dict(session.config.unavailable),
+        "mode": session.mode, "jogs": _jogs(session),
         "held": session.to_go_on() if held else "",
         "faults": [{"text": fault, "remedy": "Remove the cause, then reset."} for fault in session.faults],
         "all_faults": len(session.outcome.faults), "failure": session.failure_text,
@@ -129,6 +113,14 @@ def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
         "episodes": session.outcome.episodes, "successes": session.outcome.successes,
         "pages": pages, "log": log.lines(), "commander": session.commander, "panels": _panels(session),
     }  # fmt: skip
+
+
+def _jogs(session: RunView) -> list[str]:
+    """The devices with which the page can jog now."""
+    mode = session.config.control_modes.get(session.mode)
+    if mode is None or not session.bus.serves(JOG):
+        return []
+    return list(page_devices(session.config, mode).values())
 
 
 def _panels(session: RunView) -> list[dict[str, Any]]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from functools import partial
 from types import NoneType
 from typing import override
+from weakref import WeakKeyDictionary
 
 import attrs
 import numpy as np
@@ -23,7 +25,7 @@ from ibrobot_core.api import (
     option,
     seconds,
 )
-from ibrobot_core.app import Service
+from ibrobot_core.app import Bus, Service
 from ibrobot_web.messages import within_one
 from ibrobot_web.options import WebTeleopOptions
 
@@ -48,7 +50,8 @@ class Jog:
     turn: tuple[float, float, float] = option(
         (0.0, 0.0, 0.0), validator=within_one, help="angular velocity about the tool's own axes, each -1 to 1"
     )
-    pose: str = option("", help="named pose that all joints approach")
+    pose: str = option("", help="named pose that all joints of the device approach")
+    device: str = option("", help="the device that moves; empty: the only one of the mode")
 
 
 @documented
@@ -61,6 +64,24 @@ class Released:
 
 JOG = Service("/web_teleop/jog", Jog, NoneType, "Move the robot until the next call, or for the timeout.")
 RELEASE = Service("/web_teleop/release", Released, NoneType, "Release the deadman.", urgent=True)
+_devices: WeakKeyDictionary[Bus, dict[str, WebTeleop]] = WeakKeyDictionary()
+"""The open devices of each run, by name: a mode may have one for each arm, which share the services."""
+_opening = threading.Lock()
+
+
+def _take(devices: dict[str, WebTeleop], request: Jog | Released) -> None:
+    """Pass a request on: a jog to its device, a release to all."""
+    with _opening:
+        opened = dict(devices)
+    if isinstance(request, Released):
+        for device in opened.values():
+            device.take(request)
+        return
+    name = request.device or (next(iter(opened), "") if len(opened) == 1 else "")
+    if name not in opened:
+        known = ", ".join(opened)
+        raise TeleopError(f"device {request.device!r} does not jog in this mode; those that do are: {known}")
+    opened[name].take(request)
 
 
 class WebTeleop(Teleop):
@@ -93,8 +114,12 @@ class WebTeleop(Teleop):
             return
         if self._tool:
             self._arm.load_model("robot.description.mjcf")
-        self._ctx.bus.serve(JOG, self.take)
-        self._ctx.bus.serve(RELEASE, self.take)
+        with _opening:
+            devices = _devices.setdefault(self._ctx.bus, {})
+            if not devices:
+                for service in (JOG, RELEASE):
+                    self._ctx.bus.serve(service, partial(_take, devices))
+            devices[self._ctx.name] = self
         self._connected = True
 
     def take(self, request: Jog | Released) -> None:
@@ -157,8 +182,12 @@ class WebTeleop(Teleop):
     @override
     def disconnect(self) -> None:
         if self._connected and self._ctx.bus is not None:
-            self._ctx.bus.unserve(JOG)
-            self._ctx.bus.unserve(RELEASE)
+            with _opening:
+                devices = _devices[self._ctx.bus]
+                del devices[self._ctx.name]
+                if not devices:
+                    for service in (JOG, RELEASE):
+                        self._ctx.bus.unserve(service)
         self._connected = False
         self._request = self._moved_ns = self._setpoint = None
 

@@ -153,6 +153,7 @@ class WebViewer(Viewer):
             "key": str(options.key) if options.key is not None else None,
             "description": {
                 "tip": robot.description.tip,
+                "arms": {prefix: list(place) for prefix, place in robot.description.arms.items()},
                 "mounts": mounts(session.config.peripherals),
                 **{name: str(path) if path is not None else None for name, path in paths.items()},
             },

@@ -24,11 +24,13 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[3] / "tests/shared"))
 
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
-SIZES = {"phone": (390, 844), "zoom": (720, 450), "tablet": (820, 1180), "desktop": (1440, 900)}
-"""Width and height [px]; 1440x900 at 200 % has the layout of half its size. The last one stays set."""
+SIZES = {
+    "phone": (390, 844), "zoom": (640, 400), "tablet": (820, 1180), "wide": (1920, 1080), "desktop": (1280, 800),
+}  # fmt: skip
+"""Width and height [px]; 1280x800 at 200 % has the layout of half its size. The last one stays set."""
 CHECKED = ("phone", "desktop")
 """Sizes at which axe checks: the layouts differ in these."""
-TABS = ("Drive", "Episodes", "Plots", "Health", "Log")
+PANELS = ("Plots", "Health", "Log")
 _SETTLE_MS = 400
 WRONG = """robot:
   name: wrong
@@ -209,17 +211,18 @@ def look_at_run(chromium: Any, look: Look) -> None:
 
     with page_run("so101", "--sim", "--mode", "web") as address:
         page = ready(chromium, address)
-        for tab in TABS:
-            page.get_by_role("tab", name=tab).click()
+        look(page, "run-drive")
+        for panel in PANELS:
+            page.get_by_role("button", name=panel, exact=True).click()
             page.wait_for_timeout(2500)
-            look(page, f"run-{tab.lower()}")
-        page.set_viewport_size({"width": 390, "height": 844})
-        page.get_by_role("tab", name="Drive").click()
-        page.get_by_role("button", name="Cameras").click()
-        look(page, "run-cameras")
-        page.set_viewport_size({"width": 390, "height": 844})
-        page.get_by_role("button", name="3D").click()
-        page.set_viewport_size({"width": 1440, "height": 900})
+            look(page, f"run-{panel.lower()}")
+        page.get_by_role("button", name="Log", exact=True).click()
+        page.keyboard.press("2")
+        look(page, "run-camera")
+        page.keyboard.press("1")
+        page.locator("#mode summary").click()
+        look(page, "run-modes")
+        page.locator("#mode summary").click()
         page.get_by_role("button", name="End the run").click()
         look(page, "run-dialog-end")
         page.get_by_role("button", name="Keep it running").click()
@@ -230,7 +233,8 @@ def look_at_run(chromium: Any, look: Look) -> None:
         watcher = ready(chromium, link)
         look(watcher, "run-watch-link")
         watcher.close()
-        page.get_by_role("button", name="moveit_planning").click()
+        page.locator("#mode summary").click()
+        page.get_by_role("button", name="plan motions").click()
         page.locator("#goal").wait_for()
         page.get_by_role("button", name="rest", exact=True).click()
         page.get_by_text("The path takes").wait_for()
@@ -306,7 +310,7 @@ def look_at_training(chromium: Any, look: Look) -> None:
                     break
                 run_page.wait_for_timeout(100)
             print("runs", run_page.evaluate("[ibrobot.status.mode, ibrobot.status.counts.dispatch]"), flush=True)
-            run_page.get_by_role("tab", name="Plots").click()
+            run_page.get_by_role("button", name="Plots", exact=True).click()
             run_page.wait_for_timeout(3000)
             run_page.locator("#plot-topic").select_option("counters of dispatch")
             look(run_page, "run-trained")

@@ -23,7 +23,7 @@ def test_the_page_shows_and_drives_it(tmp_path: Path) -> None:
     async def test(address: str) -> None:
         async with client(address) as page:
             await page.call("operate", take_over=True)
-            await page.until(lambda: page.states and "jog" in page.status.get("services", ()))
+            await page.until(lambda: page.states and page.status.get("jogs"))
             robot = page.status["robot"]
             assert [joint["name"] for joint in robot["joints"]] == list(JOINTS)
             assert set(robot["poses"]) == {"home", "bent"}

@@ -69,7 +69,7 @@ class Scene:
             "ibrobot.state.estop || ibrobot.status.faults.length ? ibrobot.drive.command('reset') : 0"
         )
         await self.page.evaluate("ibrobot.drive.command('mode', {mode: 'web'})")
-        await self.until("ibrobot.jogs")
+        await self.until("ibrobot.jogs.length > 0")
         await self.page.get_by_role("button", name="home", exact=True).scroll_into_view_if_needed()
 
     async def hold(self) -> None:

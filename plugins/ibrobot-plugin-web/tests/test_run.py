@@ -49,7 +49,7 @@ def moved_until_ns(page: PageClient) -> int:
 
 
 async def ready(page: PageClient) -> None:
-    await page.until(lambda: page.states and "jog" in page.status.get("services", ()))
+    await page.until(lambda: page.states and page.status.get("jogs"))
     if page.status["faults"]:
         await page.call("reset")
 

@@ -36,7 +36,7 @@ def test_bodies_joints_and_shapes_of_any_robot(tmp_path: Path) -> None:
     shapes = [geom for body in scene["bodies"] for geom in body["geoms"]]
     assert [geom["type"] for geom in shapes] == ["plane"] + ["capsule"] * 7
     assert scene["cameras"] == [{"body": 7, "pos": [0.0, 0.0, 0.05], "quat": [1.0, 0.0, 0.0, 0.0], "fovy": 50.0}]
-    assert scene["tip"] == {"body": 7, "pos": [0.0, 0.0, 0.1], "quat": [1.0, 0.0, 0.0, 0.0]}
+    assert scene["tips"][""] == {"body": 7, "pos": [0.0, 0.0, 0.1], "quat": [1.0, 0.0, 0.0, 0.0]}
 
 
 def test_meshes_are_few_triangles(tmp_path: Path) -> None:

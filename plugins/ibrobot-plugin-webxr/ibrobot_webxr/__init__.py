@@ -36,6 +36,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         check_options=_check,
         events=_events,
         peripherals=lambda options: [(("cameras", i), name) for i, name in enumerate(options.cameras)],
+        label="drive with a phone or VR controller",
         summary="moves the tool with a phone, a VR controller or a hand, through a web page",
     )
 

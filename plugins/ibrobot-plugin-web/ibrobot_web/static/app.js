@@ -1,20 +1,23 @@
-// The page of a run: header, faults, 3D, cameras, joints, and panels in tabs.
+// The page of a run: header, faults, pictures, recording, driving, and panels that fold away.
 
 import { h, refresh, say, toast } from "./dom.js";
 import { Deadman } from "./hold.js";
 import { Drive, StopLine, Stream } from "./link.js";
 import { View3D, isDark } from "./view3d.js";
-import { Cameras } from "./cameras.js";
+import { Dock } from "./dock.js";
 import { Joints } from "./joints.js";
+import { Modes } from "./modes.js";
+import { Motion } from "./motion.js";
+import { Pictures } from "./pictures.js";
+import { Record } from "./record.js";
 import { Thumb } from "./thumb.js";
-import { DrivePanel } from "./panels/drive.js";
-import { EpisodesPanel } from "./panels/episodes.js";
 import { PlotsPanel } from "./panels/plots.js";
 import { HealthPanel } from "./panels/health.js";
 import { LogPanel } from "./panels/log.js";
 
 const STALE_MS = 1500;
 const CONFIRMED_MS = 300;
+const LATE_MS = 5000;
 const $ = (id) => document.getElementById(id);
 
 // What all parts of the page share.
@@ -23,8 +26,15 @@ const page = {
   arrived: 0, unconfirmed: "",
   get operating() { return this.drive.facts.operating; },
   get mode() { return this.status?.robot.modes.find((mode) => mode.name === this.status.mode); },
-  // Whether the operator can jog from this page now.
-  get jogs() { return this.operating && this.status?.services.includes("jog") && !this.status.faults.length; },
+  // The devices with which the operator can jog from this page now; and the one that moves the tool.
+  get jogs() { return this.operating && !this.status?.faults.length ? this.status?.jogs ?? [] : []; },
+  get device() { return this.jogs.includes(this.chosen) ? this.chosen : this.jogs[0]; },
+  // The name of the joints that a device moves.
+  groupOf(device) {
+    const own = this.mode.jogs[device];
+    return Object.entries(this.status.robot.groups).find(([, joints]) => String(joints) === String(own))?.[0] ?? device;
+  },
+  setDevice(device) { this.chosen = device; update(); },
   // Carries out a command, and shows its error.
   async command(name, facts = {}, done = "") {
     try {
@@ -37,6 +47,15 @@ const page = {
     }
   },
 };
+// Asks in a dialog; resolves with whether it was confirmed.
+page.confirm = (title, text, yes, danger = true, no = "Cancel") => {
+  const dialog = $("dialog");
+  dialog.replaceChildren(h("h2", { id: "dialog-title" }, title), h("p", {}, text), h("form", { method: "dialog", class: "row" },
+    h("button", { class: danger ? "danger" : "primary", value: "yes" }, yes), h("button", { value: "no", autofocus: true }, no)));
+  dialog.returnValue = "no";
+  dialog.showModal();
+  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
+};
 page.deadman = new Deadman(page.drive);
 window.ibrobot = page; // for tests and for the console
 
@@ -44,15 +63,17 @@ let toolMotion = [0, 0, 0];
 const view = new View3D($("view"), {
   onTool({ press, held, linear }) {
     toolMotion = linear;
-    if (press) page.deadman.hold(() => ({ linear: toolMotion }), press);
+    const { device } = page;
+    if (press) page.deadman.hold(() => ({ device, linear: toolMotion }), press);
     if (!held) page.deadman.release();
   },
-  onGoal: (point) => panels[0].setGoal?.(`xyz=${point.map((value) => value.toFixed(3)).join(",")}`),
+  onGoal: (point) => motion.setGoal?.(`xyz=${point.map((value) => value.toFixed(3)).join(",")}`),
 });
 page.view = view;
-page.cameras = new Cameras($("cameras"), page);
-const parts = [page.cameras, new Joints($("joints"), page), new Thumb($("thumb"), page)];
-const panels = [DrivePanel, EpisodesPanel, PlotsPanel, HealthPanel, LogPanel].map((Panel) => new Panel(page));
+const pictures = new Pictures($("pictures"), page), record = new Record($("record"), page), motion = new Motion($("motion"), page);
+const dock = new Dock($("dock"), page, [PlotsPanel, HealthPanel, LogPanel].map((Panel) => new Panel(page)));
+const joints = new Joints($("joints"), page);
+const parts = [pictures, record, new Modes($("mode"), page), motion, joints, new Thumb($("thumb"), page), dock];
 
 // Stops the robot. The button says so at once, and an alarm names other ways while the run has not confirmed it.
 let stopping = 0;
@@ -102,52 +123,27 @@ $("theme").addEventListener("click", () => {
   document.documentElement.dataset.theme = theme;
   localStorage.setItem("theme", theme);
 });
-for (const which of ["3d", "cameras"]) {
-  $(`show-${which}`).addEventListener("click", () => {
-    document.body.dataset.shown = which;
-    for (const each of ["3d", "cameras"]) $(`show-${each}`).setAttribute("aria-pressed", String(each === which));
-  });
-}
-document.body.dataset.shown = "3d";
+// Keys of recording and of pictures, unless something is typed or asked.
+window.addEventListener("keydown", (event) => {
+  if (event.repeat || event.ctrlKey || event.altKey || event.metaKey || event.defaultPrevented) return;
+  if (event.target.closest?.("input:not([type=range]):not([type=checkbox]), select, textarea, dialog")) return;
+  if (record.press(event.key.toLowerCase()) || pictures.press(event.key)) event.preventDefault();
+});
 
-function showTabs() {
-  const list = document.querySelector("[role=tablist]");
-  const content = document.querySelector(".panels");
-  const tabs = panels.map((panel, i) => {
-    panel.element = h("div", { role: "tabpanel", id: `panel-${panel.id}`, "aria-labelledby": `tab-${panel.id}`, tabindex: "0" });
-    panel.mount(panel.element);
-    content.append(panel.element);
-    return h("button", {
-      role: "tab", id: `tab-${panel.id}`, "aria-controls": `panel-${panel.id}`, onclick: () => choose(i),
-    }, panel.title);
-  });
-  const choose = (chosen) => tabs.forEach((tab, i) => {
-    tab.setAttribute("aria-selected", String(i === chosen));
-    tab.tabIndex = i === chosen ? 0 : -1;
-    panels[i].element.hidden = i !== chosen;
-    panels[i].show?.(i === chosen);
-  });
-  list.append(...tabs);
-  list.addEventListener("keydown", (event) => {
-    const by = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-    if (!by) return;
-    const next = (tabs.indexOf(document.activeElement) + by + tabs.length) % tabs.length;
-    choose(next);
-    tabs[next].focus();
-  });
-  choose(0);
-}
-showTabs();
-
+let missed = 0, missedAt = -Infinity; // the loop's late ticks, and when the last one came
 function showHeader() {
   const { status } = page;
   if (!status) return;
   say($("robot"), status.robot.name);
   document.title = `${status.robot.name}: ${status.mode}`;
-  say($("mode"), `${status.mode}${status.robot.simulated ? " · simulation" : ""}`);
+  say($("body"), status.robot.simulated ? "simulation" : "real robot");
   const loop = status.counts.loop ?? {};
-  say($("late"), loop.ticks ? `${Math.round(loop.rate_hz)} Hz · late p99 ${Math.round(loop.lateness_p99_us)} µs · missed ${loop.missed}` : "");
-  $("late").classList.toggle("bad", (loop.missed ?? 0) > 0);
+  if ((loop.missed ?? 0) > missed) missedAt = performance.now();
+  missed = loop.missed ?? 0;
+  const late = performance.now() - missedAt < LATE_MS;
+  say($("late"), loop.ticks ? `${Math.round(loop.rate_hz)} Hz, ${late ? "late" : "on time"}` : "");
+  $("late").title = loop.ticks ? `Lateness of the control loop: 99 % below ${Math.round(loop.lateness_p99_us)} µs; ${loop.missed} of ${loop.ticks} ticks missed` : "";
+  $("late").classList.toggle("bad", late);
 }
 
 function showOperator() {
@@ -204,7 +200,7 @@ page.stream.addEventListener("state", ({ detail: state }) => {
   page.drive.stops = state.stops;
   page.arrived = performance.now();
   view.tell({ do: "state", state });
-  for (const part of [...parts, ...panels]) part.state?.(state);
+  joints.state(state);
   if (before?.estop !== state.estop) showFaults();
 });
 page.stream.addEventListener("status", ({ detail: status }) => {
@@ -219,7 +215,7 @@ page.stream.addEventListener("status", ({ detail: status }) => {
 page.stream.addEventListener("plan", ({ detail: plan }) => {
   if (page.state) view.tell({ do: "plan", plan, positions: page.state.position });
 });
-page.stream.addEventListener("samples", ({ detail }) => panels.forEach((panel) => panel.samples?.(detail)));
+page.stream.addEventListener("samples", ({ detail }) => dock.samples(detail));
 page.stream.addEventListener("connection", ({ detail }) => {
   page.connected = detail.open;
   showConnection();
@@ -235,9 +231,10 @@ function update() {
   showFaults();
   const tool = page.operating && page.status?.robot.tool;
   view.tell({
-    do: "handle", jog: Boolean(tool && page.jogs), goal: Boolean(tool && page.status.services.includes("goal")),
+    do: "handle", jog: Boolean(tool && page.device), goal: Boolean(tool && page.status.services.includes("goal")),
+    moved: page.mode?.jogs[page.device] ?? [],
   });
-  for (const part of [...parts, ...panels]) if (page.status) part.update?.(page.status);
+  for (const part of parts) if (page.status) part.update(page.status);
 }
 
 setInterval(showConnection, 500);

@@ -1,21 +1,27 @@
-// Camera pictures, each drawn when it arrives. Hidden cameras are not sent.
+// Camera pictures, each drawn when it arrives. Cameras that are not shown are not sent.
 
 import { h, refresh } from "./dom.js";
 
 export class Cameras {
-  constructor(section, page) {
+  // `changed` is called when there are other cameras.
+  constructor(section, page, changed) {
     this.section = section;
     this.page = page;
+    this.changed = changed;
     this.views = new Map();
     this.frames = {};
     page.stream.addEventListener("picture", ({ detail }) => this.draw(detail));
   }
 
   update({ cameras, sensors }) {
-    refresh(this.section, cameras, () => {
+    const key = JSON.stringify(cameras);
+    if (this.key !== key) {
+      this.key = key;
+      for (const { element } of this.views.values()) element.remove();
       this.views.clear();
-      return cameras.length ? cameras.map((camera) => this.add(camera)) : [h("p", { class: "note" }, "No cameras.")];
-    });
+      this.section.append(...cameras.map((camera) => this.add(camera)));
+      this.changed();
+    }
     for (const camera of cameras) {
       const sensor = sensors[nameOf(camera.topic)];
       const view = this.views.get(camera.channel);
@@ -24,11 +30,13 @@ export class Cameras {
   }
 
   add({ channel, topic }) {
-    const canvas = h("canvas", { width: "4", height: "3", role: "img", "aria-label": `Camera ${nameOf(topic)}` });
-    const caption = h("figcaption", {}, nameOf(topic));
-    this.views.set(channel, { canvas, caption, context: canvas.getContext("2d"), name: nameOf(topic), rate: "" });
+    const name = nameOf(topic);
+    const canvas = h("canvas", { width: "4", height: "3", role: "img", "aria-label": `Camera ${name}` });
+    const caption = h("figcaption", {}, `${name}: waiting for its first picture …`);
+    const element = h("figure", { class: "picture", "data-name": name }, canvas, caption);
+    this.views.set(channel, { canvas, caption, element, context: canvas.getContext("2d"), name, rate: "" });
     this.page.stream.show(channel, true);
-    return h("figure", {}, canvas, caption);
+    return element;
   }
 
   draw({ channel, bitmap, stamp }) {

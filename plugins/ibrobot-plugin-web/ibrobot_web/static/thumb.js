@@ -11,15 +11,17 @@ export class Thumb {
   }
 
   update({ robot }) {
-    refresh(this.bar, [robot.joints, robot.tool], () => {
+    const { page } = this;
+    const device = page.device;
+    refresh(this.bar, [device, page.mode?.jogs, robot.tool], () => {
       const group = (label, names) => h("optgroup", { label }, names.map((name) => h("option", {}, name)));
       const choice = h("select", { "aria-label": "Motion" }, robot.tool ? group("Tool", Object.keys(TOOL)) : null,
-        group("Joints", robot.joints.map((joint) => joint.name)));
-      const button = (label, speed) => this.page.deadman.button(h("button", { "aria-label": `${label}, hold to move` },
-        speed < 0 ? "−" : "+"), () => request(choice.value, speed));
+        group("Joints", page.mode?.jogs[device] ?? []));
+      const button = (label, speed) => page.deadman.button(h("button", { "aria-label": `${label}, hold to move` },
+        speed < 0 ? "−" : "+"), () => ({ device, ...request(choice.value, speed) }));
       return [button("less", -1), choice, button("more", 1)];
     });
-    this.bar.hidden = !this.page.jogs;
+    this.bar.hidden = !device;
   }
 }
 

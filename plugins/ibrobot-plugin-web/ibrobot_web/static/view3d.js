@@ -40,7 +40,7 @@ export class View3D {
       if (data.tool) onTool(data.tool);
       if (data.goal) onGoal(data.goal);
     };
-    new ResizeObserver(() => this.resize()).observe(section);
+    new ResizeObserver(() => this.resize()).observe(this.canvas);
     this.resize();
     this.listen();
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.theme());
@@ -68,7 +68,7 @@ export class View3D {
   tell(message) { this.worker?.postMessage(message); }
 
   resize() {
-    const { width, height } = this.section.getBoundingClientRect();
+    const { width, height } = this.canvas.getBoundingClientRect();
     this.tell({ do: "size", width, height, ratio: Math.min(window.devicePixelRatio, 2) });
   }
 

@@ -15,7 +15,7 @@ const OBJECT = [0.55, 0.6, 0.66, 0.75];
 const FRAME_MS = 40; // 25 frames a second leave a small machine time for the rest
 const COMMANDED = [0.18, 0.5, 0.83, 0.3], PLANNED = [0.12, 0.62, 0.33, 0.3];
 
-let screen, bodies = [], joints = [], tip = null, extras = [], dark = false;
+let screen, bodies = [], joints = [], tips = {}, tip = null, extras = [], dark = false;
 let measured = null, commanded = null, planned = null;
 let trail = [], path, future, grid, ball;
 let dirty = true, stamp = 0, drawn = 0, size = [1, 1], jogs = false, view = null;
@@ -61,7 +61,8 @@ function load({ scene }) {
     })),
   }));
   postMessage({ slides: bodies.flatMap(({ joints: own }) => own.filter(({ type }) => type === "slide").map(({ name }) => name)) });
-  tip = scene.tip;
+  tips = scene.tips;
+  tip = Object.values(tips)[0] ?? null;
   cameras = (scene.cameras ?? []).map(({ body, pos, quat, fovy }) => (
     { body, local: placed(pos, quat), shape: screen.line(frustum(fovy), true) }));
   orbit.distance = Math.max(0.45, 1.5 * scene.extent);
@@ -255,6 +256,7 @@ function resize({ width, height, ratio }) {
   screen.canvas.width = Math.round(size[0] * ratio);
   screen.canvas.height = Math.round(size[1] * ratio);
   dirty = true;
+  begun = 0; // a resized canvas is empty until it is drawn
 }
 
 const actions = {
@@ -268,7 +270,12 @@ const actions = {
     screen.change(path, []);
     dirty = true;
   },
-  handle: ({ jog, goal: moves }) => {
+  // `moved`: the joints that the tool's handle moves, by which a robot with several arms has several tools.
+  handle: ({ jog, goal: moves, moved }) => {
+    const arm = Object.keys(tips).find((prefix) => moved.every((name) => name.startsWith(prefix)));
+    const other = tips[arm] ?? tip;
+    if (other !== tip) { release(); trail = []; }
+    tip = other;
     if (jogs && !jog) release();
     if (goals !== moves) goal = null;
     if (goals && !moves) kept = false;

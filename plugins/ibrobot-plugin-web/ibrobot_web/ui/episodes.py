@@ -93,7 +93,7 @@ def scene(ui: Ui, request: NamesPath) -> dict[str, Any]:
     try:
         description = playback(ui, request.path).description(ui.folders.find)
     except IbrobotError as error:
-        return {"bodies": [], "meshes": [], "tip": None, "problem": str(error)}
+        return {"bodies": [], "meshes": [], "tips": {}, "problem": str(error)}
     key = json.dumps(description, sort_keys=True)
     scenes: dict[str, Any] = ui.view_state.setdefault("scenes", {})
     if key not in scenes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from ibrobot_core.app import (
     shipped_configs,
     unavailable_modes,
 )
+from ibrobot_web.modes import modes_json
 from ibrobot_web.ui.context import Route, Ui
 
 _ROBOT = re.compile(r"^robot:", re.MULTILINE)
@@ -137,14 +138,11 @@ def _facts(config: RobotConfig) -> dict[str, Any]:
         for name, each in hardware.items()
         for what, device in registry.find("hardware", each.type).devices(each.options).items()
     }
-    modes = [
-        {"name": name, "kind": _kind(config, name), "unavailable": config.unavailable.get(name, "")}
-        for name in config.control_modes
-    ]
+    modes = modes_json(config, registry, terminal=False)
     recording = config.recording
     return {
         "name": config.robot.name, "simulated": config.simulated, "joints": list(config.robot.joint_names),
-        "modes": modes, "mode": _mode_for_page(config), "devices": devices,
+        "modes": modes, "mode": _mode_for_page(modes, config.default_control_mode), "devices": devices,
         "cameras": [name for name, each in config.peripherals.items() if each.kind == "camera"],
         "has_simulation": config.simulation is not None, "has_hardware": bool(config.hardware),
         "dataset": recording.dataset if recording is not None else "default",
@@ -152,27 +150,12 @@ def _facts(config: RobotConfig) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _kind(config: RobotConfig, name: str) -> str:
-    """How a mode is driven."""
-    mode = config.control_modes[name]
-    if mode.inference is not None:
-        return "policy"
-    if mode.planner is not None:
-        return "planner"
-    types = {config.teleoperation[device].type for device in mode.devices.values()}
-    return (
-        "the robot's page"
-        if types == {"web"}
-        else f"teleoperation by {', '.join(sorted(types))}"
-        if types
-        else "commands"
-    )
-
-
-def _mode_for_page(config: RobotConfig) -> str:
-    """The mode that a page chooses first: one that it drives, or else the default mode."""
-    own = [name for name in config.control_modes if _kind(config, name) == "the robot's page"]
-    return own[0] if own else config.default_control_mode
+def _mode_for_page(modes: Iterable[Mapping[str, Any]], default: str) -> str:
+    """The mode that a page chooses first: one that only the page drives, the default, or one that it can run."""
+    available = [mode for mode in modes if not mode["unavailable"]]
+    own = [mode["name"] for mode in available if mode["jogs"] and not mode["policy"]]
+    names = [mode["name"] for mode in available]
+    return next(iter(own), default if default in names or not names else names[0])
 
 
 def launch(ui: Ui, request: Launch) -> dict[str, int]:

@@ -1,0 +1,75 @@
+// Recording, beside the pictures: begins, judges, discards and redoes episodes, each by a button or its key.
+
+import { h, refresh, say } from "./dom.js";
+
+const GIB = 1 << 30;
+
+export class Record {
+  constructor(section, page) {
+    this.section = section;
+    this.page = page;
+    this.facts = h("p", { "aria-live": "polite" });
+    this.line = h("div", { class: "line" });
+    this.time = h("progress", { max: "1", value: "0", "aria-label": "Time of the episode" });
+    this.problem = h("p", { class: "bad", role: "status" });
+    section.append(this.line, this.time, this.problem);
+  }
+
+  update({ episode, services, episodes, successes }) {
+    const { page } = this;
+    this.section.hidden = !episode && !episodes;
+    if (!episode) {
+      say(this.facts, `${count(episodes)}, ${successes} successful`);
+      this.time.classList.add("idle");
+      refresh(this.line, "none", () => [this.facts]);
+      return;
+    }
+    say(this.facts, words(episode));
+    this.facts.classList.toggle("recording", episode.recording);
+    say(this.problem, episode.failure);
+    this.time.classList.toggle("idle", !episode.recording);
+    this.time.value = Math.min(1, episode.elapsed_s / episode.max_duration_s);
+    const redo = services.includes("redo") && episode.saved > 0;
+    refresh(this.line, [episode.recording, episode.by_mode, redo, page.operating], () => [this.facts, ...this.controls(episode, redo)]);
+  }
+
+  controls({ recording, by_mode: byMode, prompt: before }, redo) {
+    const { page } = this;
+    if (byMode) return [h("span", { class: "note" }, "The mode begins and ends its episodes itself.")];
+    const button = (text, key, command, facts, kind = "") => h("button", {
+      class: kind, disabled: !page.operating, "data-key": key, onclick: () => page.command(command, facts),
+    }, text, h("kbd", { "aria-hidden": "true" }, key.toUpperCase()));
+    if (recording) {
+      return [button("Success", "s", "episode_stop", { outcome: "success" }, "primary"),
+        button("Failure", "f", "episode_stop", { outcome: "failure" }),
+        button("Discard", "d", "episode_discard", {}, "danger")];
+    }
+    const prompt = h("input", { type: "text", "aria-label": "Task", placeholder: "task, e.g. pick the cube" });
+    prompt.value = this.prompt ?? before;
+    prompt.addEventListener("input", () => { this.prompt = prompt.value; });
+    const form = h("form", {}, prompt, h("button", { class: "primary", disabled: !page.operating, "data-key": "b" }, "Begin",
+      h("kbd", { "aria-hidden": "true" }, "B")));
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      page.command("episode_start", { prompt: prompt.value });
+      prompt.blur(); // so that keys judge the episode
+    });
+    return [form, redo ? button("Redo the last", "r", "episode_redo", {}) : null].filter(Boolean);
+  }
+
+  // Presses the button with this key; false if there is none.
+  press(key) {
+    const button = this.section.querySelector(`button[data-key="${CSS.escape(key)}"]:not(:disabled)`);
+    button?.click();
+    return Boolean(button);
+  }
+}
+
+const count = (number) => `${number} episode${number === 1 ? "" : "s"}`;
+
+function words({ recording, saved, wanted, elapsed_s: elapsed, max_duration_s: longest, free_bytes: free, bytes_per_s: flow }) {
+  if (recording) return `● ${saved + 1}${wanted ? ` of ${wanted}` : ""} · ${elapsed.toFixed(1)} of ${longest} s`;
+  const minutes = flow ? Math.floor(free / flow / 60) : Infinity;
+  const left = minutes < 120 ? ` · disk for ${minutes} min` : free < 5 * GIB ? ` · ${(free / GIB).toFixed(1)} GiB left` : "";
+  return `${saved}${wanted ? ` of ${wanted}` : ""} saved${left}`;
+}
