@@ -75,6 +75,7 @@ def option(
     label: str | None = "",
     more: bool = False,
     names: str = "",
+    suggest: str = "",
     argument: bool = False,
     flag: str = "",
 ) -> Any:
@@ -98,6 +99,8 @@ def option(
         label: what forms and their errors call it; the key by default. None: it is for terminals, and not in forms.
         more: whether forms show it among further options.
         names: what a text or path names, for forms: `episodes`, `dataset`, `policy`, `robot` or `calibration`.
+        suggest: a value that forms enter, e.g. `datasets/{episodes}`: a name in braces stands for the last part of the
+            path that is given for the option of this name.
         argument: whether it is an argument of the command line, and not a flag.
         flag: its flag on the command line, if that is not made of the key, e.g. `--from`.
     """
@@ -109,7 +112,12 @@ def option(
         **bounds,
     }
     metadata |= {"secret": secret, "plain": plain, "label": label, "more": more, "names": names, "argument": argument}
-    metadata |= {"flag": flag, "open": open, "words": dict(choices) if isinstance(choices, Mapping) else {}}
+    metadata |= {
+        "flag": flag,
+        "open": open,
+        "suggest": suggest,
+        "words": dict(choices) if isinstance(choices, Mapping) else {},
+    }
     shown: Any = _hidden if secret else True
 
     def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:

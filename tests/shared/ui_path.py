@@ -91,12 +91,10 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
     page.get_by_label("Episodes", exact=True).fill("2")
     page.get_by_label("Dataset").blur()
     shot(page, "record")
-    page.get_by_role("button", name="Start the session").click()
-    link = page.get_by_role("link", name="Open the robot's page")
-    link.wait_for(timeout=2 * _WAIT_MS)  # the robot starts
     with page.context.expect_page(timeout=_WAIT_MS) as opened:
-        link.click()
-    run = opened.value
+        page.get_by_role("button", name="Start the session").click()
+    run = opened.value  # it shows the robot's page once the robot has started
+    run.wait_for_url("http://**", timeout=2 * _WAIT_MS)
     until(run, "window.ibrobot?.jogs.length && ibrobot.status.episode")
     # Joints that meet nothing, however long a busy machine takes to release the button.
     for number, (joint, index, verdict) in enumerate([("shoulder_pan", 0, "Success"), ("wrist_roll", 4, "Failure")]):
@@ -113,18 +111,23 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
             until(run, "ibrobot.status.episode.saved === 1")
     page.locator(".job .state:not(.running)").first.wait_for(timeout=_WAIT_MS)
     assert page.locator(".job .state.done").count() == 1, page.locator(".job").all_inner_texts()
+    until(run, "ibrobot.status.ended")
+    assert "2 of 2 saved" in run.locator("#faults .ended").inner_text()
+    shot(run, "ended")
+    assert run.get_by_role("link", name="Judge and convert").get_attribute("href").startswith(page.url.split("#")[0])
     run.close()
     shot(page, "session")
 
 
 def convert(page: Any, shot: Shot = lambda page, name: None) -> None:
     """Play back an episode, convert both, and play back the dataset."""
-    page.get_by_role("link", name="See the episodes").click()
+    page.get_by_role("link", name="Judge the episodes").click()
     page.get_by_role("link", name="episode_000001").click(timeout=_WAIT_MS)
     plays(page)
     shot(page, "episodes")
-    page.get_by_role("link", name="Convert", exact=True).click()
-    page.get_by_label("Dataset", exact=True).fill("datasets/pick")
+    page.get_by_role("link", name="Record", exact=True).click()
+    page.locator(".job").get_by_role("link", name="Convert", exact=True).click()
+    assert page.get_by_label("Dataset", exact=True).input_value() == "datasets/pick", "is filled in"
     page.get_by_role("button", name="Convert", exact=True).click()
     page.get_by_role("link", name="Open the dataset").wait_for(timeout=_WAIT_MS)
     shot(page, "convert")

@@ -36,7 +36,9 @@ class ConvertOptions:
     episodes: tuple[Path, ...] = option(
         argument=True, names="episodes", validator=_some, help="episodes, or folders of them"
     )
-    out: Path = option(names="dataset", open=True, label="Dataset", help="folder of the dataset")
+    out: Path = option(
+        names="dataset", open=True, suggest="datasets/{episodes}", label="Dataset", help="folder of the dataset"
+    )
     append: bool = option(False, label="Add to it", help="add new episodes to an existing dataset")
     outcome: tuple[str, ...] = option(tuple(OUTCOMES), choices=OUTCOMES, label="Outcomes", help="episodes to convert")
     prompt: str = option("", label="Task", help="task of episodes that were recorded without one")

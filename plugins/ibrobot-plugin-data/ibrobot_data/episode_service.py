@@ -181,8 +181,8 @@ class EpisodeService(Episodes):
         """The state of recording, for a user interface."""
         failure = self._recording.failure
         return {
-            "recording": self.running, "by_mode": self.by_mode, "episode": self.number, "saved": self.saved, "wanted": self.wanted,
-            "prompt": self.prompt, "elapsed_s": round(self.elapsed_s(), 2),
+            "recording": self.running, "by_mode": self.by_mode, "episode": self.number, "saved": self.saved,
+            "wanted": self.wanted, "prompt": self.prompt, "elapsed_s": round(self.elapsed_s(), 2),
             "max_duration_s": self._session.config.contract.max_duration_s,
             "rates_hz": {topic: round(rate, 1) for topic, rate in self._recording.rates().items()},
             "silent": list(self._recording.silent()), "lost": self._recording.lost(),

@@ -78,7 +78,9 @@ class TrainOptions:
         label="Policy",
         help="a policy type of LeRobot, or small_act",
     )
-    out: Path = option(label="Folder", help="folder for the checkpoints; a training in it is continued")
+    out: Path = option(
+        suggest="training/{dataset}", label="Folder", help="folder for the checkpoints; a training in it is continued"
+    )
     steps: int = option(5000, ge=1, le=100_000_000, label="Steps", help="steps of the training")
     batch_size: int = option(32, ge=1, le=1_000_000, label="Frames per step", help="size of the batches")
     device: str = option(

@@ -114,6 +114,11 @@ class DiscardEpisode:
 
 
 @attrs.frozen
+class RedoEpisode:
+    """Deletes the last episode, and begins it again."""
+
+
+@attrs.frozen
 class SetSmoothing:
     """Switches the blending of action chunks."""
 
@@ -182,8 +187,8 @@ class AskTime:
 
 
 RunCommand = (
-    Jog | Release | Reset | SetMode | BeginEpisode | EndEpisode | DiscardEpisode | SetSmoothing | Intervene | Preview
-    | GoTo | Cancel | Finish
+    Jog | Release | Reset | SetMode | BeginEpisode | EndEpisode | DiscardEpisode | RedoEpisode | SetSmoothing
+    | Intervene | Preview | GoTo | Cancel | Finish
 )  # fmt: skip
 """Commands that the run carries out."""
 PageCommand = RunCommand | Operate | Resign | AskTime
@@ -192,9 +197,9 @@ _COMMANDS: Mapping[str, Service[Any, None]] = {
     name: Service(name, kind, type(None), limits=_LIMITS)
     for name, kind in {
         "jog": Jog, "release": Release, "reset": Reset, "mode": SetMode, "episode_start": BeginEpisode,
-        "episode_stop": EndEpisode, "episode_discard": DiscardEpisode, "smoothing": SetSmoothing,
-        "intervene": Intervene, "preview": Preview, "goal": GoTo, "cancel": Cancel, "finish": Finish,
-        "operate": Operate, "resign": Resign, "time": AskTime,
+        "episode_stop": EndEpisode, "episode_discard": DiscardEpisode, "episode_redo": RedoEpisode,
+        "smoothing": SetSmoothing, "intervene": Intervene, "preview": Preview, "goal": GoTo, "cancel": Cancel,
+        "finish": Finish, "operate": Operate, "resign": Resign, "time": AskTime,
     }.items()
 }  # fmt: skip
 _NAMES = {service.request: name for name, service in _COMMANDS.items()}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from typing import Any
 
 from ibrobot_core.api import IbrobotError, TeleopDescriptor
@@ -80,15 +79,8 @@ def _words(registry: Registry, kind: str, type_: str) -> str:
 
 
 def _lacks_terminal(config: RobotConfig, registry: Registry, mode: ControlMode) -> str:
-    needing: Mapping[str, str] = {
-        name: device.type
-        for name in mode.devices.values()
-        if _needs_terminal(registry, device := config.teleoperation[name])
-    }
-    if not needing:
-        return ""
-    names = " and ".join(f"{name} ({type_})" for name, type_ in needing.items())
-    return f"{names} needs a terminal: start the robot in one, with `ibrobot launch`"
+    names = [name for name in mode.devices.values() if _needs_terminal(registry, config.teleoperation[name])]
+    return f"{' and '.join(names)} needs a terminal: start the robot in one, with ibrobot launch" if names else ""
 
 
 def _needs_terminal(registry: Registry, device: Any) -> bool:

@@ -119,8 +119,14 @@ class Playback:
                  "rate_hz": round((each.count - 1) / length_s, 1) if length_s and each.count > 1 else None}
                 for name, each in summary.topics.items()
             ],
-            "motion": self._motion(),
+            "motion": self._motion(), "first_picture_s": self._first_picture_s(cameras),
         }  # fmt: skip
+
+    def _first_picture_s(self, cameras: list[str]) -> float:
+        """The time from which all cameras have a picture [s]."""
+        with self._plain.lock:
+            firsts = (next(iter(self._plain.reader.messages({topic})), None) for topic in cameras)
+            return max((self._seconds(item) for item in firsts if item is not None), default=0.0)
 
     def series(self, topic: str) -> dict[str, Any]:
         """The numbers of a topic over time, at most `_POINTS` of each: `times` [s], and `values`, path -> numbers.

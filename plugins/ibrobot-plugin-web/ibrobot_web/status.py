@@ -31,6 +31,7 @@ SERVICES = {
     "goal": "/planning/go_to",
     "smoothing": "/action_dispatcher/toggle_smoothing",
     "record": "/record_episode/start",
+    "redo": "/record_episode/redo",
     "intervene": "/intervene",
     "preview": "/plan_kinematic_path",
 }

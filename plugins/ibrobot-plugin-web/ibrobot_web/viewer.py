@@ -122,6 +122,8 @@ class WebViewer(Viewer):
         if child is None:
             return
         if self.url:
+            if self.pages:
+                self._send(STATUS, {**self._status(), "ended": True})
             if self._ctx.log.parent is not None:
                 self._ctx.log.parent.removeHandler(self._log)
             for subscription in (*self._pictures.values(), *self._samples.values()):
@@ -259,9 +261,7 @@ class WebViewer(Viewer):
     def _send_slower(self, now_s: float) -> None:
         session = self._session
         if self._is_due(STATUS, _STATUS_S, now_s):
-            cameras = [{"channel": FIRST_PICTURE + i, "topic": topic} for i, topic in enumerate(self._pictures)]
-            status = status_json(session, self._log, self.pages)
-            self._send(STATUS, {**status, "cameras": cameras, "objects": self._objects.json()})
+            self._send(STATUS, self._status())
         if self._is_due(PLAN, _STATUS_S, now_s):
             self._send(PLAN, plan_json(session, session.clock.now_ns()))
         if self._wanted is None or not self._shows(SAMPLES):  # pages that show all want pictures and states
@@ -270,6 +270,12 @@ class WebViewer(Viewer):
             self._samples.clear()
         elif self._is_due(SAMPLES, _SAMPLES_S, now_s):
             self._send(SAMPLES, {"stamp": session.clock.now_ns(), "topics": self._sampled()})
+
+    def _status(self) -> dict[str, Any]:
+        """Everything about the run that changes, except joint states."""
+        cameras = [{"channel": FIRST_PICTURE + i, "topic": topic} for i, topic in enumerate(self._pictures)]
+        status = status_json(self._session, self._log, self.pages)
+        return {**status, "cameras": cameras, "objects": self._objects.json(), "ended": False}
 
     def _sampled(self) -> dict[str, dict[str, float]]:
         """The newest numbers of every topic that has any."""

@@ -6,6 +6,7 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -40,6 +41,26 @@ def chromium() -> Iterator[Any]:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         yield browser
         browser.close()
+
+
+OUT_OF_SIGHT = """(selectors) => selectors.flatMap((selector) => {
+    const found = [...document.querySelectorAll(selector)].filter((each) => each.getClientRects().length);
+    const hidden = found.filter((each) => {
+        const {left, top, right, bottom, width, height} = each.getBoundingClientRect();
+        const at = document.elementFromPoint(left + width / 2, top + height / 2);
+        return left < 0 || top < 0 || right > innerWidth + 1 || bottom > innerHeight + 1 || !each.contains(at);
+    });
+    return found.length ? hidden.map((each) => `${selector}: ${each.textContent}`) : [`${selector}: is not there`];
+})"""
+"""Elements that are not inside the window, or that something covers, without scrolling."""
+IN_SIGHT = ("#stop", "#view", "figure.picture", "#record button", "#mode summary")
+"""What one looks at and what one does, at every size."""
+SIZES: dict[tuple[int, int], tuple[str, ...]] = {
+    (1280, 800): (".joint input", ".pad button", "#toggles button"),
+    (1920, 1080): (".joint input", ".pad button", "#toggles button"),
+    (390, 844): ("#thumb button", "#thumb select"),
+}
+"""Size of the window [px] -> what else is in sight: what moves the robot."""
 
 
 class Tab:
@@ -255,3 +276,55 @@ def test_a_goal_is_previewed_before_it_is_executed(tab: Tab) -> None:
     tab.page.get_by_role("button", name="Go", exact=True).click()
     tab.until(lambda: abs(tab.position(1) + 1.57) < 0.05)
     tab.enter("drive from the page", "web")
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Iterator[str]:
+    from page_run import SO101, page_run
+
+    arguments = (*SO101, "--dataset", "pick", "--episodes", "2", "--set", "contract.max_duration_s=900")
+    with page_run(*arguments, command=("record",), folder=tmp_path) as found:
+        yield found
+
+
+def test_an_operator_sees_and_does_all_without_scrolling_until_the_end(chromium: Any, recorded: str) -> None:
+    tab = Tab(chromium, recorded)
+    keyboard = tab.page.keyboard
+    tab.until(lambda: tab.ask("ibrobot.jogs.length > 0 && Object.keys(ibrobot.cameras.frames).length === 2"))
+
+    def in_sight() -> None:
+        for (width, height), more in SIZES.items():
+            tab.page.set_viewport_size({"width": width, "height": height})
+            tab.page.wait_for_timeout(100)
+            assert tab.page.evaluate(OUT_OF_SIGHT, [*IN_SIGHT, *more]) == [], (width, height)
+            assert tab.ask("document.documentElement.scrollWidth") <= width
+            assert tab.ask("document.querySelector('.attention').offsetHeight") > 0.25 * height
+
+    in_sight()
+    tab.page.set_viewport_size({"width": 1280, "height": 800})
+    for key, large in (("2", "top"), ("3", "wrist"), ("1", "3D")):
+        keyboard.press(key)
+        assert tab.ask("document.querySelector('.attention').dataset.name") == large
+    tab.page.get_by_label("Task").fill("pick b")  # a letter that is typed begins nothing
+    tab.page.get_by_label("Task").blur()
+    for key, saved in (("d", 0), ("s", 1)):
+        keyboard.press("b")
+        tab.until(lambda: tab.ask("ibrobot.status.episode.recording"))
+        assert tab.ask("ibrobot.status.episode.prompt") == "pick b"
+        tab.until(lambda: tab.page.get_by_role("button", name="Discard").is_visible())
+        if key == "d":
+            in_sight()
+        keyboard.press(key)
+        tab.until(lambda: not tab.ask("ibrobot.status.episode.recording"))
+        tab.until(lambda saved=saved: tab.text("#record p") == f"{saved} of 2 saved")  # type: ignore[misc]
+    tab.until(lambda: tab.page.get_by_role("button", name="Begin").is_visible())
+    keyboard.press("b")
+    tab.until(lambda: tab.page.get_by_role("button", name="Failure").is_visible())
+    keyboard.press("f")
+    tab.until(lambda: tab.page.locator("#faults .ended").is_visible())
+    assert tab.text("#faults") == "The run has ended2 of 2 saved"
+    tab.until(lambda: tab.ask("ibrobot.connected === false"))
+    assert tab.page.locator("#faults .fault, .chip.bad").count() == 0, "an end is no alarm"
+    assert tab.page.locator("#stop").is_disabled()
+    tab.errors = [each for each in tab.errors if "WebSocket connection" not in each]  # the page tries again
+    tab.close()

@@ -39,6 +39,19 @@ def test_bodies_joints_and_shapes_of_any_robot(tmp_path: Path) -> None:
     assert scene["tips"][""] == {"body": 7, "pos": [0.0, 0.0, 0.1], "quat": [1.0, 0.0, 0.0, 0.0]}
 
 
+def test_a_robot_of_several_arms_has_its_model_several_times(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(seven_joints())
+    arms = {"left_": [0.0, 0.2, 0.0, 0.0], "right_": [0.0, -0.2, 0.0, 0.0]}
+    scene = make_scene({"mjcf": str(tmp_path / "arm.xml"), "urdf": None, "tip": "tip", "arms": arms})
+    joints = [joint["name"] for body in scene["bodies"] for joint in body["joints"]]
+    assert joints == [f"{arm}j{i}" for arm in arms for i in range(7)]
+    assert {arm: scene["bodies"][tip["body"]]["name"] for arm, tip in scene["tips"].items()} == {
+        "left_": "left_link6", "right_": "right_link6",
+    }  # fmt: skip
+    bases = [body["pos"][1] for body in scene["bodies"] if body["name"].endswith("link0")]
+    assert bases == [0.2, -0.2]
+
+
 def test_meshes_are_few_triangles(tmp_path: Path) -> None:
     grid = np.linspace(0, 0.1, 60)
     points = [(x, y, 0.02 * np.sin(60 * x)) for x in grid for y in grid]

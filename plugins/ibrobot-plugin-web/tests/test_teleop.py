@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ibrobot_testing import TeleopSuite, check_descriptor, host_context
 from ibrobot_web import ibrobot_teleop
 from ibrobot_web.options import WebTeleopOptions
-from ibrobot_web.teleop import JOG, Jog, Released, WebTeleop
+from ibrobot_web.teleop import JOG, RELEASE, Jog, Released, WebTeleop
 
 from ibrobot_core.api import Context, JointReading, Teleop, TeleopError, ns
 
@@ -230,3 +230,38 @@ def test_a_press_whose_begin_is_known_to_a_tenth_of_a_millisecond_stays_one(erro
     began_ns = rig.press()
     assert rig.hold(began_ns)
     assert all(rig.hold(began_ns + error_ns) for error_ns in errors_ns)
+
+
+def test_the_devices_of_a_mode_share_the_services() -> None:
+    context = host_context()
+    names = ("left", "right")
+    robots = {name: attrs.evolve(context.robot, joints=context.robot.joints[part]) for name, part in
+              zip(names, (slice(0, 3), slice(3, 6)), strict=True)}  # fmt: skip
+    devices = {
+        name: WebTeleop(WebTeleopOptions(), attrs.evolve(context, name=name, robot=robot))
+        for name, robot in robots.items()
+    }
+    bus = context.bus
+    assert bus is not None
+    for device in devices.values():
+        device.connect()
+
+    def press(device: str, joint: str) -> list[str]:
+        context.clock.sleep_until(context.clock.now_ns() + ns(0.001))
+        now_ns = context.clock.now_ns()
+        bus.call(JOG, Jog(now_ns, now_ns, {joint: 1.0}, device=device))
+        zeros = np.zeros(3)
+        reading = JointReading(now_ns, zeros, zeros, zeros)
+        return [name for name, each in devices.items() if each.read(reading).positions is not None]
+
+    joints = {name: robot.joint_names[0] for name, robot in robots.items()}
+    assert press("left", joints["left"]) == ["left"]
+    assert press("right", joints["right"]) == ["left", "right"], "both arms move at once"
+    bus.call(RELEASE, Released())
+    assert press("right", joints["right"]) == ["right"], "a release is one for all"
+    with pytest.raises(TeleopError, match="device '' does not jog in this mode; those that do are: left, right"):
+        press("", joints["left"])
+    devices["left"].disconnect()
+    assert press("", joints["right"]) == ["right"], "the only one need not be named"
+    devices["right"].disconnect()
+    assert not bus.serves(JOG)

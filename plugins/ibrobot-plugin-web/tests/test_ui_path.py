@@ -52,7 +52,7 @@ def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
             assert page.get_by_role("button", name="Launch").is_disabled()
         record(page)
         with held(page, "**/api/jobs/form?*"):
-            page.get_by_role("link", name="Convert", exact=True).click()
+            page.locator("#nav").get_by_role("link", name="Convert", exact=True).click()
             assert page.get_by_role("button", name="Convert", exact=True).is_disabled()
         page.go_back()
         convert(page)

@@ -7,6 +7,7 @@ slow page therefore skips frames; it neither delays other pages nor lets memory 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 
 from aiohttp import web
@@ -15,6 +16,7 @@ from ibrobot_web.link import FIRST_PICTURE
 
 CREDITS, PICTURE_CREDITS = 2, 1
 """Frames of a channel that may be on their way to a page; of pictures fewer, so that none is old when it is shown."""
+_DRAIN_S = 0.02
 _GONE_S = 10.0
 """Time without an acknowledgement after which a page is disconnected [s]."""
 
@@ -35,6 +37,11 @@ class Page:
         if self.wanted is None or channel in self.wanted:
             self._waiting[channel] = frame
             self._wake.set()
+
+    @property
+    def behind(self) -> bool:
+        """Whether frames wait, or are on their way."""
+        return bool(self._waiting) or any(self._flying.values())
 
     def acknowledge(self, channel: int) -> None:
         """The page has taken a frame of this channel."""
@@ -86,6 +93,13 @@ class Broadcast:
             self._newest[channel] = frame
         for page in self.pages:
             page.offer(channel, frame)
+
+    async def drain(self, timeout_s: float) -> None:
+        """Wait until the frames that wait are sent to all pages, but no longer than a time [s]."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                while any(page.behind for page in self.pages):
+                    await asyncio.sleep(_DRAIN_S)
 
     def forget(self) -> None:
         """Forget the newest frames, e.g. when a run has ended."""

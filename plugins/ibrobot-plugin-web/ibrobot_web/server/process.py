@@ -38,6 +38,8 @@ from ibrobot_web.server.page_guard import page_guard
 
 _STREAM_BYTES = 4 << 20
 """Frames that wait to be broadcast [bytes]."""
+_DRAIN_S = 0.5
+"""Longest time until pages have the last status [s]."""
 _log = logging.getLogger("ibrobot.web")
 
 
@@ -152,6 +154,7 @@ async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any
         scene = asyncio.create_task(link.scene())  # so that the first page does not wait for it
         channel.send({"url": guard.link("drive"), "watch_url": guard.link("watch")})
         await link.ended.wait()
+        await link.broadcast.drain(_DRAIN_S)  # the last status says that the run has ended
         loop.remove_reader(channel.fileno())
         tasks = (relaying, living, scene)
         for task in tasks:

@@ -154,7 +154,7 @@ function showOperator() {
   $("operator").classList.toggle("good", operating);
   $("operate").hidden = role === "watch" || !page.drive.open;
   say($("operate"), operating ? "Only watch" : operator ? "Take over" : "Operate");
-  $("stop").disabled = role === "watch";
+  $("stop").disabled = role === "watch" || (page.status?.ended ?? false);
 }
 
 function showFaults() {
@@ -163,9 +163,10 @@ function showFaults() {
   const faults = status?.faults ?? [];
   const held = status?.held ?? "", failure = status?.failure ?? "";
   const absent = status?.absent ?? [], conditions = status?.conditions ?? [];
-  const lost = page.connected === false;
+  const ended = status?.ended ?? false;
+  const lost = page.connected === false && !ended;
   const unconfirmed = page.unconfirmed ?? "";
-  refresh($("faults"), { lost, unconfirmed, estop, faults, held, failure, absent, conditions, operating: page.operating }, () => {
+  refresh($("faults"), { ended, lost, unconfirmed, estop, faults, held, failure, absent, conditions, operating: page.operating }, () => {
     const reset = () => h("button", { onclick: () => page.command("reset"), disabled: !page.operating }, "Reset");
     return [
       unconfirmed ? h("div", { class: "fault alarm" }, h("strong", {}, "The robot may not have stopped: "), h("span", {},
@@ -179,6 +180,7 @@ function showFaults() {
         h("button", { onclick: () => page.command("mode", { mode: page.status.mode }), disabled: !page.operating }, "Go on"))
         : null,
       failure ? h("div", { class: "fault" }, h("strong", {}, "The run ended: "), h("span", {}, failure)) : null,
+      ended && !failure ? h("div", { class: "ended" }, h("strong", {}, "The run has ended"), h("span", {}, results(status)), ...onwards(status)) : null,
       ...conditions.map((each) => h("div", { class: "warning" },
         h("strong", {}, `${each.joint}: `), h("span", {}, each.message ?? ""))),
       ...absent.map(({ name, why }) => h("div", { class: "warning" },
@@ -187,11 +189,27 @@ function showFaults() {
   });
 }
 
+// What a run has achieved.
+function results({ episode, episodes, successes }) {
+  if (episode) return `${episode.saved}${episode.wanted ? ` of ${episode.wanted}` : ""} saved`;
+  return episodes ? `${successes} of ${episodes} episodes successful` : "";
+}
+
+// The page that launched the run, whose address this one has after #, goes on with what was recorded.
+function onwards({ episode }) {
+  const home = new URLSearchParams(location.hash.slice(1)).get("home");
+  if (!home || !URL.canParse(home) || new URL(home).hostname !== location.hostname) return [];
+  const { origin } = new URL(home);
+  return [episode?.saved ? h("a", { class: "button", href: `${origin}/#record` }, "Judge and convert the episodes") : null,
+    h("a", { class: "button", href: `${origin}/#robots` }, "Launch another run")].filter(Boolean);
+}
+
 function showConnection() {
   const stale = performance.now() - page.arrived > STALE_MS;
   const open = page.drive.open && page.connected;
-  say($("connection"), !open ? "not connected" : stale ? "no states" : "");
-  $("connection").classList.toggle("bad", !open || stale);
+  const ended = page.status?.ended ?? false;
+  say($("connection"), ended ? "ended" : !open ? "not connected" : stale ? "no states" : "");
+  $("connection").classList.toggle("bad", !ended && (!open || stale));
 }
 
 page.stream.addEventListener("state", ({ detail: state }) => {

@@ -39,6 +39,26 @@ class Ui extends EventTarget {
     }
   }
 
+  // Starts a run, and opens its page, as soon as it is ready, in a window that browsers permit only at a click.
+  async openRun(start) {
+    const opened = window.open("about:blank");
+    const started = await this.attempt(start);
+    if (!opened) return;
+    const follow = () => {
+      const job = this.jobs.get(started?.number);
+      const ended = !started || (job && job.state !== "running");
+      if (job?.facts.url) opened.location.replace(this.runAddress(job.facts.url));
+      else if (ended) opened.close();
+      else opened.document.body.textContent = `The robot starts … ${job?.lines.at(-1) ?? ""}`;
+      if (ended || job?.facts.url) this.removeEventListener("job", follow);
+    };
+    this.addEventListener("job", follow);
+    follow();
+  }
+
+  // The address of a run's page, with the address of this one, to which its end leads back.
+  runAddress(url) { return `${url}#${new URLSearchParams({ home: location.origin })}`; }
+
   // The jobs of a kind, newest first.
   of(...kinds) { return [...this.jobs.values()].filter(({ kind }) => kinds.includes(kind)).reverse(); }
 
@@ -146,7 +166,7 @@ function showConnection(why = "not connected: is ibrobot ui running?") {
 function showRunning() {
   const running = [...ui.jobs.values()].filter((job) => job.state === "running");
   refresh($("busy"), running.map((job) => [job.number, job.facts.url]), () => running.map((job) => (job.facts.url
-    ? h("a", { class: "chip good", href: job.facts.url, target: "_blank" }, `${job.title}: open its page`)
+    ? h("a", { class: "chip good", href: ui.runAddress(job.facts.url), target: "_blank" }, `${job.title}: open its page`)
     : h("a", { class: "chip good", href: "#jobs" }, job.title))));
 }
 

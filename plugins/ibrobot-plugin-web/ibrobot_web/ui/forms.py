@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, get_args, get_origin
 
 import attrs
@@ -67,6 +68,18 @@ def form_of(ui: Ui, name: str) -> dict[str, Any]:
     except IbrobotError as error:
         form["missing"] = str(error)
     return form
+
+
+def takes(name: str) -> dict[str, str]:
+    """What a command works on: what its arguments name, e.g. `dataset` -> the field; empty if it is not installed."""
+    command = installed_plugins().declarations().get(name)
+    if command is None:
+        return {}
+    return {
+        field.metadata["names"]: key
+        for key, field in _shown(command).items()
+        if field.metadata["argument"] and field.metadata["names"]
+    }
 
 
 def read_form(ui: Ui, command: Command, values: Mapping[str, Any]) -> Any:
@@ -165,7 +178,7 @@ def _known(ui: Ui) -> dict[str, list[dict[str, str]]]:
     found = find_recordings(ui.folders.paths)
     counts: dict[str, int] = {}
     for path in found.episodes:
-        name = ui.folders.name(path.parent)
+        name = ui.folders.name(_dataset_of(path))
         counts[name] = counts.get(name, 0) + 1
     return {
         "episodes": [
@@ -176,6 +189,12 @@ def _known(ui: Ui) -> dict[str, list[dict[str, str]]]:
         "policy": [{"value": name, "text": name} for name in (ui.folders.name(path) for path, _ in find_policies(ui))],
         "robot": [{"value": name, "text": name} for name in robot_names(ui)],
     }
+
+
+def _dataset_of(episode: Path) -> Path:
+    """The folder that one gives to work on all episodes of a dataset, which are in its folder `episodes`."""
+    folder = episode.parent
+    return folder.parent if folder.name == "episodes" and folder.parent.name == "episodes" else folder
 
 
 def _field_json(name: str, field: attrs.Attribute[Any]) -> dict[str, Any]:
@@ -189,7 +208,7 @@ def _field_json(name: str, field: attrs.Attribute[Any]) -> dict[str, Any]:
         "kind": {bool: "flag", int: "whole", float: "number"}.get(item, "text"), "several": several,
         "required": default is attrs.NOTHING, "default": None if default is attrs.NOTHING else default,
         "choices": choices, "open": metadata["open"], "min": metadata["ge"], "max": metadata["le"],
-        "more": metadata["more"], "names": metadata["names"],
+        "more": metadata["more"], "names": metadata["names"], "suggest": metadata["suggest"],
     }  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import ConfigError, error_text, installed_plugins
 from ibrobot_web.server.app import STATIC
 from ibrobot_web.ui.context import Blob, File, Route, Ui
-from ibrobot_web.ui.forms import job_commands, title_of
+from ibrobot_web.ui.forms import job_commands, takes, title_of
 
 VIEWS = {
     "robots": "Robots",
@@ -60,7 +60,7 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
         folders = [str(path) for path in ui.folders.paths]
         views = [{"name": name, "title": title, "module": name} for name, title in VIEWS.items()]
         jobs = [
-            {"name": f"job-{name}", "title": title_of(name), "module": "command", "command": name}
+            {"name": f"job-{name}", "title": title_of(name), "module": "command", "command": name, "takes": takes(name)}
             for name in job_commands()
         ]
         reports = [

@@ -6,6 +6,12 @@ const SOURCES = { folder: "In the opened folders", ibrobot: "Shipped with ibrobo
 const KEY = "robot";
 const choice = { robot: "", sim: true, mode: "", ...JSON.parse(sessionStorage.getItem(KEY) ?? "{}") };
 
+// Chooses for all views.
+export function remember(facts) {
+  Object.assign(choice, facts);
+  sessionStorage.setItem(KEY, JSON.stringify(choice));
+}
+
 export class Chooser {
   // `changed` is called with what was found about the choice: {problems, modes, …}, or null while it is checked.
   constructor(ui, changed) {
@@ -19,10 +25,12 @@ export class Chooser {
     this.mode = h("select", { id: `mode-${Math.random()}` });
     this.mode.addEventListener("change", () => this.choose({ mode: this.mode.value }));
     this.summary = h("p", { class: "note" });
+    this.warning = h("p", { class: "warned", role: "status" });
     this.report = h("div", { "aria-live": "polite" });
     this.fields = h("div", { class: "fields" },
       h("label", { for: this.robot.id }, "Robot"), this.robot, h("span", {}), this.summary,
-      h("span", { class: "label" }, "Body"), this.body, h("label", { for: this.mode.id }, "Mode"), this.mode);
+      h("span", { class: "label" }, "Body"), this.body, h("label", { for: this.mode.id }, "Mode"), this.mode,
+      h("span", {}), this.warning);
     const name = `body-${Math.random()}`;
     for (const [value, label] of [[true, "Simulation"], [false, "Real hardware"]]) {
       const radio = h("input", { type: "radio", name });
@@ -36,8 +44,7 @@ export class Chooser {
   get ready() { return Boolean(this.found && !this.found.problems.length && choice.mode); }
 
   choose(facts) {
-    Object.assign(choice, facts);
-    sessionStorage.setItem(KEY, JSON.stringify(choice));
+    remember(facts);
     this.found = null;
     this.changed(null);
     this.check();
@@ -72,10 +79,13 @@ export class Chooser {
     if (found.modes && !found.modes.some(({ name, unavailable }) => name === choice.mode && !unavailable)) {
       choice.mode = found.modes.some(({ name, unavailable }) => name === found.mode && !unavailable) ? found.mode : "";
     }
-    refresh(this.mode, [choice.robot, found.modes ?? []], () => (found.modes ?? []).map(({ name, kind, unavailable }) =>
-      h("option", { value: name, disabled: Boolean(unavailable) }, `${name} (${unavailable ? "unavailable" : kind})`)));
+    refresh(this.mode, [choice.robot, found.modes ?? []], () => (found.modes ?? []).map(({ name, label, unavailable }) =>
+      h("option", { value: name, disabled: Boolean(unavailable), title: unavailable || name }, unavailable ? `${label}: ${unavailable}` : label)));
     this.mode.value = choice.mode;
     this.mode.disabled = !found.modes;
+    const chosen = found.modes?.find(({ name }) => name === choice.mode);
+    this.warning.textContent = [chosen?.policy && "The robot moves by itself as soon as the run has started, until you stop it.",
+      chosen && !choice.sim && "Real hardware moves. Keep a hand at the power switch."].filter(Boolean).join(" ");
     refresh(this.report, found, () => reportOf(found));
     this.changed(found);
   }

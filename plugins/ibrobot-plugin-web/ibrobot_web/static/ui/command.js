@@ -18,10 +18,14 @@ export class View {
     element.append(h("h2", {}, this.title), this.form.element, h("h2", {}, "Jobs"), this.list);
   }
 
-  async show(shown) {
+  // The address may fill in a field: FIELD=VALUE.
+  async show(shown, rest) {
     if (!shown) return;
     for (const job of this.ui.of(this.command)) this.job(job);
     await this.load();
+    const [, name, value] = /^(\w+)=(.*)$/.exec(rest) ?? [];
+    if (name && rest !== this.filled) this.form.enter({ [name]: value }, true);
+    this.filled = rest;
   }
 
   async load() {

@@ -129,9 +129,17 @@ function field(guide, { name, text, default: preset, choices, open }) {
     const select = h("select", { id }, choices.map((choice) => h("option", { selected: choice === preset }, choice)));
     return { name, elements: [label, select], value: () => select.value };
   }
-  const input = h("input", { type: "text", id, value: preset, list: choices.length ? `${id}-list` : null });
-  const list = choices.length ? [h("datalist", { id: `${id}-list` }, choices.map((choice) => h("option", { value: choice })))] : [];
-  return { name, elements: [label, h("span", {}, input, ...list)], value: () => input.value };
+  const input = h("input", { type: "text", id, value: preset });
+  if (!choices.length) return { name, elements: [label, h("span", {}, input)], value: () => input.value };
+  // What was found, or else what is typed.
+  const other = choices.includes(preset) ? "" : preset;
+  const select = h("select", { id }, choices.map((choice) => h("option", { value: choice, selected: choice === preset }, choice)),
+    other ? h("option", { value: other }, `${other} (not found)`) : null, h("option", { value: "" }, "another …"));
+  input.id = `${id}-other`;
+  input.hidden = true;
+  input.setAttribute("aria-label", `${text}, another`);
+  select.addEventListener("change", () => { input.hidden = select.value !== ""; if (!input.hidden) { input.value = ""; input.focus(); } });
+  return { name, elements: [label, h("span", {}, select, input)], value: () => select.value || input.value };
 }
 
 function table({ columns, rows }) {

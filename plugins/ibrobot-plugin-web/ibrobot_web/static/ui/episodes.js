@@ -22,9 +22,12 @@ export class View {
     this.title = h("h2", { tabindex: "-1" });
     this.about = h("div", {});
     this.controls = h("div", {});
+    const key = (text, name, act) => h("button", { "data-key": name, onclick: act }, text, h("kbd", { "aria-hidden": "true" }, name.toUpperCase()));
     this.detail = h("section", { class: "card", hidden: true, "aria-label": "Episode" },
-      h("div", { class: "row" }, this.title, h("button", { onclick: () => { location.hash = "episodes"; } }, "Close")),
+      h("div", { class: "row" }, this.title, key("Previous", "p", () => this.go(-1)), key("Next", "n", () => this.go(1)),
+        h("button", { onclick: () => { location.hash = "episodes"; } }, "Close")),
       this.about, this.player.element, this.controls);
+    document.addEventListener("keydown", (event) => this.press(event));
     element.append(this.detail, h("section", { class: "card" }, h("h2", {}, "Episodes"), this.note,
       h("div", { class: "row" }, h("label", { for: "episode-filter" }, "Filter"), this.filter,
         h("button", { onclick: () => this.load() }, "Refresh")), this.bulk, this.table), this.trash);
@@ -34,7 +37,30 @@ export class View {
     this.shown = shown;
     if (!shown) { this.player.pause(); return; }
     await this.load();
-    if (rest !== this.path) await this.open(rest);
+    const inside = this.rows.filter(({ path }) => path.startsWith(`${rest}/`)); // a folder: its first one, if possible not judged
+    if (rest && inside.length) {
+      location.replace(`#episodes/${encodeURIComponent((inside.find(({ outcome }) => outcome === "unknown") ?? inside[0]).path)}`);
+    } else if (rest !== this.path) await this.open(rest);
+  }
+
+  // Goes to the next or the previous episode of the list.
+  go(by) {
+    const rows = this.shownRows();
+    const next = rows[rows.findIndex(({ path }) => path === this.path) + by];
+    if (next) location.hash = `episodes/${encodeURIComponent(next.path)}`;
+    else toast(by > 0 ? "This is the last episode." : "This is the first episode.");
+  }
+
+  // The keys of the open episode: its buttons, space to play, arrows to step.
+  press(event) {
+    if (!this.shown || !this.path || event.ctrlKey || event.altKey || event.metaKey || event.defaultPrevented) return;
+    if (event.target.closest?.("input, select, textarea, dialog")) return;
+    const button = this.detail.querySelector(`button[data-key="${CSS.escape(event.key.toLowerCase())}"]:not(:disabled)`);
+    if (button) button.click();
+    else if (event.key === " " && !event.target.closest?.("button, a, summary")) this.player.toggle();
+    else if (event.key === "ArrowLeft" || event.key === "ArrowRight") this.player.step(event.key === "ArrowLeft" ? -1 : 1);
+    else return;
+    event.preventDefault();
   }
 
   job(job) {
@@ -162,8 +188,9 @@ export class View {
     show();
     this.controls.replaceChildren(
       h("div", { class: "row" }, h("span", {}, "Judge:"), this.outcomes.map(([outcome, text]) => h("button", {
-        disabled: off || !facts.finished, "aria-pressed": String(facts.outcome === outcome), onclick: () => this.mark([path], outcome),
-      }, text)),
+        disabled: off || !facts.finished, "aria-pressed": String(facts.outcome === outcome), "data-key": text[0].toLowerCase(),
+        onclick: () => this.mark([path], outcome),
+      }, text, h("kbd", { "aria-hidden": "true" }, text[0].toUpperCase()))),
       facts.finished ? null : h("button", { class: "primary", disabled: off, onclick: () => this.repair(path) }, "Repair"),
       h("button", { class: "danger", disabled: off, onclick: () => this.remove([path]) }, "Delete")),
       h("div", { class: "row" }, h("span", {}, "Trim:"), begin, end, whole, kept, trim));

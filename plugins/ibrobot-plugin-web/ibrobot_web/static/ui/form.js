@@ -12,14 +12,32 @@ export class Form {
     this.others = h("details", { hidden: true }, h("summary", {}, "More options"), this.more);
     this.button = h("button", { class: "primary", disabled: true }, title);
     this.element = h("form", { class: "card" }, this.note, this.first, this.others, h("div", { class: "row" }, this.button));
+    this.element.addEventListener("input", () => this.suggest());
     this.element.addEventListener("submit", (event) => { event.preventDefault(); submit(this.values); });
   }
 
   get values() { return Object.fromEntries(this.fields.map(({ name, value }) => [name, value()])); }
 
-  // Enters values by name.
-  enter(values) {
+  // Enters values by name; `alone`: what is suggested after them is suggested anew.
+  enter(values, alone = false) {
     for (const field of this.fields) if (field.name in values) field.enter(values[field.name]);
+    if (alone) for (const field of this.fields) if (field.suggest && !(field.name in values)) field.enter("");
+    this.suggest();
+  }
+
+  // Enters suggestions that follow from other fields, where nothing else was entered.
+  suggest() {
+    for (const field of this.fields) {
+      if (!field.suggest || (field.value() !== "" && field.value() !== field.suggested)) continue;
+      const { values } = this;
+      let whole = true;
+      field.suggested = field.suggest.replace(/\{(\w+)\}/g, (_, name) => {
+        const part = [values[name]].flat()[0]?.split("/").at(-1);
+        whole &&= Boolean(part);
+        return part;
+      });
+      field.enter(whole ? field.suggested : "");
+    }
   }
 
   // Shows the form; values that were entered stay as long as the fields are the same.
@@ -32,6 +50,7 @@ export class Form {
       const entered = this.values;
       this.fields = fields.map((field) => new Field(field, known[field.names] ?? []));
       this.enter(entered);
+      this.suggest();
       this.others.hidden = !fields.some(({ more }) => more);
       this.more.replaceChildren(...this.fields.filter(({ more }) => more).flatMap(({ elements }) => elements));
       return this.fields.filter(({ more }) => !more).flatMap(({ elements }) => elements);
@@ -43,6 +62,7 @@ class Field {
   constructor(field, known) {
     this.name = field.name;
     this.more = field.more;
+    this.suggest = field.suggest;
     const id = `field-${field.name}`, help = h("small", { class: "help", id: `${id}-help` }, sentence(field));
     const described = { id, "aria-describedby": help.id };
     const choices = field.choices.length ? field.choices : known.map(({ value, text }) => [value, text]);
@@ -64,7 +84,7 @@ class Field {
         boxes.length ? boxes : h("span", { class: "note" }, "none in the opened folders"));
       this.elements = [h("span", { class: "label" }, field.label), h("div", {}, group, help)];
       this.value = () => [...group.querySelectorAll("input:checked")].map(({ value }) => value);
-      this.enter = (entered) => { for (const box of group.querySelectorAll("input")) box.checked = entered.includes(box.value); };
+      this.enter = (entered) => { for (const box of group.querySelectorAll("input")) box.checked = [entered].flat().includes(box.value); };
       return;
     }
     const label = h("label", { for: id }, field.label);

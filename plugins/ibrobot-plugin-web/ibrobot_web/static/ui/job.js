@@ -5,7 +5,8 @@ import { drawPlot } from "../plot.js";
 import { Question } from "./question.js";
 
 // What a job has made -> the view that shows it.
-const MADE = { dataset: ["datasets", "Open the dataset"], policy: ["policies", "Use it in a robot"], episode: ["episodes", "See the episode"], episodes: ["episodes", "See the episodes"] };
+const MADE = { dataset: ["datasets", "Open the dataset"], policy: ["policies", "Use it in a robot"], episode: ["episodes", "See the episode"], episodes: ["episodes", "Judge the episodes"] };
+const RUNS = ["run", "record"];
 const STATES = { running: "running", done: "done", failed: "failed", cancelled: "ended" };
 
 export class JobCard {
@@ -37,7 +38,8 @@ export class JobCard {
     const { progress } = job.facts;
     this.progress.hidden = progress === undefined || job.state !== "running";
     if (progress !== undefined) this.progress.value = progress;
-    say(this.facts, job.facts.text ?? "");
+    const starts = job.state === "running" && RUNS.includes(job.kind) && !job.facts.url;
+    say(this.facts, starts ? `starts … ${job.lines.at(-1) ?? ""}` : job.facts.text ?? "");
     this.question.update(job);
     refresh(this.error, [job.state, job.exit_code, job.facts.error], () => (job.state === "failed" ? failure(job) : []));
     refresh(this.controls, [job.state, job.cancelling, job.facts.url, this.ui.drives], () => this.buttons(job));
@@ -45,9 +47,7 @@ export class JobCard {
     this.draw();
     const { problems = [], made = [] } = job.facts;
     refresh(this.problems, problems, () => problems.map((problem) => h("div", { class: "problem" }, problem)));
-    const shows = (kind) => MADE[kind] ?? this.ui.session.views.filter(({ report }) => report === kind).map(({ name, title }) => [name, `Open in ${title}`])[0];
-    refresh(this.made, [made, job.state], () => (job.state === "running" ? [] : made).filter(({ kind }) => shows(kind)).map(({ kind, path }) => (
-      h("a", { class: "button", href: `#${shows(kind)[0]}${kind === "episodes" ? "" : `/${encodeURIComponent(path)}`}` }, shows(kind)[1]))));
+    refresh(this.made, [made, job.state], () => (job.state === "running" ? [] : made.flatMap((each) => this.next(each))));
     const text = job.lines.join("\n");
     this.details.hidden = !text;
     if (this.output.textContent !== text) {
@@ -55,6 +55,15 @@ export class JobCard {
       this.output.textContent = text;
       if (atEnd) this.output.scrollTop = this.output.scrollHeight;
     }
+  }
+
+  // Links from what a job has made: to the view that shows it, and to the commands that work on it, filled in.
+  next({ kind, path }) {
+    const { views } = this.ui.session;
+    const shows = MADE[kind] ?? views.filter(({ report }) => report === kind).map(({ name, title }) => [name, `Open in ${title}`])[0];
+    const link = (name, rest, text) => h("a", { class: "button", href: `#${name}/${encodeURIComponent(rest)}` }, text);
+    return [shows && link(shows[0], path, shows[1]),
+      ...views.filter(({ takes }) => takes?.[kind]).map(({ name, title, takes }) => link(name, `${takes[kind]}=${path}`, title))].filter(Boolean);
   }
 
   // The curve of the job, e.g. its loss over its steps.
@@ -74,11 +83,11 @@ export class JobCard {
   buttons(job) {
     if (job.state !== "running") return [];
     const open = job.facts.url
-      ? h("a", { class: "button primary", href: job.facts.url, target: "_blank" }, "Open the robot's page") : null;
+      ? h("a", { class: "button primary", href: this.ui.runAddress(job.facts.url), target: "_blank" }, "Open the robot's page") : null;
     const end = h("button", {
       class: "danger", disabled: !this.ui.drives,
       onclick: () => this.ui.attempt(() => this.ui.post("jobs/cancel", { number: job.number })),
-    }, job.cancelling ? "End it at once" : ["run", "record"].includes(job.kind) ? "Stop the run" : "Cancel");
+    }, job.cancelling ? "End it at once" : RUNS.includes(job.kind) ? "Stop the run" : "Cancel");
     return [open, end].filter(Boolean);
   }
 }

@@ -43,7 +43,7 @@ export class Player {
       this.seek(timeAt(this.canvas, event, 0, this.length));
     });
     this.legend = h("p", { class: "legend" });
-    this.element = h("div", { class: "player" }, this.scene, this.pictures,
+    this.element = h("div", { class: "player" }, this.pictures, this.scene,
       h("div", { class: "row player-line" }, this.play, this.line, this.clock, this.speed),
       h("div", { class: "player-plot" }, h("div", { class: "row" },
         h("label", { for: `${this.routes}-topic` }, "Plot"), this.topic, this.group), this.canvas, this.legend));
@@ -78,7 +78,7 @@ export class Player {
     this.topic.replaceChildren(...plotted.map((name) => h("option", { selected: name === chosen }, name)));
     this.objects = [];
     this.view.tell({ do: "objects", objects: [] });
-    this.seek(0);
+    this.seek(Math.min(this.length, facts.first_picture_s ?? 0)); // at first all cameras have a picture
     this.plot();
     this.loadObjects(path);
     return facts;
@@ -133,6 +133,12 @@ export class Player {
       else requestAnimationFrame(step);
     };
     requestAnimationFrame(step);
+  }
+
+  // Pauses, and goes on or back by a step.
+  step(by) {
+    this.pause();
+    this.seek(Math.min(this.length, Math.max(0, this.at + by * STEP_S)));
   }
 
   pause() {

@@ -1,6 +1,7 @@
 // View: trained policies, which are put into robot YAMLs.
 
 import { h, refresh, toast } from "../dom.js";
+import { remember } from "./chooser.js";
 
 export class View {
   constructor(ui) { this.ui = ui; }
@@ -37,7 +38,10 @@ export class View {
     if (!found || !robots) return;
     fill(this.checkpoint, found.map(({ path }) => path),
       found.map(({ path, changed_s: at }) => `${path} (${new Date(at * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`));
+    const first = !this.robot.value;
     fill(this.robot, robots.map(({ robot }) => robot), robots.map(({ robot }) => robot));
+    const { robot } = JSON.parse(sessionStorage.getItem("robot") ?? "{}"); // the one of the last run
+    if (first && robots.some((each) => each.robot === robot)) this.robot.value = robot;
     this.look.disabled = !found.length;
     this.none.hidden = found.length > 0;
   }
@@ -71,10 +75,13 @@ export class View {
     const done = await this.ui.attempt(() => this.ui.post("policies/apply", { ...request, digest }));
     if (!done) return;
     toast(`${done.robot} is written.`);
-    const key = "robot";
-    sessionStorage.setItem(key, JSON.stringify({ robot: done.robot, sim: true, mode: done.mode }));
+    const request = { robot: done.robot, sim: true, mode: done.mode };
+    remember(request);
     this.change.replaceChildren(h("p", {}, `${done.robot} is written; its mode ${done.mode} runs the policy.`),
-      h("button", { class: "primary", onclick: () => { location.hash = "robots"; location.reload(); } }, "Launch it"));
+      h("p", { class: "warned" }, "The robot moves by itself as soon as the run has started, until you stop it."),
+      h("div", { class: "row" },
+        h("button", { class: "primary", onclick: () => this.ui.openRun(() => this.ui.post("robots/launch", request)) }, "Launch it in simulation"),
+        h("a", { class: "button", href: "#robots" }, "Choose how to launch it")));
     await this.load();
   }
 }

@@ -74,7 +74,7 @@ export class View {
 
   async start(values) {
     this.form.button.disabled = true;
-    await this.ui.attempt(() => this.ui.post("record/start", { ...this.chooser.request, values }));
+    await this.ui.openRun(() => this.ui.post("record/start", { ...this.chooser.request, values }));
     this.enable();
   }
 

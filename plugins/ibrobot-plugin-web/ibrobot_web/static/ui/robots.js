@@ -35,16 +35,14 @@ export class View {
 
   enable() {
     this.launch.disabled = !this.chooser.ready || !this.ui.drives;
-    const { found, request } = this.chooser;
-    const kind = found?.modes?.find(({ name }) => name === request.mode)?.kind;
-    this.hint.textContent = found?.modes && !found.modes.some((mode) => mode.kind === "the robot's page")
-      ? "No mode of this YAML is driven from the robot's page. To jog from it, add `web: {type: web}` to `teleoperation`, and a mode with `teleop: web`."
-      : !request.sim && kind ? "Real hardware moves. Keep a hand at the power switch." : "";
+    const { found } = this.chooser;
+    this.hint.textContent = found?.modes && !found.modes.some(({ jogs }) => Object.keys(jogs).length)
+      ? "No mode of this YAML is driven from the robot's page. To jog from it, add `web: {type: web}` to `teleoperation`, and a mode with `teleop: web`." : "";
   }
 
   async start() {
     this.launch.disabled = true;
-    await this.ui.attempt(() => this.ui.post("robots/launch", this.chooser.request));
+    await this.ui.openRun(() => this.ui.post("robots/launch", this.chooser.request));
     this.enable();
   }
 
