@@ -49,7 +49,6 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         type="web",
         options=WebTeleopOptions,
         make=_teleop,
-        devices=lambda options: {"type": "the page of the run"},
         label="drive from the page",
         summary="joint and tool jog from the page of the viewer web, while a button is held",
     )

@@ -117,8 +117,8 @@ class WebTeleop(Teleop):
         with _opening:
             devices = _devices.setdefault(self._ctx.bus, {})
             if not devices:
-                for service in (JOG, RELEASE):
-                    self._ctx.bus.serve(service, partial(_take, devices))
+                self._ctx.bus.serve(JOG, partial(_take, devices))
+                self._ctx.bus.serve(RELEASE, partial(_take, devices))
             devices[self._ctx.name] = self
         self._connected = True
 

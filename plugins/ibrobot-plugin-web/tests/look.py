@@ -299,12 +299,10 @@ def look_at_training(chromium: Any, look: Look) -> None:
             look(page, "ui-training-done")
             page.get_by_role("button", name="Show the change").click()
             page.get_by_role("button", name="Write picking.yaml").click()
-            page.get_by_role("button", name="Launch it").click()
-            page.get_by_text("No problems found.").wait_for(timeout=60_000)
-            page.get_by_role("button", name="Launch", exact=True).click()
             with page.context.expect_page(timeout=120_000) as opening:
-                page.get_by_role("link", name="Open the robot's page").click(timeout=120_000)
+                page.get_by_role("button", name="Launch it in simulation").click()
             run_page = opening.value
+            run_page.wait_for_url("http://**", timeout=120_000)
             for _ in range(1200):
                 if run_page.evaluate("(window.ibrobot?.status?.counts.dispatch?.plan_length ?? 0) > 0"):
                     break

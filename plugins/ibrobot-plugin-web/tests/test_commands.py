@@ -23,6 +23,7 @@ SERVICES: dict[str, tuple[RunCommand, Any]] = {
     "/record_episode/start": (messages.BeginEpisode("pick"), "pick"),
     "/record_episode/stop": (messages.EndEpisode("failure"), "failure"),
     "/record_episode/discard": (messages.DiscardEpisode(), None),
+    "/record_episode/redo": (messages.RedoEpisode(), None),
     "/action_dispatcher/toggle_smoothing": (messages.SetSmoothing(enabled=False), False),
     "/intervene": (messages.Intervene(take=True), True),
     "/planning/go_to": (messages.GoTo("home"), "home"),

@@ -261,7 +261,7 @@ def test_the_devices_of_a_mode_share_the_services() -> None:
     assert press("right", joints["right"]) == ["right"], "a release is one for all"
     with pytest.raises(TeleopError, match="device '' does not jog in this mode; those that do are: left, right"):
         press("", joints["left"])
-    devices["left"].disconnect()
+    devices.pop("left").disconnect()
     assert press("", joints["right"]) == ["right"], "the only one need not be named"
     devices["right"].disconnect()
     assert not bus.serves(JOG)

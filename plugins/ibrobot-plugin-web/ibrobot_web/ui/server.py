@@ -58,7 +58,7 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
 
     async def session(request: web.Request) -> web.StreamResponse:
         folders = [str(path) for path in ui.folders.paths]
-        views = [{"name": name, "title": title, "module": name} for name, title in VIEWS.items()]
+        views: list[dict[str, Any]] = [{"name": name, "title": title, "module": name} for name, title in VIEWS.items()]
         jobs = [
             {"name": f"job-{name}", "title": title_of(name), "module": "command", "command": name, "takes": takes(name)}
             for name in job_commands()

@@ -188,9 +188,9 @@ export class View {
     show();
     this.controls.replaceChildren(
       h("div", { class: "row" }, h("span", {}, "Judge:"), this.outcomes.map(([outcome, text]) => h("button", {
-        disabled: off || !facts.finished, "aria-pressed": String(facts.outcome === outcome), "data-key": text[0].toLowerCase(),
+        disabled: off || !facts.finished, "aria-pressed": String(facts.outcome === outcome), "data-key": outcome[0],
         onclick: () => this.mark([path], outcome),
-      }, text, h("kbd", { "aria-hidden": "true" }, text[0].toUpperCase()))),
+      }, text, h("kbd", { "aria-hidden": "true" }, outcome[0].toUpperCase()))),
       facts.finished ? null : h("button", { class: "primary", disabled: off, onclick: () => this.repair(path) }, "Repair"),
       h("button", { class: "danger", disabled: off, onclick: () => this.remove([path]) }, "Delete")),
       h("div", { class: "row" }, h("span", {}, "Trim:"), begin, end, whole, kept, trim));
