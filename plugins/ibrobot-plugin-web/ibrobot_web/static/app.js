@@ -208,8 +208,10 @@ function showConnection() {
   const stale = performance.now() - page.arrived > STALE_MS;
   const open = page.drive.open && page.connected;
   const ended = page.status?.ended ?? false;
-  say($("connection"), ended ? "ended" : !open ? "not connected" : stale ? "no states" : "");
-  $("connection").classList.toggle("bad", !ended && (!open || stale));
+  const starts = !page.status && page.connected !== false; // a page that was just opened
+  const waits = !open ? "connecting …" : "waiting for the robot …";
+  say($("connection"), ended ? "ended" : starts ? waits : !open ? "not connected" : stale ? "no states" : "");
+  $("connection").classList.toggle("bad", !ended && !starts && (!open || stale));
 }
 
 page.stream.addEventListener("state", ({ detail: state }) => {

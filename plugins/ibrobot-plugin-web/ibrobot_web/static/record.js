@@ -26,6 +26,7 @@ export class Record {
     }
     say(this.facts, words(episode));
     this.facts.classList.toggle("recording", episode.recording);
+    this.facts.setAttribute("aria-live", episode.recording ? "off" : "polite"); // the time runs
     say(this.problem, episode.failure);
     this.time.classList.toggle("idle", !episode.recording);
     this.time.value = Math.min(1, episode.elapsed_s / episode.max_duration_s);

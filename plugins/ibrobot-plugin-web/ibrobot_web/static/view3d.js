@@ -49,11 +49,13 @@ export class View3D {
   }
 
   async load(scene) {
-    this.note.textContent = "Loading the robot …";
+    this.note.textContent = "The server makes the robot's shapes …";
     try {
       const response = await fetch(scene);
       if (!response.ok) throw new Error(await response.text());
+      this.note.textContent = "Loading the robot's shapes …";
       this.tell({ do: "scene", scene: await response.json() });
+      this.note.textContent = "Drawing the robot …";
     } catch (error) {
       this.note.textContent = `The robot's shapes cannot be loaded: ${error.message}`;
     }

@@ -1,7 +1,8 @@
 // View: datasets: counts, features, statistics, and their episodes, which are played back.
 
-import { h, refresh, say } from "../dom.js";
+import { h, refresh, say, toast } from "../dom.js";
 import { size } from "./episodes.js";
+import { keyed, press } from "./keys.js";
 import { Player } from "./player.js";
 
 export class View {
@@ -16,12 +17,22 @@ export class View {
     this.title = h("h3", {});
     this.problem = h("div", {});
     this.playing = h("section", { class: "card", hidden: true, "aria-label": "Episode" }, h("div", { class: "row" }, this.title,
+      keyed("Previous", "p", () => this.go(-1)), keyed("Next", "n", () => this.go(1)),
       h("button", { onclick: () => this.play(null) }, "Close")), this.problem, this.player.element);
+    document.addEventListener("keydown", (event) => { if (this.shown && !this.playing.hidden) press(event, this.playing, this.player); });
     element.append(h("h2", {}, "Datasets"), h("div", { class: "row" }, h("label", { for: "dataset" }, "Dataset"), this.choice),
       this.note, this.playing, this.facts);
   }
 
+  // Plays the next or the previous episode.
+  go(by) {
+    const next = this.number + by;
+    if (next >= 0 && next < this.count) this.play(next);
+    else toast(by > 0 ? "This is the last episode." : "This is the first episode.");
+  }
+
   async show(shown, rest) {
+    this.shown = shown;
     if (!shown) { this.player.pause(); return; }
     const found = await this.ui.attempt(() => this.ui.get("datasets/list"));
     if (!found) return;
@@ -43,6 +54,7 @@ export class View {
   }
 
   tables(facts) {
+    this.count = facts.episodes;
     const counts = [["Episodes", facts.episodes], ["Frames", facts.frames], ["Rate", `${facts.fps} Hz`],
       ["Length", `${facts.seconds.toFixed(1)} s`], ["Size", size(facts.bytes)], ["Robot", facts.robot_type || "not given"],
       ["Tasks", facts.tasks.join("; ") || "none"], ["Unit of joints", facts.norm_mode || "not given"]];
@@ -60,6 +72,7 @@ export class View {
   }
 
   async play(number) {
+    this.number = number;
     this.playing.hidden = number === null;
     if (number === null) { this.player.close(); return; }
     say(this.title, `${this.path}, episode ${number}`);

@@ -1,6 +1,7 @@
 // View: recorded episodes.
 
 import { h, refresh, say, toast } from "../dom.js";
+import { keyed, press } from "./keys.js";
 import { Player } from "./player.js";
 
 
@@ -22,12 +23,11 @@ export class View {
     this.title = h("h2", { tabindex: "-1" });
     this.about = h("div", {});
     this.controls = h("div", {});
-    const key = (text, name, act) => h("button", { "data-key": name, onclick: act }, text, h("kbd", { "aria-hidden": "true" }, name.toUpperCase()));
     this.detail = h("section", { class: "card", hidden: true, "aria-label": "Episode" },
-      h("div", { class: "row" }, this.title, key("Previous", "p", () => this.go(-1)), key("Next", "n", () => this.go(1)),
+      h("div", { class: "row" }, this.title, keyed("Previous", "p", () => this.go(-1)), keyed("Next", "n", () => this.go(1)),
         h("button", { onclick: () => { location.hash = "episodes"; } }, "Close")),
       this.about, this.player.element, this.controls);
-    document.addEventListener("keydown", (event) => this.press(event));
+    document.addEventListener("keydown", (event) => { if (this.shown && this.path) press(event, this.detail, this.player); });
     element.append(this.detail, h("section", { class: "card" }, h("h2", {}, "Episodes"), this.note,
       h("div", { class: "row" }, h("label", { for: "episode-filter" }, "Filter"), this.filter,
         h("button", { onclick: () => this.load() }, "Refresh")), this.bulk, this.table), this.trash);
@@ -49,18 +49,6 @@ export class View {
     const next = rows[rows.findIndex(({ path }) => path === this.path) + by];
     if (next) location.hash = `episodes/${encodeURIComponent(next.path)}`;
     else toast(by > 0 ? "This is the last episode." : "This is the first episode.");
-  }
-
-  // The keys of the open episode: its buttons, space to play, arrows to step.
-  press(event) {
-    if (!this.shown || !this.path || event.ctrlKey || event.altKey || event.metaKey || event.defaultPrevented) return;
-    if (event.target.closest?.("input, select, textarea, dialog")) return;
-    const button = this.detail.querySelector(`button[data-key="${CSS.escape(event.key.toLowerCase())}"]:not(:disabled)`);
-    if (button) button.click();
-    else if (event.key === " " && !event.target.closest?.("button, a, summary")) this.player.toggle();
-    else if (event.key === "ArrowLeft" || event.key === "ArrowRight") this.player.step(event.key === "ArrowLeft" ? -1 : 1);
-    else return;
-    event.preventDefault();
   }
 
   job(job) {
