@@ -75,12 +75,12 @@ export class View {
     const done = await this.ui.attempt(() => this.ui.post("policies/apply", { ...request, digest }));
     if (!done) return;
     toast(`${done.robot} is written.`);
-    const request = { robot: done.robot, sim: true, mode: done.mode };
-    remember(request);
+    const launched = { robot: done.robot, sim: true, mode: done.mode };
+    remember(launched);
     this.change.replaceChildren(h("p", {}, `${done.robot} is written; its mode ${done.mode} runs the policy.`),
       h("p", { class: "warned" }, "The robot moves by itself as soon as the run has started, until you stop it."),
       h("div", { class: "row" },
-        h("button", { class: "primary", onclick: () => this.ui.openRun(() => this.ui.post("robots/launch", request)) }, "Launch it in simulation"),
+        h("button", { class: "primary", onclick: () => this.ui.openRun(() => this.ui.post("robots/launch", launched)) }, "Launch it in simulation"),
         h("a", { class: "button", href: "#robots" }, "Choose how to launch it")));
     await this.load();
   }
