@@ -121,9 +121,15 @@ class WebViewer(Viewer):
         child, self._child = self._child, None
         if child is None:
             return
-        if self.url:
-            if self.pages:
+        try:
+            if self.url and self.pages:
                 self._send(STATUS, {**self._status(), "ended": True})
+        finally:
+            self._shut(child)
+
+    def _shut(self, child: Child) -> None:
+        """End the server, and what was opened for it."""
+        if self.url:
             if self._ctx.log.parent is not None:
                 self._ctx.log.parent.removeHandler(self._log)
             for subscription in (*self._pictures.values(), *self._samples.values()):

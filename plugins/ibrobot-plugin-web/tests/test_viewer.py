@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import re
 import signal
@@ -87,6 +88,26 @@ def test_the_address_has_a_token_and_the_page_is_gone_after_close() -> None:
         viewer.close()
     with pytest.raises(urllib.error.URLError, match="refused"):
         urllib.request.urlopen(found[1])
+
+
+def test_the_last_status_says_that_the_run_has_ended() -> None:
+    from page_run import client
+
+    async def test(viewer: WebViewer) -> None:
+        async with client(viewer.url) as page:
+            while not page.status:
+                viewer.update()
+                await asyncio.sleep(0.01)
+            assert page.status["ended"] is False
+            await asyncio.to_thread(viewer.close)
+            await page.until(lambda: page.status["ended"])
+
+    viewer = WebViewer(OPTIONS, make_context())
+    viewer.open()
+    try:
+        asyncio.run(asyncio.wait_for(test(viewer), 60))
+    finally:
+        viewer.close()
 
 
 def test_a_port_in_use_is_an_error_with_a_remedy() -> None:
