@@ -1,0 +1,136 @@
+"""The layout of a run's page in headless Chromium, without a robot: what is in sight at each size."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from ibrobot_http.server import HttpServer
+from ibrobot_testing import make_session
+from ibrobot_web.link import FIRST_PICTURE, STATE, STATUS
+from ibrobot_web.options import WebOptions
+from ibrobot_web.server.app import make_app
+from ibrobot_web.server.broadcast import Broadcast
+from ibrobot_web.server.drive import Answer, Drive
+from ibrobot_web.server.page_guard import page_guard
+from ibrobot_web.status import LogLines, status_json
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
+]
+OUT_OF_SIGHT = """(selectors) => selectors.flatMap((selector) => {
+    const found = [...document.querySelectorAll(selector)].filter((each) => each.getClientRects().length);
+    const hidden = found.filter((each) => {
+        const {left, top, right, bottom, width, height} = each.getBoundingClientRect();
+        const at = document.elementFromPoint(left + width / 2, top + height / 2);
+        return left < 0 || top < 0 || right > innerWidth + 1 || bottom > innerHeight + 1 || !each.contains(at);
+    });
+    return found.length ? hidden.map((each) => `${selector}: ${each.textContent}`) : [`${selector}: is not there`];
+})"""
+"""Elements that are not inside the window, or that something covers, without scrolling."""
+IN_SIGHT = ("#stop", "#view", "figure.picture", "#record button", "#mode summary")
+"""What one looks at and what one does, at every size."""
+SIZES: dict[tuple[int, int], tuple[str, ...]] = {
+    (1280, 800): (".joint input", ".pad button", "#toggles button"),
+    (1920, 1080): (".joint input", ".pad button", "#toggles button"),
+    (390, 844): ("#thumb button", "#thumb select"),
+}
+"""Size of the window [px] -> what else is in sight: what moves the robot."""
+
+
+EPISODE = {
+    "recording": False, "by_mode": False, "saved": 1, "wanted": 10, "prompt": "pick the cube", "elapsed_s": 4.2,
+    "max_duration_s": 20.0, "rates_hz": {}, "silent": [], "lost": {}, "free_bytes": 10**11, "bytes_per_s": 10**6,
+    "failure": "",
+}  # fmt: skip
+
+
+def status(**changes: Any) -> dict[str, Any]:
+    """The status of a run that the page drives and records."""
+    found = status_json(make_session(), LogLines(), 1)
+    joints = [joint["name"] for joint in found["robot"]["joints"]]
+    mode = {"planner": False, "policy": False, "unavailable": ""}
+    modes = [
+        {"name": "web", "label": "drive from the page", **mode, "jogs": {"page": joints}},
+        {"name": "jog", "label": "drive by keys", **mode, "jogs": {}, "unavailable": "keyboard needs a terminal"},
+        {"name": "run", "label": "run the policy pick", **mode, "jogs": {}, "policy": True},
+    ]
+    cameras = [
+        {"channel": FIRST_PICTURE + i, "topic": f"/camera/{name}/image"} for i, name in enumerate(("top", "wrist"))
+    ]
+    robot = {**found["robot"], "modes": modes, "tool": True}
+    facts = {"mode": "web", "jogs": ["page"], "cameras": cameras, "objects": [], "episode": EPISODE, "ended": False}
+    return {**found, "robot": robot, **facts, **changes}
+
+
+class Run:
+    """What a page takes for a run: it shows what it is told to."""
+
+    def __init__(self) -> None:
+        self.guard = page_guard(WebOptions(port=0), any_port="0")
+        self.broadcast = Broadcast(lambda: None, frozenset({STATE, STATUS}))
+        self.drive = Drive(lambda _, answer: answer({"ok": None}), self._stop, lambda: None)
+
+    @staticmethod
+    def _stop(answer: Answer) -> None:
+        answer({"ok": None})
+
+    def show(self, found: Mapping[str, Any]) -> None:
+        """Show a status, and a robot at rest."""
+        zeros = [0.0] * len(found["robot"]["joints"])
+        state = {"stamp": 1, "estop": False, "stops": 0, "stale": False, "position": zeros, "command": zeros}
+        for channel, message in ((STATUS, found), (STATE, state)):
+            self.broadcast.publish(channel, json.dumps(message).encode())
+
+
+async def no_scene() -> bytes:
+    return json.dumps({"bodies": [], "meshes": [], "tips": {}, "problem": "this robot has no model"}).encode()
+
+
+async def until(page: Any, expression: str) -> None:
+    async with asyncio.timeout(60):
+        while not await page.evaluate(f"Boolean({expression})"):
+            await asyncio.sleep(0.02)
+
+
+async def look() -> None:
+    from playwright.async_api import async_playwright
+
+    run = Run()
+    app = make_app(run.guard, run.broadcast, run.drive, no_scene)
+    async with HttpServer(run.guard, app, close_s=0.1), async_playwright() as playwright:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = await browser.new_page(device_scale_factor=0.5)
+        await page.goto(run.guard.link("drive"))
+        for recording in (False, True):
+            run.show(status(episode={**EPISODE, "recording": recording}))
+            wanted = "Discard" if recording else "Begin"
+            await until(
+                page, f"window.ibrobot?.operating && document.querySelector('#record').innerText.includes('{wanted}')"
+            )
+            for (width, height), more in SIZES.items():
+                await page.set_viewport_size({"width": width, "height": height})
+                assert await page.evaluate(OUT_OF_SIGHT, [*IN_SIGHT, *more]) == [], (width, height, recording)
+                assert await page.evaluate("document.documentElement.scrollWidth") <= width
+                large = "document.querySelector('.attention').offsetHeight"
+                assert await page.evaluate(large) > 0.25 * height, "the picture of attention is large"
+        await page.locator("#mode summary").click()
+        assert await page.get_by_role("button", name="drive by keys keyboard needs a terminal").is_disabled()
+        await page.get_by_role("button", name="run the policy pick").click()
+        assert await page.get_by_text("The robot moves by itself as soon as it is in this mode").is_visible()
+        await page.get_by_role("button", name="Cancel").click()
+        run.show(status(ended=True))
+        await until(page, "document.querySelector('#faults .ended')")
+        assert await page.locator("#faults .ended").inner_text() == "The run has ended\n1 of 10 saved"
+        await browser.close()
+
+
+def test_what_one_looks_at_and_does_is_in_sight_without_scrolling() -> None:
+    pytest.importorskip("playwright.async_api", reason="needs playwright: pip install playwright")
+    asyncio.run(asyncio.wait_for(look(), 120))
