@@ -73,7 +73,7 @@ def test_a_form_has_all_that_its_owner_declares(ui: Ui) -> None:
     assert fields["heat"] == {
         "name": "heat", "label": "Heat", "help": "how hot", "unit": "degC", "kind": "number", "several": False,
         "required": False, "default": 95.0, "choices": [], "open": False, "min": 0, "max": 100, "more": False,
-        "names": "",
+        "names": "", "suggest": "",
     }  # fmt: skip
     assert fields["roast"]["choices"] == [["dark", "dark and bitter"], ["light", "light"]]
     assert (fields["cups"]["kind"], fields["cups"]["label"]) == ("whole", "Cups")
