@@ -285,7 +285,7 @@ def test_an_operator_records_by_keys_until_the_run_ends(chromium: Any, recorded:
         tab.until(lambda: tab.page.get_by_role("button", name="Discard").is_visible())
         keyboard.press(key)
         tab.until(lambda: not tab.ask("ibrobot.status.episode.recording"))
-        tab.until(lambda saved=saved: tab.text("#record p").startswith(f"{saved} of 2 saved"))  # type: ignore[misc]
+        tab.until(lambda saved=saved: tab.text("#record .line > p").startswith(f"{saved} of 2 saved"))  # type: ignore[misc]
     tab.until(lambda: tab.page.get_by_role("button", name="Begin").is_visible())
     keyboard.press("b")
     tab.until(lambda: tab.page.get_by_role("button", name="Failure").is_visible())
