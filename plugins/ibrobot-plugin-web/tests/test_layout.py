@@ -51,9 +51,11 @@ EPISODE = {
 }  # fmt: skip
 
 
-def status(**changes: Any) -> dict[str, Any]:
-    """The status of a run that the page drives and records."""
+def status(arms: tuple[str, ...] = ("",), **changes: Any) -> dict[str, Any]:
+    """The status of a run that the page drives and records; with the prefixes of its arms."""
     found = status_json(make_session(), LogLines(), 1)
+    joints = found["robot"]["joints"]
+    found["robot"]["joints"] = [{**joint, "name": f"{arm}{joint['name']}"} for arm in arms for joint in joints]
     joints = [joint["name"] for joint in found["robot"]["joints"]]
     mode = {"planner": False, "policy": False, "unavailable": ""}
     modes = [
@@ -120,6 +122,12 @@ async def look() -> None:
                 assert await page.evaluate("document.documentElement.scrollWidth") <= width
                 large = "document.querySelector('.attention').offsetHeight"
                 assert await page.evaluate(large) > 0.25 * height, "the picture of attention is large"
+        run.show(status(("left_", "right_")))
+        await page.set_viewport_size({"width": 1280, "height": 800})
+        await until(page, "document.querySelectorAll('.joint').length === 12")
+        assert await page.evaluate(OUT_OF_SIGHT, [*IN_SIGHT, "#toggles button"]) == [], (
+            "more joints scroll on their own"
+        )
         await page.locator("#mode summary").click()
         assert await page.get_by_role("button", name="drive by keys keyboard needs a terminal").is_disabled()
         await page.get_by_role("button", name="run the policy pick").click()
@@ -128,6 +136,9 @@ async def look() -> None:
         run.show(status(ended=True))
         await until(page, "document.querySelector('#faults .ended')")
         assert await page.locator("#faults .ended").inner_text() == "The run has ended\n1 of 10 saved"
+        assert await page.locator("#drive :enabled, #record button:enabled, #stop:enabled").count() <= 1, (
+            "but for the unit"
+        )
         await browser.close()
 
 

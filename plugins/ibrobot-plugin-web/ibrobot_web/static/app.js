@@ -24,7 +24,7 @@ const $ = (id) => document.getElementById(id);
 const page = {
   stream: new Stream(), drive: new Drive(), line: new StopLine(), status: null, state: null, links: {}, role: "watch",
   arrived: 0, unconfirmed: "",
-  get operating() { return this.drive.facts.operating; },
+  get operating() { return this.drive.facts.operating && !this.status?.ended; },
   get mode() { return this.status?.robot.modes.find((mode) => mode.name === this.status.mode); },
   // The devices with which the operator can jog from this page now; and the one that moves the tool.
   get jogs() { return this.operating && !this.status?.faults.length ? this.status?.jogs ?? [] : []; },
