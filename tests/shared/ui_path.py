@@ -94,7 +94,7 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
     with page.context.expect_page(timeout=_WAIT_MS) as opened:
         page.get_by_role("button", name="Start the session").click()
     run = opened.value  # it shows the robot's page once the robot has started
-    run.wait_for_url("http://**", wait_until="commit", timeout=2 * _WAIT_MS)
+    run.wait_for_url(re.compile("^http"), wait_until="commit", timeout=2 * _WAIT_MS)
     until(run, "window.ibrobot?.jogs.length && ibrobot.status.episode")
     # Joints that meet nothing, however long a busy machine takes to release the button.
     for number, (joint, index, verdict) in enumerate([("shoulder_pan", 0, "Success"), ("wrist_roll", 4, "Failure")]):

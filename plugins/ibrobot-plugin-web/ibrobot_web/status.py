@@ -110,10 +110,15 @@ def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
             for name, each in session.sensors.items()
         },
         "counts": {group: {key: _plain(value) for key, value in values.items()} for group, values in counts.items()},
-        "episode": _plain(session.bus.call(EPISODE_STATUS, None)) if session.bus.serves(EPISODE_STATUS) else None,
+        "episode": episode_json(session),
         "episodes": session.outcome.episodes, "successes": session.outcome.successes,
         "pages": pages, "log": log.lines(), "commander": session.commander, "panels": _panels(session),
     }  # fmt: skip
+
+
+def episode_json(session: RunView) -> Any:
+    """The state of recording; None if nothing records."""
+    return _plain(session.bus.call(EPISODE_STATUS, None)) if session.bus.serves(EPISODE_STATUS) else None
 
 
 def _jogs(session: RunView) -> list[str]:

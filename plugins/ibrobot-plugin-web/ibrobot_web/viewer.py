@@ -20,7 +20,7 @@ from ibrobot_web.messages import Pages, Release, Sent, StopRun, from_server
 from ibrobot_web.objects import SceneObjects, mounts
 from ibrobot_web.options import WebOptions
 from ibrobot_web.pictures import to_payload
-from ibrobot_web.status import LogLines, numbers_of, plan_json, state_json, status_json
+from ibrobot_web.status import LogLines, episode_json, numbers_of, plan_json, state_json, status_json
 
 _MODULE = "ibrobot_web.server.process"
 _START_S = 30.0
@@ -56,6 +56,8 @@ class WebViewer(Viewer):
         self._wanted: frozenset[int] | None = frozenset()
         self._child: Child | None = None
         self._finish = threading.Event()
+        self._episode: Any = None
+        """The newest state of recording."""
         self._dead: str = ""
 
     @override
@@ -107,6 +109,7 @@ class WebViewer(Viewer):
         self._next_s = now_s + 0.8 / self._options.rate_hz
         self._send_state()
         if self.pages:
+            self._episode = episode_json(self._session) or self._episode
             self._send_pictures(now_s)
             self._send_slower(now_s)
         self._frames.flush()
@@ -281,6 +284,8 @@ class WebViewer(Viewer):
         """Everything about the run that changes, except joint states."""
         cameras = [{"channel": FIRST_PICTURE + i, "topic": topic} for i, topic in enumerate(self._pictures)]
         status = status_json(self._session, self._log, self.pages)
+        if status["episode"] is None:  # at the end, recording has ended before the page
+            status["episode"] = self._episode
         return {**status, "cameras": cameras, "objects": self._objects.json(), "ended": False}
 
     def _sampled(self) -> dict[str, dict[str, float]]:

@@ -302,7 +302,7 @@ def look_at_training(chromium: Any, look: Look) -> None:
             with page.context.expect_page(timeout=120_000) as opening:
                 page.get_by_role("button", name="Launch it in simulation").click()
             run_page = opening.value
-            run_page.wait_for_url("http://**", wait_until="commit", timeout=120_000)
+            run_page.wait_for_url(lambda url: url.startswith("http"), wait_until="commit", timeout=120_000)
             for _ in range(1200):
                 if run_page.evaluate("(window.ibrobot?.status?.counts.dispatch?.plan_length ?? 0) > 0"):
                     break
