@@ -105,19 +105,10 @@ def option(
         flag: its flag on the command line, if that is not made of the key, e.g. `--from`.
     """
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
-    metadata: dict[str, Any] = {
-        "unit": unit,
-        "help": help,
-        "choices": tuple(choices) if choices is not None else None,
-        **bounds,
-    }
+    metadata: dict[str, Any] = {"unit": unit, "help": help, "suggest": suggest, **bounds}
+    metadata["choices"] = tuple(choices) if choices is not None else None
     metadata |= {"secret": secret, "plain": plain, "label": label, "more": more, "names": names, "argument": argument}
-    metadata |= {
-        "flag": flag,
-        "open": open,
-        "suggest": suggest,
-        "words": dict(choices) if isinstance(choices, Mapping) else {},
-    }
+    metadata |= {"flag": flag, "open": open, "words": dict(choices) if isinstance(choices, Mapping) else {}}
     shown: Any = _hidden if secret else True
 
     def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
