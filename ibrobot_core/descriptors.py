@@ -341,6 +341,18 @@ class ConfigFile:
 
 
 @attrs.frozen
+class ForeignConfig:
+    """A format of another program's configs, which a command of the plugin makes into robot YAMLs."""
+
+    name: str
+    """What such a file is, e.g. `a robot YAML of IB-Robot`."""
+    reads: Callable[[Mapping[str, Any]], bool]
+    """Returns whether the plain values of a file have this format."""
+    command: str
+    """The command that takes such a file, e.g. `config import`."""
+
+
+@attrs.frozen
 class Command:
     """A command of a plugin: `ibrobot NAME …`; `load` imports it when it is called.
 

@@ -1,0 +1,148 @@
+"""`ibrobot config import`: a config of another program becomes a robot YAML."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+import click
+
+from ibrobot_core.app import (
+    ConfigError,
+    Problem,
+    contract_alone,
+    echo,
+    load_config,
+    parse_yaml,
+    read_document,
+)
+from ibrobot_import import ib_robot, lerobot, rosetta
+from ibrobot_import.draft import Draft
+from ibrobot_import.formats import CALIBRATION, FORMATS, IB_ROBOT, LEROBOT, ROSETTA, Format
+from ibrobot_import.source import Fate, Source, Verdict
+
+
+_CONVERTERS: Mapping[Format, Callable[[Source], dict[str, Any]]] = {
+    IB_ROBOT: ib_robot.convert,
+    ROSETTA: rosetta.convert,
+    LEROBOT: lerobot.convert,
+    CALIBRATION: lerobot.convert_calibration,
+}
+
+
+@attrs.frozen
+class Imported:
+    """An imported file."""
+
+    format: Format
+    draft: Draft
+    verdicts: list[Verdict]
+    alone: bool
+    """Whether it is a contract alone."""
+    name: str
+
+    def count(self) -> Counter[Fate]:
+        """How many values were taken, changed and refused."""
+        return Counter(each.fate for each in self.verdicts)
+
+
+@click.command("import")
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("out", required=False, type=click.Path(path_type=Path, dir_okay=False))
+@click.option("--contract", "contract", is_flag=True, help="Import the contract of Rosetta alone, to convert its bags.")
+def import_(file: Path, out: Path | None, contract: bool) -> None:
+    """Make a robot YAML from FILE of IB-Robot, Rosetta or LeRobot.
+
+    FILE is a robot YAML or contract of IB-Robot, a contract of Rosetta (version 2), or of LeRobot a calibration, or the
+    config of a robot or a recording, as YAML or JSON. OUT is a new file, by default the robot's name in this folder.
+    Comments in OUT say where each line comes from. The command lists the values that were changed, and those that have
+    no counterpart, and why.
+    """
+    found = convert_file(file, contract=contract)
+    target = out or Path(f"{found.name}.yaml")
+    write(found, file, target)
+    count = found.count()
+    echo(
+        f"{target}: from {found.format.name}: {count[Fate.TAKEN]} values taken, {count[Fate.CHANGED]} changed, "
+        f"{count[Fate.REFUSED]} without a counterpart"
+    )
+    for fate, title in ((Fate.CHANGED, "changed:"), (Fate.REFUSED, "without a counterpart:")):
+        chosen = [each for each in found.verdicts if each.fate is fate]
+        for line in (title, *(f"  {each}" for each in chosen)) if chosen else ():
+            echo(line)
+    if found.alone:
+        echo(f"use it: ibrobot convert BAG --contract {target} --out DATASET")
+    else:
+        echo(f"try it: ibrobot launch {target} --sim --mode web --web")
+
+
+def convert_file(path: Path, *, contract: bool = False) -> Imported:
+    """Convert a file.
+
+    Args:
+        path: the file.
+        contract: whether to import a contract of Rosetta alone.
+
+    Raises:
+        ConfigError: if it cannot be read, has an unknown format, or wrong values.
+        CalibrationError: for a wrong calibration.
+    """
+    read_document(path)  # refuses what no reader takes, such as a file that is no mapping
+    document = parse_yaml(path.read_text(encoding="utf-8"), str(path), expands=False)
+    document.raise_problems()
+    format_ = next((each for each in FORMATS if each.reads(document.root)), None)
+    if format_ is None:
+        known = "; ".join(each.name for each in FORMATS)
+        keys = ", ".join(map(str, list(document.root)[:8])) or "none"
+        problem = f"of no known format; it has the keys {keys}. The formats are: {known}"
+        raise ConfigError([Problem(path, 0, "", problem)])
+    if contract and format_ is not ROSETTA:
+        raise ConfigError([Problem(path, 0, "", f"is {format_.name}; --contract is for {ROSETTA.name}")])
+    source = Source(document)
+    sections = rosetta.convert(source, alone=True) if contract else _CONVERTERS[format_](source)
+    document.raise_problems()
+    verdicts = source.verdicts(format_.program)
+    draft = Draft()
+    draft.comment(f"Made by `ibrobot config import` from {path.name}, {format_.name}. Units are SI.")
+    draft.comment("`line N: KEY` is where a line comes from; all others are marked.")
+    refused = [each for each in verdicts if each.fate is Fate.REFUSED]
+    draft.comment("Without a counterpart:" if refused else "Nothing is left out.")
+    for each in refused:
+        draft.comment(f"- {each}")
+    draft.block({name: value for name, value in sections.items() if value})
+    alone = set(sections) == {"contract"}
+    name = path.stem if alone else str(sections["robot"]["name"].value)
+    return Imported(format_, draft, verdicts, alone, "".join(c if c.isalnum() or c in "-_" else "_" for c in name))
+
+
+def write(found: Imported, source: Path, out: Path) -> None:
+    """Write the new file, and check it; a file that does not pass is not left behind.
+
+    Raises:
+        ConfigError: if `out` exists or cannot be written, or with the lines of `source` whose values are wrong.
+    """
+    try:
+        with out.open("x", encoding="utf-8") as file:
+            file.write(found.draft.text)
+    except FileExistsError:
+        raise ConfigError([Problem(out, 0, "", "exists already, and is not overwritten")]) from None
+    except OSError as error:
+        raise ConfigError([Problem(out, 0, "", f"cannot be written: {error.strerror}")]) from error
+    try:
+        if found.alone:
+            contract_alone(read_document(out), out.absolute().parent)
+        else:
+            load_config(out)
+            load_config(out, sim=True)
+    except ConfigError as error:
+        out.unlink()
+        raise ConfigError(_at_the_source(each, found.draft, source) for each in error.problems) from None
+
+
+def _at_the_source(problem: Problem, draft: Draft, source: Path) -> Problem:
+    """A fault of the new file at the line of the old one that it comes from."""
+    line = draft.origins[problem.line - 1] if 0 < problem.line <= len(draft.origins) else 0
+    return Problem(source, line, problem.path, problem.message)

@@ -1,0 +1,271 @@
+"""Imports LeRobot's configs of robots and recordings, and its calibrations, for SO-100 and SO-101."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ibrobot_core.api import load_calibration
+from ibrobot_import import so101
+from ibrobot_import.draft import Titled
+from ibrobot_import.source import Fate, From, Node, Source
+
+_SINGLE = ("so100_follower", "so101_follower", "so_follower")
+_DOUBLE = ("bi_so100_follower", "bi_so101_follower", "bi_so_follower")
+_LEADERS = ("so100_leader", "so101_leader", "so_leader")
+_BI_LEADERS = ("bi_so100_leader", "bi_so101_leader", "bi_so_leader")
+_DEVICES = {"keyboard": "keyboard", "gamepad": "gamepad", "phone": "webxr"}
+_NAMED = re.compile(r"[^A-Za-z0-9_-]")
+_CAMERA = {
+    "color_mode": "datasets have RGB",
+    "warmup_s": "a camera is ready when its first image came",
+    "backend": "cameras are opened by Video4Linux, streams and files by OpenCV",
+    "use_depth": "a further peripheral {type: realsense, stream: depth} gives depth",
+    "color_format": "datasets have RGB",
+    "rotation": "this camera is not turned here",
+}
+_DATASET = {
+    "single_task": "`ibrobot record --prompt`",
+    "num_episodes": "`ibrobot record --episodes`",
+    "root": "`ibrobot convert --out`; recordings are bags below recording.root",
+    "push_to_hub": "`hf upload`, after `ibrobot convert`",
+    "private": "`hf upload`, after `ibrobot convert`",
+    "tags": "`hf upload`, after `ibrobot convert`",
+    "reset_time_s": "the operator begins each episode",
+    "video": "an option of `ibrobot convert`",
+    "vcodec": "an option of `ibrobot convert`",
+}
+_RECORD = {
+    "display_data": "`ibrobot record --web`",
+    "play_sounds": "`ibrobot record` says when to begin",
+    "resume": "a recording goes on in its dataset",
+}
+_STEP = "the robot's joints have max_velocity and max_acceleration, which always hold"
+
+
+def convert_calibration(source: Source) -> dict[str, Any]:
+    """An SO-101 with this calibration.
+
+    Raises:
+        CalibrationError: if it is wrong.
+    """
+    path = Path(source.document.file).absolute()
+    load_calibration(path, tuple(so101.SERVOS.values()))
+    source.mark((), Fate.TAKEN, "hardware.calibration reads it as it is")
+    body = so101.SINGLE
+    return _sections(source.root["-"], body, [None], [From(str(path), "this file, which stays as it is")], {}, {})
+
+
+def convert(source: Source) -> dict[str, Any]:
+    """The sections of the new file."""
+    root = source.root
+    record = root["robot"].value is not None
+    robot = root["robot"] if record else root
+    kind = robot["type"]
+    body = so101.SINGLE if kind.value in _SINGLE else so101.DOUBLE if kind.value in _DOUBLE else None
+    if body is None:
+        kind.wrong(f"there is no plugin here for {kind.value!r}; those imported are: {', '.join((*_SINGLE, *_DOUBLE))}")
+        return {}
+    kind.changed("feetech_so101", "type: feetech_so101")
+    arms = _arms(robot, body)
+    cameras = _cameras([robot, *arms])
+    devices = _devices(root["teleop"], body) if record else {}
+    sections = _sections(
+        robot, body, [_port(arm, robot, side) for arm, side in zip(arms, body.prefixes, strict=True)],
+        [_calibration(arm, robot, "robots", kind, side) for arm, side in zip(arms, body.prefixes, strict=True)],
+        cameras, devices,
+    )  # fmt: skip
+    for arm in (*arms, robot):
+        arm["max_relative_target"].refuse(_STEP)
+        arm["use_degrees"].refuse("joints are in radians; `ibrobot convert --norm-mode` chooses the unit of a dataset")
+        arm["record_telemetry"].refuse("temperature, load and voltage are published as /diagnostics")
+        stop = arm["disable_torque_on_disconnect"]
+        if stop.flag() is not None:
+            word = "relax" if stop.flag() else "hold"
+            sections["control"] = {
+                "rate_hz": From(100, so101.added(body)),
+                "stop": stop.changed(word, "relax takes the torque off at the end, hold keeps it"),
+            }
+    if record:
+        _record(root, sections)
+    return sections
+
+
+def _sections(
+    robot: Node,
+    body: so101.Body,
+    ports: list[From | None],
+    calibrations: list[From | None],
+    cameras: Mapping[str, Any],
+    devices: Mapping[str, Any],
+) -> dict[str, Any]:
+    streams = list(so101.streams(body))
+    modes: dict[str, Any] = {}
+    if devices:
+        names = list(devices)
+        given: Any = names[0] if len(names) == 1 else dict(zip(body.groups, names, strict=True))
+        modes["teleop"] = Titled(
+            {"executors": From(streams, "added"), "teleop": From(given, "added")}, "added: the device of `teleop`"
+        )
+    observations = [so101.state_observation(body)]
+    observations += [
+        so101.picture_observation(From(f"observation.images.{name}", part["name"].comment, part["name"].line), name)
+        for name, part in cameras.items()
+    ]
+    return {
+        "robot": so101.robot_section(body, From(body.config, so101.added(body)), None),
+        "hardware": so101.hardware_section(body, ports, calibrations),
+        "simulation": so101.simulation_section(),
+        "peripherals": list(cameras.values()),
+        "executors": so101.executor_sections(so101.streams(body)),
+        "control_modes": modes | so101.added_modes(streams, list(modes)),
+        "default_control_mode": From("teleop" if modes else "hold", "added"),
+        "teleoperation": {**devices, "web": From({"type": "web"}, "added, for the mode web")},
+        "contract": {
+            "rate_hz": From(30, "LeRobot's default"),
+            "observations": observations,
+            "actions": [so101.action_part(name, so101.added(body)) for name in streams],
+        },
+        "recording": {"type": From("mcap", "added")},
+        "control": From({"rate_hz": 100, "stop": "hold"}, so101.added(body)),
+    }
+
+
+def _arms(robot: Node, body: so101.Body) -> list[Node]:
+    if len(body.prefixes) == 1:
+        return [robot]
+    return [robot[f"{prefix}arm_config"] for prefix in body.prefixes]
+
+
+def _port(arm: Node, robot: Node, side: str) -> From | None:
+    return arm["port"].text() or (robot[f"{side}arm_port"].text() if side else None)
+
+
+def _calibration(arm: Node, whole: Node, kind: str, type_: Node, side: str) -> From | None:
+    """The path of a calibration, as LeRobot finds it by the robot's id."""
+    name = arm["id"] if arm["id"].value is not None else whole["id"]
+    if name.value is None:
+        return None
+    folder = arm["calibration_dir"] if arm["calibration_dir"].value is not None else whole["calibration_dir"]
+    stem = str(name.value) if name.key[:-1] == arm.key else f"{name.value}_{side.rstrip('_')}"
+    if folder.value is not None:
+        path = Path(str(folder.value)) / f"{stem}.json"
+        folder.taken(folder.value)
+    else:
+        cache = Path(os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface")
+        base = Path(os.environ.get("HF_LEROBOT_CALIBRATION") or cache / "lerobot" / "calibration") / kind
+        single = str(type_.value).removeprefix("bi_")
+        names = dict.fromkeys((re.sub(r"so10[01]", "so", single), single))
+        found = [base / each / f"{stem}.json" for each in names]
+        path = next((each for each in found if each.is_file()), found[0])
+    note = "LeRobot's file, which stays as it is" if path.is_file() else f"LeRobot's file; it is not there: {path}"
+    return name.changed(str(path), note if path.is_file() else "LeRobot's file, which is not on this machine")
+
+
+def _cameras(nodes: list[Node]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for node in nodes:
+        for name, camera in node["cameras"].items():
+            kind = camera["type"].value
+            if kind not in ("opencv", "intelrealsense"):
+                camera.refuse(f"there is no plugin here for a camera of type {kind}")
+                continue
+            plain = _NAMED.sub("_", name)
+            prefix = node.key[-1].removesuffix("arm_config") if node.key and isinstance(node.key[-1], str) else ""
+            plain = f"{prefix}{plain}" if prefix in so101.DOUBLE.prefixes else plain
+            values: dict[str, Any] = {
+                "name": From(plain, camera.origin, camera.line),
+                "kind": From("camera", camera.origin, camera.line),
+            }
+            if kind == "opencv":
+                device = camera["index_or_path"]
+                values |= {
+                    "type": camera["type"].text(),
+                    "device": device.whole() if isinstance(device.value, int) else device.text(),
+                    "fourcc": camera["fourcc"].text(),
+                }
+                turn = camera["rotation"].value
+                if isinstance(turn, int) and turn % 90 == 0:
+                    values["rotation"] = camera["rotation"].taken(turn % 360)
+            else:
+                values |= {
+                    "type": camera["type"].changed("realsense", "the type here"),
+                    "serial": camera["serial_number_or_name"].text(),
+                }
+            values |= {key: camera[key].whole() for key in ("width", "height")} | {"fps": camera["fps"].number()}
+            for key, reason in _CAMERA.items():
+                if key not in values:
+                    camera[key].refuse(reason)
+            found[plain] = {key: value for key, value in values.items() if value is not None}
+    return found
+
+
+def _devices(teleop: Node, body: so101.Body) -> dict[str, Any]:
+    kind = teleop["type"]
+    if kind.value in _LEADERS and len(body.prefixes) == 1:
+        return {"leader": _leader(teleop, teleop, kind, "")}
+    if kind.value in _BI_LEADERS and len(body.prefixes) > 1:
+        kind.changed("so101_leader", "the type here")
+        return {
+            f"leader_{prefix.rstrip('_')}": _leader(teleop[f"{prefix}arm_config"], teleop, kind, prefix)
+            for prefix in body.prefixes
+        }
+    if kind.value in _DEVICES and len(body.prefixes) == 1:
+        name = kind.changed(_DEVICES[str(kind.value)], "the type here")
+        teleop.refuse(f"`ibrobot config schema` has the options of {name.value}")
+        return {str(kind.value): Titled({"type": name}, teleop.origin, teleop.line)}
+    teleop.refuse(f"there is no plugin here for a device of type {kind.value} with this robot")
+    return {}
+
+
+def _leader(node: Node, whole: Node, kind: Node, prefix: str) -> Titled:
+    own = so101.shipped("so101" if not prefix else "bi_so101")["teleoperation"]
+    shipped = own["leader" if not prefix else f"leader_{prefix.rstrip('_')}"]
+    values: dict[str, Any] = {
+        "type": From("so101_leader", kind.origin, kind.line) if prefix else kind.changed("so101_leader", "the type here"),
+        "port": _port(node, whole, prefix) or From(shipped["port"], "so101 of ibrobot"),
+        "calibration": _calibration(node, whole, "teleoperators", kind, prefix)
+        or From(shipped["calibration"], "so101 of ibrobot"),
+        "prefix": From(prefix, "added") if prefix else None,
+    }
+    node["use_degrees"].refuse("joints are in radians")
+    return Titled({key: value for key, value in values.items() if value is not None}, node.origin, node.line)
+
+
+def _record(root: Node, sections: dict[str, Any]) -> None:
+    dataset = root["dataset"]
+    contract, recording = sections["contract"], sections["recording"]
+    contract["rate_hz"] = dataset["fps"].number() or contract["rate_hz"]
+    sections["contract"] = {
+        "rate_hz": contract.pop("rate_hz"), "max_duration_s": dataset["episode_time_s"].number(), **contract,
+    }  # fmt: skip
+    repository = dataset["repo_id"].text()
+    if repository is not None:
+        name = _NAMED.sub("_", str(repository.value).rpartition("/")[2]) or "default"
+        recording["dataset"] = dataset["repo_id"].changed(name, "the dataset's name; `hf upload` takes the owner")
+    for place, reasons in ((dataset, _DATASET), (root, _RECORD)):
+        for key, reason in reasons.items():
+            place[key].refuse(reason)
+    dataset.refuse("an option of LeRobot's writer; `ibrobot convert` has its own")
+    policy = root["policy"]
+    path = policy["path"] if policy["path"].value is not None else policy["pretrained_path"]
+    if path.value is not None and (where := path.text()) is not None:
+        sections["models"] = {"policy": {"type": From("lerobot", "added"), "path": where}}
+        sections["models"]["policy"]["norm_mode"] = _norm_mode(root["robot"])
+        executors = list(so101.streams(so101.SINGLE if root["robot"]["type"].value in _SINGLE else so101.DOUBLE))
+        sections["control_modes"]["model_inference"] = Titled(
+            {"executors": From(executors, "added"), "inference": {"model": From("policy", path.origin, path.line)}},
+            path.origin,
+            path.line,
+        )
+    policy.refuse("the checkpoint has its own options")
+
+
+def _norm_mode(robot: Node) -> From:
+    degrees = robot["use_degrees"]
+    if degrees.value is None:
+        return From("degrees", "GUESS: the default of LeRobot 0.6; older policies have range_m100_100")
+    return degrees.changed("degrees" if degrees.flag() else "range_m100_100", "the unit of the policy's joints")

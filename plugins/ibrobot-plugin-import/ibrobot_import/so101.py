@@ -1,0 +1,202 @@
+"""The SO-101 as ibrobot ships it: what an imported robot takes from there, and the sections that every robot needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import attrs
+
+from ibrobot_core.app import find_config, installed_plugins, read_document
+from ibrobot_import.draft import Titled
+from ibrobot_import.source import From, Node
+
+ARM, GRIPPER = "arm", "gripper"
+SERVOS = {
+    str(number): name
+    for number, name in enumerate(
+        ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"), start=1
+    )
+}
+"""Id of a servo -> the name of its joint."""
+SYNONYMS = {"elbow": "elbow_flex", "wrist_pitch": "wrist_flex"} | SERVOS
+"""Other names of its joints."""
+LINKS = {
+    "base": "base_link", "shoulder": "shoulder_link", "upper_arm": "upper_arm_link", "lower_arm": "lower_arm_link",
+    "wrist": "wrist_link", "gripper": "gripper_link", "jaw": "moving_jaw_so101_v1_link",
+}  # fmt: skip
+"""Other names of its links."""
+ADDED_MODES = ("hold", "web")
+
+
+@attrs.frozen
+class Body:
+    """One SO-101, or two side by side."""
+
+    config: str
+    """The config that ibrobot ships."""
+    prefixes: tuple[str, ...]
+    """What the joints' names begin with, for each arm."""
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """All joints, in order."""
+        return tuple(f"{prefix}{name}" for prefix in self.prefixes for name in SERVOS.values())
+
+    @property
+    def groups(self) -> dict[str, list[str]]:
+        """The joint groups that executors own."""
+        if len(self.prefixes) == 1:
+            return {ARM: list(self.joints[:-1]), GRIPPER: [self.joints[-1]]}
+        return {prefix.rstrip("_"): [f"{prefix}{name}" for name in SERVOS.values()] for prefix in self.prefixes}
+
+    @property
+    def grippers(self) -> dict[str, list[str]]:
+        """Further groups, for devices."""
+        return {} if len(self.prefixes) == 1 else {f"{each}{GRIPPER}": [f"{each}{GRIPPER}"] for each in self.prefixes}
+
+
+SINGLE = Body("so101", ("",))
+DOUBLE = Body("bi_so101", ("left_", "right_"))
+
+
+@cache
+def shipped(config: str) -> Mapping[str, Any]:
+    """The plain values of a config that ibrobot ships."""
+    root: Mapping[str, Any] = read_document(find_config(config, installed_plugins())).root
+    return root
+
+
+def robot_section(
+    body: Body,
+    name: From,
+    robot_type: From | None,
+    limits: Mapping[str, tuple[float, float, Node]] | None = None,
+    poses: Mapping[str, From] | None = None,
+    groups: Mapping[str, From] | None = None,
+) -> dict[str, Any]:
+    """The section `robot`.
+
+    Args:
+        body: the arms.
+        name: name of the robot.
+        robot_type: LeRobot's name of the robot type.
+        limits: joint -> lower and upper limit [rad] and where they stand; the narrower ones hold.
+        poses: name -> joint positions [rad], beside those of ibrobot's own.
+        groups: name -> joints, for those in the file.
+    """
+    own = shipped(body.config)["robot"]
+    joints: list[From] = []
+    for each in own["joints"]:
+        lower, upper, node = (limits or {}).get(each["name"], (each["lower"], each["upper"], None))
+        narrowed = {**each, "lower": max(lower, each["lower"]), "upper": min(upper, each["upper"])}
+        comment = f"{added(body)}"
+        if node is not None:
+            comment = f"{node.origin}; the narrower of it and {body.config} of ibrobot"
+            if narrowed["lower"] >= narrowed["upper"]:
+                node.wrong(f"leaves {each['name']} no range within {each['lower']} to {each['upper']} rad")
+        joints.append(From(narrowed, comment, node.line if node is not None else 0))
+    description = {key: _comment(value, body) for key, value in own["description"].items() if key != "poses"}
+    return {
+        "name": name,
+        "robot_type": robot_type or From(own["robot_type"], added(body)),
+        "joints": joints,
+        "groups": {
+            **{each: (groups or {}).get(each) or From(names, added(body)) for each, names in body.groups.items()},
+            **{each: From(names, added(body)) for each, names in body.grippers.items()},
+        },
+        "description": {
+            **description,
+            "poses": {**{each: From(pose, added(body)) for each, pose in own["description"]["poses"].items()}}
+            | dict(poses or {}),
+        },
+    }
+
+
+def hardware_section(body: Body, ports: Sequence[From | None], calibrations: Sequence[From | None]) -> dict[str, Any]:
+    """The section `hardware`, with a port and a calibration for each arm."""
+    own = shipped(body.config)["hardware"]
+    parts = [own] if len(body.prefixes) == 1 else list(own.values())
+    names = [""] if len(body.prefixes) == 1 else list(own)
+    found = []
+    for part, port, calibration in zip(parts, ports, calibrations, strict=True):
+        values = {key: From(value, added(body)) for key, value in part.items()}
+        values |= {"port": port} if port is not None else {}
+        values |= {"calibration": calibration} if calibration is not None else {}
+        found.append(values)
+    return found[0] if names == [""] else dict(zip(names, found, strict=True))
+
+
+def executor_sections(names: Mapping[str, tuple[str, str, str, int]]) -> dict[str, Any]:
+    """The section `executors`: name -> type, group, comment and line."""
+    return {
+        name: From(
+            {"type": type_, "group": group} | ({"stale_timeout": 0.25} if type_ == "position" else {}), comment, line
+        )
+        for name, (type_, group, comment, line) in names.items()
+    }
+
+
+def streams(body: Body) -> dict[str, tuple[str, str, str, int]]:
+    """An executor of setpoints for each group, as for `executor_sections`."""
+    return {f"{group}_position": ("position", group, added(body), 0) for group in body.groups}
+
+
+def added_modes(executors: Sequence[str], taken: Sequence[str]) -> dict[str, Any]:
+    """Modes that every robot can run, also in simulation, without devices."""
+    modes: dict[str, Any] = {
+        "hold": Titled({"executors": From(list(executors), "added")}, "added: holds its pose, needs no device"),
+        "web": Titled(
+            {"executors": From(list(executors), "added"), "teleop": From("web", "added")},
+            "added: driven from the page of `ibrobot launch --web`",
+        ),
+    }
+    return {name: mode for name, mode in modes.items() if name not in taken}
+
+
+def simulation_section(type_: From | None = None, scene: From | None = None, mode: str = "hold") -> dict[str, Any]:
+    """The section `simulation`."""
+    return {
+        "type": type_ or From("mujoco", "added"),
+        "scene": scene or From("empty", "added"),
+        "default_control_mode": From(mode, "added: a mode that needs no device"),
+    }
+
+
+def state_observation(body: Body) -> dict[str, Any]:
+    """The observation of all joints, as LeRobot's datasets have it."""
+    return {
+        "key": From("observation.state", added(body)),
+        "topic": From("/joint_states", added(body)),
+        "select": From([f"position.{name}" for name in body.joints], added(body)),
+        "align": From({"strategy": "hold", "stamp": "header"}, added(body)),
+    }
+
+
+def picture_observation(key: From, peripheral: str) -> dict[str, Any]:
+    """The observation of a camera."""
+    return {
+        "key": key,
+        "peripheral": From(peripheral, "added"),
+        "align": From({"strategy": "asof", "stamp": "header", "tol_ms": 100}, "added"),
+    }
+
+
+def action_part(executor: str, comment: str = "added", line: int = 0) -> dict[str, Any]:
+    """The part of the action vector that an executor follows."""
+    return {
+        "key": From("action", comment, line),
+        "executor": From(executor, comment, line),
+        "topic": From(f"/{executor}_controller/commands", comment, line),
+        "safety_behavior": From("hold", "added"),
+    }
+
+
+def added(body: Body) -> str:
+    """The comment of a value of ibrobot's own config."""
+    return f"{body.config} of ibrobot"
+
+
+def _comment(value: Any, body: Body) -> From:
+    return From(value, added(body))
