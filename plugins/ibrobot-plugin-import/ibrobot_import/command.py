@@ -15,7 +15,10 @@ from ibrobot_core.app import (
     Problem,
     contract_alone,
     echo,
+    install_command,
+    installed_plugins,
     load_config,
+    official_plugins,
     parse_yaml,
     read_document,
 )
@@ -23,7 +26,6 @@ from ibrobot_import import ib_robot, lerobot, rosetta
 from ibrobot_import.draft import Draft
 from ibrobot_import.formats import CALIBRATION, FORMATS, IB_ROBOT, LEROBOT, ROSETTA, Format
 from ibrobot_import.source import Fate, Source, Verdict
-
 
 _CONVERTERS: Mapping[Format, Callable[[Source], dict[str, Any]]] = {
     IB_ROBOT: ib_robot.convert,
@@ -43,6 +45,8 @@ class Imported:
     alone: bool
     """Whether it is a contract alone."""
     name: str
+    types: tuple[tuple[str, str], ...] = ()
+    """Kind and type of the plugins that the file needs."""
 
     def count(self) -> Counter[Fate]:
         """How many values were taken, changed and refused."""
@@ -63,7 +67,7 @@ def import_(file: Path, out: Path | None, contract: bool) -> None:
     """
     found = convert_file(file, contract=contract)
     target = out or Path(f"{found.name}.yaml")
-    write(found, file, target)
+    note = write(found, file, target)
     count = found.count()
     echo(
         f"{target}: from {found.format.name}: {count[Fate.TAKEN]} values taken, {count[Fate.CHANGED]} changed, "
@@ -73,8 +77,10 @@ def import_(file: Path, out: Path | None, contract: bool) -> None:
         chosen = [each for each in found.verdicts if each.fate is fate]
         for line in (title, *(f"  {each}" for each in chosen)) if chosen else ():
             echo(line)
+    if note:
+        echo(f"note: {note}")
     if found.alone:
-        echo(f"use it: ibrobot convert BAG --contract {target} --out DATASET")
+        echo(f"use it: ibrobot convert BAG --config {target} --out DATASET")
     else:
         echo(f"try it: ibrobot launch {target} --sim --mode web --web")
 
@@ -97,7 +103,7 @@ def convert_file(path: Path, *, contract: bool = False) -> Imported:
     if format_ is None:
         known = "; ".join(each.name for each in FORMATS)
         keys = ", ".join(map(str, list(document.root)[:8])) or "none"
-        problem = f"of no known format; it has the keys {keys}. The formats are: {known}"
+        problem = f"has an unknown format, with the keys {keys}. The formats are: {known}"
         raise ConfigError([Problem(path, 0, "", problem)])
     if contract and format_ is not ROSETTA:
         raise ConfigError([Problem(path, 0, "", f"is {format_.name}; --contract is for {ROSETTA.name}")])
@@ -112,14 +118,28 @@ def convert_file(path: Path, *, contract: bool = False) -> Imported:
     draft.comment("Without a counterpart:" if refused else "Nothing is left out.")
     for each in refused:
         draft.comment(f"- {each}")
-    draft.block({name: value for name, value in sections.items() if value})
-    alone = set(sections) == {"contract"}
-    name = path.stem if alone else str(sections["robot"]["name"].value)
-    return Imported(format_, draft, verdicts, alone, "".join(c if c.isalnum() or c in "-_" else "_" for c in name))
+    for name, value in sections.items():
+        if value:
+            draft.add("")
+            draft.block({name: value})
+    if set(sections) == {"contract"}:
+        return Imported(format_, draft, verdicts, True, path.stem)
+    name = "".join(c if c.isalnum() or c in "-_" else "_" for c in str(sections["robot"]["name"].value))
+    return Imported(format_, draft, verdicts, False, name, _types(sections))
 
 
-def write(found: Imported, source: Path, out: Path) -> None:
+def _types(sections: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    hardware = sections["hardware"]
+    bodies = [hardware, sections["simulation"]] if "type" in hardware else [*hardware.values(), sections["simulation"]]
+    sensors = [("sensor", str(each["type"].value)) for each in sections.get("peripherals", ())]
+    return (*(("hardware", str(each["type"].value)) for each in bodies), *sensors)
+
+
+def write(found: Imported, source: Path, out: Path) -> str:
     """Write the new file, and check it; a file that does not pass is not left behind.
+
+    Returns:
+        What could not be checked, since a plugin is not installed; empty if all was.
 
     Raises:
         ConfigError: if `out` exists or cannot be written, or with the lines of `source` whose values are wrong.
@@ -135,11 +155,20 @@ def write(found: Imported, source: Path, out: Path) -> None:
         if found.alone:
             contract_alone(read_document(out), out.absolute().parent)
         else:
-            load_config(out)
             load_config(out, sim=True)
+            load_config(out)
     except ConfigError as error:
+        if packages := _lacking(found):
+            return f"{error}; not all could be checked: {install_command(packages)}, then ibrobot config check {out}"
         out.unlink()
         raise ConfigError(_at_the_source(each, found.draft, source) for each in error.problems) from None
+    return ""
+
+
+def _lacking(found: Imported) -> list[str]:
+    """The packages of the hardware, the simulation and the recorder that are not installed."""
+    lacking = [each for each in found.types if each not in installed_plugins().entries]
+    return [name for name, offers in official_plugins().items() if any(t in offers.get(k, ()) for k, t in lacking)]
 
 
 def _at_the_source(problem: Problem, draft: Draft, source: Path) -> Problem:

@@ -47,15 +47,15 @@ def _observation(node: Node, body: so101.Body | None, peripherals: Mapping[str, 
     type_ = node["type"].value or (_PICTURES[0] if peripheral.value is not None else JOINT_STATE)
     node["qos"].refuse(QOS)
     if type_ == "sensor_msgs/msg/PointCloud2":
-        node.refuse("a point cloud has no fixed number of values for a policy")
+        node.drop("a point cloud has no fixed number of values for a policy")
         return None
     values: dict[str, Any] = {"key": key}
     if type_ in _PICTURES and body is not None:
         if key.value.endswith(".depth"):
-            node.refuse("depth needs a peripheral of its own here: {type: realsense, stream: depth}")
+            node.drop("depth needs a peripheral of its own here: {type: realsense, stream: depth}")
             return None
         if peripheral.value not in peripherals:
-            node.refuse("its camera is not imported")
+            node.drop("its camera is not imported")
             return None
         values["peripheral"] = peripheral.text()
         published = f"/camera/{peripheral.value}/image_raw"
@@ -138,9 +138,10 @@ def _actions(node: Node, body: so101.Body | None) -> list[dict[str, Any]]:
     publish["strategy"].refuse("each action has its time in the plan")
     node["from_tensor"].refuse("the safety layer limits commands, by robot.joints")
     behaviour = node["safety_behavior"]
-    safety = behaviour.changed("hold", "zeros would move the joints to 0") if behaviour.value == "zeros" else behaviour.text()
     if body is None:
         return [_foreign_action(title, publish, names, behaviour)]
+    zeros = behaviour.value == "zeros"
+    safety = behaviour.changed("hold", "zeros would move the joints to 0") if zeros else behaviour.text()
     match = _COMMANDS.fullmatch(str(publish["topic"].value))
     group = match[1] if match is not None else None
     if group in body.groups:
@@ -156,9 +157,10 @@ def _actions(node: Node, body: so101.Body | None) -> list[dict[str, Any]]:
             names.changed(None, f"the joints of group {group}, in order")
         return [{name: value for name, value in values.items() if value is not None}]
     if match is not None:
-        node.refuse(f"there is no joint group {group!r} here")
+        node.drop(f"there is no joint group {group!r} here")
         return []
     note = "commands go to the executors, each with a topic of its own"
+    key.changed("action", "an action for each executor")
     for part in (publish["topic"], publish["type"], names):
         part.changed(None, note)
     comment = f"{publish['topic'].origin}; {note}"

@@ -104,7 +104,7 @@ def scalar(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
-        return repr(value) if math.isfinite(value) else f"{'-' if value < 0 else ''}.{'nan' if math.isnan(value) else 'inf'}"
+        return repr(value) if math.isfinite(value) else repr(value).replace("nan", ".nan").replace("inf", ".inf")
     if isinstance(value, int):
         return str(value)
     text = str(value)

@@ -44,6 +44,8 @@ _EXECUTOR = {
 }
 _INFERENCE = {
     "enabled": "a mode with `inference` runs its model",
+    "model": "a mode without `inference` runs no model",
+    "execution_mode": "a mode without `inference` runs no model",
     "force_disable": "a mode without `inference` runs no model",
     "action_server": "the dispatcher calls the model itself",
     "publish_attention": "attention is not published",
@@ -143,6 +145,8 @@ def _sections(part: _Robot) -> dict[str, Any]:
     modes |= so101.added_modes(streams, list(modes))
     for name, reason in _SECTIONS.items():
         robot[name].refuse(reason)
+    for recording in (robot["recording"], robot["contract"]["recording"]):
+        recording.refuse("`ibrobot record` records, and takes --root and --dataset; all topics of the contract")
     return {
         "robot": section,
         "hardware": hardware,
@@ -154,7 +158,6 @@ def _sections(part: _Robot) -> dict[str, Any]:
         "default_control_mode": _default_mode(robot["default_control_mode"], modes),
         "teleoperation": devices | {"web": From({"type": "web"}, "added, for the mode web")},
         "contract": contract,
-        "recording": _recording(robot["recording"], robot["contract"]["recording"]),
         "control": From({"rate_hz": 100, "stop": "hold"}, "so101 of ibrobot"),
     }
 
@@ -204,7 +207,7 @@ def _limits(node: Node, body: so101.Body) -> dict[str, tuple[float, float, Node]
         joint = _joint(name, body)
         lower, upper = each["min"].number("applies to every mode"), each["max"].number("applies to every mode")
         if joint is None:
-            each.refuse("not a joint of this robot")
+            each.drop("not a joint of this robot")
         elif lower is not None and upper is not None:
             limits[joint] = (lower.value, upper.value, each)
     return limits
@@ -243,7 +246,7 @@ def _hardware_section(part: _Robot) -> dict[str, Any]:
         node[key].refuse(reason)
     rest: list[From | None] = [None] * (arms - 1)
     if arms > 1 and calibration is not None:
-        node["calib_file"].refuse("has the servos of two buses; each arm has its own calibration here")
+        node["calib_file"].drop("has the servos of two buses; each arm has its own calibration here")
         calibration = None
     return so101.hardware_section(body, [port, *rest], [calibration, *rest])
 
@@ -253,7 +256,7 @@ def _peripherals(part: _Robot) -> dict[str, dict[str, Any]]:
     for node in part.node["peripherals"].each():
         kind, driver, name = node["type"].value, node["driver"].value or "opencv", node["name"].text()
         if kind != "camera" or driver not in ("opencv", "realsense") or name is None:
-            node.refuse(f"there is no plugin here for a {kind} with driver {driver}")
+            node.drop(f"there is no plugin here for a {kind} with driver {driver}")
             continue
         node["type"].taken(kind)
         values: dict[str, Any] = {
@@ -267,6 +270,7 @@ def _peripherals(part: _Robot) -> dict[str, dict[str, Any]]:
         values |= {"frame_id": optical, "transform": _transform(node, part.body)}
         for key, reason in _CAMERA.items():
             node[key].refuse(reason)
+        values["sim"] = so101.simulated(str(values["name"].value), part.body)
         found[str(name.value)] = {key: value for key, value in values.items() if value is not None}
     return found
 
@@ -305,8 +309,10 @@ def _transform(node: Node, body: so101.Body) -> Titled | None:
         axes = [[given[key].number() for key in keys] for keys in (("x", "y", "z"), ("roll", "pitch", "yaw"))]
         origin = (given.origin, given.line)
         xyz, rpy = ([0.0 if each is None else float(each.value) for each in three] for three in axes)
+        if link != parent.value:
+            parent = given["parent_frame"].changed(link, "the link's name in the URDF")
         values = {
-            "parent": given["parent_frame"].changed(link, "the link's name in the URDF") if link != parent.value else parent,
+            "parent": parent,
             "xyz": From(xyz, *origin),
             "rpy": From(rpy, *origin),
             "frame": node["frame_id"].text(),
@@ -325,9 +331,9 @@ def _renamed(node: Node, name: From) -> From:
 def _models(node: Node) -> dict[str, Any]:
     models = {}
     for name, each in node.items():
-        type_ = each["policy_type"]
+        note = "the checkpoint says which policy it is"
         values: dict[str, Any] = {
-            "type": type_.changed("lerobot", "the checkpoint says which policy it is") if type_.value else From("lerobot", "added"),
+            "type": each["policy_type"].changed("lerobot", note),
             "path": each["path"].text(),
         }
         mode = each["lerobot_norm_mode"]
@@ -340,7 +346,8 @@ def _models(node: Node) -> dict[str, Any]:
         else:
             values["device"] = each["device"].text()
         each["normalization"].refuse("the checkpoint's own processors normalise")
-        models[_NAMED.sub("_", name)] = Titled({k: v for k, v in values.items() if v is not None}, each.origin, each.line)
+        present = {key: value for key, value in values.items() if value is not None}
+        models[_NAMED.sub("_", name)] = Titled(present, each.origin, each.line)
     return models
 
 
@@ -349,43 +356,45 @@ def _control_modes(part: _Robot) -> dict[str, Any]:
     for name, node in part.node["control_modes"].items():
         executors = _mode_executors(part, node["controllers"])
         if not executors:
-            node.refuse("no executor of an arm is left for this mode")
+            node.drop("no executor of an arm is left for this mode")
             continue
         values: dict[str, Any] = {"executors": node["controllers"].changed(executors, "controllers are executors")}
-        types = {part.executors[each][0] for each in executors}
-        inference = node["inference"]
-        watermark = node["executor"]["watermark_threshold"]
-        if types != {"position"}:
-            values["planner"] = From({"type": "rrt_connect"}, "added: its executors take goals of a planner")
-        elif inference["enabled"].flag() and inference["model"].value is not None:
-            model = inference["model"].text()
-            values["inference"] = {"model": model}
-            if watermark.value is not None:
-                values["dispatch"] = {"watermark": watermark.whole()}
-            if inference["execution_mode"].value == "distributed":
-                inference["execution_mode"].refuse(
-                    "the model runs in this process; on a server it needs `transport`, see the how-to on serving"
-                )
-            else:
-                inference["execution_mode"].taken("monolithic")
-        elif (device := part.node["teleoperation"]["active_device"]).value is not None and name == "teleop":
-            known = _NAMED.sub("_", str(device.value))
-            if known in part.devices:
-                values["teleop"] = device.taken(known)
-            else:
-                device.refuse("this device is not imported, so that the mode holds the robot")
-        watermark.refuse("belongs to modes with a model")
+        values |= _source(part, name, node, executors)
+        node["executor"]["watermark_threshold"].refuse("belongs to modes with a model")
         rate, contract = node["executor"]["control_frequency"], part.node["contract"]["rate_hz"].value
         rate.refuse(f"setpoints come at control.rate_hz; the actions of a chunk at contract.rate_hz ({contract} Hz)")
         comment = node["description"]
         titled = node.origin
         if isinstance(comment.value, str):
             titled += f"; {comment.taken(comment.value, 'is a comment').value}"
-        for reasons, place in ((_MODE, node), (_EXECUTOR, node["executor"]), (_INFERENCE, inference)):
+        for reasons, place in ((_MODE, node), (_EXECUTOR, node["executor"]), (_INFERENCE, node["inference"])):
             for key, reason in reasons.items():
                 place[key].refuse(reason)
         modes[_NAMED.sub("_", name)] = Titled(values, titled, node.line)
     return modes
+
+
+def _source(part: _Robot, name: str, node: Node, executors: list[str]) -> dict[str, Any]:
+    """What commands a mode: a planner, a model or a device."""
+    inference, watermark = node["inference"], node["executor"]["watermark_threshold"]
+    if {part.executors[each][0] for each in executors} != {"position"}:
+        return {"planner": From({"type": "rrt_connect"}, "added: its executors take goals of a planner")}
+    if inference["enabled"].flag() and inference["model"].value is not None:
+        mode = inference["execution_mode"]
+        if mode.value == "distributed":
+            mode.refuse("the model runs in this process; on a server it needs `transport`, see the how-to on serving")
+        else:
+            mode.taken("monolithic", "the default")
+        dispatch = {"dispatch": {"watermark": watermark.whole()}} if watermark.value is not None else {}
+        return {"inference": {"model": inference["model"].text()}, **dispatch}
+    device = part.node["teleoperation"]["active_device"]
+    if device.value is None or name != "teleop":
+        return {}
+    known = _NAMED.sub("_", str(device.value))
+    if known in part.devices:
+        return {"teleop": device.taken(known)}
+    device.refuse("this device is not imported, so that the mode holds the robot")
+    return {}
 
 
 def _mode_executors(part: _Robot, node: Node) -> list[str]:
@@ -451,7 +460,7 @@ def _teleoperation(part: _Robot) -> dict[str, Any]:
     for device in node["devices"].each():
         name, kind = device["name"].text(), device["type"].value
         if name is None or kind not in _TELEOP:
-            device.refuse(f"there is no plugin here for a device of type {kind}")
+            device.drop(f"there is no plugin here for a device of type {kind}")
             continue
         values: dict[str, Any] = {"type": device["type"].changed(_TELEOP[kind], "the type here")}
         if kind == "leader_arm":
@@ -473,21 +482,3 @@ def _teleoperation(part: _Robot) -> dict[str, Any]:
             {key: value for key, value in values.items() if value is not None}, device.origin, device.line
         )
     return part.devices
-
-
-def _recording(*nodes: Node) -> dict[str, Any] | None:
-    values: dict[str, Any] = {}
-    for node in nodes:
-        storage = node["storage"]
-        if storage.value == "mcap":
-            values["type"] = storage.taken("mcap")
-        elif storage.value is not None:
-            values["type"] = storage.changed("mcap", "bags are written as MCAP")
-        root = node["bag_base_dir"].text()
-        if root is not None:
-            values["root"] = root
-        if node["extra_topics"].texts():
-            values["topics"] = node["extra_topics"].changed("all", "all topics of a run")
-    if values:
-        values.setdefault("type", From("mcap", "added"))
-    return values or None

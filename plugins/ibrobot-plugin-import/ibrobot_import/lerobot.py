@@ -28,6 +28,7 @@ _CAMERA = {
     "rotation": "this camera is not turned here",
 }
 _DATASET = {
+    "repo_id": "`ibrobot record --dataset`, and `hf upload` after `ibrobot convert`",
     "single_task": "`ibrobot record --prompt`",
     "num_episodes": "`ibrobot record --episodes`",
     "root": "`ibrobot convert --out`; recordings are bags below recording.root",
@@ -129,7 +130,6 @@ def _sections(
             "observations": observations,
             "actions": [so101.action_part(name, so101.added(body)) for name in streams],
         },
-        "recording": {"type": From("mcap", "added")},
         "control": From({"rate_hz": 100, "stop": "hold"}, so101.added(body)),
     }
 
@@ -199,6 +199,7 @@ def _cameras(nodes: list[Node]) -> dict[str, Any]:
             for key, reason in _CAMERA.items():
                 if key not in values:
                     camera[key].refuse(reason)
+            values["sim"] = so101.simulated(plain, so101.DOUBLE if prefix in so101.DOUBLE.prefixes else so101.SINGLE)
             found[plain] = {key: value for key, value in values.items() if value is not None}
     return found
 
@@ -225,7 +226,7 @@ def _leader(node: Node, whole: Node, kind: Node, prefix: str) -> Titled:
     own = so101.shipped("so101" if not prefix else "bi_so101")["teleoperation"]
     shipped = own["leader" if not prefix else f"leader_{prefix.rstrip('_')}"]
     values: dict[str, Any] = {
-        "type": From("so101_leader", kind.origin, kind.line) if prefix else kind.changed("so101_leader", "the type here"),
+        "type": kind.changed("so101_leader", "the type here"),
         "port": _port(node, whole, prefix) or From(shipped["port"], "so101 of ibrobot"),
         "calibration": _calibration(node, whole, "teleoperators", kind, prefix)
         or From(shipped["calibration"], "so101 of ibrobot"),
@@ -237,15 +238,11 @@ def _leader(node: Node, whole: Node, kind: Node, prefix: str) -> Titled:
 
 def _record(root: Node, sections: dict[str, Any]) -> None:
     dataset = root["dataset"]
-    contract, recording = sections["contract"], sections["recording"]
+    contract = sections["contract"]
     contract["rate_hz"] = dataset["fps"].number() or contract["rate_hz"]
     sections["contract"] = {
         "rate_hz": contract.pop("rate_hz"), "max_duration_s": dataset["episode_time_s"].number(), **contract,
     }  # fmt: skip
-    repository = dataset["repo_id"].text()
-    if repository is not None:
-        name = _NAMED.sub("_", str(repository.value).rpartition("/")[2]) or "default"
-        recording["dataset"] = dataset["repo_id"].changed(name, "the dataset's name; `hf upload` takes the owner")
     for place, reasons in ((dataset, _DATASET), (root, _RECORD)):
         for key, reason in reasons.items():
             place[key].refuse(reason)

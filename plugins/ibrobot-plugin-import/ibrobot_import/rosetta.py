@@ -18,7 +18,7 @@ _NAMED = re.compile(r"[^A-Za-z0-9_-]")
 _SIGNALS = {"task": "std_msgs/msg/String", "next.reward": "", "next.done": ""}
 _ARRAY = re.compile(r"std_msgs/msg/\w+MultiArray")
 _SCALAR = re.compile(r"std_msgs/msg/\w+")
-_DEGREES = "values stay in radians; `ibrobot convert --norm-mode degrees` writes degrees, a model has norm_mode: degrees"
+_DEGREES = "values are in radians; `ibrobot convert --norm-mode degrees` writes degrees, models have norm_mode: degrees"
 
 
 def convert(source: Source, *, alone: bool = False) -> dict[str, Any]:
@@ -60,7 +60,8 @@ def _arm(root: Node) -> dict[str, str] | None:
 def _robot(root: Node, joints: Mapping[str, str]) -> dict[str, Any]:
     """A whole SO-101 with the keys of the contract."""
     body = so101.SINGLE
-    peripherals, observations = [], []
+    peripherals: list[dict[str, Any]] = []
+    observations: list[dict[str, Any]] = []
     for key, node in root["observations"].items():
         if key.startswith(IMAGES):
             name = _NAMED.sub("_", key.removeprefix(IMAGES))
@@ -99,7 +100,6 @@ def _robot(root: Node, joints: Mapping[str, str]) -> dict[str, Any]:
             "observations": observations,
             "actions": [so101.action_part(name, so101.added(body)) for name in streams],
         },
-        "recording": From({"type": "mcap"}, "added"),
         "control": From({"rate_hz": 100, "stop": "hold"}, so101.added(body)),
     }
 
@@ -115,6 +115,7 @@ def _camera(node: Node, name: str, number: int) -> dict[str, Any]:
         "width": From(640, "GUESS"),
         "height": From(480, "GUESS"),
         "fps": From(30, "GUESS"),
+        "sim": so101.simulated(name, so101.SINGLE),
     }
 
 
@@ -203,7 +204,7 @@ def _action(key: str, node: Node) -> dict[str, Any] | None:
     }
     strategy = node["align"]["strategy"]
     if strategy.value == "hold":
-        strategy.taken("hold")
+        strategy.taken("hold", "the default")
     return _present(values) | _rest(node, "the command in effect at the tick")
 
 
@@ -211,7 +212,8 @@ def _select(node: Node, type_: str) -> From | None:
     select = node["select"]
     given = select.texts()
     if _ARRAY.fullmatch(type_) and given:
-        return select.changed([f"data.{i}" for i in range(len(given))], f"labels {', '.join(given)} are numbers in order")
+        numbers = [f"data.{i}" for i in range(len(given))]
+        return select.changed(numbers, f"labels {', '.join(given)} are numbers in order")
     if given:
         return select.taken(given)
     return From(["data"], "added: the number of the message") if _SCALAR.fullmatch(type_) else None

@@ -8,7 +8,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.app import find_config, installed_plugins, read_document
+from ibrobot_core.app import find_config, installed_plugins, parse_yaml
 from ibrobot_import.draft import Titled
 from ibrobot_import.source import From, Node
 
@@ -64,7 +64,8 @@ DOUBLE = Body("bi_so101", ("left_", "right_"))
 @cache
 def shipped(config: str) -> Mapping[str, Any]:
     """The plain values of a config that ibrobot ships."""
-    root: Mapping[str, Any] = read_document(find_config(config, installed_plugins())).root
+    path = find_config(config, installed_plugins())
+    root: Mapping[str, Any] = parse_yaml(path.read_text(encoding="utf-8"), str(path), expands=False).root
     return root
 
 
@@ -162,6 +163,20 @@ def simulation_section(type_: From | None = None, scene: From | None = None, mod
         "scene": scene or From("empty", "added"),
         "default_control_mode": From(mode, "added: a mode that needs no device"),
     }
+
+
+def simulated(name: str, body: Body) -> From | None:
+    """With --sim, the scene's camera for one whose name no camera of scenes has: by the words in its name."""
+    wrists = {f"{prefix}wrist": f"{prefix}wrist_cam" for prefix in body.prefixes}
+    if name in ("top", "front", *wrists):
+        return None
+    sides = [camera for prefix, camera in zip(body.prefixes, wrists.values(), strict=True) if prefix in name]
+    if "wrist" in name or "hand" in name:
+        camera = sides[0] if sides else next(iter(wrists.values()))
+    else:
+        camera = "front" if "front" in name else "top"
+    cameras = ", ".join(("top", "front", *wrists.values()))
+    return From({"camera": camera}, f"GUESS: with --sim, a camera of the scene: {cameras}")
 
 
 def state_observation(body: Body) -> dict[str, Any]:

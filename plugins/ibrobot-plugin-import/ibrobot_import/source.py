@@ -58,10 +58,12 @@ class Source:
         """The whole file."""
         return Node(self, ())
 
-    def mark(self, key: Key, fate: Fate, reason: str) -> None:
-        """Note what became of the values at or below `key`; those with a verdict are refused no more."""
+    def mark(self, key: Key, fate: Fate, reason: str, *, keeps: bool = False) -> None:
+        """Note what became of the values at or below `key`; `keeps` earlier verdicts."""
+        if key and _is_plain_list(self.document.get(*key[:-1])):
+            key = key[:-1]
         for leaf in _leaves(self.document.get(*key), key):
-            if fate is not Fate.REFUSED or leaf not in self._fates:
+            if not keeps or leaf not in self._fates:
                 self._fates[leaf] = (fate, reason)
 
     def verdicts(self, program: str) -> list[Verdict]:
@@ -154,7 +156,8 @@ class Node:
     def numbers(self, count: int) -> list[float]:
         """A list of numbers, without a verdict; empty if it is not there, or has a fault."""
         values = [each.value for each in self.each()]
-        if values and (len(values) != count or any(isinstance(v, bool) or not isinstance(v, int | float) for v in values)):
+        right = all(isinstance(each, int | float) and not isinstance(each, bool) for each in values)
+        if values and (len(values) != count or not right):
             self.fault(f"{count} numbers")
             return []
         return values
@@ -171,6 +174,10 @@ class Node:
 
     def refuse(self, reason: str) -> None:
         """It, or all below it without a verdict, has no counterpart."""
+        self.source.mark(self.key, Fate.REFUSED, reason, keeps=True)
+
+    def drop(self, reason: str) -> None:
+        """It, and all below it, has no counterpart, whatever was taken of it before."""
         self.source.mark(self.key, Fate.REFUSED, reason)
 
     def fault(self, expected: str) -> None:
@@ -198,10 +205,14 @@ class Node:
         return self.changed(value, note) if note else self.taken(value)
 
 
+def _is_plain_list(value: Any) -> bool:
+    return isinstance(value, list) and not any(isinstance(each, Mapping | list) for each in value)
+
+
 def _leaves(value: Any, key: Key) -> list[Key]:
     """The keys of the values below `key`; a list of plain values is one."""
     if isinstance(value, Mapping) and value:
         return [leaf for name, each in value.items() for leaf in _leaves(each, (*key, name))]
-    if isinstance(value, list) and any(isinstance(each, Mapping | list) for each in value):
+    if isinstance(value, list) and not _is_plain_list(value):
         return [leaf for i, each in enumerate(value) for leaf in _leaves(each, (*key, i))]
     return [key] if key else []
