@@ -1,4 +1,4 @@
-"""The plugin's hooks: transport `zenoh`, its panel, the commands `ibrobot topic …`, `service …` and `certs`."""
+"""The plugin's hooks: transport `zenoh`, its panel, commands for topics, services, bags and certificates."""
 
 from __future__ import annotations
 
@@ -88,9 +88,16 @@ def _service() -> click.Command:
     return service
 
 
+def _bag() -> click.Command:
+    from ibrobot_zenoh.commands.bag import bag
+
+    return bag
+
+
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """Commands for topics, services and certificates."""
+    """Commands for topics, services, bags and certificates."""
+    yield Command("bag", "Play recorded episodes to machines on the network.", _bag)
     yield Command("topic", "List, show, measure and publish topics shared over the network.", _topic)
     yield Command("service", "List, show and call services shared over the network.", _service)
     yield Command("certs", "Make certificates for a server and its robots.", _certs)

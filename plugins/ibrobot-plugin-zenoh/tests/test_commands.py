@@ -132,6 +132,20 @@ def test_pub(robot: ZenohTransport, endpoint: str):
     assert [arrived.get(timeout=WAIT_S) for _ in range(3)] == [Bool(False)] * 3
 
 
+def test_words_of_ros2(robot: ZenohTransport, endpoint: str):
+    arrived: queue.SimpleQueue[Message] = queue.SimpleQueue()
+    robot.subscribe_messages("/lamp", arrived.put)
+    run("pub", "-1", "-w", "/lamp", "std_msgs/msg/Bool", "{data: true}", "--endpoint", endpoint)
+    run("pub", "-r", "500", "-t", "2", "/lamp", "std_msgs/msg/Bool", "{data: false}", "--endpoint", endpoint)
+    run("pub", "--times", "1", "/lamp", "std_msgs/msg/Bool", "{data: true}", "--endpoint", endpoint)
+    assert [arrived.get(timeout=WAIT_S) for _ in range(4)] == [Bool(each) for each in (True, False, False, True)]
+    assert run("list", "-t", "--endpoint", endpoint).startswith("/joint_states  sensor_msgs/msg/JointState")
+    echoed = run("echo", "--once", "/joint_states", "--endpoint", endpoint)
+    assert len(list(yaml.safe_load_all(echoed))) == 2
+    both = ["pub", "--once", "--rate", "1", "/lamp", "std_msgs/msg/Bool", "{}", "--endpoint", endpoint]
+    assert "--once excludes --rate and --times" in CliRunner().invoke(topic, both).output
+
+
 def test_pub_warns_without_a_subscriber(robot: ZenohTransport, endpoint: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("ibrobot_zenoh.commands.topic._HEARD_S", 0.05)
     result = CliRunner().invoke(topic, ["pub", "/dark", "std_msgs/msg/Bool", "data: true", "--endpoint", endpoint])

@@ -1,1 +1,1 @@
-"""The commands `ibrobot topic …`, `ibrobot service …` and `ibrobot certs`."""
+"""The commands `ibrobot topic …`, `ibrobot service …`, `ibrobot bag …` and `ibrobot certs`."""

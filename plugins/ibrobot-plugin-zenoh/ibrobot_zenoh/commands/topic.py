@@ -41,7 +41,13 @@ def _command(function: Callable[..., None]) -> click.Command:
 
 
 @_command
-@click.option("--types", is_flag=True, help="Show message types and the numbers of publishers and subscribers.")
+@click.option(
+    "-t",
+    "--types",
+    "--show-types",
+    is_flag=True,
+    help="Show message types and the numbers of publishers and subscribers.",
+)
 def list_(transport: ZenohTransport, types: bool) -> None:
     """List the shared topics."""
     shared = transport.shared_topics(_LIST_S)
@@ -55,13 +61,14 @@ def list_(transport: ZenohTransport, types: bool) -> None:
 @_command
 @click.argument("name", metavar="TOPIC")
 @click.option("--count", "-n", type=click.IntRange(1), help="Stop after this many messages.")
-@click.option("--full", is_flag=True, help="Show all elements of arrays.")
-def echo_(transport: ZenohTransport, name: str, count: int | None, full: bool) -> None:
+@click.option("--once", is_flag=True, help="Stop after the first message.")
+@click.option("-f", "--full", "--full-length", is_flag=True, help="Show all elements of arrays.")
+def echo_(transport: ZenohTransport, name: str, count: int | None, once: bool, full: bool) -> None:
     """Show the messages on TOPIC, until Ctrl-C."""
     arrived: queue.SimpleQueue[Message] = queue.SimpleQueue()
     transport.subscribe_messages(name, arrived.put)
     _warn_if_unpublished(transport, name)
-    for _ in _counted(count):
+    for _ in _counted(1 if once else count):
         echo(f"{shown(arrived.get(), full=full)}---")
 
 
@@ -96,18 +103,39 @@ def hz(transport: ZenohTransport, name: str, count: int | None, period: float) -
 @click.argument("name", metavar="TOPIC")
 @click.argument("type_name", metavar="TYPE")
 @click.argument("text", metavar="MESSAGE")
-@click.option("--rate", type=click.FloatRange(0.01, 1000), help="Publish at this rate [Hz], until Ctrl-C.")
-@click.option("--count", "-n", type=click.IntRange(1), help="With --rate: stop after this many messages.")
-def pub(transport: ZenohTransport, name: str, type_name: str, text: str, rate: float | None, count: int | None) -> None:
+@click.option("-r", "--rate", type=click.FloatRange(0.01, 1000), help="Publish at this rate [Hz], until Ctrl-C.")
+@click.option(
+    "-t",
+    "--times",
+    "--count",
+    "-n",
+    "count",
+    type=click.IntRange(1),
+    help="Stop after this many messages; 1 Hz without --rate.",
+)
+@click.option("-1", "--once", is_flag=True, help="Publish one message, as without --rate and --times.")
+@click.option(
+    "-w", "--wait-matching-subscriptions", "wait", is_flag=True, help="Wait for a subscriber before publishing."
+)
+def pub(
+    transport: ZenohTransport, name: str, type_name: str, text: str, rate: float | None, count: int | None,
+    once: bool, wait: bool,
+) -> None:  # fmt: skip
     """Publish MESSAGE, as YAML, on TOPIC: once, or repeatedly.
 
     E.g. `ibrobot topic pub /lamp std_msgs/msg/Bool '{data: true}'`.
     """
+    if once and (rate is not None or count is not None):
+        raise click.UsageError("--once excludes --rate and --times")
+    if count is not None and rate is None:
+        rate = 1.0
     message = message_from(type_name, text)
     known = {each.type for each in transport.shared_topics(_LIST_S) if each.name == name and each.publishers}
     if known - {message.ros_type}:
         raise TransportError(f"topic {name} carries {', '.join(sorted(known))}, not {message.ros_type}")
-    if not transport.is_heard(name, message.ros_type, _HEARD_S):
+    while not (heard := transport.is_heard(name, message.ros_type, _HEARD_S)) and wait:
+        pass
+    if not heard:
         echo(f"{name} has no subscriber yet", err=True)
     due = time.monotonic()
     for _ in _counted(1 if rate is None else count):

@@ -1,0 +1,201 @@
+"""`ibrobot bag play`: publishes a recorded episode at its times, but for what commands a robot."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import closing, suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import attrs
+import click
+from ibrobot_ros2.convert import make_class
+from ibrobot_ros2.definitions import standard_types
+
+from ibrobot_core.api import (
+    NS_PER_S,
+    Clock,
+    Contract,
+    EpisodeSummary,
+    IbrobotError,
+    Message,
+    NotSupported,
+    RealClock,
+    Recorded,
+    RecorderError,
+    did_you_mean,
+    ns,
+)
+from ibrobot_core.app import EpisodePath, echo, installed_plugins
+from ibrobot_zenoh.commands.network import connected, network_options
+
+CLOCK = "/clock"
+_CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+_LATCHED = ("/tf_static", "/robot_description")
+"""Topics whose last message is for later subscribers, too."""
+_COMMAND_TYPES = ("trajectory_msgs/msg/JointTrajectory", "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
+_COMMAND_NAME = re.compile(r"(?:^|[/_])(?:cmd|commands?|goal|target)(?:$|[/_])")
+
+
+@click.group()
+def bag() -> None:
+    """Play recorded episodes to machines on the network."""
+
+
+@bag.command()
+@click.argument("episode", type=EpisodePath())
+@network_options
+@click.option("-r", "--rate", default=1.0, show_default=True, type=click.FloatRange(0.001, 1000), help="Speed.")
+@click.option("-l", "--loop", is_flag=True, help="Begin again at the end, until Ctrl-C.")
+@click.option("--start-offset", default=0.0, metavar="S", type=click.FloatRange(0), help="Begin so many seconds in.")
+@click.option(
+    "--clock", "clock_hz", is_flag=False, flag_value=40.0, type=click.FloatRange(0.001, 1000), metavar="[HZ]",
+    help="Also publish the recorded time on /clock; 40 Hz without a number.",
+)  # fmt: skip
+@click.option("--topics", multiple=True, metavar="TOPIC", help="Play only this topic; can be repeated.")
+@click.option("--exclude-topics", multiple=True, metavar="TOPIC", help="Leave out this topic; can be repeated.")
+@click.option("-m", "--remap", "renamed", multiple=True, metavar="OLD:=NEW", help="Play a topic under another name.")
+def play(
+    episode: Path, config: str | None, endpoints: tuple[str, ...], domain: int | None, rate: float, loop: bool,
+    start_offset: float, clock_hz: float | None, topics: tuple[str, ...], exclude_topics: tuple[str, ...],
+    renamed: tuple[str, ...],
+) -> None:  # fmt: skip
+    """Play EPISODE: publish its messages at their times, with their stamps.
+
+    A run of ibrobot receives the topics of its `transport.share.subscribe`, and ROS 2 nodes receive all. Topics that
+    command a robot are not played, so that no arm moves by it: the actions of the recorded contract, trajectories,
+    twists, and names with cmd, command, goal or target. To look at one, give it another name with --remap.
+    """
+    names = dict(_renaming(each) for each in renamed)
+    with closing(installed_plugins().open_episode(episode)) as reader:
+        summary = reader.summary()
+        chosen = choose(summary, topics, exclude_topics, names)
+        start_ns = summary.start_ns + ns(start_offset)
+        if start_ns > summary.end_ns:
+            length = (summary.end_ns - summary.start_ns) / NS_PER_S
+            raise RecorderError(f"{episode}: --start-offset {start_offset:g} is after its end; it lasts {length:.1f} s")
+        with suppress(KeyboardInterrupt), connected(config, endpoints, domain) as transport:
+            player = Player(RealClock(), transport.publish_message, chosen, rate, clock_hz)
+            while True:
+                player.play(reader.messages_since(start_ns, list(chosen)), start_ns)
+                if not loop:
+                    break
+        echo(f"{player.count} messages on {len(chosen)} topics")
+
+
+@attrs.define
+class Player:
+    """Publishes messages at their times.
+
+    Args:
+        clock: the time to play by.
+        publish: publishes a message on a topic.
+        names: topic in the episode -> topic to publish.
+        rate: speed.
+        clock_hz: how often to publish /clock [Hz]; None for never.
+    """
+
+    clock: Clock
+    publish: Callable[..., object]
+    names: Mapping[str, str]
+    rate: float = 1.0
+    clock_hz: float | None = None
+    count: int = attrs.field(default=0, init=False)
+    """Number of published messages."""
+    _unsendable: set[str] = attrs.field(factory=set, init=False)
+
+    def play(self, messages: Iterator[Recorded], start_ns: int) -> None:
+        """Publish messages, the first of which may be at `start_ns` [ns]; returns after the last one."""
+        began_ns = self.clock.now_ns()
+        step_ns = None if self.clock_hz is None else max(1, round(NS_PER_S * self.rate / self.clock_hz))
+        ticks = 0
+        for each in messages:
+            while step_ns is not None and start_ns + ticks * step_ns <= each.received_ns:
+                self._wait(began_ns, ticks * step_ns)
+                self.publish(CLOCK, clock_message(start_ns + ticks * step_ns))
+                ticks += 1
+            self._wait(began_ns, each.received_ns - start_ns)
+            self._send(self.names[each.topic], each.message)
+
+    def _wait(self, began_ns: int, recorded_ns: int) -> None:
+        self.clock.sleep_until(began_ns + round(recorded_ns / self.rate))
+
+    def _send(self, topic: str, message: Message) -> None:
+        try:
+            self.publish(topic, message, latched=topic in _LATCHED)
+        except IbrobotError as error:
+            if topic not in self._unsendable:
+                self._unsendable.add(topic)
+                echo(f"{topic} is not played: {error}", err=True)
+            return
+        self.count += 1
+
+
+@cache
+def _clock_class() -> Any:
+    return make_class(_CLOCK_TYPE, standard_types())
+
+
+def clock_message(stamp_ns: int) -> Message:
+    """The message of /clock for a time [ns]."""
+    message: Message = _clock_class()(stamp_ns)
+    return message
+
+
+def commands(summary: EpisodeSummary) -> dict[str, str]:
+    """The topics of an episode that command a robot -> why."""
+    contract = Contract.of_episode(summary.metadata)
+    actions = {part.topic for part in contract.action_parts} if contract is not None else set()
+    found = {}
+    for topic, about in summary.topics.items():
+        if topic in actions:
+            found[topic] = "an action of the recorded contract"
+        elif about.type in _COMMAND_TYPES:
+            found[topic] = f"a {about.type}"
+        elif _COMMAND_NAME.search(topic):
+            found[topic] = "by its name"
+    return found
+
+
+def choose(
+    summary: EpisodeSummary, topics: Collection[str], excluded: Collection[str], names: Mapping[str, str]
+) -> dict[str, str]:
+    """Topic of an episode -> the name to play it under.
+
+    Args:
+        summary: the episode.
+        topics: those to play; all if empty.
+        excluded: those to leave out.
+        names: topic -> another name.
+
+    Raises:
+        NotSupported: for a topic that is not there, or commands a robot.
+    """
+    known = list(summary.topics)
+    for topic in (*topics, *excluded, *names):
+        if topic not in known:
+            raise NotSupported(f"{summary.path}: has no topic {topic!r}{did_you_mean(topic, known, 'its topics')}")
+    forbidden = commands(summary)
+    for topic, new in names.items():
+        if not new.startswith("/"):
+            raise NotSupported(f"--remap {topic}:={new}: a topic starts with /")
+        if new in forbidden or _COMMAND_NAME.search(new):
+            raise NotSupported(f"--remap {topic}:={new}: {new} commands a robot; choose another name")
+    wanted = [topic for topic in topics or known if topic not in excluded]
+    for topic in topics:
+        if topic in forbidden and topic not in names:
+            reason = f"{topic} commands a robot ({forbidden[topic]}), and is not played"
+            raise NotSupported(f"{reason}; give it another name, e.g. --remap {topic}:=/recorded/joints")
+    left_out = [topic for topic in wanted if topic in forbidden and topic not in names]
+    if left_out:
+        echo(f"not played, as they command a robot: {', '.join(left_out)}", err=True)
+    return {topic: names.get(topic, topic) for topic in wanted if topic not in left_out}
+
+
+def _renaming(text: str) -> tuple[str, str]:
+    old, sign, new = text.partition(":=")
+    if not sign or not old or not new:
+        raise click.BadParameter(f"expected OLD:=NEW, got {text!r}", param_hint="--remap")
+    return old, new
