@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import queue
 from collections.abc import Collection, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, override
 
@@ -200,15 +201,19 @@ def network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> tuple[ZenohTrans
     return router(address), address
 
 
+def _put(arrived: queue.SimpleQueue[tuple[str, Message]], topic: str, message: Message) -> None:
+    arrived.put((topic, message))
+
+
 def test_episode_is_played_into_the_network_without_its_commands(network: tuple[ZenohTransport, str]) -> None:
     machine, address = network
     arrived: queue.SimpleQueue[tuple[str, Message]] = queue.SimpleQueue()
     for topic in (*FORBIDDEN, "/joint_states", CLOCK):
-        machine.subscribe_messages(topic, lambda message, topic=topic: arrived.put((topic, message)))
+        machine.subscribe_messages(topic, partial(_put, arrived, topic))
     arguments = ["play", "taught", "--endpoint", address, "--clock", "-r", "1000", "--start-offset", "0.01"]
     result = CliRunner().invoke(bag, arguments, catch_exceptions=False)
     assert result.output.endswith("12 messages on 3 topics\n")
-    found: dict[str, list[Message]] = {}
+    found: dict[str, list[Any]] = {}
     while sum(map(len, found.values())) < 5:
         topic, message = arrived.get(timeout=WAIT_S)
         found.setdefault(topic, []).append(message)
