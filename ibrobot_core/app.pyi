@@ -9,7 +9,6 @@ from ibrobot_core.descriptors import (
     GuideDescriptor as GuideDescriptor,
     ReportDescriptor as ReportDescriptor,
     ConfigFile as ConfigFile,
-    ForeignConfig as ForeignConfig,
     PoolDescriptor as PoolDescriptor,
 )
 

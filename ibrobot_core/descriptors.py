@@ -341,18 +341,6 @@ class ConfigFile:
 
 
 @attrs.frozen
-class ForeignConfig:
-    """A format of another program's configs, which a command of the plugin makes into robot YAMLs."""
-
-    name: str
-    """What such a file is, e.g. `a robot YAML of IB-Robot`."""
-    reads: Callable[[Mapping[str, Any]], bool]
-    """Returns whether the plain values of a file have this format."""
-    command: str
-    """The command that takes such a file, e.g. `config import`."""
-
-
-@attrs.frozen
 class Command:
     """A command of a plugin: `ibrobot NAME …`; `load` imports it when it is called.
 
@@ -368,6 +356,9 @@ class Command:
     """The classes of what it prints with `--events`. Pages can run a command with events, and show its progress."""
     check: Callable[[], None] = attrs.field(default=lambda: None, kw_only=True)
     """As `Descriptor.check`."""
+    takes: Callable[[Mapping[str, Any]], str] = attrs.field(default=lambda values: "", kw_only=True)
+    """Returns what a file with these plain values is, e.g. `a contract of Rosetta`, if it is no robot YAML but the
+    command takes it; errors then name the command. Otherwise empty."""
     commands: tuple[Command, ...] = attrs.field(default=(), kw_only=True)
     """The commands below it that programs use; their names begin with its own, e.g. `episodes trim`."""
 

@@ -135,11 +135,6 @@ def ibrobot_configs() -> Iterable[descriptors.ConfigFile]:  # type: ignore[empty
 
 
 @hookspec
-def ibrobot_foreign_configs() -> Iterable[descriptors.ForeignConfig]:  # type: ignore[empty-body]
-    """Formats of other programs' configs that a command of this plugin makes into robot YAMLs."""
-
-
-@hookspec
 def ibrobot_commands() -> Iterable[descriptors.Command]:  # type: ignore[empty-body]
     """Commands that this plugin adds to `ibrobot`."""
 

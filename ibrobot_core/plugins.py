@@ -54,8 +54,7 @@ KINDS: Mapping[str, str] = {
 }
 """Plugin kind -> its registration hook."""
 _UNTYPED = tuple(
-    f"ibrobot_{objects}"
-    for objects in ("readers", "decoders", "configs", "foreign_configs", "commands", "panels", "guides", "reports")
+    f"ibrobot_{objects}" for objects in ("readers", "decoders", "configs", "commands", "panels", "guides", "reports")
 )
 """Registration hooks for objects that the YAML does not name by `type`."""
 
@@ -103,7 +102,6 @@ class Registry:
     entries: dict[tuple[str, str], Entry] = attrs.field(factory=dict)
     failures: list[Failure] = attrs.field(factory=list)
     configs: list[descriptors.ConfigFile] = attrs.field(factory=list)
-    foreign_configs: list[descriptors.ForeignConfig] = attrs.field(factory=list)
     readers: list[descriptors.ReaderDescriptor] = attrs.field(factory=list)
     panels: list[descriptors.PanelDescriptor] = attrs.field(factory=list)
     guides: list[descriptors.GuideDescriptor] = attrs.field(factory=list)
@@ -377,7 +375,6 @@ def _add(registry: Registry, plugin: str, package: str, version: str, load: Call
     registry.readers += offers["ibrobot_readers"]
     registry.decoders += offers["ibrobot_decoders"]
     registry.configs += offers["ibrobot_configs"]
-    registry.foreign_configs += offers["ibrobot_foreign_configs"]
     registry.panels += offers["ibrobot_panels"]
     registry.guides += offers["ibrobot_guides"]
     registry.reports += offers["ibrobot_reports"]

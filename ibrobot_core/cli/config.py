@@ -59,17 +59,12 @@ def check(
 ) -> None:
     """Report all faults of CONFIG; exit with 2 if there are any."""
     from ibrobot_core.config import find_config, load_config
-    from ibrobot_core.config.load import contract_alone, read_document
     from ibrobot_core.config.missing import absent_models, unavailable_modes
     from ibrobot_core.launch.absence import absent_sensors, describe_absent
     from ibrobot_core.launch.models import check_models
 
     try:
         path = find_config(config, installed_plugins())
-        if not overrides and not sim and mode is None and set((document := read_document(path)).root) == {"contract"}:
-            keys = dict.fromkeys(each.key for each in contract_alone(document, path.parent).observations)
-            echo("[]" if as_json else f"{path}: ok (a contract alone, to convert bags: {', '.join(keys)})")
-            return
         found = load_config(path, overrides=overrides, mode=mode, sim=sim)
         modes = [name for name in found.control_modes if name not in found.unavailable]
         models = check_models(found, installed_plugins(), modes) if deep else []
@@ -137,12 +132,9 @@ def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | 
 @click.argument("config")
 @click.argument("copy", type=click.Path(path_type=Path, dir_okay=False))
 @click.option(
-    "--value",
-    "values",
-    multiple=True,
-    metavar="NAME=VALUE",
+    "--value", "values", multiple=True, metavar="NAME=VALUE",
     help="Default of the variable ${NAME} in the copy, e.g. IBROBOT_FOLLOWER_PORT=/dev/ttyACM1.",
-)
+)  # fmt: skip
 @click.option("--defaults", is_flag=True, help="Keep all other defaults; do not ask.")
 @click.pass_context
 def copy(context: click.Context, config: str, copy: Path, values: tuple[str, ...], defaults: bool) -> None:

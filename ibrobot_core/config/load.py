@@ -52,12 +52,12 @@ def load_config(
     Raises:
         ConfigError: with all faults, in file order.
     """
-    registry = registry or installed_plugins()
     document = read_document(path)
-    if (foreign := next((each for each in registry.foreign_configs if each.reads(document.root)), None)) is not None:
-        raise ConfigError([Problem(path, 0, "", f"this is {foreign.name}: ibrobot {foreign.command} {path}")])
+    for command in (registry or installed_plugins()).commands.values():
+        if found := command.takes(document.root):
+            raise ConfigError([Problem(path, 0, "", f"this is {found}: ibrobot {command.name} {path}")])
     _override(document, overrides, mode)
-    config = _build(document, Path(path), sim, registry, communicates)
+    config = _build(document, Path(path), sim, registry or installed_plugins(), communicates)
     warn_of_secrets(document)
     return config
 
@@ -65,7 +65,7 @@ def load_config(
 def contract_alone(document: Document, base: Path, registry: Registry | None = None) -> ContractConfig:
     """The contract of a document without other sections, for converting foreign bags.
 
-    Its actions have `joints` in place of an executor.
+    Its actions have `joints`, since there are no executors to determine them.
 
     Args:
         document: the document from `read_document`.
@@ -75,11 +75,6 @@ def contract_alone(document: Document, base: Path, registry: Registry | None = N
     Raises:
         ConfigError: with all faults, in file order.
     """
-    actions = document.get("contract", "actions")
-    for action in (each for each in actions if isinstance(each, dict)) if isinstance(actions, list) else ():
-        for key, value in (("executor", str(action.get("topic", ""))), ("foreign", True)):
-            if action.setdefault(key, value) != value:
-                document.add(("contract", "actions"), f"{key} has no meaning in a contract alone; leave it out")
     sections = SectionParser(document, registry or installed_plugins(), base, sim=False).contract()
     contract = ContractChecks(document, sections, alone=True).run()
     document.raise_problems()

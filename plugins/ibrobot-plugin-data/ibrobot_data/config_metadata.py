@@ -31,6 +31,13 @@ def load_contract(path: str | Path) -> RobotConfig:
     document = read_document(path)
     if set(document.root) != {"contract"}:
         return load_config(path)
+    section = document.root["contract"]
+    actions = section.get("actions") if isinstance(section, Mapping) else None
+    for action in actions if isinstance(actions, list) else ():
+        if isinstance(action, dict):
+            for key, value in (("executor", str(action.get("topic", ""))), ("foreign", True)):
+                if action.setdefault(key, value) != value:
+                    document.add(("contract", "actions"), f"{key} has no meaning in a contract alone; leave it out")
     contract = contract_alone(document, Path(path).absolute().parent)
     parts_of = {spec.executor: spec.joints for spec in contract.actions}
     return RobotConfig(

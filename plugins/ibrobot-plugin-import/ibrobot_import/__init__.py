@@ -1,18 +1,16 @@
-"""The plugin's hooks: `ibrobot config import`, and the formats that it reads."""
+"""The plugin's hook: `ibrobot config import`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import hookimpl
-from ibrobot_core.app import Command, ForeignConfig
+from ibrobot_core.app import Command
 from ibrobot_import.formats import FORMATS
 
 if TYPE_CHECKING:
     import click
-
-_COMMAND = "config import"
 
 
 def _import() -> click.Command:
@@ -21,14 +19,12 @@ def _import() -> click.Command:
     return import_
 
 
+def _takes(values: Mapping[str, Any]) -> str:
+    return next((each.name for each in FORMATS if each.reads(values)), "")
+
+
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot config import`."""
-    yield Command(_COMMAND, "Make a robot YAML from a config of IB-Robot, Rosetta or LeRobot.", _import)
-
-
-@hookimpl
-def ibrobot_foreign_configs() -> Iterable[ForeignConfig]:
-    """The formats that `ibrobot config import` reads."""
-    for each in FORMATS:
-        yield ForeignConfig(each.name, each.reads, _COMMAND)
+    summary = "Make a robot YAML from a config of IB-Robot, Rosetta or LeRobot."
+    yield Command("config import", summary, _import, takes=_takes)

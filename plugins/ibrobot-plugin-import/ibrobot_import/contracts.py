@@ -182,4 +182,5 @@ def _foreign_action(key: From, publish: Node, names: Node, behaviour: Node) -> d
     else:
         values["select"] = names.taken(select)
     values["joints"] = From(joints, f"{names.origin}; the names of the numbers", names.line)
+    values |= {"executor": values["topic"], "foreign": From(True, "added: the commands of bags")}
     return {name: value for name, value in values.items() if value is not None}

@@ -201,6 +201,8 @@ def _action(key: str, node: Node) -> dict[str, Any] | None:
         "type": channel["type"].text(),
         "select": select,
         "joints": From(names, f"{node['select'].origin}; the names of the numbers", node.line),
+        "executor": channel["topic"].text(),
+        "foreign": From(True, "added: the commands of bags"),
     }
     strategy = node["align"]["strategy"]
     if strategy.value == "hold":
