@@ -127,7 +127,7 @@ def convert(page: Any, shot: Shot = lambda page, name: None) -> None:
     shot(page, "episodes")
     page.get_by_role("link", name="Record", exact=True).click()
     page.locator(".job").get_by_role("link", name="Convert", exact=True).click()
-    assert page.get_by_label("Dataset", exact=True).input_value() == "datasets/pick", "is filled in"
+    until(page, "document.querySelector('#field-out')?.value === 'datasets/pick'")  # filled in
     page.get_by_role("button", name="Convert", exact=True).click()
     page.get_by_role("link", name="Open the dataset").wait_for(timeout=_WAIT_MS)
     shot(page, "convert")

@@ -178,7 +178,7 @@ def _known(ui: Ui) -> dict[str, list[dict[str, str]]]:
     found = find_recordings(ui.folders.paths)
     counts: dict[str, int] = {}
     for path in found.episodes:
-        name = ui.folders.name(_dataset_of(path))
+        name = ui.folders.name(_dataset_of(ui, path))
         counts[name] = counts.get(name, 0) + 1
     return {
         "episodes": [
@@ -191,10 +191,10 @@ def _known(ui: Ui) -> dict[str, list[dict[str, str]]]:
     }
 
 
-def _dataset_of(episode: Path) -> Path:
+def _dataset_of(ui: Ui, episode: Path) -> Path:
     """The folder that one gives to work on all episodes of a dataset, which are in its folder `episodes`."""
     folder = episode.parent
-    return folder.parent if folder.name == "episodes" and folder.parent.name == "episodes" else folder
+    return folder.parent if folder.name == "episodes" and folder.parent not in ui.folders.paths else folder
 
 
 def _field_json(name: str, field: attrs.Attribute[Any]) -> dict[str, Any]:
