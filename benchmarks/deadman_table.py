@@ -679,7 +679,7 @@ def measure(device: str, event: str, folder: Path) -> Cell | None:
 
 
 def _measure(person: Person, event: str) -> Cell:
-    overrides = [f"teleoperation={{it: {person.device}}}", "control_modes.teleop.teleop=it"]
+    overrides = [f"teleoperation.it={person.device}", "control_modes.teleop.teleop=it"]
     registry = installed_plugins()
     config = load_config(CONFIG, sim=True, mode="teleop", overrides=overrides, registry=registry)
     runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, keys=person.subscribe)))

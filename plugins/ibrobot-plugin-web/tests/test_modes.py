@@ -11,7 +11,10 @@ from ibrobot_core.app import find_config, installed_plugins, load_config, shippe
 
 REGISTRY = installed_plugins()
 SHIPPED = sorted(shipped_configs(REGISTRY))
-pytestmark = pytest.mark.integration
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(("hardware", "mujoco") not in REGISTRY.entries, reason="needs ibrobot-plugin-mujoco"),
+]
 
 
 def modes(robot: str, *, terminal: bool = False) -> dict[str, Any]:
