@@ -1,4 +1,4 @@
-"""The plugin's hooks: section `ros`, its panel, and what `ibrobot doctor` says of the ROS of this machine."""
+"""The plugin's hooks: section `ros`, hardware `ros2_control`, and checks of `ibrobot doctor` for the ROS found here."""
 
 from __future__ import annotations
 

@@ -28,6 +28,8 @@ _SETUP_S = 10.0
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 1.0, 30.0
 _STATUS_S = 1.0
 _STOP_S = 5.0
+_END_S = 1.0
+"""Longest time for sending the rest at the end [s]."""
 
 
 class RosNode(Component):
@@ -117,9 +119,11 @@ class RosNode(Component):
         for calls, call in ((session.on_goal, self._actions.take_event), (session.on_state, self._actions.take_state)):
             if call in calls:
                 calls.remove(call)  # type: ignore[arg-type]
+        wire, self._wire = self._wire, None
+        if wire is not None:
+            self._send_rest(wire)
         self.topics.close()
         self._services.close()
-        wire, self._wire = self._wire, None
         if wire is not None:
             wire.send({"op": "end"})
             wire.flush(1.0)
@@ -145,6 +149,12 @@ class RosNode(Component):
                 self._ending.wait(_GLANCE_S)
             else:
                 self.topics.send_next(wire, _GLANCE_S)
+
+    def _send_rest(self, wire: Wire) -> None:
+        """Send what waits at the end: with it ends what others record."""
+        deadline_s = time.monotonic() + _END_S
+        while not wire.closed and time.monotonic() < deadline_s and self.topics.send_next(wire, 0.0):
+            pass
 
     def _receive(self) -> None:
         """Take what the node sends, watch it, and start it again, in a thread of its own."""

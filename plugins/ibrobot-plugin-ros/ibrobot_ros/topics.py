@@ -11,7 +11,7 @@ from ibrobot_ros2 import decode, encode
 from ibrobot_core.api import NS_PER_S, IbrobotError, JointState
 from ibrobot_core.app import Received, RunView, Subscription
 from ibrobot_ros.options import NAME, Ros2ControlOptions, RosOptions
-from ibrobot_ros.wire import Wire
+from ibrobot_ros.wire import Frame, Wire
 
 CLOCK = "/clock"
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
@@ -27,8 +27,8 @@ LATCHED = ("/tf_static", "/robot_description", "/robot_description_semantic")
 """Topics that ROS latches."""
 LARGE = SENSOR_DATA[:3]
 """Types that are not sent to the node while nobody subscribes."""
-DEPTH = 200
-"""Messages that wait for the thread that sends them."""
+DEPTH = 4096
+"""Messages that wait for the thread that sends them, as many as for a recorder; what exceeds them is dropped."""
 BACKLOG = 16 << 20
 """Bytes that the node may leave unread before messages for it are dropped."""
 
@@ -93,17 +93,22 @@ class Topics:
                 {"op": "subscriber", "topic": name, "type": type_name, "qos": qos, "rate_hz": self._options.rate_hz}
             )
         for received in self._session.bus.latched().values():
-            self._send(wire, received)
+            wire.send_all(self._frames(received, wire.backlog))
 
     def send_next(self, wire: Wire, timeout_s: float) -> bool:
-        """Send the next message of the bus; returns whether there was one within `timeout_s` [s]."""
+        """Send the messages of the bus that wait; returns whether there was one within `timeout_s` [s]."""
         queue = self._queue
-        received = queue.get(timeout_s) if queue is not None else None
-        if received is None:
+        first = queue.get(timeout_s) if queue is not None else None
+        if queue is None or first is None:
             return False
-        self._send(wire, received)
-        if self.clock and isinstance(received.message, JointState):
-            self._send_clock(wire, received.message.header.stamp_ns)
+        if queue.dropped:
+            self._note_lost(queue)
+        frames: list[Frame] = []
+        for received in (first, *queue.drain()):
+            frames += self._frames(received, wire.backlog)
+            if self.clock and isinstance(received.message, JointState):
+                frames += self._clock_frames(received.message.header.stamp_ns)
+        wire.send_all(frames)
         return True
 
     def take(self, name: str, payload: bytes) -> None:
@@ -125,16 +130,24 @@ class Topics:
             self._told.add(what)
             self._session.log.warning("ros: %s", what)
 
+    def _note_lost(self, queue: Subscription) -> None:
+        """Count what the bus dropped because nobody took it in time."""
+        for topic, lost in queue.lost.copy().items():
+            self.counts[f"lost {topic}"] = lost
+        self.tell("this machine is too slow for its topics: the oldest messages are dropped; ros.publish lists fewer")
+
     def _is_shared(self, topic: str) -> bool:
         if topic in self._options.subscribe or ros_name(topic, self._options.namespace) in self._theirs:
             return False
         return self._options.publish == "all" or topic in self._options.publish
 
-    def _send(self, wire: Wire, received: Received) -> None:
+    def _frames(self, received: Received, backlog: int) -> list[Frame]:
+        """A message of the bus for a node that has not read `backlog` bytes [bytes] yet."""
         topic, type_name = received.topic, received.message.ros_type
         if not self._is_shared(topic):
-            return
+            return []
         name = ros_name(topic, self._options.namespace)
+        frames: list[Frame] = []
         if topic not in self._declared:
             self._declared[topic] = type_name
             if not NAME.fullmatch(name):
@@ -142,22 +155,24 @@ class Topics:
             else:
                 latched = topic in self._session.bus.latched()
                 qos = profile(topic, type_name, self._options.qos, latched=latched)
-                wire.send({"op": "publisher", "topic": name, "type": type_name, "qos": qos})
+                frames.append(({"op": "publisher", "topic": name, "type": type_name, "qos": qos}, b""))
         if type_name in LARGE and not self._subscribers.get(name):
-            return
-        if wire.backlog > BACKLOG:
+            return frames
+        if backlog > BACKLOG:
             self.counts[f"dropped {topic}"] += 1
-            return
+            return frames
         try:
-            wire.send({"op": "message", "topic": name}, encode(received.message).tobytes())
+            frames.append(({"op": "message", "topic": name}, encode(received.message).tobytes()))
         except IbrobotError as error:
             self.counts[f"refused {topic}"] += 1
             self.tell(f"{topic}: {error}")
+        return frames
 
-    def _send_clock(self, wire: Wire, now_ns: int) -> None:
+    def _clock_frames(self, now_ns: int) -> list[Frame]:
+        frames: list[Frame] = []
         if CLOCK not in self._declared:
             self._declared[CLOCK] = _CLOCK_TYPE
-            wire.send({"op": "publisher", "topic": CLOCK, "type": _CLOCK_TYPE, "qos": "sensor_data"})
+            frames.append(({"op": "publisher", "topic": CLOCK, "type": _CLOCK_TYPE, "qos": "sensor_data"}, b""))
         text = bytearray(_CLOCK_CDR.pack(*divmod(now_ns, NS_PER_S)))
         text[:4] = _LITTLE_ENDIAN
-        wire.send({"op": "message", "topic": CLOCK}, bytes(text))
+        return [*frames, ({"op": "message", "topic": CLOCK}, bytes(text))]

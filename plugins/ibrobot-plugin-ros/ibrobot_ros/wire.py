@@ -12,8 +12,9 @@ import socket
 import struct
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from itertools import islice
 from typing import Any
 
 Frame = tuple[dict[str, Any], bytes]
@@ -22,6 +23,8 @@ _SIZES = struct.Struct("<II")
 _LONGEST = 1 << 28
 """Longest object or payload [bytes]; a peer that announces a longer one is disconnected."""
 _CHUNK = 1 << 18
+_MOST = 256
+"""Parts of frames that one system call sends."""
 
 
 class Wire:
@@ -43,14 +46,21 @@ class Wire:
 
     def send(self, head: Mapping[str, Any], payload: bytes = b"") -> None:
         """Send a frame, or queue it until `wait` can send it."""
-        text = json.dumps(head, separators=(",", ":")).encode()
+        self.send_all([(head, payload)])
+
+    def send_all(self, frames: Iterable[tuple[Mapping[str, Any], bytes]]) -> None:
+        """Send frames, or queue them, at once: each system call may cost a turn of this process's other threads."""
+        parts: list[memoryview] = []
+        for head, payload in frames:
+            text = json.dumps(head, separators=(",", ":")).encode()
+            parts.append(memoryview(_SIZES.pack(len(text), len(payload)) + text))
+            if payload:
+                parts.append(memoryview(payload))
         with self._sending:
             if self.closed:
                 return
-            self._unsent.append(memoryview(_SIZES.pack(len(text), len(payload)) + text))
-            if payload:
-                self._unsent.append(memoryview(payload))
-            self.backlog += _SIZES.size + len(text) + len(payload)
+            self._unsent += parts
+            self.backlog += sum(map(len, parts))
             self._flush()
             if self.backlog:
                 self.wake()
@@ -102,7 +112,7 @@ class Wire:
     def _flush(self) -> None:
         while self._unsent and not self.closed:
             try:
-                sent = self._socket.sendmsg([*self._unsent][:16])
+                sent = self._socket.sendmsg([*islice(self._unsent, _MOST)])
             except BlockingIOError:
                 return
             except OSError:

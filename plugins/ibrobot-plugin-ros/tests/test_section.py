@@ -171,3 +171,24 @@ def test_a_node_that_dies_at_the_start_says_why(started):
 def test_an_interpreter_that_does_not_exist_is_named(started, tmp_path):
     with pytest.raises(MissingDependency, match=r"ros\.python: no such program: /no/python"):
         RosNode(RosOptions(python="/no/python"), make_session()).start()
+
+
+def test_messages_that_nobody_takes_in_time_are_counted(started, caplog, monkeypatch):
+    monkeypatch.setattr("ibrobot_ros.topics.DEPTH", 2)
+    part = started()
+    with part.session.bus._lock:  # nobody takes one meanwhile
+        for _ in range(5):
+            part.session.bus.publish("/lamp", Bool(True))
+    until(lambda: part.node.counts.get("lost /lamp") == 3)
+    assert caplog.text.count("too slow for its topics") == 1
+
+
+def test_the_rest_is_sent_at_the_end(started, monkeypatch):
+    part = started()
+    part.node._ending.set()
+    for thread in part.node._threads:
+        thread.join()
+    for _ in range(5):
+        part.session.bus.publish("/lamp", Bool(True))
+    part.node.stop()
+    assert len(part.frames("message")) == 5

@@ -109,7 +109,7 @@ class Process:
             "answer": services.answer,
             "ping": lambda head, payload: wire.send({"op": "pong"}),
         }
-        self._watch = topics.watch
+        self._watch, self._finish = topics.watch, topics.finish
         for thread in threads:
             thread.start()
 
@@ -118,6 +118,7 @@ class Process:
         while not self._wire.closed:
             for head, payload in self._wire.wait(_POLL_S):
                 if head["op"] == "end":
+                    self._finish()
                     return
                 self._does[head["op"]](head, payload)
             self._watch()

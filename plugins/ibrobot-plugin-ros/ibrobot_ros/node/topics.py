@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -15,9 +16,10 @@ from ibrobot_ros.wire import Wire
 
 BACKLOG = 16 << 20
 """Bytes that the run may leave unread before messages for it are dropped."""
-_DEPTH = 100
-"""Messages that a late reader still gets: a second of joint states."""
+_DEPTH = 1000
+"""Messages that a reader which falls behind still gets: some seconds of joint states."""
 _WATCH_S = 1.0
+_END_S = 0.5
 
 
 def profile(name: str) -> QoSProfile:
@@ -109,6 +111,13 @@ class Topics:
             self._inputs.append(found)
 
         self._try(found.topic, make)
+
+    def finish(self) -> None:
+        """Wait until reliable subscribers have everything, at most for a moment."""
+        deadline_s = time.monotonic() + _END_S
+        for publisher in self._publishers.values():
+            left_s = max(0.0, deadline_s - time.monotonic())
+            publisher.wait_for_all_acked(Duration(seconds=left_s))
 
     def watch(self) -> None:
         """Report, once a second, what was dropped, and publishers of another type."""

@@ -30,7 +30,7 @@ def find(name):
 def profile(name):
     reliable = ReliabilityPolicy.BEST_EFFORT if name == "sensor_data" else ReliabilityPolicy.RELIABLE
     latched = DurabilityPolicy.TRANSIENT_LOCAL if name == "latched" else DurabilityPolicy.VOLATILE
-    return QoSProfile(depth=100, reliability=reliable, durability=latched)
+    return QoSProfile(depth=1000, reliability=reliable, durability=latched)
 
 
 def until(ready, timeout_s=PATIENCE_S):
