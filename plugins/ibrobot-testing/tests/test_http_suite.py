@@ -304,7 +304,7 @@ WRONG = {
 def test_catches(wrong, caught_by, tmp_path):
     class Wrong(Attacks):
         handler = wrong
-        patience_s = 1.0 if wrong is Patient else Attacks.patience_s
+        patience_s = 1.0 if wrong in (Patient, ReadsAll) else Attacks.patience_s
 
     assert failed_checks(Wrong, tmp_path) == {caught_by}
 
