@@ -72,6 +72,8 @@ UNTYPED = (
 """Tests need no annotations; what has them is checked, and so is what is in functions without."""
 NAMED = os.environ.setdefault("NOX_NAMED", "yes" if sys.argv[1:] else "")
 """Whether a person asked for certain sessions, and not for all side by side."""
+SHORT = "" if NAMED else " and not long"
+"""In all sessions side by side, the tests that are marked `long` are left to those that are asked for by name."""
 IS_FIRST = "NOX_NOT_TESTED" not in os.environ
 """Whether this process started the others: those that run one session each, side by side."""
 NOT_TESTED = Path(os.environ.setdefault("NOX_NOT_TESTED", str(Path(f".nox/not-tested-{os.getpid()}").absolute())))
@@ -184,7 +186,7 @@ def integration(session: nox.Session) -> None:
     install(session, *PLUGINS, groups=("test", "browser"))
     system_libraries(session)
     chromium(session)
-    session.run(*PYTEST, *TWO, "-m", "integration", *marked("integration"), *session.posargs)
+    session.run(*PYTEST, *TWO, "-m", f"integration{SHORT}", *marked("integration"), *session.posargs)
 
 
 @nox.session(default=False)
@@ -195,7 +197,7 @@ def minimums(session: nox.Session) -> None:
     """
     install(session, *PLUGINS, options=("--resolution=lowest-direct",))
     system_libraries(session)
-    few = ("--hypothesis-profile=few", "-m", "not integration and not lerobot")
+    few = ("--hypothesis-profile=few", "-m", "not integration and not lerobot and not long")
     # These read files, or break devices on purpose, whatever the versions; suites run in the tests of all plugins.
     alike = ("tests/house", "tests/docs", "plugins/ibrobot-testing/tests")
     ignored = (f"--ignore={folder}" for folder in alike)
@@ -208,7 +210,7 @@ def lerobot(session: nox.Session) -> None:
     lerobot = "lerobot[dataset,diffusion,evaluation,feetech,smolvla,training]>=0.6.1,<0.7"
     install(session, *PLUGINS, options=(lerobot, "onnxscript"))  # the latter exports policies
     system_libraries(session)
-    session.run(*PYTEST, "-m", "lerobot", *marked("lerobot"), *session.posargs)
+    session.run(*PYTEST, "-m", f"lerobot{SHORT}", *marked("lerobot"), *session.posargs)
 
 
 def check_wheels(session: nox.Session, folder: Path) -> None:
@@ -266,7 +268,7 @@ def plugin(session: nox.Session, name: str) -> None:
     system_libraries(session)
     # A report without a threshold shows code that the package's own tests do not reach. It takes half as long again.
     measured = (f"--cov=ibrobot_{name.replace('-', '_')}", "--cov-report=term:skip-covered") if NAMED else ()
-    chosen = () if NAMED else ("-m", "not cluster")
+    chosen = () if NAMED else ("-m", "not long")
     session.run(*PYTEST, *chosen, *measured, str(FOLDERS[name] / "tests"), *session.posargs)
 
 

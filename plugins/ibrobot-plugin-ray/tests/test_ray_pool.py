@@ -15,7 +15,7 @@ from ray.cluster_utils import Cluster
 
 from ibrobot_core.app import ComponentFailed, Job, installed_plugins
 
-pytestmark = pytest.mark.cluster
+pytestmark = pytest.mark.long
 NODES = 3
 LOOPBACK = "127.0.0.2"
 """Ray replaces 127.0.0.1 by the address of the network when it connects."""
