@@ -11,9 +11,9 @@ machines, `zenoh shm` as within one. `lerobot` is its RobotClient and PolicyServ
 Ray Serve in the interpreter PYTHON, which has `ray[serve]==2.60.*`; of these blocking and processor time are unknown.
 
 All ways are measured in turn, eight times, since a machine may be slower for a while; LeRobot and Ray Serve, which are
-slow to start, every other time. Times are in ms: request to chunk p50 and p99, how long the control loop is blocked in asking, and
-processor time of both sides together for a request. One request follows the other; with a pause between them [s], all
-ways find their memory and code out of the caches.
+slow to start, every other time. Times are in ms: request to chunk p50 and p99, how long the control loop is blocked in
+asking, and processor time of both sides together for a request. One request follows the other; with a pause between
+them [s], all ways find their memory and code out of the caches.
 Exits with 1 where ours is less than 5 times as fast as LeRobot when given, raw cameras over Zenoh take more than 5
 times their floor, `process` more than 3 times, or asking blocks for over 1 ms.
 """
