@@ -1,0 +1,259 @@
+"""The device process: has one device of LeRobot's and answers requests, until its parent ends it or dies.
+
+Started by `DeviceLink` as `python -m ibrobot_lerobot_devices.device CHANNEL PICTURES`. PICTURES is a pipe for the
+pictures of cameras. LeRobot's calls may block; a thread takes the requests meanwhile, and keeps the newest action.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import attrs
+
+from ibrobot_core.app import Channel, ComponentFailed, Failure, open_parent, raise_thread_priority
+from ibrobot_lerobot_devices.stand_in import replace_torch
+
+_FAREWELL_S = 1.0
+"""How long a call may go on after the parent has ended or died [s]."""
+READY, ANSWER, DONE = "ready", "answer", "done"
+"""Events: the device is connected; a reading or why there is none; a request is carried out."""
+_END: dict[str, Any] = {"do": "end"}
+
+
+@attrs.define
+class Requests:
+    """Requests of the parent, in order; of actions and of requests to read only the newest counts."""
+
+    channel: Channel
+    _waiting: queue.SimpleQueue[dict[str, Any]] = attrs.field(factory=queue.SimpleQueue)
+    _newest: dict[str, dict[str, Any]] = attrs.field(factory=dict)
+    ended: threading.Event = attrs.field(factory=threading.Event)
+
+    def start(self) -> None:
+        """Take requests in a thread, which ends the process if a call outlives the parent."""
+        threading.Thread(target=self._take, daemon=True).start()
+
+    def next(self) -> dict[str, Any]:
+        """The next request; waits for it."""
+        while True:
+            request = self._waiting.get()
+            if request["do"] not in ("act", "read"):
+                return request
+            newest = self._newest.pop(request["do"], None)
+            if newest is not None:
+                return newest
+
+    def _take(self) -> None:
+        raise_thread_priority()
+        try:
+            while True:
+                for request in self.channel.wait(None):
+                    if request["do"] == "end":
+                        raise ComponentFailed("ended")
+                    if request["do"] in ("act", "read"):
+                        self._newest[request["do"]] = request
+                    self._waiting.put(request)
+        except ComponentFailed:
+            self._waiting.put(_END)
+            if not self.ended.wait(_FAREWELL_S):
+                os._exit(1)
+
+
+class Device:
+    """A connected device of LeRobot's, of any kind.
+
+    Args:
+        order: its kind, type and config.
+        pictures: the pipe for pictures.
+    """
+
+    def __init__(self, order: Mapping[str, Any], pictures: int) -> None:
+        from ibrobot_lerobot_devices import library
+
+        self._library = library
+        self._order = order
+        self._pictures = pictures
+        self._device: Any = None
+        self._broken = False
+
+    def make(self) -> dict[str, Any]:
+        """Make LeRobot's object; return what it says about itself without being connected."""
+        order = self._order
+        self._device = device = self._library.make(order["kind"], order["type"], order["config"])
+        if order["kind"] == "camera":
+            return {}
+        names = ("action_features", "observation_features")
+        features = {name: _plain(getattr(device, name)) for name in names if hasattr(device, name)}
+        return features | {
+            "motors": self._library.motors(device),
+            "torque": bool(self._torque()),
+            "keeps_torque": self._library.KEEPS_TORQUE in _names(getattr(device, "config", None)),
+            "name": device.name,
+            "calibration": str(device.calibration_fpath),
+        }
+
+    def connect(self) -> dict[str, Any]:
+        """Make and connect the device; return what it says about itself."""
+        found = self.make()
+        if self._order["kind"] == "camera":
+            self._device.connect()
+            return found
+        device = self._device
+        device.connect(calibrate=False)
+        if not device.is_calibrated:
+            self._device.disconnect()
+            raise self._library.DeviceError(
+                f"is not calibrated: LeRobot finds no calibration that fits its motors; its file is "
+                f"{device.calibration_fpath}"
+            )
+        return found | {"motors": self._library.motors(device)}
+
+    def read(self) -> dict[str, float]:
+        """The plain values of an observation, or of an action of a teleoperator."""
+        get = self._device.get_observation if self._order["kind"] == "robot" else self._device.get_action
+        return _numbers(get())
+
+    def picture(self) -> dict[str, Any]:
+        """Send the newest picture, once it is there, through the pipe; return its shape and type."""
+        import numpy as np
+
+        pixels = np.ascontiguousarray(self._device.async_read(timeout_ms=200))
+        taken_s = getattr(self._device, "latest_timestamp", None)  # by time.perf_counter
+        age_s = max(0.0, time.perf_counter() - taken_s) if isinstance(taken_s, float) else 0.0
+        content = memoryview(pixels).cast("B")
+        return {"shape": list(pixels.shape), "type": str(pixels.dtype), "age_s": age_s, "content": content}
+
+    def act(self, action: Mapping[str, float]) -> None:
+        """Send an action."""
+        self._device.send_action(dict(action))
+
+    def relax(self) -> None:
+        """Switch the torque off."""
+        for owner in self._torque():
+            owner.disable_torque()
+
+    def hold(self) -> None:
+        """Switch the torque on, with the present positions as goals."""
+        self.act({name: value for name, value in self.read().items() if name in self._device.action_features})
+        for owner in self._torque():
+            owner.enable_torque()
+
+    def reconnect(self) -> dict[str, Any]:
+        """Connect again, e.g. after a cable was out."""
+        self.disconnect()
+        return self.connect()
+
+    def disconnect(self) -> None:
+        """Release the device; its torque stays as it is."""
+        with contextlib.suppress(Exception):  # e.g. since it is not connected, or since its cable is out
+            self._device.disconnect()
+
+    def _torque(self) -> list[Any]:
+        device = self._device
+        if hasattr(device, "disable_torque") and hasattr(device, "enable_torque"):
+            return [device]
+        return [bus for _, bus in self._library.buses(device) if hasattr(bus, "enable_torque")]
+
+
+def _plain(features: Mapping[str, Any]) -> list[str]:
+    """The names of the features that are numbers, and not pictures."""
+    return [name for name, kind in features.items() if not isinstance(kind, tuple | list)]
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    return {
+        name: float(value) for name, value in values.items() if getattr(value, "ndim", 0) == 0 and _is_number(value)
+    }
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return not isinstance(value, str)
+
+
+def _names(config: Any) -> set[str]:
+    """The names of a config's fields, and of those of configs within it."""
+    own = getattr(config, "__dataclass_fields__", {})
+    return set(own).union(*(_names(getattr(config, name, None)) for name in own))
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    return text if type(error).__name__ == "DeviceError" else f"{type(error).__name__}: {text}"
+
+
+def serve(device: Device, requests: Requests) -> None:
+    """Carry requests out until the parent ends or dies."""
+    channel = requests.channel
+    while (request := requests.next())["do"] != "end":
+        what = request["do"]
+        begun_ns = time.monotonic_ns()
+        answer: dict[str, Any] = {"event": ANSWER if what in ("read", "picture") else DONE, "id": request.get("id")}
+        try:
+            found = device.act(request["action"]) if what == "act" else getattr(device, what)()
+        except Exception as error:  # noqa: BLE001 - contained: the answer has the error
+            channel.send(answer | {"do": what, "error": _one_line(error)})
+            continue
+        if what == "picture":
+            content = found.pop("content")
+            channel.send(answer | found)
+            _send(device._pictures, content)
+        elif what == "read":
+            channel.send(answer | {"values": found, "made_ns": (begun_ns + time.monotonic_ns()) // 2})
+        elif what != "act":
+            channel.send(answer | {"do": what, "found": found})
+
+
+def _send(pipe: int, content: memoryview) -> None:
+    while content:
+        content = content[os.write(pipe, content) :]
+
+
+def main(parent: int, pictures: int) -> int:
+    """Run with the parent's channel; returns the exit status."""
+    channel = open_parent(parent)
+    order = channel.wait(None)[0]
+    requests = Requests(channel)
+    try:
+        if not order["torch"]:
+            replace_torch()
+        if order["kind"] == "describe":
+            from ibrobot_lerobot_devices import library
+
+            channel.send({"event": READY, "found": library.describe()})
+            return 0
+        device = Device(order, pictures)
+        if order.get("only_make"):
+            channel.send({"event": READY, "found": device.make()})
+            return 0
+        requests.start()
+        try:
+            found = device.connect()
+            raise_thread_priority()  # the control loop waits for its readings
+            channel.send({"event": READY, "found": found})
+            serve(device, requests)
+        finally:
+            device.disconnect()
+    except Exception as error:  # noqa: BLE001 - the parent reports it
+        channel.report(Failure(_one_line(error)))
+        return 1
+    finally:
+        channel.flush()
+        requests.ended.set()
+    return 0
+
+
+if __name__ == "__main__":
+    status = main(*(int(argument) for argument in sys.argv[1:]))
+    sys.stdout.flush()
+    os._exit(status)  # threads of LeRobot's devices may never end

@@ -1,0 +1,193 @@
+"""LeRobot's own registry and devices: imported in device processes alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import logging
+import pkgutil
+import re
+from collections.abc import Iterator, Mapping
+from importlib.metadata import distributions, version
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from ibrobot_core.api import did_you_mean
+from ibrobot_lerobot_devices.registry import third_parties
+
+Kind = Literal["robot", "teleoperator", "camera"]
+KINDS: tuple[Kind, ...] = ("robot", "teleoperator", "camera")
+_PACKAGES: Mapping[str, tuple[str, str]] = {
+    "robot": ("lerobot.robots", "RobotConfig"),
+    "teleoperator": ("lerobot.teleoperators", "TeleoperatorConfig"),
+    "camera": ("lerobot.cameras", "CameraConfig"),
+}
+KEEPS_TORQUE = "disable_torque_on_disconnect"
+"""The key of LeRobot's configs that decides about the torque after the end; here `control.stop` does."""
+
+
+class DeviceError(Exception):
+    """A device cannot be made, e.g. because its type is unknown; the text is for the operator."""
+
+
+def choices(kind: Kind, wanted: str = "") -> Mapping[str, type[Any]]:
+    """The config classes of a kind, by type, of LeRobot and of third-party packages.
+
+    Args:
+        kind: the kind of device.
+        wanted: a type; then only what may define it is imported.
+    """
+    name, base = _PACKAGES[kind]
+    package = importlib.import_module(name)
+    registry = getattr(package, base)
+    for module in pkgutil.iter_modules(package.__path__):
+        if module.ispkg and (not wanted or _registers(Path(package.__path__[0]) / module.name, wanted)):
+            try:
+                importlib.import_module(f"{name}.{module.name}")
+            except ImportError as error:
+                logging.getLogger("ibrobot.lerobot").info("%s.%s: %s", name, module.name, error)
+    if wanted not in registry.get_known_choices():
+        _import_third_parties()
+    found: Mapping[str, type[Any]] = registry.get_known_choices()
+    return dict(sorted(found.items()))
+
+
+def _import_third_parties() -> None:
+    """Import the packages that LeRobot would import; its own function also imports those of policies, with torch."""
+    for name in third_parties(distributions()):
+        try:
+            importlib.import_module(name)
+        except Exception as error:  # noqa: BLE001 - of a package of others, which is named
+            logging.getLogger("ibrobot.lerobot").warning("package %s cannot be imported: %s", name, error)
+
+
+def _registers(folder: Path, wanted: str) -> bool:
+    """Whether a module in `folder` registers a type."""
+    pattern = re.compile(rf"register_subclass\(\s*[\"']{re.escape(wanted)}[\"']")
+    return any(pattern.search(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.py")))
+
+
+def make(kind: Kind, wanted: str, config: Mapping[str, Any]) -> Any:
+    """LeRobot's object for a device, which is not connected yet.
+
+    Raises:
+        DeviceError: for an unknown type, a wrong config, or a missing library.
+    """
+    known = choices(kind, wanted)
+    if wanted not in known:
+        raise DeviceError(f"LeRobot has no {kind} {wanted!r}{did_you_mean(wanted, list(choices(kind)), 'it has')}")
+    given = dict(config)
+    if kind != "camera":
+        _keep_torque(known[wanted], given)
+    import draccus
+
+    name, base = _PACKAGES[kind]
+    package = importlib.import_module(name)
+    try:
+        decoded = draccus.decode(getattr(package, base), {"type": wanted, **given})
+    except Exception as error:  # of draccus and of what the dataclass checks
+        raise DeviceError(f"LeRobot's {wanted} refuses its config: {error}") from error
+    utils = importlib.import_module(f"{name}.utils")
+    try:
+        if kind == "camera":
+            return utils.make_cameras_from_configs({"camera": decoded})["camera"]
+        return getattr(utils, f"make_{kind}_from_config")(decoded)
+    except Exception as error:  # also of a library that is not installed
+        raise DeviceError(f"LeRobot cannot make {wanted}: {error}") from error
+
+
+def _keep_torque(kind: type[Any], given: dict[str, Any]) -> None:
+    """Let a device keep its torque when it is disconnected, also those within it."""
+    for name, nested in _nested(kind):
+        if isinstance(given.get(name), Mapping):
+            given[name] = dict(given[name])
+            _keep_torque(nested, given[name])
+    if KEEPS_TORQUE in {field.name for field in dataclasses.fields(kind)}:
+        given[KEEPS_TORQUE] = False
+
+
+def _nested(kind: type[Any]) -> Iterator[tuple[str, type[Any]]]:
+    for name, hint in get_type_hints(kind).items():
+        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+            yield name, hint
+
+
+def describe() -> dict[str, Any]:
+    """What LeRobot has, as plain data: kind -> type -> fields, and its version."""
+    found: dict[str, Any] = {"version": version("lerobot")}
+    for kind in KINDS:
+        found[kind] = {name: _described(each) for name, each in choices(kind).items()}
+    return found
+
+
+def _described(kind: type[Any]) -> dict[str, Any]:
+    doc = inspect.getmodule(kind)
+    return {"module": doc.__name__ if doc else "", "class": kind.__name__, "fields": _fields(kind)}
+
+
+def _fields(kind: type[Any]) -> dict[str, Any]:
+    """Each field of a dataclass: its type in words, whether it is required, its plain default, and fields within."""
+    hints = get_type_hints(kind)
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(kind):
+        if not field.init:
+            continue
+        hint = hints[field.name]
+        default = field.default
+        if default is dataclasses.MISSING and field.default_factory is not dataclasses.MISSING:
+            default = None
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        row: dict[str, Any] = {"type": _words(hint), "required": required}
+        if isinstance(default, str | int | float | bool):
+            row["default"] = default
+        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+            row["fields"] = _fields(hint)
+        found[field.name] = row
+    return found
+
+
+def _words(hint: Any) -> list[str]:
+    """The plain types that a field takes, e.g. `["int", "None"]`; `["any"]` if it takes others."""
+    if get_origin(hint) is not None and get_args(hint) and hasattr(hint, "__args__"):
+        if get_origin(hint) in (dict, list, tuple, set):
+            return [get_origin(hint).__name__]
+        return [word for each in get_args(hint) for word in _words(each)]
+    if hint is type(None):
+        return ["None"]
+    if hint in (int, float, bool, str):
+        return [hint.__name__]
+    if isinstance(hint, type) and issubclass(hint, Path):
+        return ["str"]
+    return ["any"]
+
+
+def motors(device: Any) -> dict[str, dict[str, Any]]:
+    """Feature -> its motor's unit, resolution and calibration, for every motor bus of a device and within it."""
+    found: dict[str, dict[str, Any]] = {}
+    for prefix, bus in buses(device):
+        for name, motor in getattr(bus, "motors", {}).items():
+            mode = getattr(motor, "norm_mode", None)
+            row: dict[str, Any] = {"unit": getattr(mode, "value", None)}
+            calibration = (getattr(bus, "calibration", None) or {}).get(name)
+            resolution = getattr(bus, "model_resolution_table", {}).get(getattr(motor, "model", ""))
+            if calibration is not None and resolution:
+                row |= {
+                    "resolution": resolution,
+                    "range_min": calibration.range_min,
+                    "range_max": calibration.range_max,
+                    "reversed": bool(getattr(bus, "apply_drive_mode", False) and calibration.drive_mode),
+                }
+            found[f"{prefix}{name}"] = row
+    return found
+
+
+def buses(device: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The motor buses of a device, with the prefix of their features, e.g. `left_` for `left_arm.bus`."""
+    for name, each in vars(device).items():
+        if hasattr(each, "motors") and hasattr(each, "disable_torque"):
+            yield prefix, each
+        elif name.endswith("arm") and hasattr(
+            each, "get_observation" if hasattr(each, "send_action") else "get_action"
+        ):
+            yield from buses(each, f"{prefix}{name.removesuffix('arm')}")

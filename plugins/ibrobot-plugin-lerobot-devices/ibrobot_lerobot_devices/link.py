@@ -1,0 +1,234 @@
+"""The parent's side of a device process: start it, ask it for readings, send it actions, end it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Mapping
+from importlib.util import find_spec
+from typing import Any
+
+import attrs
+
+from ibrobot_core.app import Child, ComponentFailed
+from ibrobot_lerobot_devices.device import ANSWER, DONE, READY
+
+INSTALL = "pip install 'lerobot>=0.6.1,<0.7'"
+"""The command that installs LeRobot; its devices need extras, e.g. `lerobot[feetech]`."""
+_MODULE = "ibrobot_lerobot_devices.device"
+_END_S = 1.5
+"""How long a device process may take to end [s]; then it is killed."""
+_MANY = 1 << 16
+"""Unread bytes from which on actions are dropped: LeRobot's call has blocked for seconds."""
+
+
+class DeviceProblem(Exception):
+    """A device process cannot do what it is asked; the text is for the operator."""
+
+
+def is_installed() -> bool:
+    """Whether LeRobot is installed in this environment."""
+    return find_spec("lerobot") is not None
+
+
+@attrs.frozen
+class Reading:
+    """Values that LeRobot has given, or why it gave none."""
+
+    values: Mapping[str, float]
+    made_ns: int
+    """The middle of LeRobot's call, by `time.monotonic_ns`."""
+    error: str = ""
+
+
+class DeviceLink:
+    """A device of LeRobot's in a process of its own.
+
+    Args:
+        kind: robot, teleoperator or camera.
+        type: LeRobot's name of the device.
+        config: its config, without `type`.
+        torch: whether the process loads torch.
+    """
+
+    def __init__(self, kind: str, type: str, config: Mapping[str, Any], *, torch: bool = False) -> None:
+        self._order = {"kind": kind, "type": type, "config": dict(config), "torch": torch}
+        self.type = type
+        self._child: Child | None = None
+        self._number = 0
+        self._asked_s: float | None = None
+        """When the request without an answer was sent [s]; None if there is none."""
+        self._pipe = -1
+        self.late = 0
+        """How many readings came after the tick that asked for them."""
+
+    @property
+    def pid(self) -> int | None:
+        """The id of the process; None if there is none."""
+        return self._child.pid if self._child is not None else None
+
+    def start(self, timeout_s: float) -> Mapping[str, Any]:
+        """Start the process, connect the device, and return what it says about itself.
+
+        Raises:
+            DeviceProblem: if LeRobot is not installed, or the device cannot be connected.
+        """
+        self.begin()
+        try:
+            found = self.poll_start(timeout_s)
+            if found is None:
+                raise DeviceProblem(f"LeRobot does not connect it within {timeout_s:g} s")
+            return found
+        except BaseException:
+            self.end()
+            raise
+
+    def begin(self) -> None:
+        """Start the process, which connects the device; `poll_start` waits for that."""
+        if not is_installed():
+            raise DeviceProblem(f"LeRobot is not installed here: {INSTALL}")
+        self.end()
+        self._pipe, far_end = os.pipe()
+        try:
+            self._child = Child(_MODULE, self._order, far_end)
+        finally:
+            os.close(far_end)
+        self._asked_s = None
+
+    def poll_start(self, timeout_s: float) -> Mapping[str, Any] | None:
+        """What the device says about itself, once it is connected; None if that takes more than `timeout_s` [s].
+
+        Raises:
+            DeviceProblem: if it cannot be connected.
+        """
+        return self._await(READY, timeout_s)
+
+    def read(self, wait_s: float, what: str = "read") -> dict[str, Any] | None:
+        """The newest answer that was not returned yet; asks for one, and waits up to `wait_s` [s] for it.
+
+        A request that is not answered yet is not repeated.
+
+        Raises:
+            DeviceProblem: if the process has died.
+        """
+        newest = self._received()
+        if newest is not None:
+            self.late += 1
+        if self._asked_s is None:
+            self._number += 1
+            self._asked_s = time.monotonic()
+            self._running().channel.send({"do": what, "id": self._number})
+        deadline_s = time.monotonic() + wait_s
+        while self._asked_s is not None and (left_s := deadline_s - time.monotonic()) > 0:
+            answer = self._next(left_s)
+            newest = answer if answer is not None else newest
+        return newest
+
+    @property
+    def blocked_s(self) -> float:
+        """How long the present call of LeRobot's has taken, if a reading waits for it [s]."""
+        return 0.0 if self._asked_s is None else time.monotonic() - self._asked_s
+
+    def act(self, action: Mapping[str, float]) -> None:
+        """Send an action; LeRobot gets the newest one when its present call has returned.
+
+        Raises:
+            DeviceProblem: if the process has died.
+        """
+        channel = self._running().channel
+        if channel.backlog < _MANY:
+            channel.send({"do": "act", "action": dict(action)})
+
+    def call(self, what: str, timeout_s: float) -> Any:
+        """Carry a request out: `relax`, `hold` or `reconnect`; returns its result.
+
+        Raises:
+            DeviceProblem: if it fails, or takes more than `timeout_s` [s].
+        """
+        self._running().channel.send({"do": what})
+        found = self._await(what, timeout_s)
+        if found is None:
+            raise DeviceProblem(f"a call of LeRobot's blocks: {what} is not done after {timeout_s:g} s")
+        return found
+
+    def end(self) -> None:
+        """End the process; safe at any time."""
+        child, self._child = self._child, None
+        if child is not None:
+            child.channel.send({"do": "end"})
+            if child.end(_END_S):
+                logging.getLogger("ibrobot.lerobot").warning("%s did not end, and was killed", self.type)
+            child.receive()  # what it has logged
+            child.channel.close()
+        if self._pipe >= 0:
+            os.close(self._pipe)
+            self._pipe = -1
+
+    def content(self, size: int) -> bytearray:
+        """The bytes of a picture.
+
+        Raises:
+            DeviceProblem: if the process has died.
+        """
+        content = bytearray()
+        while len(content) < size:
+            part = os.read(self._pipe, size - len(content))
+            if not part:
+                raise self._death()
+            content += part
+        return content
+
+    def _running(self) -> Child:
+        if self._child is None:
+            raise DeviceProblem("is not connected")
+        return self._child
+
+    def _received(self) -> dict[str, Any] | None:
+        """The newest answer that has arrived already."""
+        newest = None
+        while (answer := self._next(0.0)) is not None:
+            newest = answer
+        return newest
+
+    def _next(self, timeout_s: float) -> dict[str, Any] | None:
+        """The next answer to a request to read; None if none arrives in time."""
+        message = self._message(timeout_s)
+        if message is None or message["event"] != ANSWER:
+            if message is not None and "error" in message:
+                return dict(message)  # an action that failed, which nobody waits for
+            return None
+        if message["id"] == self._number:
+            self._asked_s = None
+        return dict(message)
+
+    def _await(self, what: str, timeout_s: float) -> Mapping[str, Any] | None:
+        """The result of a request, or of the start; None if there is none in time."""
+        deadline_s = time.monotonic() + timeout_s
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            message = self._message(left_s)
+            if message is None:
+                continue
+            if message["event"] == ANSWER:
+                self._asked_s = None
+            elif message["event"] == READY or (message["event"] == DONE and message.get("do") == what):
+                if "error" in message:
+                    raise DeviceProblem(message["error"])
+                return message["found"] or {}
+        return None
+
+    def _message(self, timeout_s: float) -> Mapping[str, Any] | None:
+        try:
+            found = self._running().wait(timeout_s)
+        except ComponentFailed:
+            raise self._death() from None
+        if found is None and self._running().failure is not None:
+            raise self._death()
+        return found
+
+    def _death(self) -> DeviceProblem:
+        child = self._running()
+        cause = child.cause(_END_S)
+        failed = child.failure is not None
+        self.end()
+        return DeviceProblem(cause if failed else f"LeRobot's process has ended: {cause}")

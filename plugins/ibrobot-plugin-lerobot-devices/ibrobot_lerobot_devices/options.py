@@ -1,0 +1,75 @@
+"""Options of LeRobot's devices."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import documented, not_empty, option
+from ibrobot_lerobot_devices.units import UNITS, Choices
+
+GRIPPER = ("gripper",)
+"""Default of `anchored`; ignored if another component has the gripper."""
+_CONFIG = "LeRobot's config of it, e.g. {port: /dev/ttyACM0, id: my_arm}; `ibrobot lerobot list TYPE` has its keys"
+_TORCH = option(
+    False, help="whether its process loads torch; most devices only import it, and 5 s and 500 MB are saved without"
+)
+
+
+def _unit_names(instance: object, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
+    for name, unit in value.items():
+        if unit not in UNITS:
+            raise ValueError(f"{name}: {unit!r} is not one of: {', '.join(UNITS)}")
+
+
+def _joint_options() -> dict[str, Any]:
+    return {
+        "joints": option(factory=dict, help="LeRobot's name of a joint -> joint of the robot, where they differ"),
+        "units": option(
+            factory=dict,
+            validator=_unit_names,
+            help=f"LeRobot's name of a joint -> its unit, where LeRobot does not say it: {', '.join(UNITS)}",
+        ),
+        "zero_at": option(
+            "pose",
+            choices=("pose", "range"),
+            help="position of 0 rad of joints with a calibration: the middle of the encoder, which is the pose set by "
+            "hand at calibration, or the middle of the calibrated range",
+        ),
+        "anchored": option(
+            GRIPPER, help="joints whose calibrated closed end is at their lower limit, as with feetech_so101"
+        ),
+        "inverted": option((), help="joints whose direction is reversed"),
+    }
+
+
+_JOINTS = _joint_options()
+
+
+@documented
+@attrs.frozen
+class RobotOptions:
+    """Options of hardware `type: lerobot`: a robot of LeRobot's, in a process of its own."""
+
+    robot: str = option(validator=not_empty, help="LeRobot's type of the robot, e.g. koch_follower")
+    config: Mapping[str, Any] = option(factory=dict, help=_CONFIG)
+    joints: Mapping[str, str] = _JOINTS["joints"]
+    units: Mapping[str, str] = _JOINTS["units"]
+    zero_at: str = _JOINTS["zero_at"]
+    anchored: tuple[str, ...] = _JOINTS["anchored"]
+    inverted: tuple[str, ...] = _JOINTS["inverted"]
+    lost_readings: int = option(3, ge=0, help="consecutive readings that LeRobot may fail to give")
+    blocked: float = option(
+        0.08,
+        unit="s",
+        gt=0,
+        help="how long a call of LeRobot's may block before it is a fault; control.state_timeout must be longer",
+    )
+    start_timeout: float = option(40.0, unit="s", gt=0, help="how long LeRobot may take to start and to connect")
+    torch: bool = _TORCH
+
+    def choices(self) -> Choices:
+        """What the options say about the conversion of units."""
+        return Choices(self.joints, self.units, self.zero_at, self.anchored, self.inverted)

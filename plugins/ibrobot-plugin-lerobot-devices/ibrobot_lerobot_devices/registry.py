@@ -1,0 +1,150 @@
+"""What the installed LeRobot has, read once in a process of its own and kept in a file; checks of options by it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
+from importlib.metadata import Distribution, distributions
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ibrobot_core.api import OptionFault, did_you_mean, replace_file
+from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem, is_installed
+from ibrobot_lerobot_devices.options import GRIPPER
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
+    from ibrobot_lerobot_devices.options import RobotOptions
+
+_PREFIXES = ("lerobot_robot_", "lerobot_teleoperator_", "lerobot_camera_")
+"""LeRobot imports the distributions whose names begin with one of these."""
+_TIMEOUT_S = 90.0
+_KEEPS_TORQUE = "disable_torque_on_disconnect"
+_PYTHON: Mapping[str, tuple[type, ...]] = {
+    "int": (int,),
+    "float": (int, float),
+    "bool": (bool,),
+    "str": (str, int),
+    "None": (type(None),),
+    "dict": (Mapping,),
+    "list": (list, tuple),
+    "tuple": (list, tuple),
+    "set": (list, tuple),
+}
+
+
+def registry() -> Mapping[str, Any]:
+    """Kind -> type -> its config's fields, of LeRobot and of third-party packages; see `library.describe`.
+
+    Raises:
+        DeviceProblem: if LeRobot is not installed, or cannot be imported.
+    """
+    if not is_installed():
+        raise DeviceProblem("LeRobot is not installed here")
+    return _registry(_installed())
+
+
+@lru_cache(maxsize=1)
+def _registry(key: str) -> Mapping[str, Any]:
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ibrobot" / f"lerobot-{key}.json"
+    try:
+        found: Mapping[str, Any] = json.loads(cache.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        link = DeviceLink("describe", "LeRobot", {})
+        try:
+            found = link.start(_TIMEOUT_S)
+        finally:
+            link.end()
+        try:
+            cache.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(cache, json.dumps(found).encode())
+        except OSError:
+            pass  # it is read anew the next time
+    return found
+
+
+def _installed() -> str:
+    """A fingerprint of LeRobot and the packages that add to it, with their versions."""
+    names = {"lerobot", *third_parties(distributions())}
+    found = sorted(
+        (_module(each), each.version, str(each.locate_file(""))) for each in distributions() if _module(each) in names
+    )
+    return hashlib.sha256(json.dumps(found).encode()).hexdigest()[:16]
+
+
+def third_parties(installed: Iterable[Distribution]) -> list[str]:
+    """The modules of packages that add devices to LeRobot, also of those with dashes, which LeRobot overlooks."""
+    return sorted({name for each in installed if (name := _module(each)).startswith(_PREFIXES)})
+
+
+def _module(distribution: Distribution) -> str:
+    return str(distribution.metadata["Name"]).replace("-", "_")
+
+
+def check_device(kind: str, option: str, type_: str, config: Mapping[str, Any]) -> Iterator[OptionFault]:
+    """Yield faults of a device's type and config; none if LeRobot is not installed here.
+
+    Args:
+        kind: robot, teleoperator or camera.
+        option: the option with the type.
+        type_: LeRobot's type.
+        config: its config.
+    """
+    try:
+        known = registry()[kind]
+    except DeviceProblem:
+        return  # the robot's computer may have it
+    if type_ not in known:
+        yield OptionFault((option,), f"LeRobot has no {kind} {type_!r}{did_you_mean(type_, list(known), 'it has')}")
+        return
+    yield from _check(("config",), known[type_]["fields"], config, type_)
+
+
+def _check(
+    at: tuple[str | int, ...], fields: Mapping[str, Any], given: Mapping[str, Any], type_: str
+) -> Iterator[OptionFault]:
+    for key, value in given.items():
+        if key not in fields:
+            yield OptionFault(
+                (*at, key), f"LeRobot's {type_} has no {key!r}{did_you_mean(key, list(fields), 'it has')}"
+            )
+        elif key == _KEEPS_TORQUE:
+            yield OptionFault(
+                (*at, key), "is control.stop here: relax switches the torque off at the end, hold does not"
+            )
+        elif key == "cameras" and value:
+            yield OptionFault((*at, key), "cameras are peripherals here: {name: top, kind: camera, type: lerobot, ...}")
+        elif "fields" in fields[key] and isinstance(value, Mapping):
+            yield from _check((*at, key), fields[key]["fields"], value, type_)
+        elif fault := _wrong_type(fields[key]["type"], value):
+            yield OptionFault((*at, key), fault)
+    for key, field in fields.items():
+        if field["required"] and key not in given:
+            yield OptionFault(at, f"LeRobot's {type_} needs {key}")
+
+
+def _wrong_type(words: list[str], value: object) -> str:
+    if "any" in words or any(_fits(word, value) for word in words):
+        return ""
+    return f"must be {' or '.join(words)}, not {value!r}"
+
+
+def _fits(word: str, value: object) -> bool:
+    if isinstance(value, bool) and word != "bool":
+        return False
+    return isinstance(value, _PYTHON.get(word, (object,)))
+
+
+def check_joints(options: RobotOptions, robot: Robot) -> Iterator[OptionFault]:
+    """Check that the options name joints of the robot."""
+    known = robot.joint_names
+    for theirs, ours in options.joints.items():
+        if ours not in known:
+            yield OptionFault(("joints", theirs), f"unknown joint {ours!r}{did_you_mean(ours, known, 'known')}")
+    for key, names in (("anchored", options.anchored), ("inverted", options.inverted)):
+        for i, name in enumerate(names):
+            if name not in known and names != GRIPPER:
+                yield OptionFault((key, i), f"unknown joint {name!r}{did_you_mean(name, known, 'known')}")

@@ -1,0 +1,138 @@
+"""Conversion between LeRobot's values of a joint and radians."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+
+from ibrobot_core.api import Vector
+
+POSITION = (".pos", ".q")
+"""Ends of the names of features that are joint positions."""
+VELOCITY = (".vel", ".dq")
+EFFORT = (".torque", ".tau", ".effort", ".eff")
+DEGREES, RADIANS, SYMMETRIC, PERCENT = "degrees", "radians", "range_m100_100", "range_0_100"
+UNITS = (DEGREES, RADIANS, SYMMETRIC, PERCENT)
+"""LeRobot's units of joints: `range_m100_100` and `range_0_100` are shares of the calibrated range."""
+
+
+@attrs.frozen
+class Scale:
+    """A linear conversion: radians = `factor` * value + `offset`."""
+
+    factor: float
+    offset: float = 0.0
+
+
+@attrs.frozen
+class Mapped:
+    """A feature of LeRobot's that is a joint of the robot."""
+
+    feature: str
+    """Without its end, e.g. `shoulder_pan`."""
+    joint: str
+    unit: str
+    scale: Scale
+
+
+@attrs.frozen
+class Choices:
+    """What the options say about the conversion."""
+
+    joints: Mapping[str, str]
+    """LeRobot's name -> joint, where they differ."""
+    units: Mapping[str, str]
+    """LeRobot's name -> unit, where LeRobot does not say it."""
+    zero_at: str
+    anchored: Sequence[str]
+    inverted: Sequence[str]
+
+
+class UnitProblem(Exception):
+    """A feature has no joint, or a joint no unit; the text is for the operator."""
+
+
+def bases(features: Sequence[str], ends: Sequence[str]) -> dict[str, str]:
+    """Name without its end -> whole name, of the features with one of these ends."""
+    return {name.removesuffix(end): name for name in features for end in ends if name.endswith(end)}
+
+
+def map_joints(
+    features: Sequence[str],
+    motors: Mapping[str, Mapping[str, Any]],
+    choices: Choices,
+    wanted: Sequence[str],
+    limits: Mapping[str, tuple[float, float]],
+) -> list[Mapped]:
+    """The joints of a device, in the order of `wanted`.
+
+    Args:
+        features: names of LeRobot's features.
+        motors: what is known of the motors, by feature.
+        choices: the options.
+        wanted: the joints to map.
+        limits: joint -> its limits [rad].
+
+    Raises:
+        UnitProblem: if a joint has no feature, or a feature no unit.
+    """
+    positions = bases(features, POSITION)
+    by_joint = {choices.joints.get(base, base): base for base in positions}
+    found = []
+    for joint in wanted:
+        base = by_joint.get(joint)
+        if base is None:
+            raise UnitProblem(
+                f"LeRobot has no joint {joint!r}; it has {', '.join(positions) or 'none'}: give the names that differ "
+                "as joints: {LEROBOT'S: JOINT}"
+            )
+        motor = motors.get(base, {})
+        unit = choices.units.get(base) or motor.get("unit") or (RADIANS if positions[base].endswith(".q") else "")
+        if unit not in UNITS:
+            raise UnitProblem(f"LeRobot does not say the unit of {base!r}: give it as units: {{{base}: degrees}}")
+        found.append(Mapped(base, joint, unit, _scale(unit, motor, joint, choices, limits[joint])))
+    return found
+
+
+def _scale(unit: str, motor: Mapping[str, Any], joint: str, choices: Choices, limits: tuple[float, float]) -> Scale:
+    turned = -1.0 if joint in choices.inverted else 1.0
+    if "resolution" in motor and unit != RADIANS:
+        return _by_calibration(unit, motor, joint, choices, limits[0])
+    lower, upper = limits
+    match unit:
+        case "degrees":
+            return Scale(turned * math.pi / 180)
+        case "radians":
+            return Scale(turned)
+        case "range_0_100":
+            half = (upper - lower) / 100
+            return Scale(half, lower) if turned > 0 else Scale(-half, upper)
+    return Scale(turned * (upper - lower) / 200, (upper + lower) / 2)
+
+
+def _by_calibration(unit: str, motor: Mapping[str, Any], joint: str, choices: Choices, lower: float) -> Scale:
+    """By way of the encoder's ticks, as LeRobot counts them."""
+    resolution, first, last = motor["resolution"], motor["range_min"], motor["range_max"]
+    span, backwards = last - first, motor["reversed"]
+    # ticks = slope * value + start
+    if unit == DEGREES:
+        slope, start = (resolution - 1) / 360, (first + last) / 2
+    elif unit == SYMMETRIC:
+        slope, start = span / 200 * (-1 if backwards else 1), (first + last) / 2
+    else:
+        slope, start = (-span / 100, last) if backwards else (span / 100, first)
+    angle = 2 * math.pi / resolution * (-1 if backwards != (joint in choices.inverted) else 1)
+    if joint in choices.anchored:
+        zero = (first if angle > 0 else last) - lower / angle
+    else:
+        zero = resolution / 2 if choices.zero_at == "pose" else (first + last) / 2
+    return Scale(angle * slope, angle * (start - zero))
+
+
+def columns(mapped: Sequence[Mapped]) -> tuple[Vector, Vector]:
+    """Factors and offsets of joints, each of shape (J,)."""
+    return np.array([each.scale.factor for each in mapped]), np.array([each.scale.offset for each in mapped])

@@ -1,0 +1,14 @@
+"""Robots."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import draccus
+
+
+@dataclass(kw_only=True)
+class RobotConfig(draccus.ChoiceRegistry):
+    """Base of the configs."""
+
+    id: str | None = None
+    calibration_dir: Path | None = None

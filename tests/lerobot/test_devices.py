@@ -1,0 +1,156 @@
+"""LeRobot's own devices, unmodified, in device processes of ours, on the emulated bus."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib import invalidate_caches
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ibrobot_feetech.calibration import save_calibration
+from ibrobot_feetech.emulator import Emulator
+from ibrobot_feetech.follower import FeetechFollower
+from ibrobot_feetech.options import FollowerOptions
+from ibrobot_lerobot_devices import hardware
+from ibrobot_lerobot_devices.hardware import LeRobotHardware
+from ibrobot_lerobot_devices.options import RobotOptions
+from ibrobot_testing.contexts import control_context
+
+from ibrobot_core.api import Calibration, HardwareError, JointCalibration, RealClock, SteppedClock, Torque
+
+pytestmark = [pytest.mark.lerobot, pytest.mark.usefixtures("patient_buses")]
+
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+TICK = 2 * np.pi / 4096
+CALIBRATION = {
+    name: JointCalibration(servo, 0, -300 + 100 * servo, 500 + servo, 3500 + servo)
+    for servo, name in enumerate(JOINTS, 1)
+}
+PATIENCE_S = 30.0
+PATIENT = """
+import lerobot.motors.feetech.feetech as bus
+from dataclasses import dataclass
+from lerobot.robots import RobotConfig
+from lerobot.robots.so_follower import SOFollower, SOFollowerRobotConfig
+
+def wait(port, packet_length):
+    port.packet_start_time = port.getCurrentTime()
+    port.packet_timeout = 3000
+
+bus.patch_setPacketTimeout = wait
+
+@RobotConfig.register_subclass("patient_so101")
+@dataclass
+class PatientConfig(SOFollowerRobotConfig):
+    pass
+
+class Patient(SOFollower):
+    config_class = PatientConfig
+"""
+"""A package for LeRobot: its so101_follower, which waits longer for servos that a busy machine keeps from answering."""
+
+
+@pytest.fixture(autouse=True)
+def patient_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    site = tmp_path / "site"
+    metadata = site / "lerobot_robot_patient-1.0.dist-info"
+    metadata.mkdir(parents=True)
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: lerobot-robot-patient\nVersion: 1.0\n")
+    (site / "lerobot_robot_patient.py").write_text(PATIENT)
+    monkeypatch.syspath_prepend(str(site))
+    invalidate_caches()
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(hardware, "_WAIT", PATIENCE_S * 100)
+    monkeypatch.setattr(hardware, "_RELAX_S", PATIENCE_S)
+
+
+@pytest.fixture
+def clock() -> SteppedClock:
+    return SteppedClock()
+
+
+@pytest.fixture
+def emulator(clock: SteppedClock) -> Iterator[Emulator]:
+    """An arm at the middle of its ranges, with its calibration."""
+    with Emulator(clock=clock) as served:
+        with served.lock:
+            for joint in CALIBRATION.values():
+                servo = served.servos[joint.id]
+                servo.set("homing_offset", joint.homing_offset)
+                servo.set("min_position_limit", joint.range_min)
+                servo.set("max_position_limit", joint.range_max)
+                servo.turn(joint.range_middle + joint.homing_offset)
+        yield served
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """LeRobot's calibration folder, with the file of the arm."""
+    save_calibration(Calibration(dict(CALIBRATION)), tmp_path / "arm.json")
+    return tmp_path
+
+
+def goals(emulator: Emulator) -> list[int]:
+    with emulator.lock:
+        return [emulator.servos[servo].get("goal_position") for servo in range(1, 7)]
+
+
+def test_so101_follower_moves_as_our_own_driver(emulator: Emulator, clock: SteppedClock, folder: Path) -> None:
+    """Positions and goals are those of our driver, within the tick that LeRobot cuts off."""
+    config = {"port": emulator.port, "id": "arm", "calibration_dir": str(folder)}
+    theirs = LeRobotHardware(RobotOptions("patient_so101", config), control_context("theirs", clock=RealClock()))
+    theirs.connect()
+    ours = FeetechFollower(
+        FollowerOptions(emulator.port, str(folder / "arm.json")), control_context("ours", clock=clock)
+    )
+    try:
+        begun = theirs.read().position
+        wanted = begun + np.array([0.3, -0.2, 0.25, 0.1, -0.4, 0.3])
+        theirs.write(wanted)
+        theirs.read()
+        sent = goals(emulator)
+        clock.advance(5_000_000_000)
+        reached = theirs.read().position
+        assert theirs.relax() is Torque.OFF
+    finally:
+        theirs.disconnect()
+    ours.connect()
+    try:
+        np.testing.assert_allclose(ours.read().position, reached, atol=TICK)
+        ours.write(wanted)
+        ours.read()
+        np.testing.assert_allclose(goals(emulator), sent, atol=1)
+    finally:
+        ours.relax()
+        ours.disconnect()
+    np.testing.assert_allclose(reached, wanted, atol=2 * TICK)
+
+
+def test_an_arm_without_its_cable_is_named_and_comes_back(emulator: Emulator, folder: Path) -> None:
+    config = {"port": emulator.port, "id": "arm", "calibration_dir": str(folder), "num_read_retries": 0}
+    options = RobotOptions("so101_follower", config, lost_readings=0)
+    arm = LeRobotHardware(options, control_context("arm", clock=RealClock()))
+    arm.connect()
+    try:
+        assert not arm.read().stale
+        emulator.faults.silent.add(3)
+        with pytest.raises(HardwareError, match="arm: ConnectionError: Failed to sync read 'Present_Position'"):
+            arm.read()
+        emulator.faults.silent.clear()
+        for _ in range(10):  # a busy machine may keep the servos from answering, within LeRobot's 50 ms
+            with suppress(HardwareError):
+                arm.reset_faults()
+                break
+        assert not arm.read().stale
+        held = arm.holding()
+        assert held is not None
+        assert json.dumps(config) in held.command
+    finally:
+        arm.disconnect()
+    with emulator.lock:
+        assert [emulator.servos[servo].get("torque_enable") for servo in range(1, 7)] == [1] * 6
