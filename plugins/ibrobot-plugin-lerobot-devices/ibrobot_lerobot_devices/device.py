@@ -89,15 +89,7 @@ class Device:
         self._device = device = self._library.make(order["kind"], order["type"], order["config"])
         if order["kind"] == "camera":
             return {}
-        names = ("action_features", "observation_features")
-        features = {name: _plain(getattr(device, name)) for name in names if hasattr(device, name)}
-        return features | {
-            "motors": self._library.motors(device),
-            "torque": bool(self._torque()),
-            "keeps_torque": self._library.KEEPS_TORQUE in _names(getattr(device, "config", None)),
-            "name": device.name,
-            "calibration": str(device.calibration_fpath),
-        }
+        return self._library.facts(device)
 
     def connect(self) -> dict[str, Any]:
         """Make and connect the device; return what it says about itself."""
@@ -118,32 +110,34 @@ class Device:
     def read(self) -> dict[str, float]:
         """The plain values of an observation, or of an action of a teleoperator."""
         get = self._device.get_observation if self._order["kind"] == "robot" else self._device.get_action
-        return _numbers(get())
+        return self._library.numbers(get())
 
     def picture(self) -> dict[str, Any]:
         """Send the newest picture, once it is there, through the pipe; return its shape and type."""
         import numpy as np
 
         pixels = np.ascontiguousarray(self._device.async_read(timeout_ms=200))
-        taken_s = getattr(self._device, "latest_timestamp", None)  # by time.perf_counter
-        age_s = max(0.0, time.perf_counter() - taken_s) if isinstance(taken_s, float) else 0.0
+        age_s = self._library.picture_age_s(self._device)
         content = memoryview(pixels).cast("B")
         return {"shape": list(pixels.shape), "type": str(pixels.dtype), "age_s": age_s, "content": content}
 
-    def act(self, action: Mapping[str, float]) -> None:
+    def act(self, action: Mapping[str, float]) -> dict[str, Any]:
         """Send an action."""
         self._device.send_action(dict(action))
+        return {}
 
-    def relax(self) -> None:
+    def relax(self) -> dict[str, Any]:
         """Switch the torque off."""
-        for owner in self._torque():
+        for owner in self._library.torque_switches(self._device):
             owner.disable_torque()
+        return {}
 
-    def hold(self) -> None:
+    def hold(self) -> dict[str, Any]:
         """Switch the torque on, with the present positions as goals."""
         self.act({name: value for name, value in self.read().items() if name in self._device.action_features})
-        for owner in self._torque():
+        for owner in self._library.torque_switches(self._device):
             owner.enable_torque()
+        return {}
 
     def reconnect(self) -> dict[str, Any]:
         """Connect again, e.g. after a cable was out."""
@@ -154,37 +148,6 @@ class Device:
         """Release the device; its torque stays as it is."""
         with contextlib.suppress(Exception):  # e.g. since it is not connected, or since its cable is out
             self._device.disconnect()
-
-    def _torque(self) -> list[Any]:
-        device = self._device
-        if hasattr(device, "disable_torque") and hasattr(device, "enable_torque"):
-            return [device]
-        return [bus for _, bus in self._library.buses(device) if hasattr(bus, "enable_torque")]
-
-
-def _plain(features: Mapping[str, Any]) -> list[str]:
-    """The names of the features that are numbers, and not pictures."""
-    return [name for name, kind in features.items() if not isinstance(kind, tuple | list)]
-
-
-def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    return {
-        name: float(value) for name, value in values.items() if getattr(value, "ndim", 0) == 0 and _is_number(value)
-    }
-
-
-def _is_number(value: Any) -> bool:
-    try:
-        float(value)
-    except (TypeError, ValueError):
-        return False
-    return not isinstance(value, str)
-
-
-def _names(config: Any) -> set[str]:
-    """The names of a config's fields, and of those of configs within it."""
-    own = getattr(config, "__dataclass_fields__", {})
-    return set(own).union(*(_names(getattr(config, name, None)) for name in own))
 
 
 def _one_line(error: BaseException) -> str:
@@ -200,7 +163,7 @@ def serve(device: Device, requests: Requests) -> None:
         begun_ns = time.monotonic_ns()
         answer: dict[str, Any] = {"event": ANSWER if what in ("read", "picture") else DONE, "id": request.get("id")}
         try:
-            found = device.act(request["action"]) if what == "act" else getattr(device, what)()
+            found: dict[str, Any] = device.act(request["action"]) if what == "act" else getattr(device, what)()
         except Exception as error:  # noqa: BLE001 - contained: the answer has the error
             channel.send(answer | {"do": what, "error": _one_line(error)})
             continue

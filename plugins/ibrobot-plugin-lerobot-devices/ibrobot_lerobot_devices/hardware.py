@@ -57,6 +57,8 @@ class LeRobotHardware(Hardware):
         self._link = DeviceLink("robot", options.robot, options.config, torch=options.torch)
         self._fault: HardwareError | None = self._error("is not connected")
         self._starting = False
+        self._newest: JointReading | None = None
+        self._lost = 0
         self._on = False
         self._has_torque = False
         self._relaxed = False
@@ -188,8 +190,7 @@ class LeRobotHardware(Hardware):
         self._rest = {name: 0.0 for name in actions if name.endswith(VELOCITY) and name not in self._features}
         self._unmapped = [name for name in bases(actions, POSITION).values() if name not in self._features]
         self._history: deque[tuple[int, Vector]] = deque(maxlen=_SPAN)
-        self._newest: JointReading | None = None
-        self._lost = 0
+        self._newest, self._lost = None, 0
         self._has_torque = found["torque"]
         self._starting = False
         self._on = self._has_torque

@@ -8,6 +8,7 @@ import inspect
 import logging
 import pkgutil
 import re
+import time
 from collections.abc import Iterator, Mapping
 from importlib.metadata import distributions, version
 from pathlib import Path
@@ -191,3 +192,54 @@ def buses(device: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             each, "get_observation" if hasattr(each, "send_action") else "get_action"
         ):
             yield from buses(each, f"{prefix}{name.removesuffix('arm')}")
+
+
+def facts(device: Any) -> dict[str, Any]:
+    """What a robot or teleoperator says about itself: features, motors, torque, and its calibration's file."""
+    names = ("action_features", "observation_features")
+    features = {name: _plain(getattr(device, name)) for name in names if hasattr(device, name)}
+    return features | {
+        "motors": motors(device),
+        "torque": bool(torque_switches(device)),
+        "keeps_torque": KEEPS_TORQUE in _names(getattr(device, "config", None)),
+        "calibration": str(device.calibration_fpath),
+    }
+
+
+def torque_switches(device: Any) -> list[Any]:
+    """The objects that switch the torque of a device off and on: itself, or its motor buses."""
+    if hasattr(device, "disable_torque") and hasattr(device, "enable_torque"):
+        return [device]
+    return [bus for _, bus in buses(device) if hasattr(bus, "enable_torque")]
+
+
+def numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    """The plain numbers among the values of a reading."""
+    return {name: float(value) for name, value in values.items() if _is_number(value)}
+
+
+def picture_age_s(camera: Any) -> float:
+    """The age of a camera's newest picture [s]; 0 if LeRobot does not say when it was taken."""
+    taken_s = getattr(camera, "latest_timestamp", None)  # by time.perf_counter
+    return max(0.0, time.perf_counter() - taken_s) if isinstance(taken_s, float) else 0.0
+
+
+def _plain(features: Mapping[str, Any]) -> list[str]:
+    """The names of the features that are numbers, and not pictures."""
+    return [name for name, kind in features.items() if not isinstance(kind, tuple | list)]
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, str) or getattr(value, "ndim", 0) != 0:
+        return False
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _names(config: Any) -> set[str]:
+    """The names of a config's fields, and of those of configs within it."""
+    own = getattr(config, "__dataclass_fields__", {})
+    return set(own).union(*(_names(getattr(config, name, None)) for name in own))

@@ -196,7 +196,7 @@ class DeviceLink:
         message = self._message(timeout_s)
         if message is None or message["event"] != ANSWER:
             if message is not None and "error" in message:
-                return dict(message)  # an action that failed, which nobody waits for
+                return dict(message)  # an action that failed
             return None
         if message["id"] == self._number:
             self._asked_s = None
@@ -214,7 +214,7 @@ class DeviceLink:
             elif message["event"] == READY or (message["event"] == DONE and message.get("do") == what):
                 if "error" in message:
                     raise DeviceProblem(message["error"])
-                return message["found"] or {}
+                return dict(message["found"])
         return None
 
     def _message(self, timeout_s: float) -> Mapping[str, Any] | None:

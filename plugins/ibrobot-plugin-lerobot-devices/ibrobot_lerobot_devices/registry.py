@@ -62,7 +62,7 @@ def _registry(key: str) -> Mapping[str, Any]:
             cache.parent.mkdir(parents=True, exist_ok=True)
             replace_file(cache, json.dumps(found).encode())
         except OSError:
-            pass  # it is read anew the next time
+            pass  # it is read again the next time
     return found
 
 

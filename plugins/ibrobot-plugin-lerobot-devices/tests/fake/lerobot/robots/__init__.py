@@ -1,5 +1,7 @@
 """Robots."""
 
+# mypy: disable-error-code="misc"
+
 from dataclasses import dataclass
 from pathlib import Path
 

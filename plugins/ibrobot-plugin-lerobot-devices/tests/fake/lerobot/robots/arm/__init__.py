@@ -1,5 +1,7 @@
 """A robot of six joints: degrees, shares of the range, and one that is reversed."""
 
+# mypy: disable-error-code="misc"
+
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar

@@ -1,5 +1,7 @@
 """A leader with the joints of the arm, and a device that commands a tool."""
 
+# mypy: disable-error-code="misc"
+
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
