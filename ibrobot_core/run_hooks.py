@@ -10,6 +10,7 @@ RUN_KEYS: Mapping[str, str] = {
     "tab": "start and end of an episode",
     **{f"f{i}": "mode switch" for i in range(1, 10)},
     "f10": "reset",
+    "backspace": "redo of an episode",
     "f11": "end of an episode",
     "f12": "end of an episode",
 }

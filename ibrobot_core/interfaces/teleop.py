@@ -25,6 +25,8 @@ class TeleopCommand:
     positions: Mapping[str, float] | None
     """Joint name -> position [rad]; None while the deadman is released, so that the robot holds."""
     estop: bool = False
+    approaching: bool = False
+    """Whether the robot still moves to the device's own pose, and follows it only then."""
     finished: bool = False
     """True if the device has no further commands, e.g. at the end of a recording."""
     events: tuple[OperatorEvent, ...] = ()

@@ -30,11 +30,9 @@ class ControlComponent(Component):
     def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
         config = session.config
         where = "in this process, in lockstep" if session.request.lockstep else "in a process of its own"
-        simulation = config.simulation
-        parts = (
-            simulation.type if config.simulated and simulation else ", ".join(h.type for h in config.hardware.values())
-        )
-        super().__init__(CONTROL, f"{parts} at {config.control.rate_hz:g} Hz, {where}", needs)
+        simulation = config.simulation if config.simulated else None
+        types = [simulation.type] if simulation else [each.type for each in config.hardware.values()]
+        super().__init__(CONTROL, f"{', '.join(types)} at {config.control.rate_hz:g} Hz, {where}", needs)
         self._session = session
         self._joints = config.robot.joint_names
         self._checked_s = self._ending_s = 0.0

@@ -192,6 +192,8 @@ class Session:
             simulated episode. An emergency stop never waits for it.
         commander: who commands the robot in a mode in which an operator may take it from the policy: `policy`,
             `operator`, or `handover` while neither does; empty in other modes.
+        followed_ns: when the robot last followed the devices of the present mode [ns]: they command it, and it has
+            reached their pose; 0 if it has not.
         held: whether the robot holds after the reset of a fault, until the operator enters the mode again.
         start_failed: whether the run ended before all components had started, so that nothing has moved the robot.
     """
@@ -212,6 +214,7 @@ class Session:
         self.devices = SharedDevices()
         self.changing = threading.RLock()
         self.commander = ""
+        self.followed_ns = 0
         self.held = False
         self.start_failed = False
         self.state: ControlState | None = None
@@ -468,11 +471,7 @@ class SessionWorker(Worker):
         self, session: RunView, name: str, summary: str, needs: tuple[str, ...] = (), *, ready_timeout_s: float = 60.0
     ) -> None:
         super().__init__(
-            name,
-            summary,
-            needs,
-            on_failure=session.fail,
-            lockstep=session.request.lockstep,
+            name, summary, needs, on_failure=session.fail, lockstep=session.request.lockstep,
             ready_timeout_s=ready_timeout_s,
-        )
+        )  # fmt: skip
         self.session = session

@@ -107,6 +107,7 @@ class RunAccess(RunView, Protocol):
     """A run, for the parts that command the robot or record its episodes."""
 
     commander: str
+    followed_ns: int
     on_state: list[Callable[[ControlState], None]]
     on_goal: list[Callable[[Mapping[str, Any]], None]]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import queue
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +13,9 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+from ibrobot_data.cues import Cues
+from ibrobot_data.episode_service import EpisodeService
+from ibrobot_data.operator import Operator
 from ibrobot_feetech import bus
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
@@ -135,7 +139,7 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
     monkeypatch.setattr(host, "_REPLY_TIMEOUT_S", PATIENCE_S)
     made: list[Any] = []
 
-    def start(*overrides: str) -> Station:
+    def start(*overrides: str, **asked: Any) -> Station:
         leader, leader_file = arm(tmp_path, "leader")
         follower, follower_file = arm(tmp_path, "follower")
         sections = (
@@ -150,7 +154,7 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
         )
         config = load_config(CONFIG, overrides=(*sections, *overrides), mode="teleop")
         typed = queue.SimpleQueue[str]()
-        session = Session(config, installed_plugins(), LaunchRequest(keys=lambda: typed))
+        session = Session(config, installed_plugins(), LaunchRequest(keys=lambda: typed, **asked))
         station = Station(leader, follower, Runtime(session), typed)
         made.append(station)
         follower.on_request = station.count
@@ -265,3 +269,48 @@ def test_a_recording_keeps_where_0_rad_is(tmp_path: Path):
         (kept,) = calibrations(load_config(CONFIG, overrides=(hardware,), mode="teleop")).values()
         assert {joint["zero_at"] for joint in kept.values()} == {zero_at}
         file.with_suffix(".meta.json").unlink(missing_ok=True)  # as LeRobot's own
+
+
+def test_one_person_records_ten_episodes_by_keys(
+    station: Callable[..., Station], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("ibrobot_data.operator.ENDING_S", 0.15)
+    recording = f"recording={{type: mcap, root: {tmp_path}, dataset: alone}}"
+    arms = station(recording, "contract.max_duration_s=0.4", "contract.rate_hz=50", by_operator=True)
+    session, service = arms.runtime.session, arms.runtime.session.episodes
+    assert isinstance(service, EpisodeService)
+    heard, ear = os.pipe()
+    operator = Operator(session, service, 10, 0.0, None, auto=False, keys=True, cues=Cues("beep", ear))
+    wait = arms.runtime.wait
+    monkeypatch.setattr(arms.runtime, "wait", lambda timeout_s: operator.step() or wait(timeout_s))
+
+    def keys(*pressed: str) -> None:
+        for key in pressed:
+            arms.typed.put(key)
+            operator.key(key)
+
+    try:
+        arms.until_at_rest()
+        for number in range(1, 11):
+            if number in (1, 6):  # of another task
+                keys("tab" if number == 1 else "f11", *f"task {number}", "enter")
+                arms.turn("shoulder_pan", 0.1 * number)  # the leader sinks while its hand types
+                assert service.waiting
+                arms.until(lambda: "PAUSED" in session.command_source.help(), "the arm waits")
+                arms.press_space()
+            else:
+                keys("tab")
+            arms.until(lambda number=number: service.number == number, "an episode begins")  # type: ignore[misc]
+            arms.turn("elbow_flex", 0.2 if number % 2 else -0.2)
+            arms.until(lambda number=number: service.saved == number, "an episode is saved")  # type: ignore[misc]
+        arms.until(session.finished.is_set, "the run ends")
+        assert os.read(heard, 999) == 10 * (1 + 2 + 3) * b"\a"
+    finally:
+        os.close(heard)
+        os.close(ear)
+    for folder in sorted((tmp_path / "alone/episodes").glob("episode_*")):
+        reader = installed_plugins().open_episode(folder)
+        (first, *_) = reader.messages(["/arm_position_controller/commands"])
+        reader.close()
+        way = abs(first.message.data[0] - 0.1 * (1 if folder.name < "episode_000006" else 6))
+        assert way <= 0.06, f"{folder.name} begins while the arm is on its way to the leader"

@@ -14,6 +14,8 @@ from ibrobot_testing.terminal import Terminal
 
 from ibrobot_core.plugins import installed_plugins
 
+HOLD_R = "\x1b[114;1:1;114u\x1b[114;1:2;114u"
+"""A press and a repeat, from a terminal that reports both."""
 pytestmark = pytest.mark.integration
 
 
@@ -44,6 +46,17 @@ def test_simulated_episodes_are_recorded_unattended_with_the_scenes_judgement(tm
     assert dataset["robot"] == "so101"
 
 
+def test_resume_goes_on_to_the_number_of_episodes(tmp_path: Path):
+    command = ["record", "so101_blind", "--sim", "--lockstep", "--headless", "--dataset", "pick"]
+    with chdir(tmp_path):
+        run_here(*command, "--continuous", "--mode", "moveit_planning", "--goal", "home", "--prompt", "go home")
+        again = run_here(*command, "--resume", "--episodes", "2", "--set", "contract.max_duration_s=0.5")
+        done = run_here(*command, "--resume", "--episodes", "2")
+    assert "recorded   2 of 2 episodes into" in again.stdout
+    assert [prompt for _, prompt, _ in outcomes(tmp_path / "episodes/pick")] == ["go home", "go home"]
+    assert done.stdout == "episodes/pick: has 2 episodes already\n"
+
+
 def is_recording(terminal: Terminal) -> None:
     """Wait for some of an episode; how many seconds are shown, a busy machine may skip."""
     for _ in range(5):
@@ -57,18 +70,20 @@ def test_an_operator_records_by_keys(tmp_path: Path):
         terminal.type("\t")
         terminal.wait_for("prompt (Enter alone leaves it empty")
         terminal.type("wave\r")
+        terminal.wait_for("recording begins when the robot follows you")
+        terminal.type(HOLD_R)
         is_recording(terminal)
         terminal.type("\t")
         terminal.wait_for("episode 1: success")
         terminal.type("\t")
-        terminal.wait_for("takes “wave”")
-        terminal.type("\r")
+        terminal.type(HOLD_R)
         is_recording(terminal)
         terminal.type("\x1b[24~")  # F12
         terminal.wait_for("episode 2: discarded")
         terminal.type("\x03")  # once: a second one ends it at once
         terminal.wait_for("recorded   1 episode into")
         assert terminal.end() == 0
+    assert "\a" in terminal.screen
     (kept,) = outcomes(tmp_path / "desk")
     assert kept[:2] == ("success", "wave")
 

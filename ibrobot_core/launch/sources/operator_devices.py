@@ -134,6 +134,7 @@ class OperatorDevices:
             raise TeleopError("; ".join(faults))
         return TeleopCommand(
             {joint: at for command in commands for joint, at in (command.positions or {}).items()} or None,
+            approaching=any(command.approaching for command in commands),
             finished=all(command.finished for command in commands),
             events=tuple(event for command in commands for event in command.events),
         )

@@ -72,6 +72,7 @@ class TeleopSource(SourceWorker):
 
     @override
     def begin_mode(self, seed: int) -> None:
+        self.session.followed_ns = 0
         self._braking.begin()
         self._devices.activate(self.session.measured())
 
@@ -90,15 +91,15 @@ class TeleopSource(SourceWorker):
             command = self._devices.read(session.measured())
         except TeleopError as error:
             self.end()
-            if session.finished.is_set():
-                return
-            session.control.call("fault", fault=str(error))
+            if not session.finished.is_set():
+                session.control.call("fault", fault=str(error))
             return
         if session.finished.is_set():
             return  # from here on, only emergency stops count
         if positions := self._braking.add(command.positions or {}):
-            setpoint = np.array([list(positions.values())])
-            session.send_plan(session.clock.now_ns(), 1, tuple(positions), setpoint)
+            session.send_plan(session.clock.now_ns(), 1, tuple(positions), np.array([[*positions.values()]]))
+        if command.positions and not command.approaching:
+            session.followed_ns = session.clock.now_ns()
         for event in command.events:
             if event == "intervention":
                 session.log.warning("%s: mode %s has no policy to take the robot from", event, self.mode.name)

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from contextlib import closing, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
 import yaml
 
-from ibrobot_core.api import Contract, RecorderError, replace_file
-from ibrobot_core.app import Ownership, owned
+from ibrobot_core.api import Contract, IbrobotError, RecorderError, replace_file
+from ibrobot_core.app import Ownership, installed_plugins, owned
 
 _WAIT_S = 10.0
 """Time to wait for another process, which changes `dataset.yaml` within milliseconds."""
+
+
+def count_complete(folder: Path) -> int:
+    """Number of episodes of a dataset's folder that are complete, i.e. need no repair."""
+    count = 0
+    for path in sorted(folder.glob("episodes/episode_*")):
+        with suppress(IbrobotError, OSError), closing(installed_plugins().open_episode(path)) as reader:
+            count += reader.summary().finished
+    return count
 
 
 class EpisodeDataset:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import NoneType
-from typing import TYPE_CHECKING, Any, override
+from typing import TYPE_CHECKING, Any, Literal, override
 
 import attrs
 
-from ibrobot_core.api import Contract, NotSupported, RecorderError, documented, option, seconds
+from ibrobot_core.api import NS_PER_S, Contract, NotSupported, RecorderError, documented, option, seconds
 from ibrobot_core.app import DiskFull, Episodes, NoRequest, RunAccess, Service, wrong_input
 from ibrobot_data.conversion import OUTCOMES
+from ibrobot_data.cues import Cue
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_start import is_kept
 from ibrobot_data.prompt import check_prompt
@@ -27,6 +28,9 @@ class StartEpisode:
     """A request to `/record_episode/start`."""
 
     prompt: str | None = option(None, help="description of the task; without one, that of the last episode")
+    wait: bool = option(
+        False, help="begin once the robot follows the operator's device; at once in a mode without teleoperation"
+    )
 
 
 @documented
@@ -39,11 +43,17 @@ class StopEpisode:
 
 START = Service("/record_episode/start", StartEpisode, NoneType, "Begin an episode.", alone="prompt")
 STOP = Service("/record_episode/stop", StopEpisode, NoneType, "End the episode.", alone="outcome")
+REDO = Service(
+    "/record_episode/redo", NoRequest, NoneType,
+    "Record the present or last episode again, which replaces it; begins as with `wait`.",
+)  # fmt: skip
 DISCARD = Service("/record_episode/discard", NoRequest, NoneType, "End the episode, and delete it.")
 STATUS: Service[NoRequest, Mapping[str, Any]] = Service(
     "/record_episode/status", NoRequest, Mapping, "The state of recording, for a user interface."
 )
 _MIB = 1 << 20
+_PAUSED_NS = NS_PER_S // 10
+"""A robot that has not followed for this time is paused [ns]."""
 
 
 class EpisodeService(Episodes):
@@ -56,6 +66,10 @@ class EpisodeService(Episodes):
     Attributes:
         by_mode: whether the mode begins and ends episodes, so that an operator can only watch.
         wanted: number of episodes after which the run ends; None: it does not end by itself.
+        earlier: number of episodes of earlier runs that count as saved.
+        waiting: whether an episode begins as soon as the robot follows the operator's device.
+        cues: number of cues so far; a page that sees it change plays `cue`.
+        cue: the newest cue; empty before the first.
 
     Raises:
         RecorderError: if the dataset has another contract or cannot be written, or if `recording.topics` leaves out a
@@ -66,6 +80,15 @@ class EpisodeService(Episodes):
         super().__init__(session)
         self._recording = recording
         self.wanted: int | None = None
+        self.earlier = 0
+        self.waiting = False
+        self._waiting_ns = 0
+        """Since when [ns]."""
+        self.cues = 0
+        self.cue: Cue | Literal[""] = ""
+        self.on_cue: list[Callable[[Cue], None]] = []
+        self._again = False
+        """Whether the present episode replaces the last one."""
         self.by_mode = session.simulates_episodes or not session.request.by_operator
         self._lock = threading.Lock()
         config = session.config.recording
@@ -86,8 +109,9 @@ class EpisodeService(Episodes):
 
     @override
     def begin(self) -> None:
-        self._recording.begin(self.number + 1, self.prompt)
+        self._recording.begin(self.number + 1, self.prompt, again=self._again)
         super().begin()
+        self.play("start")
 
     @override
     def end(self, outcome: str) -> None:
@@ -98,7 +122,19 @@ class EpisodeService(Episodes):
     @property
     def saved(self) -> int:
         """Number of complete episodes that were kept."""
-        return self._recording.saved
+        return self.earlier + self._recording.saved
+
+    @property
+    def writing(self) -> bool:
+        """Whether an episode that has ended is not completely written yet."""
+        return self._recording.writing
+
+    def play(self, cue: Cue) -> None:
+        """Let the operator hear a cue, unless the mode begins and ends the episodes."""
+        if not self.by_mode:
+            self.cues, self.cue = self.cues + 1, cue
+            for call in self.on_cue:
+                call(cue)
 
     @property
     def failure(self) -> RecorderError | None:
@@ -114,11 +150,12 @@ class EpisodeService(Episodes):
         """
         return self.prompt or self._dataset.prompt
 
-    def start(self, prompt: str | None = None) -> None:
+    def start(self, prompt: str | None = None, *, wait: bool = False) -> None:
         """Begin an episode.
 
         Args:
             prompt: description of the task; None repeats the last prompt.
+            wait: whether to begin once the robot follows the operator's device; see `follow`.
 
         Raises:
             RecorderError: if an episode is being recorded, a fault or emergency stop is not reset, topics of the
@@ -130,19 +167,44 @@ class EpisodeService(Episodes):
             self._check_by_operator()
             if self.running:
                 raise RecorderError("an episode is being recorded; end it first")
-            if fault := self._session.stopped_by:
-                raise RecorderError(f"not recording: {fault}; reset it first")
-            if silent := self._recording.silent():
-                topics = ", ".join(
-                    f"{topic} ({'nothing yet' if age is None else f'nothing for {age:.1f} s'})"
-                    for topic, age in silent.items()
-                )
-                raise RecorderError(f"not recording: the contract's topics are silent: {topics}")
-            self._check_space()
+            self._check_ready()
             self.prompt = self.last_prompt if prompt is None else check_prompt(prompt)
-            self.begin()
-            if self.prompt:
-                self._dataset.prompt = self.prompt
+            self._begin(wait=wait, again=False)
+
+    def redo(self) -> None:
+        """Record the present episode again, or else the last one of this run, which is deleted once that is saved.
+
+        Raises:
+            RecorderError: as `start`, or without such an episode.
+            NotSupported: if the mode begins episodes itself.
+        """
+        with self._lock:
+            self._check_by_operator()
+            if not self.can_redo:
+                raise RecorderError("no episode of this run is saved, so there is none to record again")
+            again = self._again or not self.running
+            if self.running:
+                self.end("discarded")
+            self._check_ready()
+            self._begin(wait=True, again=again)
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether `redo` has an episode to record again."""
+        return self._recording.keeps_whole and not self.waiting and (self.running or self._recording.saved > 0)
+
+    def follow(self) -> None:
+        """Begin the episode that waits, if the robot follows by now; called a few times a second.
+
+        Raises:
+            RecorderError: as `start`; the episode no longer waits.
+        """
+        with self._lock:
+            if not self.waiting or (self._is_paused(self._waiting_ns) and not self._session.stopped_by):
+                return
+            self.waiting = False
+            self._check_ready()
+            self._begin(wait=False, again=self._again)
 
     def stop(self, outcome: str = "unknown") -> None:
         """End the present episode.
@@ -164,6 +226,37 @@ class EpisodeService(Episodes):
         """
         self._end("discarded")
 
+    def _is_paused(self, since_ns: int) -> bool:
+        """Whether an operator moves the robot in this mode, and it has not followed since a time [ns]."""
+        by_hand = self._session.config.control_modes[self._session.mode].teleop is not None
+        return by_hand and self._session.followed_ns < since_ns
+
+    def _check_ready(self) -> None:
+        """Check that an episode can begin.
+
+        Raises:
+            RecorderError: as `start`.
+        """
+        if fault := self._session.stopped_by:
+            raise RecorderError(f"not recording: {fault}; reset it first")
+        if silent := self._recording.silent():
+            topics = ", ".join(
+                f"{topic} ({'nothing yet' if age is None else f'nothing for {age:.1f} s'})"
+                for topic, age in silent.items()
+            )
+            raise RecorderError(f"not recording: the contract's topics are silent: {topics}")
+        self._check_space()
+
+    def _begin(self, *, wait: bool, again: bool) -> None:
+        self._again = again
+        self._waiting_ns = self._session.clock.now_ns()
+        self.waiting = wait and self._is_paused(self._waiting_ns - _PAUSED_NS)
+        if self.waiting:
+            return
+        self.begin()
+        if self.prompt:
+            self._dataset.prompt = self.prompt
+
     def elapsed_s(self) -> float:
         """Time since the episode began [s]; 0 without an episode."""
         if not self.running:
@@ -182,7 +275,8 @@ class EpisodeService(Episodes):
         failure = self._recording.failure
         return {
             "recording": self.running, "by_mode": self.by_mode, "episode": self.number, "saved": self.saved,
-            "wanted": self.wanted, "prompt": self.prompt, "elapsed_s": round(self.elapsed_s(), 2),
+            "wanted": self.wanted, "prompt": self.prompt, "waiting": self.waiting, "can_redo": self.can_redo,
+            "cues": self.cues, "cue": self.cue, "elapsed_s": round(self.elapsed_s(), 2),
             "max_duration_s": self._session.config.contract.max_duration_s,
             "rates_hz": {topic: round(rate, 1) for topic, rate in self._recording.rates().items()},
             "silent": list(self._recording.silent()), "lost": self._recording.lost(),
@@ -193,21 +287,23 @@ class EpisodeService(Episodes):
     def serve(self) -> None:
         """Register the services on the bus."""
         bus = self._session.bus
-        bus.serve(START, lambda request: self.start(request.prompt))
+        bus.serve(START, lambda request: self.start(request.prompt, wait=request.wait))
+        bus.serve(REDO, lambda _: self.redo())
         bus.serve(STOP, lambda request: self.stop(request.outcome))
         bus.serve(DISCARD, lambda _: self.discard())
         bus.serve(STATUS, lambda _: self.status())
 
     def unserve(self) -> None:
         """Remove the services from the bus."""
-        for service in (START, STOP, DISCARD, STATUS):
+        for service in (START, STOP, REDO, DISCARD, STATUS):
             self._session.bus.unserve(service)
 
     def _end(self, outcome: str) -> None:
         with self._lock:
             self._check_by_operator()
-            if not self.running:
+            if not (self.running or self.waiting):
                 raise RecorderError("no episode is being recorded")
+            self.waiting = False
             self.end(outcome)
 
     def _check_space(self) -> None:

@@ -8,13 +8,15 @@ from typing import override
 
 from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, TeleopDescriptor, ViewerDescriptor, seconds
 from ibrobot_core.app import DiskFull, Event, RunAccess, RunHooks
+from ibrobot_data.cues import ENDING_S, Cues
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.plural import plural
 from ibrobot_data.recording_session import Session as SessionEvent
 
 _MIB = 1 << 20
-_START, _FAILURE, _DISCARD = "tab", "f11", "f12"
-"""The keys; `_START` also ends an episode as a success. None of them jogs the robot."""
+_START, _FAILURE, _DISCARD, _REDO = "tab", "f11", "f12", "backspace"
+"""The keys; `_START` also ends an episode as a success, and between episodes `_FAILURE` asks for another prompt. None
+of them jogs the robot."""
 
 
 class Operator(RunHooks):
@@ -30,6 +32,7 @@ class Operator(RunHooks):
             fails, or the disk has no room for another episode, the run ends.
         continuous: one episode, from the first complete set of messages to the end of the run.
         keys: whether the run has a terminal for the operator's keys.
+        cues: plays cues; by default none.
         report: receives the state of the session when it changes.
 
     Raises:
@@ -39,6 +42,7 @@ class Operator(RunHooks):
     def __init__(
         self, run: RunAccess, service: EpisodeService, count: int | None, reset_time_s: float, prompt: str | None, *,
         auto: bool, keys: bool, continuous: bool = False, report: Callable[[Event], None] | None = None,
+        cues: Cues | None = None,
     ) -> None:  # fmt: skip
         if service.by_mode and continuous:
             raise NotSupported(f"--continuous: mode {run.mode} begins and ends its episodes itself")
@@ -49,6 +53,10 @@ class Operator(RunHooks):
             )
         self._run = run
         self._service = service
+        self._cues = cues or Cues("none", None)
+        service.on_cue.append(self._cues.play)
+        self._warned_of = 0
+        """Number of the episode whose end was announced."""
         self._count = service.wanted = count
         self._keys = keys
         self._reset_time_s = reset_time_s
@@ -59,6 +67,8 @@ class Operator(RunHooks):
         self._not_before_s = 0.0
         self._typed: str | None = None
         """The typed part of a prompt; None while none is asked for."""
+        self._asked = False
+        """Whether the operator has given a prompt, which then holds for the next episodes, too."""
         self._complaint = ""
         self._report = report
         self._reported: Event | None = None
@@ -70,11 +80,16 @@ class Operator(RunHooks):
     def step(self) -> None:
         """Begin or end an episode when it is due; called a few times a second."""
         self._tell()
+        self._cues.step()
         while not self._run.operator_events.empty():
             self._press(self._run.operator_events.get())
         if self._service.by_mode:
             return
         service = self._service
+        left_s = self._longest_s - service.elapsed_s()
+        if service.running and left_s <= ENDING_S < self._longest_s and service.number != self._warned_of:
+            self._warned_of = service.number
+            service.play("ending")
         if service.running:
             if service.failure is not None:
                 self._end(lambda: service.stop("unknown"))
@@ -83,13 +98,21 @@ class Operator(RunHooks):
                     self._run.finish()
             elif self._auto and service.faults:
                 self._end(lambda: service.stop("failure"))
-            elif service.elapsed_s() >= self._longest_s:
+            elif left_s <= 0.0:
                 self._run.log.info("the episode is %g s long (contract.max_duration_s): ended", self._longest_s)
                 self._end(lambda: service.stop("unknown"))
+        elif service.waiting:
+            self._try(service.follow)
         elif self._count is not None and service.saved - self._spoilt >= self._count:
-            self._run.finish()
+            if self._is_over():
+                self._run.finish()
         elif self._auto and self._clock_s() >= self._not_before_s:
             self._begin(self._prompt)
+
+    def _is_over(self) -> bool:
+        """Whether the last episode is written and heard of, and its pause has passed, in which it can be redone."""
+        heard = not (self._service.writing or self._cues.playing)
+        return heard and (self._auto or self._clock_s() >= self._not_before_s)
 
     @property
     def _spoilt(self) -> int:
@@ -105,12 +128,18 @@ class Operator(RunHooks):
             self._type(key)
         elif key == _START and self._service.running:
             self._end(lambda: self._service.stop("success"))
-        elif key == _START:
+        elif key in (_START, _DISCARD) and self._service.waiting:
+            self._service.discard()
+        elif key == _START and (self._prompt is not None or self._asked):
+            self._begin(self._prompt)
+        elif key == _START or (key == _FAILURE and self._prompt is None and not self._service.running):
             self._ask()
         elif key == _FAILURE and self._service.running:
             self._end(lambda: self._service.stop("failure"))
         elif key == _DISCARD and self._service.running:
             self._end(self._service.discard)
+        elif key == _REDO and self._service.can_redo:
+            self._try(self._service.redo)
         else:
             return False
         return True
@@ -121,7 +150,7 @@ class Operator(RunHooks):
         if service.by_mode or self._continuous:
             self._run.log.warning("%s: this run begins and ends its episodes automatically", event)
         elif event == "start":
-            self._begin(self._prompt)
+            self._begin(self._prompt, wait=False)
         elif not service.running:
             self._refuse(f"{event}: no episode is being recorded")
         elif event == "discard":
@@ -158,7 +187,14 @@ class Operator(RunHooks):
         """The keys."""
         if self._service.by_mode or self._continuous:
             return ""
-        return "Tab start, and end as success   F11 end as failure   F12 discard"
+        service = self._service
+        again = ["Backspace again"] if service.can_redo else []
+        if service.running:
+            return "   ".join(["Tab success", "F11 failure", "F12 discard", *again])
+        if service.waiting:
+            return "Tab goes back"
+        other = ["F11 another task"] if self._prompt is None and self._asked else []
+        return "   ".join(["Tab start", *other, *again])
 
     @override
     def summary_rows(self) -> list[tuple[str, str]]:
@@ -176,6 +212,8 @@ class Operator(RunHooks):
             prompt = f" “{service.last_prompt}”" if service.last_prompt else ""
             left = "" if self._continuous else f", {max(0.0, self._longest_s - service.elapsed_s()):.0f} s left"
             return f"recording{prompt}, {service.elapsed_s():.0f} s{left}"
+        if service.waiting:
+            return "ready: recording begins when the robot follows you"
         pause_s = self._not_before_s - self._clock_s()
         if pause_s > 0:
             return f"reset the scene, {pause_s:.0f} s"
@@ -196,9 +234,6 @@ class Operator(RunHooks):
         return f"{saved} of {self._count}" if self._count is not None else str(saved)
 
     def _ask(self) -> None:
-        if self._prompt is not None:
-            self._begin(self._prompt)
-            return
         # Letters of the prompt must not jog the arm.
         self._run.end_source()
         self._typed = ""
@@ -207,6 +242,7 @@ class Operator(RunHooks):
         assert self._typed is not None
         if key == "enter":
             typed, self._typed = self._typed, None
+            self._asked = True
             self._run.begin_source()
             self._begin(typed or None)
         elif key == _START:
@@ -219,11 +255,16 @@ class Operator(RunHooks):
         elif len(key) == 1:
             self._typed += key
 
-    def _begin(self, prompt: str | None) -> None:
+    def _begin(self, prompt: str | None, *, wait: bool = True) -> None:
+        """Begin an episode; with `wait`, once the robot follows the operator."""
         if self._clock_s() < self._not_before_s:
             self._not_before_s = 0.0  # the operator is ready sooner
+        self._try(lambda: self._service.start(prompt, wait=wait and not self._continuous))
+
+    def _try(self, act: Callable[[], None]) -> None:
+        """Do what begins an episode; show why it does not."""
         try:
-            self._service.start(prompt)
+            act()
         except IbrobotError as error:
             if str(error) != self._complaint:
                 self._run.log.error("%s", error)

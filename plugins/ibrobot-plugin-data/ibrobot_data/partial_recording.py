@@ -28,6 +28,8 @@ class PartialRecording(RecordingWorker):
         options: which parts, and how much before and after them.
     """
 
+    keeps_whole = False
+
     def __init__(self, session: RunAccess, config: RecordingConfig, options: EpisodesOptions) -> None:
         super().__init__(session, config)
         self._options = options
@@ -50,7 +52,7 @@ class PartialRecording(RecordingWorker):
             self.on_end.callback(bus.unserve, HIGHLIGHT)
 
     @override
-    def begin(self, number: int, prompt: str) -> None:
+    def begin(self, number: int, prompt: str, *, again: bool = False) -> None:
         self._later(partial(self._begin_run_episode, number, prompt))
 
     @override
@@ -119,6 +121,7 @@ class PartialRecording(RecordingWorker):
     def _end_part(self, now_ns: int, outcome: str, faults: tuple[str, ...] = ()) -> None:
         with self._pending_lock:
             self._provisional += outcome != "discarded"
+            self._ending += 1
         self._end_episode(EpisodeEnd(now_ns, outcome, faults=faults), outcome != "discarded")
 
     def _presses(self) -> int:

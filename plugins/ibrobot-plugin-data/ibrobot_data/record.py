@@ -17,6 +17,7 @@ from ibrobot_core.app import (
     Runtime,
     check_end,
     declared,
+    echo,
     emit,
     find_config,
     installed_plugins,
@@ -26,8 +27,11 @@ from ibrobot_core.app import (
     run_robot,
 )
 from ibrobot_data import RECORD
+from ibrobot_data.cues import Cues
+from ibrobot_data.episode_dataset import EpisodeDataset, count_complete
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.operator import Operator
+from ibrobot_data.plural import plural
 from ibrobot_data.recording_session import RecordOptions
 
 
@@ -62,19 +66,30 @@ def record(options: RecordOptions, config: str | None, events: bool, **run: Any)
         raise click.UsageError("--continuous records one episode: leave --auto, --episodes and --reset-time out")
     robot = _recorded(config, options.dataset, options.root, run)
     check_end(robot, {**run, "episodes": options.episodes})
+    assert robot.recording is not None
+    folder, prompt, earlier = robot.recording.folder, options.prompt, 0
+    if options.resume:
+        earlier = count_complete(folder)
+        prompt = prompt or EpisodeDataset(folder).prompt or None
+    if options.episodes is not None and earlier >= options.episodes:
+        echo(f"{folder}: has {earlier} {plural(earlier, 'episode')} already")
+        return
     live = sys.stdin.isatty() and sys.stdout.isatty() and not run["headless"]
+    cues = Cues(options.cues, sys.stdout.fileno() if live else None)
 
     def operator(runtime: Runtime) -> Operator:
         service = runtime.session.episodes
         assert isinstance(service, EpisodeService)
+        service.earlier = earlier
         return Operator(
-            runtime.session, service, options.episodes, options.reset_time, options.prompt, auto=options.auto,
+            runtime.session, service, options.episodes, options.reset_time, prompt, auto=options.auto,
             continuous=options.continuous, keys=live, report=partial(emit, RECORD) if events else None,
+            cues=cues,
         )  # fmt: skip
 
     request = LaunchRequest(
-        run["lockstep"], run["seed"], run["duration"], options.episodes, run["goals"],
-        prompt=options.prompt or "", by_operator=True,
+        run["lockstep"], run["seed"], run["duration"], options.episodes and options.episodes - earlier, run["goals"],
+        prompt=prompt or "", by_operator=True,
     )  # fmt: skip
     run_robot(
         robot,

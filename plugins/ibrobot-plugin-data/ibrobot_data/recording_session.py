@@ -12,6 +12,9 @@ from ibrobot_core.app import Event, Shown
 from ibrobot_data.plural import plural
 from ibrobot_data.prompt import check_prompt
 
+CUES = ("beep", "speech", "none")
+"""Kinds of cues; see `Cues`."""
+
 
 def _check_prompt(instance: object, attribute: object, prompt: str | None) -> None:
     if prompt is not None:
@@ -32,6 +35,19 @@ class RecordOptions:
     root: Path | None = option(None, label=None, help="folder of all datasets")
     episodes: int | None = option(
         None, ge=1, label="Episodes", help="number of episodes after which the session ends; without one, it goes on"
+    )
+    resume: bool = option(
+        False,
+        label="Go on",
+        more=True,
+        help="count the dataset's episodes of earlier runs, and keep their last prompt unless --prompt gives another",
+    )
+    cues: str = option(
+        "beep",
+        choices=CUES,
+        label=None,
+        help="what is heard when an episode begins, ends in three seconds, and is saved: bells of the terminal, or "
+        "words by spd-say, say or espeak",
     )
     auto: bool = option(
         False,

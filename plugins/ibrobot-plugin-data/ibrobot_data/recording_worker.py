@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import override
 
 import attrs
 
-from ibrobot_core.api import NS_PER_S, Contract, EpisodeEnd, EpisodeStart, Message, Recorder, RecorderError, seconds
+from ibrobot_core.api import (
+    NS_PER_S,
+    Contract,
+    EpisodeEnd,
+    EpisodeStart,
+    IbrobotError,
+    Message,
+    Recorder,
+    RecorderError,
+    seconds,
+)
 from ibrobot_core.app import Component, Ownership, Received, RecordingConfig, RunAccess, SessionWorker, error_line
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.episode_start import episode_start, is_kept, take_next_folder
@@ -45,6 +57,8 @@ class RecordingWorker(SessionWorker):
 
     session: RunAccess
     urgent = True
+    keeps_whole = True
+    """Whether an episode of the run is one recording, so that it can be recorded again."""
 
     def __init__(self, session: RunAccess, config: RecordingConfig) -> None:
         super().__init__(session, "recording", f"{config.type} into {config.root}")
@@ -72,6 +86,12 @@ class RecordingWorker(SessionWorker):
         """Complete episodes that were kept."""
         self._provisional = 0
         """Episodes that have ended but are not completely written yet."""
+        self._ending = 0
+        """Ends of episodes that were requested and are not carried out yet."""
+        self._again = False
+        """Whether the present episode replaces the one kept last."""
+        self._kept: Path | None = None
+        """The folder of the episode kept last."""
         self.failure: RecorderError | None = None
         """The error that cut short the recording of the present or last episode; None without an error."""
 
@@ -87,8 +107,13 @@ class RecordingWorker(SessionWorker):
         self.on_end.callback(self._did, self._recorder.close)
         self.on_end.callback(self.work, 0.0)
 
-    def begin(self, number: int, prompt: str) -> None:
+    def begin(self, number: int, prompt: str, *, again: bool = False) -> None:
         """Begin an episode; it gets all messages from now on.
+
+        Args:
+            number: its number in the run, from 1.
+            prompt: description of the task.
+            again: whether it replaces the episode kept last, if it is kept itself.
 
         Raises:
             RecorderError: if the episode cannot be recorded in its dataset.
@@ -100,6 +125,7 @@ class RecordingWorker(SessionWorker):
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
             begin = partial(self._open_episode, start, owned, latched, self._incoming.lost.copy())
             self._pending.append((start.stamp_ns, begin))
+            self._again = again
 
     def _start_of(self, number: int, prompt: str, stamp_ns: int) -> tuple[EpisodeStart, Ownership]:
         """The start of the dataset's next episode, which is of episode `number` of the run, and its folder.
@@ -131,10 +157,16 @@ class RecordingWorker(SessionWorker):
     def end(self, outcome: str, faults: tuple[str, ...] = ()) -> None:
         """End the episode, during which `faults` occurred; messages up to now belong to it."""
         with self._pending_lock:
-            provisional = outcome != "discarded" and self.failure is None
-            self._provisional += provisional
+            provisional, again = outcome != "discarded" and self.failure is None, self._again
+            self._ending += 1
+            self._provisional += provisional and not again
             end = EpisodeEnd(self.session.bus.snapshot_ns(), outcome, faults=faults)
-            self._pending.append((end.stamp_ns, partial(self._end_episode, end, provisional)))
+            self._pending.append((end.stamp_ns, partial(self._end_episode, end, provisional, again)))
+
+    @property
+    def writing(self) -> bool:
+        """Whether an episode that has ended is not completely written yet."""
+        return self._ending > 0
 
     @property
     def saved(self) -> int:
@@ -218,13 +250,35 @@ class RecordingWorker(SessionWorker):
         for item in latched:
             self._write(item, start.stamp_ns)
 
-    def _end_episode(self, end: EpisodeEnd, provisional: bool) -> None:
-        """End the open episode; `provisional` if it was complete at the request to end it, and is to be kept."""
-        whole = self._finish(end)
+    def _end_episode(self, end: EpisodeEnd, provisional: bool, again: bool = False) -> None:
+        """End the open episode, which replaces the one before if `again`.
+
+        `provisional`: whether it was complete at the request to end it, and is to be kept.
+        """
+        folder = self._owned.path if self._owned is not None else None
+        kept = self._finish(end) and provisional
+        replaced = kept and again and self._remove_kept()
         with self._pending_lock:
-            self._provisional -= provisional
-            self._whole += provisional and whole
+            self._provisional -= provisional and not again
+            self._whole += kept and not replaced
+        if kept:
+            self._kept = folder
+            self.episodes.play("saved")
+        with self._pending_lock:
+            self._ending -= 1
         self._report_absent()
+
+    def _remove_kept(self) -> bool:
+        """Delete the episode kept last; return whether it is gone. One that another program uses stays."""
+        if self._kept is None:
+            return False
+        try:
+            with Ownership(self._kept, "is being deleted", wait_s=0.0):
+                shutil.rmtree(self._kept)
+        except (OSError, IbrobotError) as error:
+            self.session.log.warning("the episode that was recorded again stays: %s", error_line(error))
+            return False
+        return True
 
     def _finish(self, end: EpisodeEnd) -> bool:
         """End the open episode, if any; return whether it is complete."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import override
 
+import attrs
 from ibrobot_testing.fakes import FakeHardware, FakePolicy, FakeRealHardware, FakeRecorder, FakeTeleop
 
 from ibrobot_core.api import (
@@ -14,6 +15,7 @@ from ibrobot_core.api import (
     JointReading,
     PolicyDescriptor,
     RecorderDescriptor,
+    TeleopCommand,
     TeleopDescriptor,
     hookimpl,
 )
@@ -50,12 +52,17 @@ class Stick(FakeTeleop):
     def __init__(self, ctx: Context) -> None:
         super().__init__(ctx)
         self.velocity = 0.2
+        self.approaching = False
         STICKS.append(self)
 
     @override
     def activate(self, measured: JointReading) -> None:
         super().activate(measured)
         self.pressed = True
+
+    @override
+    def read(self, measured: JointReading) -> TeleopCommand:
+        return attrs.evolve(super().read(measured), approaching=self.approaching)
 
 
 @hookimpl

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import attrs
 import pytest
+from ibrobot_data.cues import Cues
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.operator import Operator
 from ibrobot_testing.fakes import FakeRecorder
@@ -129,12 +131,15 @@ def test_tab_asks_for_a_prompt_and_enter_begins(record: Record):
     assert "ho !_" in run.operator.rows()[0][1]
     assert not run.service.running
     run.keys("enter")
+    run.step(2)
     assert run.service.running
     assert "recording “ho !”" in run.operator.line()
     run.keys("tab")
     assert (run.service.running, run.service.saved) == (False, 1)
-    run.keys("tab", "tab")
-    assert not run.service.running, "a second Tab goes back"
+    run.keys("tab")
+    assert "recording “ho !”" in run.operator.line(), "the prompt is that of the session"
+    run.keys("f12", "f11", "tab")
+    assert not run.service.running, "Tab goes back from the question for another prompt"
     assert not run.operator.key("a"), "letters belong to the mode again"
 
 
@@ -147,6 +152,112 @@ def test_the_arm_holds_while_a_prompt_is_typed(record: Record):
     assert not source.active
     run.keys("enter")
     assert source.active
+
+
+def test_no_frame_of_a_paused_arm_is_recorded(record: Record):
+    run = record()
+    run.keys("tab", "enter")
+    (stick,) = sys.modules["arms"].STICKS[-1:]
+    stick.pressed = False
+    run.step(20)
+    assert not run.service.running
+    assert run.operator.rows()[0][1] == "ready: recording begins when the robot follows you"
+    stick.pressed = stick.approaching = True
+    run.step(20)
+    assert not run.service.running, "the robot is still on its way to the device's pose"
+    stick.approaching = False
+    run.step(2)
+    assert run.service.running
+    stick.pressed = False
+    run.step(5)
+    assert run.service.running, "a pause within an episode belongs to it"
+
+
+@pytest.mark.parametrize("key", ["tab", "f12"])
+def test_an_episode_that_waits_for_the_robot_to_follow_can_be_cancelled(record: Record, key: str):
+    run = record(prompt="pick")
+    sys.modules["arms"].STICKS[-1].pressed = False
+    run.step(2)
+    run.keys("tab")
+    assert run.operator.help() == "Tab goes back"
+    run.keys(key)
+    sys.modules["arms"].STICKS[-1].pressed = True
+    run.step(5)
+    assert not run.service.running
+
+
+def test_an_emergency_stop_cancels_an_episode_that_waits(record: Record):
+    run = record(prompt="pick")
+    sys.modules["arms"].STICKS[-1].pressed = False
+    run.step(2)
+    run.keys("tab")
+    run.runtime.session.emergency_stop()
+    run.step(3)
+    assert ("", "not recording: emergency stop; reset it first") in run.operator.rows()
+    assert not run.service.waiting
+
+
+def test_redo_replaces_the_last_episode_once_the_new_one_is_saved(record: Record):
+    run = record(prompt="pick", count=2, reset_time_s=0.1)
+    assert not run.operator.key("backspace"), "there is no episode to record again"
+    kept = lambda: sorted(path.name for path in Path("kept/pick/episodes").iterdir())  # noqa: E731
+    for keys in (("tab", "tab"), ("backspace", "f12")):
+        for key in keys:
+            run.keys(key)
+            run.step(3)
+    assert (kept(), run.service.saved) == (["episode_000001"], 1), "the new one was discarded, the old one stays"
+    for key in ("backspace", "backspace", "tab"):
+        run.keys(key)
+        run.step(3)
+    assert (kept(), run.service.saved) == (["episode_000003"], 1)
+    assert not run.finished
+    for key in ("tab", "tab", "backspace"):
+        run.keys(key)
+        run.step(2)
+    assert run.service.running, "the last one, in the pause after it"
+    run.keys("f11")
+    run.step(10)
+    assert run.finished
+    assert (kept(), run.service.saved) == (["episode_000003", "episode_000005"], 2)
+
+
+def test_cues_of_an_episode(record: Record, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("ibrobot_data.operator.ENDING_S", 0.5)
+    run = record(prompt="pick")
+    heard: list[tuple[str, float]] = []
+    run.service.on_cue.append(lambda cue: heard.append((cue, run.service.elapsed_s())))
+    run.keys("tab")
+    run.step(60)
+    assert [cue for cue, _ in heard] == ["start", "ending", "saved"]
+    assert heard[1][1] == pytest.approx(0.5, abs=0.03)
+    run.keys("tab", "f12")
+    run.step(3)
+    assert [cue for cue, _ in heard[3:]] == ["start"], "a discarded one is not saved"
+    assert run.service.status()["cues"] == 4
+
+
+def test_cues_ring_the_terminal_or_are_spoken_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    read, write = os.pipe()
+    bells = Cues("beep", write)
+    bells.play("start")
+    bells.play("ending")
+    for _ in range(5):
+        bells.step()
+    assert os.read(read, 99) == 3 * b"\a"
+    os.close(read)
+    os.close(write)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(NotSupported, match=r"cues by speech: none of spd-say, say, .* is installed; apt-get install"):
+        Cues("speech", None)
+    program = tmp_path / "espeak"
+    program.write_text(f'#!/bin/sh\necho "$1" >> {tmp_path}/spoken\n')
+    program.chmod(0o755)
+    voice = Cues("speech", None)
+    voice.play("start")
+    voice.play("saved")
+    while voice.playing:
+        voice.step()
+    assert (tmp_path / "spoken").read_text().split() == ["recording", "saved"]
 
 
 def test_changes_of_the_session_are_reported(record: Record):

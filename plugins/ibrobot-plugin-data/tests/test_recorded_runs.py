@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from fake_runs import finish, seconds
+from ibrobot_data.episode_dataset import count_complete
 
-from ibrobot_core.app import ESTOP
+from ibrobot_core.app import ESTOP, installed_plugins
 
 if TYPE_CHECKING:
     from fake_runs import Runs
@@ -108,3 +110,14 @@ def test_each_state_says_who_commanded_however_late_the_operator_is(runs: Runs) 
     assert len(commands.drain()) == 30
     said: list[Any] = [item.message for item in labels.drain()]
     assert [message.data for message in said] == ["policy"] * 30
+
+
+def test_resume_counts_the_complete_episodes_of_a_dataset(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    finish(runs.start(RECORDING, episodes=2, seed=12))
+    folder = runs.folder / "kept/picks"
+    reader = SimpleNamespace(summary=lambda: SimpleNamespace(finished=True), close=lambda: None)
+    unfinished = SimpleNamespace(summary=lambda: SimpleNamespace(finished=False), close=lambda: None)
+    found = iter((reader, unfinished))
+    monkeypatch.setattr(type(installed_plugins()), "open_episode", lambda self, path: next(found))
+    assert count_complete(folder) == 1
+    assert count_complete(folder / "none") == 0

@@ -176,7 +176,8 @@ class LeaderTeleop(Teleop):
                 self._release()
             return TeleopCommand(None)
         self._setpoint = self._next(measured)
-        return TeleopCommand(dict(zip(self._joints, self._setpoint.tolist(), strict=True)))
+        positions = dict(zip(self._joints, self._setpoint.tolist(), strict=True))
+        return TeleopCommand(positions, approaching=not self._following)
 
     @override
     def disconnect(self) -> None:

@@ -225,7 +225,9 @@ _HANDLERS: Mapping[type[RunCommand], Handler] = {
     Release: _release,
     Reset: _reset,
     SetMode: lambda session, sent: session.bus.call(SET_MODE, EnterMode(sent.command.mode)),
-    BeginEpisode: lambda session, sent: session.bus.call("/record_episode/start", sent.command.prompt or None),
+    BeginEpisode: lambda session, sent: session.bus.call(
+        "/record_episode/start", {"prompt": sent.command.prompt or None, "wait": True}
+    ),
     EndEpisode: lambda session, sent: session.bus.call("/record_episode/stop", sent.command.outcome),
     DiscardEpisode: lambda session, sent: session.bus.call("/record_episode/discard"),
     RedoEpisode: lambda session, sent: session.bus.call("/record_episode/redo"),

@@ -96,7 +96,7 @@ class SetMode:
 
 @attrs.frozen
 class BeginEpisode:
-    """Begins an episode."""
+    """Begins an episode, once the robot follows the operator."""
 
     prompt: str = option("", help="the task; empty: as before")
 
@@ -115,7 +115,7 @@ class DiscardEpisode:
 
 @attrs.frozen
 class RedoEpisode:
-    """Deletes the last episode, and begins it again."""
+    """Records the present or last episode again, which replaces it."""
 
 
 @attrs.frozen

@@ -20,7 +20,7 @@ _WAIT_S = 60.0
 SERVICES: dict[str, tuple[RunCommand, Any]] = {
     "/reset": (messages.Reset(), Reset(0)),
     "/set_mode": (messages.SetMode("web"), SetMode("web")),
-    "/record_episode/start": (messages.BeginEpisode("pick"), "pick"),
+    "/record_episode/start": (messages.BeginEpisode("pick"), {"prompt": "pick", "wait": True}),
     "/record_episode/stop": (messages.EndEpisode("failure"), "failure"),
     "/record_episode/discard": (messages.DiscardEpisode(), None),
     "/record_episode/redo": (messages.RedoEpisode(), None),

@@ -44,10 +44,17 @@ SIZES: dict[tuple[int, int], tuple[str, ...]] = {
 """Size of the window [px] -> what else is in sight: what moves the robot."""
 
 
+COUNT_TONES = """() => {
+    window.tones = 0;
+    const start = OscillatorNode.prototype.start;
+    OscillatorNode.prototype.start = function (...when) { window.tones += 1; start.apply(this, when); };
+}"""
+CUES = (("start", "1 of 10 saved", 1), ("ending", "1 of 10 saved", 3), ("saved", "1 of 10 saved", 6))
+"""Cue of the run, what the page says, and how many tones it has played so far."""
 EPISODE = {
     "recording": False, "by_mode": False, "saved": 1, "wanted": 10, "prompt": "pick the cube", "elapsed_s": 4.2,
     "max_duration_s": 20.0, "rates_hz": {}, "silent": [], "lost": {}, "free_bytes": 10**11, "bytes_per_s": 10**6,
-    "failure": "",
+    "failure": "", "waiting": False, "can_redo": True, "cues": 0, "cue": "",
 }  # fmt: skip
 
 
@@ -68,6 +75,7 @@ def status(arms: tuple[str, ...] = ("",), **changes: Any) -> dict[str, Any]:
     ]
     robot = {**found["robot"], "modes": modes, "tool": True}
     facts = {"mode": "web", "jogs": ["page"], "cameras": cameras, "objects": [], "episode": EPISODE, "ended": False}
+    facts["services"] = [*found["services"], "redo"]
     return {**found, "robot": robot, **facts, **changes}
 
 
@@ -122,6 +130,14 @@ async def look() -> None:
                 assert await page.evaluate("document.documentElement.scrollWidth") <= width
                 large = "document.querySelector('.attention').offsetHeight"
                 assert await page.evaluate(large) > 0.25 * height, "the picture of attention is large"
+        assert await page.locator("#record button", has_text="Again").is_visible()
+        await page.evaluate(COUNT_TONES)
+        for cues, (cue, words, tones) in enumerate(CUES, 1):
+            run.show(status(episode={**EPISODE, "cues": cues, "cue": cue}))
+            await until(page, f"document.querySelector('#record').innerText.includes('{words}')")
+            await until(page, f"window.tones === {tones}")
+        run.show(status(episode={**EPISODE, "waiting": True}))
+        await page.get_by_text("Ready: 2 of 10 begins when the robot follows you").wait_for()
         run.show(status(("left_", "right_")))
         await page.set_viewport_size({"width": 1280, "height": 800})
         await until(page, "document.querySelectorAll('.joint').length === 12")

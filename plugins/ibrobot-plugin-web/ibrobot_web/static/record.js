@@ -1,5 +1,6 @@
 // Recording, beside the pictures: begins, judges, discards and redoes episodes, each by a button or its key.
 
+import { Cues } from "./cues.js";
 import { h, refresh, say } from "./dom.js";
 
 const GIB = 1 << 30;
@@ -11,6 +12,7 @@ export class Record {
     this.facts = h("p", { "aria-live": "polite" });
     this.line = h("div", { class: "line" });
     this.time = h("progress", { max: "1", value: "0", "aria-label": "Time of the episode" });
+    this.cues = new Cues();
     this.problem = h("p", { class: "bad", role: "status" });
     section.append(this.line, this.time, this.problem);
   }
@@ -24,26 +26,30 @@ export class Record {
       refresh(this.line, "none", () => [this.facts]);
       return;
     }
+    this.cues.hear(episode);
     say(this.facts, words(episode));
     this.facts.classList.toggle("recording", episode.recording);
     this.facts.setAttribute("aria-live", episode.recording ? "off" : "polite"); // the time runs
     say(this.problem, episode.failure);
     this.time.classList.toggle("idle", !episode.recording);
     this.time.value = Math.min(1, episode.elapsed_s / episode.max_duration_s);
-    const redo = services.includes("redo") && episode.saved > 0;
-    refresh(this.line, [episode.recording, episode.by_mode, redo, page.operating], () => [this.facts, ...this.controls(episode, redo)]);
+    const redo = services.includes("redo") && episode.can_redo;
+    const { recording, waiting, by_mode: byMode } = episode;
+    refresh(this.line, [recording, waiting, byMode, redo, page.operating], () => [this.facts, ...this.controls(episode, redo)]);
   }
 
-  controls({ recording, by_mode: byMode, prompt: before }, redo) {
+  controls({ recording, waiting, by_mode: byMode, prompt: before }, redo) {
     const { page } = this;
     if (byMode) return [h("span", { class: "note" }, "The mode begins and ends its episodes itself.")];
     const button = (text, key, command, facts, kind = "") => h("button", {
       class: kind, disabled: !page.operating, "data-key": key, onclick: () => page.command(command, facts),
     }, text, h("kbd", { "aria-hidden": "true" }, key.toUpperCase()));
+    const again = (text) => redo ? [button(text, "r", "episode_redo", {})] : [];
+    if (waiting) return [button("Cancel", "d", "episode_discard", {})];
     if (recording) {
       return [button("Success", "s", "episode_stop", { outcome: "success" }, "primary"),
         button("Failure", "f", "episode_stop", { outcome: "failure" }),
-        button("Discard", "d", "episode_discard", {}, "danger")];
+        button("Discard", "d", "episode_discard", {}, "danger"), ...again("Again")];
     }
     const prompt = h("input", { type: "text", "aria-label": "Task", placeholder: "task, e.g. pick the cube" });
     prompt.value = this.prompt ?? before;
@@ -55,7 +61,7 @@ export class Record {
       page.command("episode_start", { prompt: prompt.value });
       prompt.blur(); // so that keys judge the episode
     });
-    return [form, redo ? button("Redo the last", "r", "episode_redo", {}) : null].filter(Boolean);
+    return [form, ...again("Redo the last"), this.cues.choice];
   }
 
   // Presses the button with this key; false if there is none.
@@ -68,8 +74,9 @@ export class Record {
 
 const count = (number) => `${number} episode${number === 1 ? "" : "s"}`;
 
-function words({ recording, saved, wanted, elapsed_s: elapsed, max_duration_s: longest, free_bytes: free, bytes_per_s: flow }) {
+function words({ recording, waiting, saved, wanted, elapsed_s: elapsed, max_duration_s: longest, free_bytes: free, bytes_per_s: flow }) {
   if (recording) return `● ${saved + 1}${wanted ? ` of ${wanted}` : ""} · ${elapsed.toFixed(1)} of ${longest} s`;
+  if (waiting) return `Ready: ${saved + 1}${wanted ? ` of ${wanted}` : ""} begins when the robot follows you`;
   const minutes = flow ? Math.floor(free / flow / 60) : Infinity;
   const left = minutes < 120 ? ` · disk for ${minutes} min` : free < 5 * GIB ? ` · ${(free / GIB).toFixed(1)} GiB left` : "";
   return `${saved}${wanted ? ` of ${wanted}` : ""} saved${left}`;
