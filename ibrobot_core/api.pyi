@@ -188,6 +188,8 @@ from ibrobot_core.messages import (
     DiagnosticStatus as DiagnosticStatus,
     KeyValue as KeyValue,
     RobotStatus as RobotStatus,
+    ModelAnswer as ModelAnswer,
+    MODEL_ANSWERS as MODEL_ANSWERS,
 )
 
 __all__: list[str]

@@ -38,6 +38,8 @@ ROBOT_STATUS = "/robot_status"
 DIAGNOSTICS = "/diagnostics"
 RUN_TOPICS = (JOINT_STATES, ROBOT_STATUS, DIAGNOSTICS)
 """The topics that every run publishes."""
+MODEL_ANSWERS = "/model_answers"
+"""The topic of a run with a model: a `ModelAnswer` for each request."""
 
 
 @attrs.frozen
@@ -381,6 +383,31 @@ class RobotStatus(Message, ros_type="ibrobot_msgs/msg/RobotStatus"):
     failures: int = 0
     timeouts: int = 0
     late_chunks: int = 0
+
+
+@attrs.frozen
+class ModelAnswer(Message, ros_type="ibrobot_msgs/msg/ModelAnswer"):
+    """ibrobot_msgs/msg/ModelAnswer: a request to a model, and its answer; stamped when the answer came or failed.
+
+    The request had the contract's frame at `observed_ns` and the prompt. `actions` is a chunk [rad], shape (N * J,),
+    row-major, for the J joints from `observed_ns` on; empty without one.
+    """
+
+    header: Header
+    request: int
+    observed_ns: int
+    model: str
+    server: str
+    weights: str
+    prompt: str
+    outcome: str
+    error: str
+    latency_ms: float
+    infer_ms: float
+    queue_ms: float
+    step_ns: int
+    joint_names: tuple[str, ...]
+    actions: NDArray[np.float64] = attrs.field(converter=_float64s, eq=_EQUAL)
 
 
 MESSAGE_TYPES: dict[str, type[Message]] = {

@@ -57,28 +57,12 @@ _BOUNDS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = {
 
 
 def option(
-    default: Any = attrs.NOTHING,
-    *,
-    unit: str = "",
-    help: str = "",
-    ge: float | None = None,
-    gt: float | None = None,
-    le: float | None = None,
-    lt: float | None = None,
-    choices: Sequence[Any] | Mapping[str, str] | None = None,
-    open: bool = False,
-    factory: Any = None,
-    validator: Any = None,
-    secret: bool = False,
-    key: str | None = None,
-    plain: Any = None,
-    label: str | None = "",
-    more: bool = False,
-    names: str = "",
-    suggest: str = "",
-    argument: bool = False,
-    flag: str = "",
-) -> Any:
+    default: Any = attrs.NOTHING, *, unit: str = "", help: str = "", ge: float | None = None, gt: float | None = None,
+    le: float | None = None, lt: float | None = None, choices: Sequence[Any] | Mapping[str, str] | None = None,
+    open: bool = False, factory: Any = None, validator: Any = None, secret: bool = False, key: str | None = None,
+    plain: Any = None, label: str | None = "", more: bool = False, names: str = "", suggest: str = "",
+    argument: bool = False, flag: str = "",
+) -> Any:  # fmt: skip
     """An attrs field for an options class.
 
     Args:

@@ -179,18 +179,12 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         "viewer": _component(sections.viewer),
         "plugin_sections": _components(sections.plugin_sections),
     }
+    missing = (*(each.error for each in sections.missing), *sections.absent_models.values())
     config = RobotConfig(
-        **arguments,
-        simulated=sections.simulated,
-        closed_ends=_closed_ends(robot, sections),
-        unavailable=unavailable,
-        missing=(*(each.error for each in sections.missing), *sections.absent_models.values()),
-        absent_models=sections.absent_models,
-        source=source,
-        document=shown,
-        complete=document.root,
+        **arguments, simulated=sections.simulated, closed_ends=_closed_ends(robot, sections), unavailable=unavailable,
+        missing=missing, absent_models=sections.absent_models, source=source, document=shown, complete=document.root,
         secrets=secrets,
-    )
+    )  # fmt: skip
     for section, _ in registry.sections(config):
         for fault in section.check_config(config):
             document.add(fault.option, fault.message)

@@ -254,18 +254,10 @@ class SafetyLayer:
         step = _limited(wanted, lower, upper) - before
         # The lead limits a joint as soon as braking for it begins.
         leads = (np.abs(wanted - before) > room) & (room < self._braking)
-        reasons = np.array(
-            (
-                differs & self._estopped,
-                ~np.isfinite(wanted),
-                ~known,
-                self._fresh,
-                (wanted < lower) | (wanted > upper),
-                leads,
-                np.abs(step) > self._max_step + self._half_slack,
-                differs,
-            )
-        )
+        reasons = np.array([
+            differs & self._estopped, ~np.isfinite(wanted), ~known, self._fresh, (wanted < lower) | (wanted > upper),
+            leads, np.abs(step) > self._max_step + self._half_slack, differs,
+        ])  # fmt: skip
         joints = np.flatnonzero(differs)
         self._counts[reasons.argmax(axis=0)[joints], joints] += 1
 

@@ -31,6 +31,7 @@ _SILENCE_NS = 2_000_000_000
 """Missing observations are reported after this time."""
 
 SendPlan = Callable[[int, int, Vector], None]
+Report = Callable[[Chunk, int, str], None]
 
 
 @attrs.define
@@ -98,6 +99,7 @@ class Dispatcher:
         bus: the source of the observations.
         client: runs the model.
         send: called with the plan: time of the first action [ns], step [ns], actions (N, A).
+        report: called with each answer, the time [ns], and what became of it: used, late, dropped or failed.
         request_timeout_s: time after which a request counts as failed.
         prompt: the task, for policies that take one.
         units: of the policy's vectors; None for radians.
@@ -107,18 +109,10 @@ class Dispatcher:
     """
 
     def __init__(
-        self,
-        contract: Contract,
-        spec: PolicySpec,
-        options: DispatchConfig,
-        robot: Robot,
-        bus: Bus,
-        client: InferenceClient,
-        send: SendPlan,
-        request_timeout_s: float,
-        prompt: str = "",
-        units: JointUnits | None = None,
-    ) -> None:
+        self, contract: Contract, spec: PolicySpec, options: DispatchConfig, robot: Robot, bus: Bus,
+        client: InferenceClient, send: SendPlan, request_timeout_s: float, prompt: str = "",
+        units: JointUnits | None = None, report: Report = lambda *_: None,
+    ) -> None:  # fmt: skip
         check_strategy(options, spec)
         self._contract = contract
         self._spec = spec
@@ -126,23 +120,21 @@ class Dispatcher:
         self._bus = bus
         self._client = client
         self._send = send
+        self._report = report
         self._timeout_ns = ns(request_timeout_s)
         self._prompt = prompt
         self._units = units
-        step_ns = round(1e9 / (spec.rate_hz or contract.rate_hz))
+        self.step_ns = step_ns = round(1e9 / (spec.rate_hz or contract.rate_hz))
+        """Time from an action of a chunk to the next [ns]."""
         joints = contract.action_joints
         columns = robot.indices(joints)
         lead_in = LeadIn(seconds(step_ns), robot.max_velocity[columns], robot.max_acceleration[columns])
         holds = all(part.safety_behavior == "hold" for part in contract.action_parts)
         blends = options.joins_by == "ensemble"
         self._smoother = TemporalSmoother(
-            step_ns,
-            len(joints),
-            coeff=options.smoothing.temporal_ensemble_coeff,
-            enabled=blends,
-            lead_in=lead_in if holds else None,
-            continues=options.joins_by == "rtc",
-        )
+            step_ns, len(joints), coeff=options.smoothing.temporal_ensemble_coeff, enabled=blends,
+            lead_in=lead_in if holds else None, continues=options.joins_by == "rtc",
+        )  # fmt: skip
         self._latency = LatencyEstimate()
         """Total latency."""
         self._unqueued = LatencyEstimate()
@@ -210,7 +202,8 @@ class Dispatcher:
         self._dry = not remaining
         for number in [number for number, asked_ns in self._open.items() if t_ns - asked_ns > self._timeout_ns]:
             self.stats.timeouts += 1
-            self._fail(number, t_ns, f"no chunk within {self._timeout_ns / 1e9:g} s")
+            error = f"no chunk within {self._timeout_ns / 1e9:g} s"
+            self._fail(Chunk(number, self._open[number], None, error), t_ns)
         self.stats.watermark = self._watermark()
         if self._client.returns != self._returns:
             self._returns = self._client.returns
@@ -232,24 +225,27 @@ class Dispatcher:
         asked_ns = self._open.get(chunk.id) if self._sampler is not None else None
         if asked_ns is None:
             self.stats.dropped_answers += 1
+            self._report(chunk, now_ns, "dropped")
             return
         if chunk.actions is None:
             if chunk.id == max(self._open):
-                self._fail(chunk.id, now_ns, chunk.error)
+                self._fail(chunk, now_ns)
             else:  # the newer request may still succeed
                 del self._open[chunk.id]
+                self._report(chunk, now_ns, "failed")
             return
         self._smoother.trim(now_ns)
         try:
             actions = chunk.actions if self._units is None else self._units.radians(ACTION, chunk.actions)
             joined = self._smoother.update(actions, chunk.start_ns)
         except (ValueError, IndexError) as error:
-            self._fail(chunk.id, now_ns, str(error))
+            self._fail(attrs.evolve(chunk, error=str(error)), now_ns)
             return
         # Chunks for older observations are useless from here on.
         self._open = {number: stamp_ns for number, stamp_ns in self._open.items() if number > chunk.id}
         self._count(chunk, now_ns, now_ns - asked_ns)
         self._settle()
+        self._report(chunk, now_ns, "used" if joined else "late")
         if not joined:
             self.stats.late_chunks += 1
             return
@@ -364,12 +360,13 @@ class Dispatcher:
             self._log.warning("holding: nothing new on %s", ", ".join(sorted(topics)))
             self._waiting_since_ns = frame.stamp_ns
 
-    def _fail(self, number: int, now_ns: int, why: str) -> None:
-        asked_ns = self._open.pop(number)
+    def _fail(self, chunk: Chunk, now_ns: int) -> None:
+        asked_ns = self._open.pop(chunk.id)
+        self._report(chunk, now_ns, "failed")
         if asked_ns < self._failed_ns:  # sent before this outage was noticed
             return
         self._failed_ns = now_ns
         self.stats.failures += 1
         self._ask_after_ns = now_ns + self._pause_ns
         self._pause_ns = min(2 * self._pause_ns, _LONGEST_PAUSE_NS)
-        self._log.warning("inference failed, the arm holds when its plan ends: %s", why)
+        self._log.warning("inference failed, the arm holds when its plan ends: %s", chunk.error)

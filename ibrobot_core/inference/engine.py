@@ -17,9 +17,14 @@ class LocalEngine(Engine):
     @override
     def start(self) -> None:
         self._policy.load()
-        self.stats.weights = self._policy.weights()
+        self._identify()
         self.stats.alive = True
 
     @override
     def run(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
-        return self._policy.infer(tensors)
+        outputs = self._policy.infer(tensors)
+        self._identify()  # a policy on a server may have connected to another one
+        return outputs
+
+    def _identify(self) -> None:
+        self.stats.weights, self.stats.server = self._policy.weights(), self._policy.identity()

@@ -21,6 +21,8 @@ class EngineStats:
     """Whether the model is reachable."""
     weights: str = ""
     """Hash of the weights in use, as in `Policy.weights`."""
+    server: str = ""
+    """What computes the answers, as in `Policy.identity`."""
     requests: int = 0
     failures: int = 0
     """Number of failed requests; requests in flight at the time of a failure are counted with it as one."""

@@ -148,6 +148,13 @@ class Policy(ABC):
         """Hash of the loaded weights; empty before `load`, and for a policy without weights. At most 128 bytes."""
         return ""
 
+    def identity(self) -> str:
+        """What computes the answers, with its version, for recordings: a server, or a library. By default empty.
+
+        At most 1,024 bytes; available after `load`.
+        """
+        return ""
+
     def picture_codec(self, quality: int = 90) -> PictureCodec | None:
         """The JPEG codec for images among its inputs, for slow links.
 

@@ -85,11 +85,14 @@ class Rig:
         self.plans: list[tuple[int, int, np.ndarray]] = []
         self.sent: list[tuple[int, tuple[int, int, np.ndarray]]] = []
         """Plans with the tick at which each was sent."""
+        self.reports: list[tuple[int, str, str]] = []
+        """Request, outcome and error of each answer."""
         names = ROBOT.joint_names
         spec = PolicySpec({"observation.state": (SIZE,)}, names, SIZE, chunk_size, rate_hz, prefix=prefix)
         self.dispatcher = Dispatcher(
             make_contract(safety_behavior), spec, DispatchConfig(watermark, strategy, Smoothing(enabled, coeff)), ROBOT,
             self.bus, self.client, self._take, timeout_s, "pick the cube",
+            report=lambda chunk, now_ns, outcome: self.reports.append((chunk.id, outcome, chunk.error)),
         )  # fmt: skip
         self.dispatcher.begin(7)
 

@@ -299,3 +299,29 @@ def test_a_new_episode_does_not_go_on_from_where_the_old_one_was_held(make_rig: 
     assert rig.requests[-1].frame.prefix is None
     rig.answer(ramp(5, first=20))
     np.testing.assert_array_equal(rig.plans[-1][2], ramp(5, first=20))
+
+
+def test_each_answer_is_reported_once_with_its_outcome(make_rig: type[Rig]):
+    rig = make_rig(timeout_s=0.3, watermark=10)
+    rig.tick()
+    rig.answer(ramp(10))
+    rig.tick()
+    rig.answer(None, error="out of memory")
+    rig.tick(3)
+    rig.answer(ramp(10)[:, :2])
+    while len(rig.reports) < 4:  # the next request times out
+        rig.tick()
+    rig.answer(ramp(10), rig.requests[3])
+    ids, outcomes, errors = zip(*rig.reports, strict=True)
+    assert ids == (1, 2, 3, 4, 4)
+    assert outcomes == ("used", "failed", "failed", "failed", "dropped")
+    assert "shape" in errors[2]
+    assert (*errors[:2], *errors[3:]) == ("", "out of memory", "no chunk within 0.3 s", "")
+
+
+def test_a_chunk_of_the_past_is_reported_as_late(make_rig: type[Rig]):
+    rig = make_rig(timeout_s=60.0)
+    rig.tick()
+    rig.tick(5)
+    rig.answer(ramp(3))
+    assert rig.reports == [(1, "late", "")]

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from fake_runs import runs, site
+from ibrobot_mcap.commands import episodes
 from ibrobot_policy_servers.openpi import OpenpiConnection
 from ibrobot_policy_servers.options import ActionMap, ObservationMap, OpenpiOptions
 from ibrobot_policy_servers.served import ServedPolicy
@@ -82,3 +86,33 @@ def test_robots_move_as_with_the_openpi_server_itself(
     behind = motion(runs.start(nowhere, *DISTRIBUTED, episodes=2, seed=5))
     np.testing.assert_array_equal(behind, direct)
     assert front.statistics()["answered"] > 2
+
+
+@pytest.mark.parametrize("engine", ["monolithic", "process", "distributed"])
+def test_a_recording_tells_what_the_model_was_asked_and_answered(
+    runs: Runs, openpi: OpenpiServer, front: InferenceService, engine: str, tmp_path: Path
+) -> None:
+    runs.installed.extend(each for name in ("data", "mcap") for each in entry_points(group="ibrobot", name=name))
+    openpi.metadata = {"model": "pi05", "version": 3}
+    transport = DISTRIBUTED[1:] if engine == "distributed" else ()
+    mode = f"control_modes.policy.inference.execution_mode={engine}"
+    runtime = runs.start(
+        MODEL.format(url=openpi.url), mode, *transport, f"recording={{type: mcap, root: {tmp_path}, dataset: picks}}",
+        episodes=1,
+    )  # fmt: skip
+    motion(runtime)
+    runtime.stop()
+    episode = tmp_path / "picks/episodes/episode_000001"
+    found = json.loads(CliRunner().invoke(episodes, ["answers", str(episode), "--json"]).output)
+    used = [each for each in found if each["outcome"] == "used"]
+    assert len(used) > 2
+    for each in used:
+        assert openpi.url in each["server"]
+        assert '"version": 3' in each["server"] or engine == "distributed"
+        assert np.shape(each["actions"]) == (10, 2)
+        assert each["weights"]
+    assert sum(each["executed"] for each in used) > 10
+    assert min(each["deviation_rad"] for each in used if each["deviation_rad"] is not None) < 0.02
+    shown = CliRunner().invoke(episodes, ["answers", str(episode)]).output
+    assert shown.splitlines()[0].startswith("model net, ")
+    assert len(shown.splitlines()) == 2 + len(found)

@@ -7,19 +7,21 @@ from types import NoneType
 from typing import override
 
 import attrs
+import numpy as np
 
 from ibrobot_core.component import Component
 from ibrobot_core.config.schema import ControlMode, InferenceConfig
-from ibrobot_core.contract.joint_units import JointUnits
+from ibrobot_core.contract.joint_units import ACTION, JointUnits
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.errors import wrong_input
-from ibrobot_core.inference.client import EngineClient, InferenceClient, LockstepClient
+from ibrobot_core.inference.client import Chunk, EngineClient, InferenceClient, LockstepClient
 from ibrobot_core.interfaces import Engine, ModelContext, Policy
 from ibrobot_core.launch.models import check_model
 from ibrobot_core.launch.session import ActingPolicy, Session
 from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.launch.transport import TransportLink
+from ibrobot_core.messages import MODEL_ANSWERS, Header, ModelAnswer
 from ibrobot_core.options import documented, option
 from ibrobot_core.robot import Vector
 from ibrobot_core.services import Service
@@ -114,13 +116,9 @@ class PolicySource(SourceWorker):
     urgent = True
 
     def __init__(
-        self,
-        session: Session,
-        mode: ControlMode,
-        inference: InferenceConfig,
-        model: LoadedModel,
+        self, session: Session, mode: ControlMode, inference: InferenceConfig, model: LoadedModel,
         needs: tuple[str, ...],
-    ) -> None:
+    ) -> None:  # fmt: skip
         summary = f"{inference.model} through the dispatcher at {session.config.contract.rate_hz:g} Hz"
         super().__init__(session, mode, summary, (*needs, model.name))
         self._inference = inference
@@ -136,7 +134,7 @@ class PolicySource(SourceWorker):
         self.on_end.callback(self._client.close)
         self._dispatcher = Dispatcher(
             contract, policy.spec, self.mode.dispatch, self.session.config.robot, self.session.bus, self._client,
-            self._send, timeout_s, self._inference.prompt, self._model.units,
+            self._send, timeout_s, self._inference.prompt, self._model.units, self._publish,
         )  # fmt: skip
         self._step_ns = contract.step_ns
 
@@ -190,6 +188,20 @@ class PolicySource(SourceWorker):
                 # In lockstep the answer has already arrived.
                 if self.session.request.lockstep and (chunk := self._client.poll()) is not None:
                     self._dispatcher.accept(chunk, now_ns)
+
+    def _publish(self, chunk: Chunk, now_ns: int, outcome: str) -> None:
+        """Publish a request and its answer."""
+        joints, model = self._model.contract.action_joints, self._model
+        engine, lockstep = model.engine.stats, self.session.request.lockstep
+        actions: Vector = np.empty((0, len(joints)))
+        if chunk.actions is not None and chunk.actions.shape[1:] == (len(joints),):
+            actions = chunk.actions if model.units is None else model.units.radians(ACTION, chunk.actions)
+        took_ms = (0.0, 0.0) if lockstep else (engine.infer_ms, chunk.queued_ns / 1e6)
+        self.session.bus.publish(MODEL_ANSWERS, ModelAnswer(
+            Header(now_ns), chunk.id, chunk.start_ns, self._inference.model, engine.server, engine.weights,
+            self._inference.prompt, outcome, chunk.error, (now_ns - chunk.start_ns) / 1e6, *took_ms,
+            self._dispatcher.step_ns, joints, actions.ravel(),
+        ))  # fmt: skip
 
     def _send(self, start_ns: int, step_ns: int, positions: Vector) -> None:
         self.session.send_plan(start_ns, step_ns, self._model.contract.action_joints, positions)

@@ -9,7 +9,7 @@ from pathlib import Path
 from uuid import NAMESPACE_OID, uuid4, uuid5
 
 import ibrobot_core
-from ibrobot_core.api import Contract, EpisodeStart, RecorderError, String
+from ibrobot_core.api import MODEL_ANSWERS, Contract, EpisodeStart, ModelAnswer, RecorderError, String
 from ibrobot_core.app import InUse, Ownership, RecordingConfig, RobotConfig, calibrations
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.options import COMMANDER
@@ -54,8 +54,8 @@ def episode_start(
         config: the robot.
         recording: its `recording` section.
         topics: topic -> message type for every topic on the bus. For `topics: contract` the episode has all topics of
-            the contract, including those not published yet, and who commands; otherwise it has the requested ones of
-            these topics, and more may follow (`any_topic`).
+            the contract, including those not published yet, who commands, and of a model its further observations and
+            its answers; otherwise it has the requested ones of these topics, and more may follow (`any_topic`).
         directory: the folder of the episode.
         mode: the control mode.
         seed: the seed of the scene.
@@ -85,6 +85,7 @@ def episode_start(
     metadata["uuid"] = str(uuid5(NAMESPACE_OID, json.dumps(metadata)) if lockstep else uuid4())
     if recording.topics == "contract":
         kept = {**contract.topics, **({COMMANDER: String.ros_type} if COMMANDER in topics else {})}
+        kept = {**model_topics(config, policy), **kept}
     else:
         kept = {topic: type_ for topic, type_ in topics.items() if is_kept(topic, recording, contract)}
     return EpisodeStart(directory, stamp_ns, kept, metadata, any_topic=recording.topics != "contract")
@@ -95,6 +96,14 @@ def is_kept(topic: str, recording: RecordingConfig, contract: Contract) -> bool:
     if recording.topics == "contract":
         return topic in contract.topics or topic == COMMANDER
     return recording.topics == "all" or topic in recording.topics
+
+
+def model_topics(config: RobotConfig, policy: Mapping[str, str] | None) -> dict[str, str]:
+    """Topic -> type of what the acting policy observes beyond the contract, and of its answers; empty for None."""
+    if policy is None:
+        return {}
+    observed = Contract.from_config(config, config.models[policy["model"]].extra_observations)
+    return {**observed.topics, MODEL_ANSWERS: ModelAnswer.ros_type}
 
 
 def _next_number(root: Path) -> int:

@@ -95,6 +95,7 @@ class PartialRecording(RecordingWorker):
 
     def _begin_run_episode(self, number: int, prompt: str) -> None:
         self._present = number, prompt
+        self._watch_model()
         self._recent.clear()
 
     def _end_run_episode(self, outcome: str, faults: tuple[str, ...]) -> None:

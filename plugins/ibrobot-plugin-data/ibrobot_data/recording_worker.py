@@ -25,7 +25,7 @@ from ibrobot_core.api import (
 )
 from ibrobot_core.app import Component, Ownership, Received, RecordingConfig, RunAccess, SessionWorker, error_line
 from ibrobot_data.episode_service import EpisodeService
-from ibrobot_data.episode_start import episode_start, is_kept, take_next_folder
+from ibrobot_data.episode_start import episode_start, is_kept, model_topics, take_next_folder
 
 _DEPTH = 4096
 """Length of the queue to the recorder, in messages."""
@@ -64,6 +64,8 @@ class RecordingWorker(SessionWorker):
         super().__init__(session, "recording", f"{config.type} into {config.root}")
         self._config = config
         self._contract = Contract.from_config(session.config)
+        self._of_model: Mapping[str, str] = {}
+        """Topics of the acting policy that an episode has beside those of the contract."""
         session.refuse_absent("the recording", self._keeps)
         self.episodes = EpisodeService(session, self)
         self._pending: deque[tuple[int, Callable[[], None]]] = deque()
@@ -135,6 +137,7 @@ class RecordingWorker(SessionWorker):
         """
         session = self.session
         self._sizes = {}
+        self._watch_model()
         topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
         owned = take_next_folder(self._config)
         try:
@@ -342,5 +345,10 @@ class RecordingWorker(SessionWorker):
                 available,
             )
 
+    def _watch_model(self) -> None:
+        """Keep the topics of the policy that acts from now on."""
+        if self._config.topics == "contract":
+            self._of_model = model_topics(self.session.config, self.session.command_source.described())
+
     def _keeps(self, topic: str) -> bool:
-        return is_kept(topic, self._config, self._contract)
+        return topic in self._of_model or is_kept(topic, self._config, self._contract)

@@ -121,3 +121,21 @@ def test_resume_counts_the_complete_episodes_of_a_dataset(runs: Runs, monkeypatc
     monkeypatch.setattr(type(installed_plugins()), "open_episode", lambda self, path: next(found))
     assert count_complete(folder) == 1
     assert count_complete(folder / "none") == 0
+
+
+def test_each_request_to_a_model_is_recorded_with_its_answer(runs: Runs, tmp_path: Path) -> None:
+    more = "models.net={type: net, extra_observations: [{key: observation.images.side, peripheral: side}]}"
+    inference = "control_modes.policy.inference={model: net, prompt: pick it up}"
+    finish(runs.start(RECORDING, inference, more, episodes=1))
+    lines = records(tmp_path / "kept" / "picks" / "episodes" / "episode_000001")
+    assert "/camera/side/image_raw" in {line["topic"] for line in lines}, "what the model sees beyond the contract"
+    answers = [line for line in lines if line["topic"] == "/model_answers"]
+    assert len(answers) > 2
+    for number, line in enumerate(answers, 1):
+        said = line["message"]
+        assert (said["request"], said["outcome"], said["error"]) == (number, "used", "")
+        assert (said["model"], said["server"], said["prompt"]) == ("net", "a fake", "pick it up")
+        assert said["joint_names"] == ["pan", "grip"]
+        assert len(said["actions"]) == 2 * 10
+        assert said["header"]["stamp_ns"] - said["observed_ns"] == said["latency_ms"] * 1e6
+        assert (said["infer_ms"], said["queue_ms"]) == (0.0, 0.0), "lockstep: equal runs make equal bytes"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, override
 
 import numpy as np
@@ -99,6 +100,11 @@ class LeRobotPolicy(Policy):
     @override
     def weights(self) -> str:
         return self._weights
+
+    @override
+    def identity(self) -> str:
+        """Versions of LeRobot and torch; empty before `load`."""
+        return "" if self._model is None else f"lerobot {version('lerobot')}, torch {version('torch')}"
 
     @override
     def picture_codec(self, quality: int = 90) -> PictureCodec | None:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, override
 
@@ -100,6 +101,11 @@ class OnnxPolicy(Policy):
     @override
     def weights(self) -> str:
         return self._weights
+
+    @override
+    def identity(self) -> str:
+        """Version of ONNX Runtime, and the provider; empty before `load`."""
+        return f"onnxruntime {version('onnxruntime')}, {self._sessions[0].get_providers()[0]}" if self._sessions else ""
 
     @override
     def preprocess(self, frame: Frame) -> Tensors:

@@ -94,6 +94,11 @@ class ServedPolicy(Policy):
         return "" if self._metadata is None else _hash(self._metadata)
 
     @override
+    def identity(self) -> str:
+        """The server's address and metadata; empty before `load`."""
+        return "" if self._metadata is None else f"{self._connection.address[:500]} {_shown(self._metadata)}"
+
+    @override
     def preprocess(self, frame: Frame) -> Tensors:
         if self.spec.prompt and not frame.prompt:
             raise PolicyError("the server's model needs a prompt that describes the task")

@@ -22,12 +22,13 @@ SETTLED_S = 5.0
 """A robot leaves a working server only for one with at least this uptime [s]."""
 _AVOIDED_S = 5.0
 """Time for which a robot prefers all other servers to one that failed [s]."""
-_OFFER_SIZE, _TEXT_SIZE = 1 << 20, 128
+_OFFER_SIZE, _TEXT_SIZE, _IDENTITY_SIZE = 1 << 20, 128, 1100
 
 
 def _text(instance: object, attribute: attrs.Attribute[str], value: object) -> None:
-    if not isinstance(value, str) or len(value) > _TEXT_SIZE:
-        raise ValueError(f"{attribute.name} is not a text of at most {_TEXT_SIZE} characters")
+    most = _IDENTITY_SIZE if attribute.name == "identity" else _TEXT_SIZE
+    if not isinstance(value, str) or len(value) > most:
+        raise ValueError(f"{attribute.name} is not a text of at most {most} characters")
 
 
 def _number(instance: object, attribute: attrs.Attribute[Any], value: object) -> None:
@@ -53,6 +54,8 @@ class Offer:
     canary: float = attrs.field(validator=_number)
     """The share of all robots that may use it although its weights differ; 0: it is an ordinary server."""
     uptime_s: float = attrs.field(validator=_number)
+    identity: str = attrs.field(default="", validator=_text)
+    """Its version, and what computes its answers."""
 
     @classmethod
     def read(cls, server: str, payload: Payload) -> Offer:
@@ -65,7 +68,8 @@ class Offer:
             if len(payload) > _OFFER_SIZE:
                 raise ValueError(f"{len(payload)} bytes")
             document = json.loads(bytes(payload))
-            return cls(server, **{field.name: document[field.name] for field in attrs.fields(cls)[1:]})
+            given = {field.name: document[field.name] for field in attrs.fields(cls)[1:-1]}
+            return cls(server, **given, identity=document.get("identity", ""))
         except (ValueError, TypeError, LookupError, RecursionError) as error:
             raise PolicyError(
                 f"{server} is not an ibrobot server: {bytes(payload[:40])!r}…: {type(error).__name__}: {error}"

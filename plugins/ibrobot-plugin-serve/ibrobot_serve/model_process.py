@@ -54,7 +54,7 @@ class ModelLoop:
             except ComponentFailed:
                 return
             size = self._answered(order["id"], order["size"])
-            self.channel.send({"event": "answer", "id": order["id"], "size": size})
+            self.channel.send({"event": "answer", "id": order["id"], "size": size, "identity": self.policy.identity()})
 
     def _answered(self, request_id: int, size: int) -> int:
         """Answer the request in memory; returns the size of the answer's frame."""
@@ -92,7 +92,10 @@ def main(parent: int, request: int, answer: int) -> int:
         config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"], registry=registry)
         policy = build_policy(config, registry, order["model"], order["seed"])
         policy.load()
-        channel.send({"event": "ready", "fingerprint": policy.fingerprint(), "weights": policy.weights()})
+        channel.send({
+            "event": "ready", "fingerprint": policy.fingerprint(), "weights": policy.weights(),
+            "identity": policy.identity(),
+        })  # fmt: skip
         frames = [memoryview(mmap.mmap(descriptor, WIRE_LIMITS.size)) for descriptor in (request, answer)]
         ModelLoop(policy, channel, frames[0], frames[1]).run()
     except Exception as error:  # noqa: BLE001 - the host reports it

@@ -109,6 +109,7 @@ class ProcessEngine(Engine):
             # The memory belongs to the next answer; this one is kept.
             answer = self._decoder.decode(bytes(self._answer[: event["size"]]))
         self._deaths = 0
+        self.stats.server = event["identity"]
         self.stats.model_ms = answer.latency_ms
         if answer.kind is WireKind.FAILURE:
             raise PolicyError(answer.text)
@@ -148,6 +149,7 @@ class ProcessEngine(Engine):
             if event is not None:
                 if event["event"] == "ready":
                     self._check(event["fingerprint"], event["weights"])
+                    self.stats.server = event["identity"]
                 elif event["event"] == "answer":
                     self._at_work_s = None if event["id"] == self._sent else time.monotonic()
                 if event["event"] == wanted:

@@ -279,6 +279,7 @@ class RemoteEngine(Engine):
         if offer.canary:
             self._log.warning("model %s: this robot tries the canary with weights %s", self._model, offer.weights)
         self._last_server, self.stats.weights = offer.server, offer.weights
+        self.stats.server = f"{offer.server}: {offer.identity}"
         self._session = _Session(offer.server, offer.fingerprint)
         return self._session
 

@@ -11,6 +11,7 @@ import traceback
 import uuid
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
+from importlib.metadata import version
 from typing import Any
 
 import attrs
@@ -245,6 +246,7 @@ class InferenceService:
         offer = {
             "fingerprint": self._fingerprint, "weights": self._weights, "spec": attrs.asdict(self._policy.spec),
             "robots": robots, "canary": self._options.canary, "uptime_s": (now_ns - self._begun_ns) / NS_PER_S,
+            "identity": f"ibrobot-plugin-serve {version('ibrobot-plugin-serve')}, {self._policy.identity()[:1024]}",
         }  # fmt: skip
         return json.dumps(offer).encode()
 

@@ -20,6 +20,7 @@ NOT_THERE = {
     "ibrobot_msgs/msg/Variant",
     "ibrobot_msgs/msg/VariantsList",
     "ibrobot_msgs/msg/RobotStatus",
+    "ibrobot_msgs/msg/ModelAnswer",
 }
 """Types that its packages from wheels do not have."""
 

@@ -203,6 +203,11 @@ class PolicySuite(Suite[Policy]):
             assert one.weights() == other.weights()
             assert len(one.weights().encode()) <= 128
 
+    def test_its_identity_is_a_short_text(self) -> None:
+        """`identity` is empty or a text of at most 1,024 bytes that recordings can hold."""
+        with self.loaded() as (policy, _):
+            assert len(policy.identity().encode()) <= 1024
+
     def test_infer_remembers_nothing(self) -> None:
         """The same input gives the same output, whatever happens in between, unless the spec is stateful."""
         with self.loaded() as (policy, ctx):

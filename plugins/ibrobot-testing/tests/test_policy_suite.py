@@ -169,6 +169,11 @@ class HashesTheObject(FakePolicy):
         return str(id(self))
 
 
+class TellsItsStory(FakePolicy):
+    def identity(self):
+        return "trained with care, " * 100
+
+
 class NeedsWeightsAtTheEdge(FakePolicy):
     scale: Any = None
 
@@ -181,6 +186,7 @@ class NeedsWeightsAtTheEdge(FakePolicy):
 
 WRONG = {
     HashesTheObject: "weights_have_one_hash",
+    TellsItsStory: "its_identity_is_a_short_text",
     AnswersABatchFromOneArray: "a_batch_is_as_good_as_one_by_one",
     CountsRequests: "infer_remembers_nothing",
     ReversesBatches: "a_batch_is_as_good_as_one_by_one",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from ibrobot_mcap.commands.answers import answers
 from ibrobot_mcap.commands.delete import delete
 from ibrobot_mcap.commands.export import export
 from ibrobot_mcap.commands.info import info
@@ -25,5 +26,5 @@ def episodes() -> None:
     """
 
 
-for command in (list_episodes, info, verify, repair, mark, plot, trim, export, delete, trash_command):
+for command in (list_episodes, info, answers, verify, repair, mark, plot, trim, export, delete, trash_command):
     episodes.add_command(command)

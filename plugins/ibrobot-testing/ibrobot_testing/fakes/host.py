@@ -142,6 +142,10 @@ class FakePolicy(Policy):
         self._goal = np.random.default_rng(seed).uniform(-0.5, 0.5, self.spec.action_size)
 
     @override
+    def identity(self) -> str:
+        return "a fake"
+
+    @override
     def preprocess(self, frame: Frame) -> Tensors:
         for key in self.spec.observations:
             if key not in frame.values:

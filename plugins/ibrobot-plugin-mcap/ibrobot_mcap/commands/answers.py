@@ -1,0 +1,129 @@
+"""`ibrobot episodes answers`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import attrs
+import click
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+
+from ibrobot_core.api import MODEL_ANSWERS, NS_PER_S, EpisodeReader, Float64MultiArray, ModelAnswer, RecorderError
+from ibrobot_core.app import EpisodePath, Screen, echo, wrong_input
+
+
+@attrs.frozen(eq=False)
+class Executed:
+    """A request with its answer, and what became of it."""
+
+    answer: ModelAnswer
+    chunk: NDArray[np.float64]
+    """The actions [rad], shape (N, J)."""
+    count: int
+    """Number of actions whose time came before the next chunk was used."""
+    deviation: float | None
+    """Largest difference between the commands of that time and the chunk [rad]; None without commands."""
+
+
+@click.command()
+@click.argument("episode", type=EpisodePath())
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, with the actions of each chunk.")
+@wrong_input()
+def answers(episode: Path, as_json: bool) -> None:
+    """Show what a model was asked and answered.
+
+    The table has a row for each request in the EPISODE, and what the robot executed of its chunk: from its arrival
+    until the next one was used. Commands differ from it where chunks blend, and where a limit or an operator
+    intervenes.
+    """
+    from ibrobot_mcap.commands.find_episodes import opened
+
+    with opened(episode) as reader:
+        start_ns = reader.summary().start_ns
+        found = list(executed(reader))
+    if not found:
+        raise RecorderError(f"{episode}: has no answers of a model: {MODEL_ANSWERS} is missing or empty")
+    if as_json:
+        echo(json.dumps([_json(each) for each in found], indent=2))
+        return
+    console = Screen(width=None if sys.stdout.isatty() else 1000)
+    table = Table(box=None, padding=(0, 1))
+    for heading in ("request", "asked s", "ms", "model ms", "queue ms", "outcome", "actions", "executed", "rad off"):
+        table.add_column(heading, justify="left" if heading == "outcome" else "right")
+    source = None
+    for each in found:
+        answer = each.answer
+        if source != (source := (answer.model, answer.server, answer.weights, answer.prompt)):
+            console.print(_source(answer), soft_wrap=True)
+        table.add_row(
+            str(answer.request), f"{(answer.observed_ns - start_ns) / NS_PER_S:.2f}", f"{answer.latency_ms:.0f}",
+            f"{answer.infer_ms:.1f}", f"{answer.queue_ms:.1f}", f"{answer.outcome} {answer.error}".strip(),
+            str(len(each.chunk)), str(each.count), "" if each.deviation is None else f"{each.deviation:.4f}",
+        )  # fmt: skip
+    console.print(table)
+
+
+def executed(reader: EpisodeReader) -> Iterator[Executed]:
+    """The requests of an episode, with what became of them, in the order of their answers."""
+    from ibrobot_mcap.commands.plot import actions_of
+
+    summary = reader.summary()
+    joints_of = actions_of(summary.metadata, summary.topics)
+    commands: dict[str, tuple[list[int], list[float]]] = {}
+    """Joint -> times [ns] and positions [rad]."""
+    found: list[ModelAnswer] = []
+    for item in reader.messages({MODEL_ANSWERS, *joints_of}):
+        message = item.message
+        if isinstance(message, ModelAnswer):
+            found.append(message)
+        elif isinstance(message, Float64MultiArray):
+            for joint, position in zip(joints_of[item.topic], message.data.tolist(), strict=False):
+                times, positions = commands.setdefault(joint, ([], []))
+                times.append(item.received_ns)
+                positions.append(position)
+    tracks = {joint: (np.array(times), np.array(positions)) for joint, (times, positions) in commands.items()}
+    next_ns = _next_used(found, summary.end_ns)
+    for answer, until_ns in zip(found, next_ns, strict=True):
+        joints = answer.joint_names
+        chunk = answer.actions.reshape(-1, len(joints)) if joints else np.empty((0, 0))
+        times_ns = answer.observed_ns + np.arange(len(chunk)) * answer.step_ns
+        begun_ns, used = answer.header.stamp_ns, answer.outcome == "used"
+        count = int(((times_ns >= begun_ns) & (times_ns < until_ns)).sum()) if used else 0
+        deviations = []
+        for column, joint in enumerate(joints if used and len(chunk) else ()):
+            if joint in tracks:
+                at_ns, told = tracks[joint]
+                chosen = (at_ns >= begun_ns) & (at_ns < min(until_ns, times_ns[-1]))
+                planned = np.interp(at_ns[chosen] - times_ns[0], times_ns - times_ns[0], chunk[:, column])
+                deviations += np.abs(told[chosen] - planned).tolist()
+        yield Executed(answer, chunk, count, max(deviations, default=None))
+
+
+def _next_used(found: Iterable[ModelAnswer], end_ns: int) -> list[int]:
+    """For each answer, the time at which the next one was used, or the end [ns]."""
+    times: list[int] = []
+    next_ns = end_ns
+    for answer in reversed([*found]):
+        times.append(next_ns)
+        if answer.outcome == "used":
+            next_ns = answer.header.stamp_ns
+    return times[::-1]
+
+
+def _source(answer: ModelAnswer) -> str:
+    """The model of an answer, and the prompt of its request."""
+    parts = [f"model {answer.model}", answer.server, f"weights {answer.weights}" if answer.weights else ""]
+    return ", ".join(part for part in [*parts, f"prompt {answer.prompt!r}" if answer.prompt else ""] if part)
+
+
+def _json(each: Executed) -> dict[str, object]:
+    document = attrs.asdict(each.answer, recurse=False)
+    return {
+        **document, "header": attrs.asdict(each.answer.header), "joint_names": list(each.answer.joint_names),
+        "actions": each.chunk.tolist(), "executed": each.count, "deviation_rad": each.deviation,
+    }  # fmt: skip
