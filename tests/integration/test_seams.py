@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +18,7 @@ import ibrobot_web
 import numpy as np
 import pytest
 from ibrobot_testing import declared_services, make_session
-from ibrobot_web import messages
+from ibrobot_web import messages, run_services
 from ibrobot_web.commands import Commands
 from ibrobot_web.messages import RunCommand, Sent
 
@@ -28,8 +29,9 @@ pytestmark = pytest.mark.integration
 PAGE = Path(inspect.getfile(ibrobot_web)).parent
 MOVES: tuple[RunCommand, ...] = (
     messages.Reset(), messages.SetMode("web"), messages.BeginEpisode("pick"), messages.EndEpisode("failure"),
-    messages.DiscardEpisode(), messages.SetSmoothing(enabled=False), messages.Intervene(take=True),
-    messages.GoTo("home"), messages.Cancel(), messages.Preview(messages.Target(joints={"j0": 0.1})),
+    messages.DiscardEpisode(), messages.RedoEpisode(), messages.SetSmoothing(enabled=False),
+    messages.Intervene(take=True), messages.GoTo("home"), messages.Cancel(),
+    messages.Preview(messages.Target(joints={"j0": 0.1})),
 )  # fmt: skip
 """The commands of a page that call services of the run."""
 
@@ -107,6 +109,76 @@ def test_another_shape_of_a_service_fails(service: str, part: str, old: str) -> 
 
 def vars_of(found: Any) -> dict[str, Any]:
     return attrs.asdict(found, recurse=False)
+
+
+def called_by_name() -> Iterator[tuple[str, str]]:
+    """The services that code calls or asks for by their names, and the module that does."""
+    for module in iter_modules():
+        if not module.name.startswith("ibrobot_") or module.name == "ibrobot_testing":
+            continue
+        package = Path(inspect.getfile(import_module(module.name))).parent
+        for path in package.rglob("*.py"):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            constants = dict(_constants(tree))
+            for node in ast.walk(tree):
+                match node:
+                    case ast.Call(func=ast.Attribute(attr="call" | "serves" | "ask"), args=[name, *_]):
+                        found = constants.get(name.id) if isinstance(name, ast.Name) else getattr(name, "value", None)
+                        if isinstance(found, str) and found.startswith("/"):
+                            yield found, path.name
+
+
+def _constants(tree: ast.Module) -> Iterator[tuple[str, Any]]:
+    """The constants of a module, and those that it imports from `run_services`."""
+    for node in tree.body:
+        match node:
+            case ast.Assign(targets=[ast.Name(id=name)], value=ast.Constant(value=value)):
+                yield name, value
+            case ast.Assign(targets=[ast.Tuple(elts=names)], value=ast.Tuple(elts=values)):
+                yield from (
+                    (ast.unparse(each), getattr(value, "value", None))
+                    for each, value in zip(names, values, strict=True)
+                )
+            case ast.ImportFrom(module="ibrobot_web.run_services", names=names):
+                yield from ((each.name, getattr(run_services, each.name)) for each in names)
+
+
+_OF_ROSBRIDGE = "/rosapi/services"
+
+
+def test_a_service_that_is_called_by_name_is_declared() -> None:
+    found = set(called_by_name())
+    assert {file for _, file in found} >= {"commands.py", "status.py", "objects.py", "performing.py", "moveit2.py"}
+    names = {name for name, _ in found} | {value for name, value in vars(run_services).items() if name.isupper()}
+    assert names - set(declared_services()) == {_OF_ROSBRIDGE}
+
+
+def check_status(status: type[Any], judged: type[Any]) -> None:
+    """Look for what the page's scripts read of a recording's state, or say of an episode, that its owner lacks."""
+    script = (PAGE / "static/record.js").read_text(encoding="utf-8")
+    taken = ",".join(re.findall(r"(?:(?:words|controls)\(|const )\{(.*?)\}(?:, redo\)|\)| = episode)", script)).split(
+        ","
+    )
+    read = {*re.findall(r"\bepisode\.(\w+)", script), *(each.partition(":")[0].strip() for each in taken)}
+    assert len(read) >= 12
+    assert read <= set(fields(status)), "record.js reads what the state of a recording does not have"
+    cues = re.findall(
+        r"(\w+):", *re.findall(r"WORDS = \{(.*?)\}", (PAGE / "static/cues.js").read_text(encoding="utf-8"))
+    )
+    assert {"", *cues} == set(fields(status)["cue"].metadata["choices"])
+    said = set(re.findall(r'outcome: "(\w+)"', script))
+    assert said
+    assert said <= set(fields(judged)["outcome"].metadata["choices"]), "record.js says an unknown outcome"
+
+
+def test_the_page_reads_the_state_of_a_recording_as_its_owner_declares_it() -> None:
+    declared = declared_services()
+    status, stop = declared["/record_episode/status"].answer, declared["/record_episode/stop"].request
+    assert isinstance(status, type)
+    check_status(status, stop)
+    for old in ("saved", "elapsed_s", "free_bytes"):
+        with pytest.raises(AssertionError, match="does not have"):
+            check_status(changed(status, old, "renamed"), stop)
 
 
 # Commands: each option that the page names is declared.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import NoneType
-from typing import TYPE_CHECKING, Any, Literal, override
+from typing import TYPE_CHECKING, Literal, get_args, override
 
 import attrs
 
@@ -41,6 +41,32 @@ class StopEpisode:
     outcome: str = option("unknown", choices=OUTCOMES, help="how the episode ended")
 
 
+@documented
+@attrs.frozen
+class EpisodeStatus:
+    """The state of recording."""
+
+    recording: bool = option(help="whether an episode is being recorded")
+    by_mode: bool = option(help="whether the mode begins and ends episodes itself")
+    episode: int = option(help="number of the present or last episode, from 1; 0 before the first")
+    saved: int = option(help="number of complete episodes that were kept")
+    wanted: int | None = option(help="number of episodes after which the run ends; null: it does not end by itself")
+    prompt: str = option(help="the task")
+    waiting: bool = option(help="whether an episode begins as soon as the robot follows the operator's device")
+    can_redo: bool = option(help="whether there is an episode to record again")
+    cues: int = option(help="number of cues so far")
+    cue: str = option(choices=("", *get_args(Cue)), help="the newest cue; empty before the first")
+    elapsed_s: float = option(unit="s", help="time since the episode began; 0 without an episode")
+    max_duration_s: float = option(unit="s", help="`contract.max_duration_s`")
+    rates_hz: Mapping[str, float] = option(unit="Hz", help="topic -> messages per second")
+    silent: Sequence[str] = option(help="topics of the contract that have had no message for too long")
+    lost: Mapping[str, int] = option(help="topic -> number of messages that were not recorded")
+    free_bytes: int = option(unit="bytes", help="free space on the disk of the dataset")
+    bytes_per_s: int = option(unit="bytes/s", help="what an episode takes at present rates")
+    waiting_bytes: int = option(unit="bytes", help="what waits to be written")
+    failure: str = option(help="the error that cut short the present or last episode; empty without one")
+
+
 START = Service("/record_episode/start", StartEpisode, NoneType, "Begin an episode.", alone="prompt")
 STOP = Service("/record_episode/stop", StopEpisode, NoneType, "End the episode.", alone="outcome")
 REDO = Service(
@@ -48,9 +74,7 @@ REDO = Service(
     "Record the present or last episode again, which replaces it; begins as with `wait`.",
 )  # fmt: skip
 DISCARD = Service("/record_episode/discard", NoRequest, NoneType, "End the episode, and delete it.")
-STATUS: Service[NoRequest, Mapping[str, Any]] = Service(
-    "/record_episode/status", NoRequest, Mapping, "The state of recording, for a user interface."
-)
+STATUS = Service("/record_episode/status", NoRequest, EpisodeStatus, "The state of recording, for a user interface.")
 _MIB = 1 << 20
 _PAUSED_NS = NS_PER_S // 10
 """A robot that has not followed for this time is paused [ns]."""
@@ -270,19 +294,18 @@ class EpisodeService(Episodes):
             folder = folder.parent
         return shutil.disk_usage(folder).free
 
-    def status(self) -> Mapping[str, Any]:
+    def status(self) -> EpisodeStatus:
         """The state of recording, for a user interface."""
-        failure = self._recording.failure
-        return {
-            "recording": self.running, "by_mode": self.by_mode, "episode": self.number, "saved": self.saved,
-            "wanted": self.wanted, "prompt": self.prompt, "waiting": self.waiting, "can_redo": self.can_redo,
-            "cues": self.cues, "cue": self.cue, "elapsed_s": round(self.elapsed_s(), 2),
-            "max_duration_s": self._session.config.contract.max_duration_s,
-            "rates_hz": {topic: round(rate, 1) for topic, rate in self._recording.rates().items()},
-            "silent": list(self._recording.silent()), "lost": self._recording.lost(),
-            "free_bytes": self.free_bytes(), "bytes_per_s": round(self._recording.flow()),
-            "waiting_bytes": self._recording.waiting(), "failure": str(failure) if failure is not None else "",
-        }  # fmt: skip
+        recording, failure = self._recording, self._recording.failure
+        return EpisodeStatus(
+            recording=self.running, by_mode=self.by_mode, episode=self.number, saved=self.saved, wanted=self.wanted,
+            prompt=self.prompt, waiting=self.waiting, can_redo=self.can_redo, cues=self.cues, cue=self.cue,
+            elapsed_s=round(self.elapsed_s(), 2), max_duration_s=self._session.config.contract.max_duration_s,
+            rates_hz={topic: round(rate, 1) for topic, rate in recording.rates().items()},
+            silent=tuple(recording.silent()), lost=recording.lost(), free_bytes=self.free_bytes(),
+            bytes_per_s=round(recording.flow()), waiting_bytes=recording.waiting(),
+            failure=str(failure) if failure is not None else "",
+        )  # fmt: skip
 
     def serve(self) -> None:
         """Register the services on the bus."""

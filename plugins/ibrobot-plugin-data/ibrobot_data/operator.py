@@ -162,8 +162,8 @@ class Operator(RunHooks):
     def rows(self) -> list[tuple[str, str]]:
         """Heading and text, for the panel."""
         status = self._service.status()
-        lost = sum(status["lost"].values())
-        rates = "  ".join(f"{topic} {rate:g} Hz" for topic, rate in status["rates_hz"].items())
+        lost = sum(status.lost.values())
+        rates = "  ".join(f"{topic} {rate:g} Hz" for topic, rate in status.rates_hz.items())
         return [  # a small terminal leaves out the end
             ("record", self._state()),
             *([("", self._complaint)] if self._complaint else []),
@@ -171,8 +171,8 @@ class Operator(RunHooks):
             ("lost", f"{lost} messages"),
             (
                 "disk",
-                f"{status['free_bytes'] // _MIB} MiB left at {status['bytes_per_s'] / _MIB:.1f} MiB/s, "
-                f"{status['waiting_bytes'] / _MIB:.1f} MiB queued",
+                f"{status.free_bytes // _MIB} MiB left at {status.bytes_per_s / _MIB:.1f} MiB/s, "
+                f"{status.waiting_bytes / _MIB:.1f} MiB queued",
             ),
             ("topics", rates or "none yet"),
         ]

@@ -71,7 +71,7 @@ def test_no_episode_begins_before_an_emergency_stop_is_reset(run: Runtime, runs:
     bus.call(RESET, None)
     ticks(run, 3)
     bus.call(START, "pick the cube")
-    assert bus.call(STATUS, None)["recording"]
+    assert bus.call(STATUS).recording
     run.stop()
 
 
@@ -79,14 +79,14 @@ def test_services_begin_end_and_discard_episodes(run: Runtime, runs: Runs):
     bus = run.session.bus
     bus.call(START, "pick the cube")
     ticks(run, 3)
-    status = bus.call(STATUS, None)
-    assert (status["recording"], status["prompt"], status["episode"]) == (True, "pick the cube", 1)
-    assert status["elapsed_s"] == pytest.approx(0.06)
-    assert status["rates_hz"]["/joint_states"] == pytest.approx(50)
+    status = bus.call(STATUS)
+    assert (status.recording, status.prompt, status.episode) == (True, "pick the cube", 1)
+    assert status.elapsed_s == pytest.approx(0.06)
+    assert status.rates_hz["/joint_states"] == pytest.approx(50)
     bus.call(STOP, "failure")
     bus.call(START, None)
     ticks(run, 2)
-    assert bus.call(STATUS, None)["prompt"] == "pick the cube", "the last one"
+    assert bus.call(STATUS).prompt == "pick the cube", "the last one"
     bus.call(DISCARD, None)
     ticks(run, 2)
     run.stop()
@@ -137,7 +137,7 @@ def test_a_silent_topic_of_the_contract_is_named(runs: Runs, monkeypatch: pytest
 def test_a_disk_too_small_for_an_episode_is_refused_with_the_figures(
     run: Runtime, runs: Runs, monkeypatch: pytest.MonkeyPatch
 ):
-    flow = run.session.bus.call(STATUS, None)["bytes_per_s"]
+    flow = run.session.bus.call(STATUS).bytes_per_s
     assert flow > 50 * (2 * 8 + 2 * 2 * 8), "joint states and commands alone"
     service, kept = run.session.episodes, runs.parts.MADE["recording"]
     assert isinstance(service, EpisodeService)
@@ -158,7 +158,7 @@ def test_a_mode_that_begins_its_own_episodes_keeps_them(runs: Runs, monkeypatch:
     monkeypatch.chdir(runs.folder)
     runtime = runs.start(RECORDING, mode="policy", by_operator=True)
     ticks(runtime, 5)
-    assert runtime.session.bus.call(STATUS, None)["recording"]
+    assert runtime.session.bus.call(STATUS).recording
     with pytest.raises(NotSupported, match="mode policy begins and ends its episodes itself"):
         runtime.session.bus.call(STOP, "success")
 

@@ -233,7 +233,7 @@ def test_cues_of_an_episode(record: Record, monkeypatch: pytest.MonkeyPatch):
     run.keys("tab", "f12")
     run.step(3)
     assert [cue for cue, _ in heard[3:]] == ["start"], "a discarded one is not saved"
-    assert run.service.status()["cues"] == 4
+    assert run.service.status().cues == 4
 
 
 def test_cues_ring_the_terminal_or_are_spoken_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

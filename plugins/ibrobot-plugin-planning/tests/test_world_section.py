@@ -16,7 +16,17 @@ from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.world.objects import SNAPSHOT, Box, Capsule, Cylinder, Mesh, Plane, Sphere, read_mesh
 from ibrobot_planning.world.options import WorldOptions
-from ibrobot_planning.world.section import ADD, ATTACH, DETACH, LARGEST_MESH, MOST_OBJECTS, REMOVE, TOUCH, WorldKeeper
+from ibrobot_planning.world.section import (
+    ADD,
+    ATTACH,
+    DETACH,
+    LARGEST_MESH,
+    MOST_OBJECTS,
+    REMOVE,
+    SHAPES,
+    TOUCH,
+    WorldKeeper,
+)
 from ibrobot_testing import SectionSuite, make_session
 
 from ibrobot_core.api import Context, Float64MultiArray, JointGoal, PlanningError, PlanRequest, SteppedClock
@@ -57,6 +67,17 @@ def run(tmp_path, monkeypatch):
     keeper.start()
     yield session.bus
     keeper.stop()
+
+
+def test_shapes_are_those_of_objects_in_the_base_frame(run) -> None:
+    run.call(ATTACH, {"name": "ball", "link": "hand"})
+    shapes = {each.name: (each.shape, each.size) for each in run.call(SHAPES)}
+    assert shapes == {
+        "table": ("box", (0.6, 0.8, 0.02)),
+        "can": ("cylinder", (0.03, 0.1)),
+        "pen": ("capsule", (0.005, 0.1)),
+        "wall": ("plane", ()),
+    }
 
 
 def test_objects_come_from_the_yaml(run):

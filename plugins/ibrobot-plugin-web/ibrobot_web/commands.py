@@ -32,6 +32,16 @@ from ibrobot_web.messages import (
     SetSmoothing,
     clock_ns,
 )
+from ibrobot_web.run_services import (
+    CANCEL,
+    DISCARD_EPISODE,
+    GO_TO,
+    INTERVENE,
+    PLAN,
+    REDO_EPISODE,
+    START_EPISODE,
+    STOP_EPISODE,
+)
 from ibrobot_web.teleop import JOG, RELEASE, Released
 from ibrobot_web.teleop import Jog as JogRequest
 
@@ -208,7 +218,7 @@ def _preview(session: RunView, sent: Sent[Preview]) -> Mapping[str, Any]:
     goal = sent.command.goal
     joints = goal.joints if goal.pose is None else _joints_of(session, goal.pose)
     target = {"xyz": list(goal.xyz)} if goal.xyz is not None else {"joints": dict(joints or {})}
-    answer = session.bus.call("/plan_kinematic_path", {"goals": [target]})
+    answer = session.bus.call(PLAN, {"goals": [target]})
     if answer.trajectory is None:
         raise PlanningError(answer.message)
     points = answer.trajectory.points
@@ -226,16 +236,16 @@ _HANDLERS: Mapping[type[RunCommand], Handler] = {
     Reset: _reset,
     SetMode: lambda session, sent: session.bus.call(SET_MODE, EnterMode(sent.command.mode)),
     BeginEpisode: lambda session, sent: session.bus.call(
-        "/record_episode/start", {"prompt": sent.command.prompt or None, "wait": True}
+        START_EPISODE, {"prompt": sent.command.prompt or None, "wait": True}
     ),
-    EndEpisode: lambda session, sent: session.bus.call("/record_episode/stop", sent.command.outcome),
-    DiscardEpisode: lambda session, sent: session.bus.call("/record_episode/discard"),
-    RedoEpisode: lambda session, sent: session.bus.call("/record_episode/redo"),
+    EndEpisode: lambda session, sent: session.bus.call(STOP_EPISODE, sent.command.outcome),
+    DiscardEpisode: lambda session, sent: session.bus.call(DISCARD_EPISODE),
+    RedoEpisode: lambda session, sent: session.bus.call(REDO_EPISODE),
     SetSmoothing: lambda session, sent: session.bus.call(TOGGLE_SMOOTHING, sent.command.enabled),
-    Intervene: lambda session, sent: session.bus.call("/intervene", sent.command.take),
+    Intervene: lambda session, sent: session.bus.call(INTERVENE, sent.command.take),
     Preview: _preview,
-    GoTo: lambda session, sent: session.bus.call("/planning/go_to", sent.command.goal),
-    Cancel: lambda session, sent: session.bus.call("/planning/cancel"),
+    GoTo: lambda session, sent: session.bus.call(GO_TO, sent.command.goal),
+    Cancel: lambda session, sent: session.bus.call(CANCEL),
 }
 
 

@@ -11,7 +11,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import attrs
 
@@ -105,7 +105,7 @@ class BeginEpisode:
 class EndEpisode:
     """Ends the episode."""
 
-    outcome: Literal["success", "failure", "unknown"] = option(help="how it went")
+    outcome: str = option(help="how it went")
 
 
 @attrs.frozen

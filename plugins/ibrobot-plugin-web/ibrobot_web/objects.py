@@ -6,13 +6,10 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import attrs
-
 from ibrobot_core.api import Float64MultiArray, HardwareDescriptor, IbrobotError, Pose, SceneObject, Vector
 from ibrobot_core.app import RunView, Subscription
+from ibrobot_web.run_services import SHAPES
 
-WORLD = "/world/snapshot"
-"""Answers with the objects around the robot, of which the page shows those with simple shapes."""
 _POSE_SIZE = 7
 _log = logging.getLogger("ibrobot.web")
 
@@ -34,7 +31,8 @@ class SceneObjects:
     def json(self) -> list[dict[str, Any]]:
         """The objects that are fixed in the base frame, and those of the scene."""
         bus = self._session.bus
-        known = of_world(bus.call(WORLD, None)) if bus.serves(WORLD) else []
+        things = bus.call(SHAPES) if bus.serves(SHAPES) else ()
+        known = [place_of(each) for each in things if each.shape != "plane"]
         names = {each["name"] for each in known}
         for topic, subscription in self._topics.items():
             for received in subscription.drain():
@@ -63,27 +61,6 @@ def place_of(thing: SceneObject) -> dict[str, Any]:
     pos, quat = _pose(thing.pose)
     size = _half(thing.shape, thing.size)
     return {"name": thing.name, "type": thing.shape, "size": size, "pos": pos, "quat": quat}
-
-
-def of_world(world: Any) -> list[dict[str, Any]]:
-    """The objects of a planners' world that are fixed in the base frame."""
-    found = []
-    for name, thing in world.objects.items():
-        shape = attrs.asdict(thing.shape)
-        kind = type(thing.shape).__name__.lower()
-        match kind:
-            case "box":
-                size = _half(kind, shape["size"])
-            case "sphere":
-                size = _half(kind, (shape["radius"],))
-            case "cylinder" | "capsule":
-                size = _half(kind, (shape["radius"], shape["height"]))
-            case _:
-                continue
-        if thing.link is None:
-            pos, quat = _pose(thing.pose)
-            found.append({"name": name, "type": kind, "size": size, "pos": pos, "quat": quat})
-    return found
 
 
 def _half(kind: str, size: Sequence[float]) -> list[float]:

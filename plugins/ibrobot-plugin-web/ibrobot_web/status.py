@@ -14,8 +14,9 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S, JointState, Message, Vector
-from ibrobot_core.app import ControlState, RunView, error_text
+from ibrobot_core.app import TOGGLE_SMOOTHING, ControlState, RunView, error_text
 from ibrobot_web.modes import modes_json, page_devices
+from ibrobot_web.run_services import EPISODE_STATUS, GO_TO, INTERVENE, PLAN, REDO_EPISODE, START_EPISODE
 from ibrobot_web.teleop import JOG
 
 _TOKEN = re.compile(r"(?<=[?&]token=)[\w-]+")
@@ -28,15 +29,14 @@ _DIGITS = 5
 _NO_VALUES = ("header", "layout")
 """Fields of messages that are not plotted."""
 SERVICES = {
-    "goal": "/planning/go_to",
-    "smoothing": "/action_dispatcher/toggle_smoothing",
-    "record": "/record_episode/start",
-    "redo": "/record_episode/redo",
-    "intervene": "/intervene",
-    "preview": "/plan_kinematic_path",
+    "goal": GO_TO,
+    "smoothing": TOGGLE_SMOOTHING.name,
+    "record": START_EPISODE,
+    "redo": REDO_EPISODE,
+    "intervene": INTERVENE,
+    "preview": PLAN,
 }
 """What a page offers only while its service is served."""
-EPISODE_STATUS = "/record_episode/status"
 
 
 def without_tokens(text: str) -> str:
@@ -118,7 +118,9 @@ def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
 
 def episode_json(session: RunView) -> Any:
     """The state of recording; None if nothing records."""
-    return _plain(session.bus.call(EPISODE_STATUS, None)) if session.bus.serves(EPISODE_STATUS) else None
+    if not session.bus.serves(EPISODE_STATUS):
+        return None
+    return _plain(attrs.asdict(session.bus.call(EPISODE_STATUS)))
 
 
 def _jogs(session: RunView) -> list[str]:

@@ -9,7 +9,6 @@ import socket
 from types import SimpleNamespace
 from typing import Any
 
-import attrs
 import numpy as np
 import pytest
 import simplejpeg
@@ -160,20 +159,10 @@ def test_panels_of_plugins_are_shown_and_a_failing_one_harms_nothing() -> None:
 
 
 def test_objects_around_the_robot_are_shown_where_they_are() -> None:
-    @attrs.frozen
-    class Box:
-        size: tuple[float, ...]
-
-    @attrs.frozen
-    class Plane:
-        pass
-
-    def thing(shape: object, link: str | None = None) -> SimpleNamespace:
-        return SimpleNamespace(shape=shape, link=link, pose=Pose(Vector3(1, 2, 3), Quaternion(0, 0, 0, 1)))
-
+    here = Pose(Vector3(1, 2, 3), Quaternion(0, 0, 0, 1))
+    things = [SceneObject("crate", "box", (0.2, 0.4, 0.6), here), SceneObject("floor", "plane", (), here)]
     session = make_session()
-    objects = {"crate": thing(Box((0.2, 0.4, 0.6))), "floor": thing(Plane()), "held": thing(Box((1, 1, 1)), "gripper")}
-    session.bus.serve(stand_in("/world/snapshot"), lambda request: SimpleNamespace(objects=objects))
+    session.bus.serve(stand_in("/world/shapes"), lambda request: things)
     (crate,) = SceneObjects(session).json()
     shape = {"type": "box", "size": [0.1, 0.2, 0.3], "pos": [1, 2, 3], "quat": [1, 0, 0, 0]}
     assert crate == {"name": "crate", **shape}

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, override
+from typing import TYPE_CHECKING, Any, Literal, override
 
 import attrs
 import numpy as np
@@ -25,7 +25,7 @@ from ibrobot_core.api import (
     did_you_mean,
     resolve_path,
 )
-from ibrobot_core.app import Component, Registry, RobotConfig, RunView, Service, Subscription
+from ibrobot_core.app import Component, NoRequest, Registry, RobotConfig, RunView, Service, Subscription
 from ibrobot_planning.world.objects import (
     FLOOR,
     SNAPSHOT,
@@ -61,6 +61,13 @@ ATTACH = Service("/world/attach", Attached, list, "Let a link carry an object fr
 DETACH = Service("/world/detach", Detached, list, "Put down an object where it is." + _ANSWER)
 TOUCH = Service("/world/touch", Touched, list, "Let the hand touch objects, until the next call." + _ANSWER)
 ALLOW = Service("/world/allow", Allowed, list, "State what an object may touch." + _ANSWER)
+SHAPES: Service[NoRequest, Sequence[SceneObject]] = Service(
+    "/world/shapes", NoRequest, Sequence, "The objects in the base frame that have simple shapes."
+)
+_SIMPLE: Mapping[Literal["box", "sphere", "cylinder", "capsule", "plane"], type[Any]] = {
+    "box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Capsule, "plane": Plane,
+}  # fmt: skip
+"""The shapes of a simulated scene."""
 _FARTHEST_M = 1000.0
 """Positions beyond this are errors."""
 _STILL = 1e-4
@@ -95,17 +102,21 @@ def first_world(options: WorldOptions, scene: Sequence[SceneObject]) -> World:
 
 
 def _shape(thing: SceneObject) -> Shape:
-    match thing.shape:
-        case "box":
-            return Box(thing.size)
-        case "sphere":
-            return Sphere(*thing.size)
-        case "cylinder":
-            return Cylinder(*thing.size)
-        case "capsule":
-            return Capsule(*thing.size)
-        case "plane":
-            return Plane()
+    return Box(thing.size) if thing.shape == "box" else _SIMPLE[thing.shape](*thing.size)
+
+
+def _size(shape: Shape) -> tuple[float, ...]:
+    return shape.size if isinstance(shape, Box) else attrs.astuple(shape)
+
+
+def simple_objects(world: World) -> list[SceneObject]:
+    """The objects of a world that stand in the base frame and have a simple shape, e.g. to draw them."""
+    kinds = {kind: name for name, kind in _SIMPLE.items()}
+    return [
+        SceneObject(name, kinds[type(shape)], _size(shape), thing.pose)
+        for name, thing in world.objects.items()
+        if thing.link is None and type(shape := thing.shape) in kinds
+    ]
 
 
 class WorldKeeper(Component):
@@ -130,6 +141,7 @@ class WorldKeeper(Component):
         self._touched: tuple[str, ...] = ()
         self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
             SNAPSHOT: lambda _: self._snapshot(),
+            SHAPES: lambda _: simple_objects(self._snapshot()),
             ADD: self._add,
             REMOVE: self._changing(lambda world, it: world.remove(it.name)),
             MOVE: self._changing(self._move),

@@ -1,0 +1,12 @@
+"""The services of a run that a page calls by name; the plugin that serves one declares it."""
+
+START_EPISODE = "/record_episode/start"
+STOP_EPISODE = "/record_episode/stop"
+REDO_EPISODE = "/record_episode/redo"
+DISCARD_EPISODE = "/record_episode/discard"
+EPISODE_STATUS = "/record_episode/status"
+INTERVENE = "/intervene"
+GO_TO = "/planning/go_to"
+CANCEL = "/planning/cancel"
+PLAN = "/plan_kinematic_path"
+SHAPES = "/world/shapes"
