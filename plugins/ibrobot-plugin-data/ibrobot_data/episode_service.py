@@ -253,7 +253,8 @@ class EpisodeService(Episodes):
     def _is_paused(self, since_ns: int) -> bool:
         """Whether an operator moves the robot in this mode, and it has not followed since a time [ns]."""
         by_hand = self._session.config.control_modes[self._session.mode].teleop is not None
-        return by_hand and self._session.followed_ns < since_ns
+        followed_ns = self._session.followed_ns
+        return by_hand and (not followed_ns or followed_ns < since_ns)
 
     def _check_ready(self) -> None:
         """Check that an episode can begin.

@@ -177,7 +177,7 @@ def test_no_frame_of_a_paused_arm_is_recorded(record: Record):
 def test_an_episode_that_waits_for_the_robot_to_follow_can_be_cancelled(record: Record, key: str):
     run = record(prompt="pick")
     sys.modules["arms"].STICKS[-1].pressed = False
-    run.step(2)
+    run.step(10)
     run.keys("tab")
     assert run.operator.help() == "Tab goes back"
     run.keys(key)
@@ -189,7 +189,7 @@ def test_an_episode_that_waits_for_the_robot_to_follow_can_be_cancelled(record: 
 def test_an_emergency_stop_cancels_an_episode_that_waits(record: Record):
     run = record(prompt="pick")
     sys.modules["arms"].STICKS[-1].pressed = False
-    run.step(2)
+    run.step(10)
     run.keys("tab")
     run.runtime.session.emergency_stop()
     run.step(3)

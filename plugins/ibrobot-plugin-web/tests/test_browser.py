@@ -278,16 +278,24 @@ def test_an_operator_records_by_keys_until_the_run_ends(chromium: Any, recorded:
         assert tab.ask("document.querySelector('.attention').dataset.name") == large
     tab.page.get_by_label("Task").fill("pick b")  # a letter that is typed begins nothing
     tab.page.get_by_label("Task").blur()
-    for key, saved in (("d", 0), ("s", 1)):
+    mouse = tab.page.mouse
+
+    def begin() -> None:
         keyboard.press("b")
-        tab.until(lambda: tab.ask("ibrobot.status.episode.recording"))
+        tab.until(lambda: tab.ask("ibrobot.status.episode.waiting"))
+        tab.page.get_by_label("wrist_roll up, hold to move").hover()
+        tab.hold(mouse.down, mouse.up, lambda: tab.ask("ibrobot.status.episode.recording"))
+        mouse.up()
+
+    for key, saved in (("d", 0), ("s", 1)):
+        begin()
         assert tab.ask("ibrobot.status.episode.prompt") == "pick b"
         tab.until(lambda: tab.page.get_by_role("button", name="Discard").is_visible())
         keyboard.press(key)
         tab.until(lambda: not tab.ask("ibrobot.status.episode.recording"))
         tab.until(lambda saved=saved: tab.text("#record .line > p").startswith(f"{saved} of 2 saved"))  # type: ignore[misc]
     tab.until(lambda: tab.page.get_by_role("button", name="Begin").is_visible())
-    keyboard.press("b")
+    begin()
     tab.until(lambda: tab.page.get_by_role("button", name="Failure").is_visible())
     keyboard.press("f")
     tab.until(lambda: tab.page.locator("#faults .ended").is_visible())
