@@ -573,7 +573,7 @@ def measure(name: str, takeovers: int, seed: int, *, live: bool = False) -> dict
             "models={wander: {type: wander}}",
             "control_modes.model_inference.inference={model: wander, intervene: it}",
             "control_modes.teleop.teleop=it",
-            f"teleoperation={{it: {person.device}}}",
+            f"teleoperation={{web: {{type: web}}, it: {person.device}}}",
             f"recording={{type: mcap, root: {folder}}}",
             "contract.max_duration_s=100000",
         ]

@@ -23,7 +23,7 @@ GROUPS = "control_modes.teleop.teleop={{arm: {}, gripper: {}}}"
 
 def test_a_leader_moves_the_arm_and_a_gamepad_its_gripper(tmp_path: Path) -> None:
     leader, pad, rng = takeovers.WithLeader(tmp_path), takeovers.WithPad(), random.Random(0)
-    devices = f"teleoperation={{leader: {leader.device}, pad: {pad.device}}}"
+    devices = f"teleoperation={{web: {{type: web}}, leader: {leader.device}, pad: {pad.device}}}"
     config = load_config(takeovers.CONFIG, sim=True, mode="teleop", overrides=[devices, GROUPS.format("leader", "pad")])
     request = LaunchRequest(lockstep=True, keys=leader.subscribe)
     runtime = Runtime(Session(config, installed_plugins(), request))
@@ -72,8 +72,8 @@ def test_a_leader_moves_the_arm_and_a_gamepad_its_gripper(tmp_path: Path) -> Non
     ],
 )
 def test_a_key_with_two_meanings_is_refused(device: str, keys: str, twice: str) -> None:
-    devices = f"{{it: {{type: {device}}}, keys: {{type: keyboard, cartesian: false, keys: {keys}}}}}"
-    overrides = [f"teleoperation={devices}", GROUPS.format("it", "keys")]
+    devices = f"it: {{type: {device}}}, keys: {{type: keyboard, cartesian: false, keys: {keys}}}"
+    overrides = [f"teleoperation={{web: {{type: web}}, {devices}}}", GROUPS.format("it", "keys")]
     if not twice:
         load_config(takeovers.CONFIG, sim=True, overrides=overrides)
         return
@@ -100,7 +100,7 @@ def test_a_key_with_two_meanings_is_refused(device: str, keys: str, twice: str) 
 )  # fmt: skip
 def test_a_key_of_takeovers_that_also_jogs_is_refused(episodes: str, message: str) -> None:
     overrides = [
-        "teleoperation={it: {type: keyboard, cartesian: false}}",
+        "teleoperation={web: {type: web}, it: {type: keyboard, cartesian: false}}",
         "control_modes.teleop.teleop=it",
         "control_modes.model_inference.inference={model: scripted_pick, intervene: it}",
         f"episodes={episodes}",

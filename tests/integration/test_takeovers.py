@@ -37,7 +37,7 @@ def test_moving_a_leader_without_a_deadman_takes_the_robot(tmp_path: Path, monke
         "models={wander: {type: wander}}",
         "control_modes.model_inference.inference={model: wander, intervene: it}",
         "control_modes.teleop.teleop=it",
-        f"teleoperation={{it: {leader.device[:-1]}, deadman: none}}}}",
+        f"teleoperation={{web: {{type: web}}, it: {leader.device[:-1]}, deadman: none}}}}",
         "episodes={takeover: deadman}",
         "contract.max_duration_s=100",
     ]

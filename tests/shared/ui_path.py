@@ -100,7 +100,8 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
     for number, (joint, index, verdict) in enumerate([("shoulder_pan", 0, "Success"), ("wrist_roll", 4, "Failure")]):
         run.get_by_role("button", name="Begin").click()
         before = run.evaluate("ibrobot.state.position")
-        moved = f"ibrobot.status.episode.elapsed_s > 1 && Math.abs(ibrobot.state.position[{index}] - {before[index]}) > 0.3"
+        moved = f"Math.abs(ibrobot.state.position[{index}] - {before[index]}) > 0.3"
+        moved = f"ibrobot.status.episode.elapsed_s > 1 && {moved}"
         press(run, f"{joint} up, hold to move", moved)
         if number == 0:
             shot(run, "episode")
