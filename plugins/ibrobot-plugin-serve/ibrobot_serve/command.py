@@ -42,6 +42,8 @@ from ibrobot_serve.service import InferenceService, ServiceOptions
 
 _PLAIN_PERIOD_S = 10.0
 _PANEL_PERIOD_S = 0.5
+_PORTS = {"openpi": 8000, "gr00t": 5555}
+"""Protocols of other projects, with their usual ports."""
 
 
 def _share(ctx: click.Context, param: click.Parameter, value: str) -> float:
@@ -123,25 +125,26 @@ def _share(ctx: click.Context, param: click.Parameter, value: str) -> float:
 )
 @click.option(
     "--protocol",
-    type=click.Choice(["ibrobot", "openpi"]),
+    type=click.Choice(["ibrobot", *_PORTS]),
     default="ibrobot",
     show_default=True,
-    help="Whose clients are answered; for openpi, --listen is HOST:PORT, by default 127.0.0.1:8000.",
+    help="Whose clients are answered; for openpi and gr00t, --listen is HOST:PORT, by default on this machine.",
 )
 def serve(what: str, **options: Any) -> None:
     """Run a model for robots on other machines.
 
     CONFIG is a robot YAML, which names model and transport; MODEL_DIR is a folder with a model, for --type.
     Robots use it by `execution_mode: distributed`. Ctrl-C or SIGTERM answers pending requests, then ends.
-    With --protocol openpi, clients of openpi use it, and need the key in the environment variable IBROBOT_API_KEY.
+    With --protocol openpi or gr00t, clients of these use it, and need the key in the environment variable
+    IBROBOT_API_KEY.
     """
     registry = installed_plugins()
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("ibrobot").setLevel(logging.INFO)
-    if options["protocol"] == "openpi":
-        _serve_openpi(what, registry, options)
+    if options["protocol"] in _PORTS:
+        _serve_clients(what, registry, options)
         return
     with wrong_input():
         name, policy, make_transport = (
@@ -267,12 +270,13 @@ def _chosen(config: RobotConfig, path: Path, options: dict[str, Any]) -> str:
     return model
 
 
-def _serve_openpi(what: str, registry: Registry, options: dict[str, Any]) -> None:
-    """Answer openpi's clients until a signal."""
+def _serve_clients(what: str, registry: Registry, options: dict[str, Any]) -> None:
+    """Answer clients of another project until a signal."""
+    from ibrobot_serve.gr00t_server import Gr00tServer
     from ibrobot_serve.openpi_server import OpenpiServer
 
-    key = os.environ.get("IBROBOT_API_KEY") or None
-    host, port = _host_and_port(options["listen"], key)
+    key, protocol = os.environ.get("IBROBOT_API_KEY") or None, options["protocol"]
+    host, port = _host_and_port(options["listen"], key, _PORTS[protocol])
     with wrong_input():
         if options["type_"]:
             policy, _ = _policy_of_folder(Path(what), registry, options)
@@ -288,26 +292,28 @@ def _serve_openpi(what: str, registry: Registry, options: dict[str, Any]) -> Non
         on_signals(stopping.set)
         with wrong_input():
             try:
-                server = OpenpiServer(policy, name, host, port, key)
+                kind = OpenpiServer if protocol == "openpi" else Gr00tServer
+                server: OpenpiServer | Gr00tServer = kind(policy, name, host, port, key)
             except OSError as error:
                 raise click.UsageError(f"--listen: {host}:{port} cannot be used: {error.strerror}") from None
         try:
-            echo(f"serving {name} to openpi's clients on ws://{host}:{server.port}; Ctrl-C ends")
+            scheme = "ws" if protocol == "openpi" else "tcp"
+            echo(f"serving {name} to clients of {protocol} on {scheme}://{host}:{server.port}; Ctrl-C ends")
             stopping.wait()
         finally:
             server.close()
-        echo(f"{server.answered} answered, {server.failed} failed")
+        echo("{} answered, {} failed".format(*server.counts))
     finally:
         policy.close()
 
 
-def _host_and_port(listen: Sequence[str], key: str | None) -> tuple[str, int]:
-    """The address of an openpi server.
+def _host_and_port(listen: Sequence[str], key: str | None, usual: int = 8000) -> tuple[str, int]:
+    """The address of a server for clients of another project; `usual` is its usual port.
 
     Raises:
         click.UsageError: if it is not one HOST:PORT, or others could use the model without a key.
     """
-    given = listen or ("127.0.0.1:8000",)
+    given = listen or (f"127.0.0.1:{usual}",)
     host, _, port = given[0].rpartition(":")
     if len(given) != 1 or not host or not port.isdecimal() or int(port) > 65535:
         raise click.UsageError(f"--listen: {' '.join(given)!r} must be one HOST:PORT, e.g. 127.0.0.1:8000")

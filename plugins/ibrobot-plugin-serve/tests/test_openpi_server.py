@@ -68,7 +68,7 @@ def test_chunks_are_those_of_the_policy(server: OpenpiServer, policy: FakePolicy
         ({STATE: np.zeros(5, np.float32)}, "'observation.state' is float32 (5,)"),
         ({STATE: [0.0] * 6}, "'observation.state' is missing"),
         ({STATE: np.zeros(6), "observation.stat": np.zeros(6)}, "'observation.stat' is unknown"),
-        ({STATE: np.zeros(6), "prompt": 3}, "'prompt' must be text"),
+        ({STATE: np.zeros(6), "prompt": 3}, "the prompt must be text"),
         (b"\xc1", "cannot be read"),
         (b"\x01", "must be a dictionary, got int"),
         ("text", "must be binary"),
@@ -80,7 +80,7 @@ def test_a_wrong_request_is_answered_by_a_text_and_the_next_one_by_a_chunk(
     _, refused, answer = asked(server, request_, {STATE: np.zeros(6)})
     assert message in refused
     assert answer["actions"].shape == (10, 6)
-    assert (server.answered, server.failed) == (1, 1)
+    assert server.counts == (1, 1)
 
 
 def test_damaged_requests_harm_no_other(server: OpenpiServer) -> None:

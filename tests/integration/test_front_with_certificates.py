@@ -1,0 +1,147 @@
+"""`ibrobot serve` with certificates in front of an openpi server, which itself asks nobody for anything."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pytest
+import yaml
+from ibrobot_policy_servers.openpi import OpenpiConnection
+from ibrobot_policy_servers.options import ActionMap, ObservationMap, OpenpiOptions
+from ibrobot_policy_servers.served import ServedPolicy
+from ibrobot_serve.remote import RemoteEngine
+from ibrobot_testing import host_context
+from ibrobot_testing.contexts import ARM, GRIPPER
+from ibrobot_testing.ports import free_port
+from ibrobot_zenoh.options import Tls
+from openpi_server import OpenpiServer
+
+from ibrobot_core.errors import PolicyError
+from ibrobot_core.plugins import installed_plugins
+
+pytestmark = pytest.mark.integration
+
+STATE = "observation.state"
+JOINTS = ARM + GRIPPER
+OPTIONS = OpenpiOptions(
+    url="ws://127.0.0.1:1",  # robots do not connect to it
+    observations=(ObservationMap(STATE, ("state",), (6,)),),
+    actions=(ActionMap(JOINTS),),
+    horizon=10,
+    rate_hz=30.0,
+    prompt=(),
+)
+
+
+@attrs.frozen
+class Front:
+    """The server in front."""
+
+    process: subprocess.Popen[str]
+    endpoint: str
+    metrics: str
+    lab: Path
+
+
+def echo(request: dict[str, Any]) -> dict[str, Any]:
+    """The state, ten times."""
+    return {"actions": np.repeat(request["state"][None], 10, axis=0)}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _zenoh_runs() -> None:
+    """Zenoh's own threads run, with the files that they keep."""
+    zenoh = installed_plugins().find("transport", "zenoh")
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    router = zenoh.make(zenoh.options(mode="router", listen=(endpoint,)), host_context())
+    zenoh.make(zenoh.options(connect=(endpoint,)), host_context()).close()
+    router.close()
+
+
+@pytest.fixture
+def openpi() -> Iterator[OpenpiServer]:
+    with OpenpiServer(echo) as server:
+        yield server
+
+
+@pytest.fixture
+def front(ibrobot: tuple[str, ...], openpi: OpenpiServer, tmp_path: Path) -> Iterator[Front]:
+    lab, endpoint, port = tmp_path / "lab", f"tls/127.0.0.1:{free_port()}", free_port()
+    names = ("--server", "127.0.0.1", "--robot", "robot1", "--robot", "robot2")
+    subprocess.run([*ibrobot, "certs", str(lab), *names], check=True, capture_output=True)
+    model = {
+        "type": "openpi", "url": openpi.url, "horizon": 10, "rate_hz": 30, "prompt": [],
+        "observations": [{"observation": STATE, "key": ["state"], "shape": [6]}],
+        "actions": [{"joints": list(JOINTS)}],
+    }  # fmt: skip
+    tls = {name: str(path) for name, path in attrs.asdict(certificates(lab, "127.0.0.1")).items()}
+    given = {"models.pi": model, "transport": {"type": "zenoh", "tls": tls}}
+    overrides = [
+        part
+        for path, value in given.items()
+        for part in ("--set", f"{path}={yaml.safe_dump(value, default_flow_style=True, width=10_000).strip()}")
+    ]
+    serve = ("serve", "so101_blind", "--model", "pi", "--listen", endpoint, "--metrics-port", str(port))
+    process = subprocess.Popen(
+        [*ibrobot, *serve, *overrides], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    assert line.startswith("serving pi"), process.communicate()[1]
+    yield Front(process, endpoint, f"http://127.0.0.1:{port}/metrics", lab)
+    process.kill()
+    process.communicate()
+
+
+def certificates(lab: Path, name: str) -> Tls:
+    folder = lab / name
+    robots = folder / "robots.txt"
+    files = (folder / file for file in ("ca.pem", "certificate.pem", "key.pem"))
+    return Tls(*files, robots if robots.exists() else None)
+
+
+@contextmanager
+def robot(front: Front, tls: Tls | None, says: str = "so101") -> Iterator[RemoteEngine]:
+    """A robot's side of the model, with its certificate, whatever it says that its name is."""
+    zenoh = installed_plugins().find("transport", "zenoh")
+    endpoint = front.endpoint if tls is not None else front.endpoint.replace("tls/", "tcp/")
+    network = zenoh.make(zenoh.options(connect=(endpoint,), tls=tls), host_context())
+    policy = ServedPolicy(OPTIONS, host_context(), OpenpiConnection(OPTIONS, host_context().log))
+    engine = RemoteEngine(policy, network, "pi", says, start_timeout_s=60.0 if tls is not None else 1.0)
+    try:
+        yield engine
+    finally:
+        engine.close()
+        network.close()
+
+
+def test_robots_are_who_their_certificates_say_and_others_get_nothing(front: Front, openpi: OpenpiServer) -> None:
+    for name, says in (("robot1", "so101"), ("robot2", "robot1")):
+        with robot(front, certificates(front.lab, name), says) as engine:
+            engine.start()
+            for number in range(1, 4):
+                state = np.full(6, number / 10 + (name == "robot2"), np.float32)
+                answer = engine.infer({STATE: state}, number, time.monotonic_ns() + 60_000_000_000)
+                np.testing.assert_allclose(answer["action"], np.tile(state, (10, 1)), atol=1e-6)
+            assert openpi.url in engine.stats.server
+    with urllib.request.urlopen(front.metrics, timeout=60) as page:
+        metrics = page.read().decode()
+    answered = dict(re.findall(r'ibrobot_serve_robot_answered_total\{model="pi",robot="([^"]*)"\} (\S+)', metrics))
+    assert answered == {"robot1": "3.0", "robot2": "3.0"}
+    asked = len(openpi.requests)
+    with robot(front, None) as stranger, pytest.raises(PolicyError, match="no server for model 'pi'"):
+        stranger.start()
+    assert len(openpi.requests) == asked
+    front.process.send_signal(signal.SIGTERM)
+    out, _ = front.process.communicate(timeout=60)
+    assert "6 requests, 6 answered, 0 expired, 0 malformed" in out
