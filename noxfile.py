@@ -207,7 +207,7 @@ def minimums(session: nox.Session) -> None:
 @nox.session
 def lerobot(session: nox.Session) -> None:
     """LeRobot itself, unmodified, against what the plugins offer; the one session with torch."""
-    lerobot = "lerobot[dataset,diffusion,evaluation,feetech,smolvla,training]>=0.6.1,<0.7"
+    lerobot = "lerobot[damiao,dataset,diffusion,dynamixel,evaluation,feetech,rebot,smolvla,training]>=0.6.1,<0.7"
     install(session, *PLUGINS, options=(lerobot, "onnxscript"))  # the latter exports policies
     system_libraries(session)
     session.run(*PYTEST, "-m", f"lerobot{SHORT}", *marked("lerobot"), *session.posargs)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import click
 
 from ibrobot_core.api import HardwareError, did_you_mean
-from ibrobot_core.app import Declined, echo
+from ibrobot_core.app import Declined, echo, wrong_input
 from ibrobot_lerobot_devices.link import INSTALL, DeviceLink, DeviceProblem
 from ibrobot_lerobot_devices.registry import registry
 
@@ -46,6 +47,22 @@ def _show(fields: Mapping[str, Any], indent: str) -> None:
         default = "required" if field["required"] else f"default {field.get('default')}"
         echo(f"{indent}{name}: {' or '.join(field['type'])}; {default}")
         _show(field.get("fields", {}), f"{indent}  ")
+
+
+@lerobot.command("new")
+@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("robot")
+@click.option("--id", "id_", metavar="ID", help="LeRobot's id of it, the name of its calibration.  [default: ROBOT]")
+def new(out: Path, robot: str, id_: str | None) -> None:
+    """Write a robot YAML for ROBOT, e.g. koch_follower, to the new file OUT."""
+    from ibrobot_lerobot_devices.new_robot import write_robot
+
+    with wrong_input():
+        found = write_robot(out, robot, id_ or robot)
+    echo(f"{out}: {found.type}, {len(found.mapped)} joints")
+    if not found.measured:
+        echo(f"note: limits of joints are guesses, since LeRobot has no calibration {id_ or robot}: check them")
+    echo(f"try it: ibrobot launch {out}")
 
 
 @lerobot.command("torque-off")

@@ -22,6 +22,8 @@ from ibrobot_lerobot_devices.stand_in import replace_torch
 
 _FAREWELL_S = 1.0
 """How long a call may go on after the parent has ended or died [s]."""
+_PICTURE_MS = 200
+"""Longest time to wait for a picture before an answer without one [ms]."""
 READY, ANSWER, DONE = "ready", "answer", "done"
 """Events: the device is connected; a reading or why there is none; a request is carried out."""
 _END: dict[str, Any] = {"do": "end"}
@@ -116,10 +118,14 @@ class Device:
         """Send the newest picture, once it is there, through the pipe; return its shape and type."""
         import numpy as np
 
-        pixels = np.ascontiguousarray(self._device.async_read(timeout_ms=200))
+        pixels = np.ascontiguousarray(self._device.async_read(timeout_ms=_PICTURE_MS))
         age_s = self._library.picture_age_s(self._device)
+        made_ns = time.monotonic_ns() - round(age_s * 1e9)
         content = memoryview(pixels).cast("B")
-        return {"shape": list(pixels.shape), "type": str(pixels.dtype), "age_s": age_s, "content": content}
+        return {
+            "shape": list(pixels.shape), "type": str(pixels.dtype), "made_ns": made_ns, "size": content.nbytes,
+            "content": content,
+        }  # fmt: skip
 
     def act(self, action: Mapping[str, float]) -> dict[str, Any]:
         """Send an action."""
@@ -196,7 +202,7 @@ def main(parent: int, pictures: int) -> int:
             channel.send({"event": READY, "found": library.describe()})
             return 0
         device = Device(order, pictures)
-        if order.get("only_make"):
+        if order["only_make"]:
             channel.send({"event": READY, "found": device.make()})
             return 0
         requests.start()

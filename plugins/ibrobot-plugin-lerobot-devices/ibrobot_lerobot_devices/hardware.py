@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import time
 from collections import deque
 from collections.abc import Mapping
 from typing import Any, override
@@ -23,7 +22,7 @@ from ibrobot_core.api import (
     nan_vector,
     seconds,
 )
-from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem
+from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem, age_ns
 from ibrobot_lerobot_devices.options import RobotOptions
 from ibrobot_lerobot_devices.units import EFFORT, POSITION, VELOCITY, UnitProblem, bases, columns, map_joints
 
@@ -219,7 +218,7 @@ class LeRobotHardware(Hardware):
         position = self._factor * position + self._offset
         if not np.isfinite(position).all():
             raise self._fail(f"LeRobot gave no finite position of {self.joints[int(np.argmin(np.isfinite(position)))]}")
-        stamp_ns = self._ctx.clock.now_ns() - (time.monotonic_ns() - answer["made_ns"])
+        stamp_ns = self._ctx.clock.now_ns() - age_ns(answer)
         self._history.append((stamp_ns, position))
         measured = self._differences()
         velocity = np.where(np.isfinite(velocity), self._factor * velocity, measured)

@@ -88,7 +88,8 @@ def make(kind: Kind, wanted: str, config: Mapping[str, Any]) -> Any:
     try:
         decoded = draccus.decode(getattr(package, base), {"type": wanted, **given})
     except Exception as error:  # of draccus and of what the dataclass checks
-        raise DeviceError(f"LeRobot's {wanted} refuses its config: {error}") from error
+        why = f": {error.__cause__}" if error.__cause__ is not None else ""
+        raise DeviceError(f"LeRobot's {wanted} refuses its config: {error}{why}") from error
     utils = importlib.import_module(f"{name}.utils")
     try:
         if kind == "camera":
@@ -197,7 +198,7 @@ def buses(device: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 def facts(device: Any) -> dict[str, Any]:
     """What a robot or teleoperator says about itself: features, motors, torque, and its calibration's file."""
     names = ("action_features", "observation_features")
-    features = {name: _plain(getattr(device, name)) for name in names if hasattr(device, name)}
+    features = {name: _plain(getattr(device, name)) if hasattr(device, name) else [] for name in names}
     return features | {
         "motors": motors(device),
         "torque": bool(torque_switches(device)),

@@ -9,8 +9,6 @@ from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import Any
 
-import attrs
-
 from ibrobot_core.app import Child, ComponentFailed
 from ibrobot_lerobot_devices.device import ANSWER, DONE, READY
 
@@ -32,14 +30,9 @@ def is_installed() -> bool:
     return find_spec("lerobot") is not None
 
 
-@attrs.frozen
-class Reading:
-    """Values that LeRobot has given, or why it gave none."""
-
-    values: Mapping[str, float]
-    made_ns: int
-    """The middle of LeRobot's call, by `time.monotonic_ns`."""
-    error: str = ""
+def age_ns(answer: Mapping[str, Any]) -> int:
+    """How long ago an answer was made [ns]."""
+    return time.monotonic_ns() - int(answer["made_ns"])
 
 
 class DeviceLink:
@@ -50,10 +43,15 @@ class DeviceLink:
         type: LeRobot's name of the device.
         config: its config, without `type`.
         torch: whether the process loads torch.
+        only_make: whether it ends after it has said what the device is, without a connection.
     """
 
-    def __init__(self, kind: str, type: str, config: Mapping[str, Any], *, torch: bool = False) -> None:
-        self._order = {"kind": kind, "type": type, "config": dict(config), "torch": torch}
+    def __init__(
+        self, kind: str, type: str, config: Mapping[str, Any], *, torch: bool = False, only_make: bool = False
+    ) -> None:
+        self._order = {
+            "kind": kind, "type": type, "config": dict(config), "torch": torch, "only_make": only_make,
+        }  # fmt: skip
         self.type = type
         self._child: Child | None = None
         self._number = 0
@@ -104,7 +102,7 @@ class DeviceLink:
         """
         return self._await(READY, timeout_s)
 
-    def read(self, wait_s: float, what: str = "read") -> dict[str, Any] | None:
+    def read(self, wait_s: float) -> dict[str, Any] | None:
         """The newest answer that was not returned yet; asks for one, and waits up to `wait_s` [s] for it.
 
         A request that is not answered yet is not repeated.
@@ -116,14 +114,31 @@ class DeviceLink:
         if newest is not None:
             self.late += 1
         if self._asked_s is None:
-            self._number += 1
-            self._asked_s = time.monotonic()
-            self._running().channel.send({"do": what, "id": self._number})
+            self._ask("read")
         deadline_s = time.monotonic() + wait_s
         while self._asked_s is not None and (left_s := deadline_s - time.monotonic()) > 0:
             answer = self._next(left_s)
             newest = answer if answer is not None else newest
         return newest
+
+    def picture(self, timeout_s: float) -> dict[str, Any] | None:
+        """The next answer with a picture, or with an error, or None if none arrives within `timeout_s` [s].
+
+        Raises:
+            DeviceProblem: if the process has died.
+        """
+        if self._asked_s is None:
+            self._ask("picture")
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            answer = self._next(max(0.0, deadline_s - time.monotonic()))
+            if answer is not None or time.monotonic() >= deadline_s:
+                return answer
+
+    def _ask(self, what: str) -> None:
+        self._number += 1
+        self._asked_s = time.monotonic()
+        self._running().channel.send({"do": what, "id": self._number})
 
     @property
     def blocked_s(self) -> float:
@@ -165,12 +180,8 @@ class DeviceLink:
             os.close(self._pipe)
             self._pipe = -1
 
-    def content(self, size: int) -> bytearray:
-        """The bytes of a picture.
-
-        Raises:
-            DeviceProblem: if the process has died.
-        """
+    def _content(self, size: int) -> bytearray:
+        """The bytes of a picture, which follow its answer."""
         content = bytearray()
         while len(content) < size:
             part = os.read(self._pipe, size - len(content))
@@ -200,7 +211,10 @@ class DeviceLink:
             return None
         if message["id"] == self._number:
             self._asked_s = None
-        return dict(message)
+        answer = dict(message)
+        if "size" in answer:
+            answer["content"] = self._content(answer["size"])
+        return answer
 
     def _await(self, what: str, timeout_s: float) -> Mapping[str, Any] | None:
         """The result of a request, or of the start; None if there is none in time."""

@@ -30,7 +30,8 @@ def _joint_options() -> dict[str, Any]:
         "units": option(
             factory=dict,
             validator=_unit_names,
-            help=f"LeRobot's name of a joint -> its unit, where LeRobot does not say it: {', '.join(UNITS)}",
+            help=f"LeRobot's name of a joint, or '*' for all others -> its unit, where LeRobot does not say it: "
+            f"{', '.join(UNITS)}",
         ),
         "zero_at": option(
             "pose",
@@ -46,6 +47,8 @@ def _joint_options() -> dict[str, Any]:
 
 
 _JOINTS = _joint_options()
+_START = option(40.0, unit="s", gt=0, help="how long LeRobot may take to start and to connect")
+_LOST = option(3, ge=0, help="consecutive readings that LeRobot may fail to give")
 
 
 @documented
@@ -60,16 +63,78 @@ class RobotOptions:
     zero_at: str = _JOINTS["zero_at"]
     anchored: tuple[str, ...] = _JOINTS["anchored"]
     inverted: tuple[str, ...] = _JOINTS["inverted"]
-    lost_readings: int = option(3, ge=0, help="consecutive readings that LeRobot may fail to give")
+    lost_readings: int = _LOST
     blocked: float = option(
         0.08,
         unit="s",
         gt=0,
         help="how long a call of LeRobot's may block before it is a fault; control.state_timeout must be longer",
     )
-    start_timeout: float = option(40.0, unit="s", gt=0, help="how long LeRobot may take to start and to connect")
+    start_timeout: float = _START
     torch: bool = _TORCH
 
     def choices(self) -> Choices:
         """What the options say about the conversion of units."""
         return Choices(self.joints, self.units, self.zero_at, self.anchored, self.inverted)
+
+
+@documented
+@attrs.frozen
+class TeleopOptions:
+    """Options of teleop `type: lerobot`: a teleoperator of LeRobot's with joint positions, e.g. a leader arm."""
+
+    teleop: str = option(validator=not_empty, help="LeRobot's type of the teleoperator, e.g. koch_leader")
+    config: Mapping[str, Any] = option(factory=dict, help=_CONFIG)
+    joints: Mapping[str, str] = _JOINTS["joints"]
+    units: Mapping[str, str] = _JOINTS["units"]
+    zero_at: str = _JOINTS["zero_at"]
+    inverted: tuple[str, ...] = _JOINTS["inverted"]
+    scaled: tuple[str, ...] = option(
+        GRIPPER,
+        help="joints whose values from 0 to 100, or from -100 to 100, map to the robot's limits; others map by angle",
+    )
+    ramp_velocity: float = option(
+        1.0, unit="rad/s", gt=0, help="velocity at which the robot approaches the device's pose, also after each pause"
+    )
+    follow_tolerance: float = option(
+        0.02, unit="rad", gt=0, help="distance from the device's pose at which the approach ends"
+    )
+    deadman: str = option(
+        "toggle",
+        choices=("toggle", "hold", "none"),
+        help="toggle: a key starts and pauses; hold: follows while it is held; none: follows once the device is moved, "
+        "for runs without a terminal",
+    )
+    release: float = option(
+        0.2, unit="s", gt=0, le=1, help="deadman hold: a key that is not repeated for this long counts as released"
+    )
+    deadman_key: str = option("space", help="key of the deadman")
+    lost_readings: int = _LOST
+    blocked: float = option(0.2, unit="s", gt=0, help="how long a call of LeRobot's may block before it is a fault")
+    start_timeout: float = _START
+    torch: bool = _TORCH
+
+    def choices(self) -> Choices:
+        """What the options say about the conversion of units."""
+        return Choices(self.joints, self.units, self.zero_at, (), self.inverted, self.scaled)
+
+
+@documented
+@attrs.frozen
+class CameraOptions:
+    """Options of a peripheral `type: lerobot` of kind camera: a camera of LeRobot's."""
+
+    camera: str = option(validator=not_empty, help="LeRobot's type of the camera, e.g. zmq")
+    config: Mapping[str, Any] = option(factory=dict, help=_CONFIG)
+    encoding: str = option("jpeg", choices=("jpeg", "raw"), help="of messages; depth is always raw")
+    jpeg_quality: int = option(90, ge=1, le=100, help="JPEG quality")
+    lost_after: float = option(5.0, unit="s", gt=0, help="how long LeRobot may report errors before the camera is lost")
+    frame_id: str = option("", help="frame id of the messages; NAME_optical_frame if empty")
+    start_timeout: float = _START
+    torch: bool = _TORCH
+
+    @property
+    def picture(self) -> tuple[int, int] | None:
+        """Height and width of the pictures [px], if the config has them."""
+        height, width = self.config.get("height"), self.config.get("width")
+        return (height, width) if isinstance(height, int) and isinstance(width, int) else None

@@ -11,13 +11,15 @@ from importlib.metadata import Distribution, distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import attrs
+
 from ibrobot_core.api import OptionFault, did_you_mean, replace_file
 from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem, is_installed
 from ibrobot_lerobot_devices.options import GRIPPER
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
-    from ibrobot_lerobot_devices.options import RobotOptions
+    from ibrobot_lerobot_devices.options import RobotOptions, TeleopOptions
 
 _PREFIXES = ("lerobot_robot_", "lerobot_teleoperator_", "lerobot_camera_")
 """LeRobot imports the distributions whose names begin with one of these."""
@@ -138,13 +140,14 @@ def _fits(word: str, value: object) -> bool:
     return isinstance(value, _PYTHON.get(word, (object,)))
 
 
-def check_joints(options: RobotOptions, robot: Robot) -> Iterator[OptionFault]:
+def check_joints(options: RobotOptions | TeleopOptions, robot: Robot) -> Iterator[OptionFault]:
     """Check that the options name joints of the robot."""
     known = robot.joint_names
     for theirs, ours in options.joints.items():
         if ours not in known:
             yield OptionFault(("joints", theirs), f"unknown joint {ours!r}{did_you_mean(ours, known, 'known')}")
-    for key, names in (("anchored", options.anchored), ("inverted", options.inverted)):
+    kinds = ("anchored", "scaled", "inverted")
+    for key, names in attrs.asdict(options, filter=lambda field, value: field.name in kinds).items():
         for i, name in enumerate(names):
             if name not in known and names != GRIPPER:
                 yield OptionFault((key, i), f"unknown joint {name!r}{did_you_mean(name, known, 'known')}")

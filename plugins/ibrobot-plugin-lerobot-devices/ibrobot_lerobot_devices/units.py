@@ -19,6 +19,9 @@ DEGREES, RADIANS, SYMMETRIC, PERCENT = "degrees", "radians", "range_m100_100", "
 UNITS = (DEGREES, RADIANS, SYMMETRIC, PERCENT)
 """LeRobot's units of joints: `range_m100_100` and `range_0_100` are shares of the calibrated range."""
 
+OTHERS = "*"
+"""In the option `units`: the joints whose unit neither LeRobot nor the option says."""
+
 
 @attrs.frozen
 class Scale:
@@ -50,6 +53,8 @@ class Choices:
     zero_at: str
     anchored: Sequence[str]
     inverted: Sequence[str]
+    scaled: Sequence[str] = ()
+    """Joints whose shares of the calibrated range map to the limits."""
 
 
 class UnitProblem(Exception):
@@ -92,15 +97,19 @@ def map_joints(
             )
         motor = motors.get(base, {})
         unit = choices.units.get(base) or motor.get("unit") or (RADIANS if positions[base].endswith(".q") else "")
+        unit = unit or choices.units.get(OTHERS, "")
         if unit not in UNITS:
-            raise UnitProblem(f"LeRobot does not say the unit of {base!r}: give it as units: {{{base}: degrees}}")
+            raise UnitProblem(
+                f"LeRobot does not say the unit of {base!r}: give it as units: {{{base}: degrees}}, or {{'*': degrees}}"
+            )
         found.append(Mapped(base, joint, unit, _scale(unit, motor, joint, choices, limits[joint])))
     return found
 
 
 def _scale(unit: str, motor: Mapping[str, Any], joint: str, choices: Choices, limits: tuple[float, float]) -> Scale:
     turned = -1.0 if joint in choices.inverted else 1.0
-    if "resolution" in motor and unit != RADIANS:
+    by_share = joint in choices.scaled and unit in (SYMMETRIC, PERCENT)
+    if "resolution" in motor and unit != RADIANS and not by_share:
         return _by_calibration(unit, motor, joint, choices, limits[0])
     lower, upper = limits
     match unit:

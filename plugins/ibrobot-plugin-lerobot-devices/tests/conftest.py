@@ -7,10 +7,11 @@ import os
 import shutil
 from importlib import invalidate_caches
 from pathlib import Path
+from typing import Any
 
 import attrs
 import pytest
-from ibrobot_lerobot_devices import hardware, registry
+from ibrobot_lerobot_devices import camera, hardware, teleop
 
 FAKE = Path(__file__).parent / "fake"
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
@@ -18,17 +19,25 @@ PATIENCE_S = 20.0
 """A busy machine may keep the device process from answering."""
 
 
-@pytest.fixture(autouse=True)
-def lerobot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder with LeRobot and the packages that add to it."""
-    folder = tmp_path / "site"
+@pytest.fixture(scope="session")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with LeRobot."""
+    folder = tmp_path_factory.mktemp("lerobot") / "site"
     shutil.copytree(FAKE, folder)
     install(folder, "lerobot", "0.6.1")
-    monkeypatch.syspath_prepend(str(folder))
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    registry._registry.cache_clear()
     return folder
+
+
+@pytest.fixture(autouse=True)
+def lerobot(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder for packages that add to LeRobot, on the path after it."""
+    added = tmp_path / "added"
+    added.mkdir()
+    for folder in (added, site):
+        monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), str(added), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(site.parent))
+    return added
 
 
 @pytest.fixture
@@ -47,6 +56,14 @@ def install(folder: Path, name: str, version: str = "1.0") -> None:
     invalidate_caches()
 
 
+@pytest.fixture
+def ageless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a stepped clock, the real age of an answer would be one of another clock."""
+    for module in (camera, teleop):
+        monkeypatch.setattr(module, "age_ns", lambda answer: 0)
+    monkeypatch.setattr(teleop, "_WAIT_S", PATIENCE_S)
+
+
 @attrs.frozen
 class Motors:
     """The motors of a fake arm, at a port of theirs."""
@@ -60,10 +77,16 @@ class Motors:
         return cls(port)
 
     @property
-    def content(self) -> dict[str, object]:
+    def content(self) -> dict[str, Any]:
         """Torque and positions."""
-        found: dict[str, object] = json.loads(self.port.read_text())
+        found: dict[str, Any] = json.loads(self.port.read_text())
         return found
+
+    def move(self, **positions: float) -> None:
+        """Move joints by hand, in LeRobot's units."""
+        partial = self.port.with_suffix(".moved")
+        partial.write_text(json.dumps({"torque": False, "positions": self.content["positions"] | positions}))
+        partial.rename(self.port)
 
     def suffer(self, what: str) -> None:
         """Have a fault, or none."""

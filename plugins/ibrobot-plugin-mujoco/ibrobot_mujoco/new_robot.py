@@ -7,7 +7,14 @@ from pathlib import Path
 import click
 
 from ibrobot_core.api import HardwareError
-from ibrobot_core.app import echo, load_config, wrong_input
+from ibrobot_core.app import (
+    echo,
+    install_command,
+    installed_plugins,
+    load_config,
+    official_plugins,
+    wrong_input,
+)
 from ibrobot_mujoco.urdf_model import UrdfModel, make_model
 
 
@@ -15,10 +22,10 @@ from ibrobot_mujoco.urdf_model import UrdfModel, make_model
 @click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
 @click.option(
     "--urdf",
-    required=True,
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="URDF or xacro file of the arm.",
 )
+@click.option("--lerobot", metavar="ROBOT", help="Instead of a URDF: a robot of LeRobot's, e.g. koch_follower.")
 @click.option("--tip", metavar="LINK", help="Link whose frame is the tool's.  [default: found by its name]")
 @click.option(
     "--package",
@@ -27,12 +34,22 @@ from ibrobot_mujoco.urdf_model import UrdfModel, make_model
     metavar="NAME=FOLDER",
     help="Folder of a ROS package that the URDF names.  [default: a folder of that name above the file]",
 )
-def new(out: Path, urdf: Path, tip: str | None, packages: tuple[str, ...]) -> None:  # fmt: skip
-    """Write a robot YAML for the arm in a URDF.
+@click.pass_context
+def new(
+    context: click.Context, out: Path, urdf: Path | None, lerobot: str | None, tip: str | None,
+    packages: tuple[str, ...],
+) -> None:  # fmt: skip
+    """Write a robot YAML for the arm in a URDF, or for a robot of LeRobot's.
 
     OUT is a new file, e.g. arm.yaml. Beside it, the folder arm_model holds an MJCF and the meshes. The YAML states
     every value that was guessed.
     """
+    if (urdf is None) == (lerobot is None):
+        raise click.UsageError("give one of --urdf and --lerobot")
+    if lerobot is not None:
+        context.invoke(_command_of_lerobot(), out=out, robot=lerobot, id_=None)
+        return
+    assert urdf is not None
     folders = {}
     for each in packages:
         name, equals, place = each.partition("=")
@@ -58,6 +75,17 @@ def new(out: Path, urdf: Path, tip: str | None, packages: tuple[str, ...]) -> No
     for note in model.notes:
         echo(f"note: {note}")
     echo(f"try it: ibrobot launch {out} --sim --mode web --web")
+
+
+def _command_of_lerobot() -> click.Command:
+    """`ibrobot lerobot new`, of another plugin."""
+    group = installed_plugins().commands.get("lerobot")
+    if group is None:
+        package = next(name for name, offers in official_plugins().items() if "lerobot" in offers.get("command", ()))
+        raise click.UsageError(f"--lerobot needs a plugin: {install_command([package])}")
+    commands = group.load()
+    assert isinstance(commands, click.Group)
+    return commands.commands["new"]
 
 
 def robot_yaml(model: UrdfModel, urdf: Path, folder: str) -> str:

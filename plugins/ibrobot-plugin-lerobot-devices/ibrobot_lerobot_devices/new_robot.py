@@ -1,0 +1,195 @@
+"""`ibrobot lerobot new`, and `ibrobot config new --lerobot`: a robot YAML for a robot of LeRobot's."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import HardwareError, did_you_mean
+from ibrobot_core.app import load_config
+from ibrobot_lerobot_devices.link import INSTALL, DeviceLink, DeviceProblem
+from ibrobot_lerobot_devices.registry import registry
+from ibrobot_lerobot_devices.units import OTHERS, POSITION, Choices, Mapped, UnitProblem, bases, map_joints
+
+_START_S = 60.0
+_GUESS = math.pi / 2
+"""Limit of a joint whose range LeRobot does not say [rad]."""
+_PORT = "/dev/ttyACM0"
+
+
+@attrs.frozen
+class NewRobot:
+    """A robot of LeRobot's, as its robot YAML needs it."""
+
+    type: str
+    config: Mapping[str, Any]
+    mapped: list[Mapped]
+    units: Mapping[str, str]
+    limits: Mapping[str, tuple[float, float]]
+    measured: bool
+    """Whether the limits are those of its calibration."""
+    leader: str
+    """A teleoperator with the same joints; empty if LeRobot has none of that name."""
+
+
+def describe_robot(type_: str, id_: str) -> NewRobot:
+    """What LeRobot says about a robot without its device.
+
+    Args:
+        type_: LeRobot's type.
+        id_: LeRobot's id of the robot, which is the name of its calibration.
+
+    Raises:
+        HardwareError: if it has no joints, or cannot be made.
+    """
+    try:
+        found = registry()
+        if type_ not in found["robot"]:
+            raise HardwareError(f"LeRobot has no robot {type_!r}{did_you_mean(type_, list(found['robot']), 'it has')}")
+        config = {**_required(found["robot"][type_]["fields"], ""), "id": id_}
+        link = DeviceLink("robot", type_, config, only_make=True)
+        try:
+            facts = link.start(_START_S)
+        finally:
+            link.end()
+    except DeviceProblem as problem:
+        raise HardwareError(f"{problem}; LeRobot is installed by {INSTALL}") from None
+    joints = list(bases(facts["action_features"], POSITION))
+    if not joints:
+        raise HardwareError(f"LeRobot's {type_} has no joints: {', '.join(facts['action_features'])}")
+    units: dict[str, str] = {}
+    try:
+        mapped = _map(facts, joints, units)
+    except UnitProblem:
+        units = {OTHERS: "degrees"}
+        mapped = _map(facts, joints, units)
+    measured = all("range_min" in facts["motors"].get(name, {}) for name in joints)
+    limits = {each.joint: _limits(each, facts["motors"].get(each.feature, {})) for each in mapped}
+    leader = type_.replace("follower", "leader")
+    return NewRobot(type_, config, mapped, units, limits, measured, leader if leader in found["teleoperator"] else "")
+
+
+def _required(fields: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    plain: Mapping[str, Any] = {"str": "", "int": 0, "float": 0.0, "bool": False}
+    found: dict[str, Any] = {}
+    for name, field in fields.items():
+        if "fields" in field:
+            found[name] = _required(field["fields"], f"{prefix}{name.split('_')[0].upper()}_")
+        elif field["required"]:
+            variable = f"IBROBOT_{prefix}FOLLOWER_PORT"
+            found[name] = f"${{{variable}:{_PORT}}}" if name == "port" else plain.get(field["type"][0], {})
+    return {name: value for name, value in found.items() if value != {}}
+
+
+def _map(facts: Mapping[str, Any], joints: list[str], units: Mapping[str, str]) -> list[Mapped]:
+    limits = {name: (0.0 if "gripper" in name else -_GUESS, _GUESS) for name in joints}
+    anchored = [name for name in joints if "gripper" in name]
+    return map_joints(
+        facts["action_features"], facts["motors"], Choices({}, units, "pose", anchored, ()), joints, limits
+    )
+
+
+def _limits(mapped: Mapped, motor: Mapping[str, Any]) -> tuple[float, float]:
+    """The ends of the calibrated range [rad], or a guess."""
+    if "range_min" not in motor:
+        return (0.0 if "gripper" in mapped.joint else -_GUESS, _GUESS)
+    match mapped.unit:
+        case "degrees":
+            half = (motor["range_max"] - motor["range_min"]) / 2 * 360 / (motor["resolution"] - 1)
+            ends = (-half, half)
+        case "range_0_100":
+            ends = (0.0, 100.0)
+        case _:
+            ends = (-100.0, 100.0)
+    first, last = sorted(mapped.scale.factor * end + mapped.scale.offset for end in ends)
+    return (first, last)
+
+
+def robot_yaml(found: NewRobot) -> str:
+    """The robot YAML of a robot of LeRobot's."""
+    names = [each.joint for each in found.mapped]
+    gripper = [name for name in names if "gripper" in name]
+    arm = [name for name in names if name not in gripper] or names
+    gripper = [name for name in gripper if name not in arm]
+    groups = f"{{arm: [{', '.join(arm)}]" + (f", gripper: [{', '.join(gripper)}]" if gripper else "") + "}"
+    joints = "\n".join(
+        f"    - {{name: {name}, lower: {found.limits[name][0]:.4f}, upper: {found.limits[name][1]:.4f}, "
+        "max_velocity: 1.5, max_acceleration: 15.0}"
+        for name in names
+    )
+    streams = ["arm_position", *(["gripper_position"] if gripper else [])]
+    executors = "\n".join(f"  {name}: {{type: position, group: {name.split('_')[0]}}}" for name in streams)
+    actions = "\n".join(
+        f"    - {{key: action, executor: {name}, topic: /{name}_controller/commands, "
+        "type: std_msgs/msg/Float64MultiArray}"
+        for name in streams
+    )
+    limits = (
+        "limits are the ends of the calibrated ranges" if found.measured else "limits are guesses: LeRobot says none"
+    )
+    extra = f", units: {json.dumps(dict(found.units))}" if found.units else ""
+    extra += f", anchored: [{', '.join(gripper)}]" if gripper and gripper != ["gripper"] else ""
+    options = f"config: {_leader_config(found)}{_leader_options(found, gripper)}"
+    leader = f"{{type: lerobot, teleop: {found.leader}, {options}}}"
+    devices = f"teleoperation:\n  leader: {leader}\n\n" if found.leader else ""
+    mode = f"  teleop:\n    executors: [{', '.join(streams)}]\n    teleop: leader\n" if found.leader else ""
+    return f"""\
+# {found.type} of LeRobot, made by `ibrobot config new --lerobot {found.type}`. Units are SI: radians, seconds.
+# Check all joints before the first motion: limits are {limits}; max_velocity and
+# max_acceleration are guesses, too. LeRobot reports no torque, temperature or voltage.
+robot:
+  name: {found.type}
+  robot_type: {found.type}
+  joints:                                 # order here = order in every vector
+{joints}
+  groups: {groups}
+
+hardware: {{type: lerobot, robot: {found.type}, config: {json.dumps(dict(found.config))}{extra}}}
+
+executors:
+{executors}
+
+control_modes:
+  hold:                                   # holds its pose
+    executors: [{", ".join(streams)}]
+{mode}default_control_mode: hold
+
+{devices}contract:
+  rate_hz: 30
+  observations:
+    - {{key: observation.state, topic: /joint_states, select: [{", ".join(f"position.{name}" for name in names)}]}}
+  actions:
+{actions}
+
+control: {{rate_hz: 100, stop: hold}}
+"""
+
+
+def _leader_config(found: NewRobot) -> str:
+    text = json.dumps({**found.config, "id": found.leader})
+    return text.replace("FOLLOWER_PORT", "LEADER_PORT").replace(_PORT, "/dev/ttyACM1").replace("follower", "leader")
+
+
+def _leader_options(found: NewRobot, gripper: list[str]) -> str:
+    """The options of the leader beside its config."""
+    extra = f", units: {json.dumps(dict(found.units))}" if found.units else ""
+    return extra + (f", scaled: [{', '.join(gripper)}]" if gripper and gripper != ["gripper"] else "")
+
+
+def write_robot(out: Path, type_: str, id_: str) -> NewRobot:
+    """Write the robot YAML, and check it.
+
+    Raises:
+        HardwareError: if the file exists already, or LeRobot does not know the robot.
+    """
+    if out.exists():
+        raise HardwareError(f"{out} exists already, and is not overwritten")
+    found = describe_robot(type_, id_)
+    out.write_text(robot_yaml(found), encoding="utf-8")
+    load_config(out)
+    return found

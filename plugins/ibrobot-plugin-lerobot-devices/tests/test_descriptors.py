@@ -1,0 +1,130 @@
+"""What core asks of the descriptors; options against LeRobot's dataclasses; commands."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import ibrobot_lerobot_devices
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ibrobot_lerobot_devices import link, registry
+from ibrobot_lerobot_devices.commands import lerobot
+from ibrobot_lerobot_devices.options import CameraOptions, RobotOptions, TeleopOptions
+from ibrobot_testing.contexts import make_robot
+from ibrobot_testing.descriptor import check_descriptor
+
+from ibrobot_core.api import HardwareError
+from ibrobot_core.app import load_config
+
+from .conftest import JOINTS, Motors
+
+
+@pytest.mark.parametrize(
+    ("hook", "options"),
+    [
+        ("ibrobot_hardware", RobotOptions("fake_arm", {"port": "/dev/ttyACM0"})),
+        ("ibrobot_teleop", TeleopOptions("fake_leader", {"port": "/dev/ttyACM1"})),
+        ("ibrobot_sensors", CameraOptions("fake_still", {"path": "picture", "height": 24, "width": 32})),
+    ],
+)
+def test_functions_of_the_descriptors(hook: str, options: Any) -> None:
+    (descriptor,) = getattr(ibrobot_lerobot_devices, hook)()
+    check_descriptor(descriptor, options)
+    assert list(descriptor.check_options(options, make_robot(), make_robot().joint_names)) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "option", "message"),
+    [
+        ({"robot": "fake_harm"}, ("robot",), "LeRobot has no robot 'fake_harm', did you mean 'fake_arm'?"),
+        ({"config": {"prot": "x", "port": "y"}}, ("config", "prot"), "LeRobot's fake_arm has no 'prot', did you mean"),
+        ({"config": {}}, ("config",), "LeRobot's fake_arm needs port"),
+        ({"config": {"port": "x", "gain": True}}, ("config", "gain"), "must be int or None, not True"),
+        ({"config": {"port": "x", "gain": "high"}}, ("config", "gain"), "must be int or None, not 'high'"),
+        ({"config": {"port": "x", "cameras": {"a": 1}}}, ("config", "cameras"), "cameras are peripherals here"),
+        (
+            {"config": {"port": "x", "disable_torque_on_disconnect": True}},
+            ("config", "disable_torque_on_disconnect"),
+            "is control.stop here",
+        ),
+        ({"joints": {"a": "gripped"}}, ("joints", "a"), "unknown joint 'gripped', did you mean 'gripper'?"),
+        ({"inverted": ("elbow",)}, ("inverted", 0), "unknown joint 'elbow', did you mean 'elbow_flex'?"),
+    ],
+)
+def test_wrong_options_are_named(changes: dict[str, Any], option: tuple[Any, ...], message: str) -> None:
+    (descriptor,) = ibrobot_lerobot_devices.ibrobot_hardware()
+    options = RobotOptions(**{"robot": "fake_arm", "config": {"port": "x"}, **changes})
+    (fault,) = descriptor.check_options(options, make_robot(), ())
+    assert fault.option == option
+    assert message in fault.message
+
+
+def test_without_lerobot_nothing_is_checked_and_doctor_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link, "is_installed", lambda: False)
+    monkeypatch.setattr(registry, "is_installed", lambda: False)
+    (descriptor,) = ibrobot_lerobot_devices.ibrobot_hardware()
+    assert list(descriptor.check_options(RobotOptions("any"), make_robot(), ())) == []
+    (check,) = ibrobot_lerobot_devices.ibrobot_doctor()
+    assert not check.ok
+    assert "pip install 'lerobot" in check.remedy
+
+
+def test_doctor_says_what_lerobot_does_not_report() -> None:
+    (check,) = ibrobot_lerobot_devices.ibrobot_doctor()
+    assert check.found == (
+        "0.6.1; its robots report no torque, temperature or voltage, so that only positions are checked in a run"
+    )
+
+
+class TestCommands:
+    def test_list(self) -> None:
+        result = CliRunner().invoke(lerobot, ["list"], catch_exceptions=False)
+        assert "robots: hardware of type lerobot: fake_arm\n" in result.output
+        assert "teleoperators: teleop of type lerobot: fake_leader, fake_stick\n" in result.output
+
+    def test_list_of_a_type_has_its_config(self) -> None:
+        result = CliRunner().invoke(lerobot, ["list", "fake_arm"], catch_exceptions=False)
+        assert "  port: str; required\n" in result.output
+        assert "  gain: int or None; default None\n" in result.output
+
+    def test_torque_off(self, motors: Motors) -> None:
+        motors.port.write_text(json.dumps(motors.content | {"torque": True}))
+        config = json.dumps({"port": str(motors.port), "id": "tester"})
+        result = CliRunner().invoke(
+            lerobot, ["torque-off", "fake_arm", "--config", config, "--yes"], catch_exceptions=False
+        )
+        assert result.output.endswith("torque off: fake_arm\n")
+        assert not motors.content["torque"]
+
+    def test_torque_off_of_an_arm_that_is_not_there(self, motors: Motors) -> None:
+        with pytest.raises(HardwareError, match="fake_arm: ConnectionError: no port"):
+            CliRunner().invoke(
+                lerobot,
+                ["torque-off", "fake_arm", "--config", '{"port": "nowhere", "id": "x"}', "--yes"],
+                catch_exceptions=False,
+            )
+
+
+class TestNew:
+    def test_a_new_robot_has_the_joints_and_ranges_of_lerobot(self, tmp_path: Path) -> None:
+        out = tmp_path / "arm.yaml"
+        result = CliRunner().invoke(lerobot, ["new", str(out), "fake_arm"], catch_exceptions=False)
+        assert result.output.startswith(f"{out}: fake_arm, 6 joints\n")
+        assert "guesses" not in result.output
+        config = load_config(out)
+        assert config.robot.joint_names == JOINTS
+        tick = 2 * math.pi / 4096
+        expected = [(700 - 2048) * tick] * 2 + [(2048 - 3300) * tick] + [(700 - 2048) * tick] * 2 + [0.0]
+        np.testing.assert_allclose(config.robot.lower, expected, atol=1e-3)
+        assert config.hardware["hardware"].options.config["id"] == "fake_arm"
+
+    def test_an_existing_file_is_not_overwritten(self, tmp_path: Path) -> None:
+        out = tmp_path / "arm.yaml"
+        out.write_text("mine")
+        with pytest.raises(HardwareError, match="exists already, and is not overwritten"):
+            CliRunner().invoke(lerobot, ["new", str(out), "fake_arm"], catch_exceptions=False, standalone_mode=False)
+        assert out.read_text() == "mine"
