@@ -195,7 +195,7 @@ class TransportDescriptor(Descriptor["interfaces.Transport"]):
     on this machine only. None if servers cannot use this transport."""
     used: Callable[[Any], bool] = attrs.field(default=lambda options: False, kw_only=True)
     """Whether a run with these options uses the transport even if no mode needs it."""
-    components: Callable[[Any, RunView, TransportLink], Sequence[Component]] = attrs.field(
+    components: Callable[[Any, RunAccess, TransportLink], Sequence[Component]] = attrs.field(
         default=lambda options, session, link: (), kw_only=True
     )
     """Returns components that the options add to a run with this transport, e.g. to send topics to other machines. Each

@@ -7,13 +7,14 @@ import time
 from collections.abc import Callable
 from typing import Any, override
 
+from ibrobot_ros2.goals import Actions, with_goals
+
 from ibrobot_core.api import DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
 from ibrobot_core.app import CONTROL, Component, ComponentFailed, RunAccess, error_line
-from ibrobot_ros.actions import Actions
 from ibrobot_ros.options import RosOptions
 from ibrobot_ros.process import NodeProcess
 from ibrobot_ros.services import Services
-from ibrobot_ros.topics import Topics
+from ibrobot_ros.topics import Topics, ros_name
 from ibrobot_ros.wire import Wire
 
 DIAGNOSTICS = "/diagnostics"
@@ -45,7 +46,10 @@ class RosNode(Component):
         self._session = session
         self._lockstep = session.request.lockstep
         self.topics = Topics(options, session)
-        self._actions = Actions(options, session)
+        self._actions = Actions(
+            session, with_goals(session) if options.actions else (), lambda name: ros_name(name, options.namespace),
+            "ros", options.gripper_action,
+        )  # fmt: skip
         self._services = Services(options, session)
         self._node: NodeProcess | None = None
         self._wire: Wire | None = None

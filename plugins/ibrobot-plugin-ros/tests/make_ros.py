@@ -17,11 +17,14 @@ import tempfile
 from pathlib import Path
 
 INTERFACES = Path(__file__).parent / "interfaces"
-OWN = Path(__file__).parents[2] / "ibrobot-ros2" / "ibrobot_ros2" / "msg"
+LIBRARY = Path(__file__).parents[2] / "ibrobot-ros2" / "ibrobot_ros2"
 PACKAGES = {
-    "control_msgs": (INTERFACES / "control_msgs", ("builtin_interfaces", "std_msgs", "sensor_msgs", "trajectory_msgs")),
+    "control_msgs": (
+        LIBRARY / "interfaces" / "control_msgs",
+        ("builtin_interfaces", "std_msgs", "sensor_msgs", "trajectory_msgs"),
+    ),
     "tf2_msgs": (INTERFACES / "tf2_msgs", ("geometry_msgs",)),
-    "ibrobot_msgs": (OWN, ("std_msgs",)),
+    "ibrobot_msgs": (LIBRARY / "msg", ("std_msgs",)),
 }
 """Package -> folder of its texts, and the packages that these need."""
 WHEELS = [

@@ -1,4 +1,4 @@
-"""The plugin's hooks: transport `zenoh`, its panel, commands for topics, services, bags and certificates."""
+"""The plugin's hooks: transport `zenoh`, its panel, commands for topics, services, actions, bags and certificates."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import click
 
     from ibrobot_core.api import CompressedImage, Context, Image, Transport
-    from ibrobot_core.app import Component, RunView, TransportLink
+    from ibrobot_core.app import Component, RunAccess, RunView, TransportLink
 
 
 def _zenoh(options: Any, ctx: Context) -> Transport:
@@ -22,7 +22,7 @@ def _zenoh(options: Any, ctx: Context) -> Transport:
     return ZenohTransport(options, ctx)
 
 
-def _components(options: ZenohOptions, session: RunView, link: TransportLink) -> list[Component]:
+def _components(options: ZenohOptions, session: RunAccess, link: TransportLink) -> list[Component]:
     from ibrobot_zenoh.sharing import components
 
     return components(options.share, session, link)
@@ -88,6 +88,18 @@ def _service() -> click.Command:
     return service
 
 
+def _action() -> click.Command:
+    from ibrobot_zenoh.commands.action import action
+
+    return action
+
+
+def _param() -> click.Command:
+    from ibrobot_zenoh.commands.param import param
+
+    return param
+
+
 def _bag() -> click.Command:
     from ibrobot_zenoh.commands.bag import bag
 
@@ -97,6 +109,8 @@ def _bag() -> click.Command:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """Commands for topics, services, bags and certificates."""
+    yield Command("action", "List actions on the network, and send goals to them.", _action)
+    yield Command("param", "List, read and set parameters of nodes on the network.", _param)
     yield Command("bag", "Play recorded episodes to machines on the network.", _bag)
     yield Command("topic", "List, show, measure and publish topics shared over the network.", _topic)
     yield Command("service", "List, show and call services shared over the network.", _service)

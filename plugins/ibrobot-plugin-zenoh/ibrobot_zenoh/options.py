@@ -126,7 +126,18 @@ class Share:
     services: tuple[str, ...] = option(
         (),
         validator=_check_services,
-        help="services of this robot that others may call, e.g. /planning/go_to; /world/ means all that begin with it",
+        help="services of this robot that others may call, e.g. /planning/go_to; /world/ means all that begin with it. "
+        "ROS 2 nodes can call those whose requests std_srvs can say",
+    )
+    actions: tuple[str, ...] = option(
+        (),
+        help="executors of this robot that take goals of others, as actions of ROS 2, e.g. arm_trajectory for "
+        "/arm_trajectory/follow_joint_trajectory",
+    )
+    parameters: bool = option(
+        False,
+        help="whether others may read this file's values, but for secrets, as parameters of the ROS 2 node "
+        "ibrobot_NAME; the parameter mode can be set if services has /set_mode",
     )
 
     def __attrs_post_init__(self) -> None:
@@ -182,6 +193,11 @@ class ZenohOptions:
         if self.mode == "client" and not self.connect:
             raise ValueError(
                 "needs endpoints to connect to, e.g. connect: [tcp/127.0.0.1:7447]; or mode: router and listen"
+            )
+        if self.share.actions and not self.listen and (self.tls is not None or self.user is not None):
+            raise ValueError(
+                "share.actions: a server that knows robots by name lets none of them take goals of others; give goals "
+                "to a run that listens itself"
             )
         for endpoint in (*self.connect, *self.listen):
             encrypted = endpoint.partition("/")[0] in _ENCRYPTED

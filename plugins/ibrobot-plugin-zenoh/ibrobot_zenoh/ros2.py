@@ -9,6 +9,7 @@ from collections.abc import Iterable
 
 import attrs
 from ibrobot_ros2 import type_hash
+from ibrobot_ros2.interfaces import ServiceType
 
 from ibrobot_core.api import TransportError
 
@@ -18,7 +19,9 @@ NO_HASH = "TypeHashNotSupported"
 
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _ATTACHMENT = struct.Struct("<qqB16s")
-_ENDPOINTS = {"MP": "publisher", "MS": "subscriber"}
+_PUBLISHER, _SUBSCRIBER, _SERVER, _CLIENT = "MP", "MS", "SS", "SC"
+"""Kinds of endpoints."""
+_SEND_GOAL, _OF_ACTION = "/_action/send_goal", "_SendGoal"
 _TOKEN_PARTS = 13
 _QOS = ":{durability}:,{depth}:,:,:,,"
 """Reliable; empty is the default of each field."""
@@ -32,6 +35,16 @@ class SharedTopic:
     type: str
     publishers: int
     subscribers: int
+
+
+@attrs.frozen
+class SharedService:
+    """A service of ROS 2: name, type, and the numbers of servers and clients."""
+
+    name: str
+    type: str
+    servers: int
+    clients: int
 
 
 def absolute(topic: str, namespace: str = "") -> str:
@@ -74,6 +87,11 @@ def topic_key(domain: int, topic: str, type_name: str, *, hashed: bool) -> str:
     return f"{domain}/{topic.strip('/')}/{typed(type_name, hashed=hashed)}"
 
 
+def service_key(domain: int, name: str, kind: ServiceType, *, hashed: bool) -> str:
+    """The key under which requests to a service are sent."""
+    return f"{domain}/{name.strip('/')}/{dds_type(kind.name)}/{kind.hash if hashed else NO_HASH}"
+
+
 def type_of_key(key: str) -> str:
     """The message type in a topic's key.
 
@@ -86,6 +104,14 @@ def type_of_key(key: str) -> str:
 def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
     """The attachment of a message: its number from 1, time of sending [ns], and the publisher's id (16 bytes)."""
     return _ATTACHMENT.pack(sequence, stamp_ns, len(gid), gid)
+
+
+def caller_of(attached: bytes) -> tuple[int, bytes]:
+    """The number of a request and its client's id (16 bytes), from its attachment; zeros if it has none."""
+    if len(attached) != _ATTACHMENT.size:
+        return 0, bytes(16)
+    number, _, _, gid = _ATTACHMENT.unpack(attached)
+    return number, gid
 
 
 @attrs.frozen
@@ -109,19 +135,46 @@ class Node:
     def publisher_token(self, number: int, topic: str, type_name: str, *, hashed: bool, latched: bool) -> str:
         """The liveliness token of publisher `number` (from 1) of the node."""
         qos = _QOS.format(durability="1" if latched else "", depth=1 if latched else 10)
-        mangled, kind = topic.replace("/", "%"), typed(type_name, hashed=hashed)
-        return f"{ADMIN}/{self.domain}/{self.session}/0/{number}/MP/%/%/{self.name}/{mangled}/{kind}/{qos}"
+        return self._token(number, _PUBLISHER, topic, typed(type_name, hashed=hashed), qos)
+
+    def server_token(self, number: int, name: str, kind: ServiceType, *, hashed: bool) -> str:
+        """The liveliness token of the server of a service, the endpoint `number` (from 1) of the node."""
+        named = f"{dds_type(kind.name)}/{kind.hash if hashed else NO_HASH}"
+        return self._token(number, _SERVER, name, named, _QOS.format(durability="", depth=10))
+
+    def _token(self, number: int, kind: str, name: str, type_name: str, qos: str) -> str:
+        mangled = name.replace("/", "%")
+        return f"{ADMIN}/{self.domain}/{self.session}/0/{number}/{kind}/%/%/{self.name}/{mangled}/{type_name}/{qos}"
 
 
 def topics_of_tokens(tokens: Iterable[str]) -> list[SharedTopic]:
-    """The topics in liveliness tokens, by name; tokens of nodes and services, and malformed ones, are ignored."""
+    """The topics in liveliness tokens, by name; malformed tokens are ignored."""
+    return [SharedTopic(*each) for each in _endpoints(tokens, _PUBLISHER, _SUBSCRIBER)]
+
+
+def services_of_tokens(tokens: Iterable[str]) -> list[SharedService]:
+    """The services in liveliness tokens, by name; malformed tokens are ignored."""
+    return [SharedService(*each) for each in _endpoints(tokens, _SERVER, _CLIENT)]
+
+
+def actions_of(services: Iterable[SharedService]) -> list[tuple[str, str]]:
+    """Names and types of the actions among services that have a server."""
+    return [
+        (each.name.removesuffix(_SEND_GOAL), each.type.removesuffix(_OF_ACTION))
+        for each in services
+        if each.servers and each.name.endswith(_SEND_GOAL) and each.type.endswith(_OF_ACTION)
+    ]
+
+
+def _endpoints(tokens: Iterable[str], offers: str, uses: str) -> list[tuple[str, str, int, int]]:
+    """Name, type, and the numbers of endpoints of two kinds, in liveliness tokens."""
     counts: Counter[tuple[str, str, str]] = Counter()
     for token in set(tokens):  # own tokens may appear twice
         parts = token.split("/")
-        if len(parts) == _TOKEN_PARTS and parts[5] in _ENDPOINTS:
+        if len(parts) == _TOKEN_PARTS and parts[5] in (offers, uses):
             try:
                 counts[parts[9].replace("%", "/"), ros_type(parts[10]), parts[5]] += 1
             except TransportError:
                 continue
-    topics = sorted({(name, type_name) for name, type_name, _ in counts})
-    return [SharedTopic(name, kind, counts[name, kind, "MP"], counts[name, kind, "MS"]) for name, kind in topics]
+    found = sorted({(name, type_name) for name, type_name, _ in counts})
+    return [(name, kind, counts[name, kind, offers], counts[name, kind, uses]) for name, kind in found]

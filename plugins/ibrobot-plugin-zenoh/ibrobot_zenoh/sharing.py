@@ -7,11 +7,13 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any, override
 
 import attrs
+from ibrobot_ros2.interfaces import ServiceType
 from ibrobot_ros2.services import DETAILS, SERVICES, Answer, decode_call, encode_answer, endpoint
 
 from ibrobot_core.api import NS_PER_S, Handler, IbrobotError, Message, NotSupported, Payload, Transport, did_you_mean
 from ibrobot_core.app import (
     Component,
+    RunAccess,
     RunView,
     SessionWorker,
     Subscription,
@@ -20,8 +22,10 @@ from ibrobot_core.app import (
     type_name,
 )
 from ibrobot_zenoh.options import Share
-from ibrobot_zenoh.ros2 import SharedTopic
+from ibrobot_zenoh.ros2 import SharedService, SharedTopic
 
+type Reply = Callable[[Mapping[str, Any]], None]
+type RosHandler = Callable[[dict[str, Any], Reply], object]
 _DEPTH = 10
 """Queue size of a topic for the network; when it is full, the bus drops and counts the oldest message."""
 
@@ -67,9 +71,56 @@ class TopicTransport(Transport):
         """
 
     @property
+    def node_name(self) -> str:
+        """The full name of this process's node in ROS 2."""
+        return "/ibrobot"
+
+    @property
     def namespace(self) -> str:
         """Prefix of this robot's names on the network."""
         return ""
+
+    @abstractmethod
+    def publish_cdr(self, name: str, type_name: str, payload: bytes, *, latched: bool = False) -> None:
+        """As `publish_message`, with the bytes of a message of any type, under its full name."""
+
+    @abstractmethod
+    def subscribe_cdr(self, name: str, callback: Callable[[str, bytes], object]) -> Callable[[], None]:
+        """As `subscribe_messages`, with the type and the bytes of each message, under its full name."""
+
+    @abstractmethod
+    def serve_ros(
+        self, name: str, kind: ServiceType, handler: RosHandler, *, urgent: bool = False
+    ) -> Callable[[], None]:
+        """Answer the calls that ROS 2 nodes make of a service, under its full name; returns a function that ends it.
+
+        Args:
+            name: the full name.
+            kind: its type.
+            handler: called in a thread with the request, as plain data, and a function to answer it with plain data,
+                now or later, in any thread.
+            urgent: whether it is answered beside other services.
+
+        Raises:
+            TransportError: if closed, or there is a server of this name.
+        """
+
+    @abstractmethod
+    def call_ros(self, name: str, kind: ServiceType, request: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
+        """Call a service of a ROS 2 node, under its full name; its response as plain data.
+
+        Raises:
+            TransportError: if there is none, or it does not answer within `timeout_s` [s].
+            CodecError: if the request does not fit the type.
+        """
+
+    @abstractmethod
+    def shared_services(self, timeout_s: float) -> list[SharedService]:
+        """The services of ROS 2 nodes, by name; waits up to `timeout_s` [s] for the answer.
+
+        Raises:
+            TransportError: if closed or not connected.
+        """
 
     @abstractmethod
     def shared_topics(self, timeout_s: float) -> list[SharedTopic]:
@@ -80,7 +131,7 @@ class TopicTransport(Transport):
         """
 
 
-def components(share: Share, session: RunView, link: TransportLink) -> list[Component]:
+def components(share: Share, session: RunAccess, link: TransportLink) -> list[Component]:
     """The components that share the topics and services in a YAML.
 
     Raises:
@@ -89,15 +140,28 @@ def components(share: Share, session: RunView, link: TransportLink) -> list[Comp
     """
     if session.request.lockstep and share.subscribe:
         raise NotSupported("transport.share.subscribe: a lockstep run cannot receive topics of other machines")
-    if session.request.lockstep and share.services:
+    if session.request.lockstep and (share.services or share.parameters):
         raise NotSupported("transport.share.services: a lockstep run cannot answer other machines")
+    if session.request.lockstep and share.actions:
+        raise NotSupported("transport.share.actions: a lockstep run cannot take goals of other machines")
+    from ibrobot_zenoh.ros_parameters import RosParameters
+    from ibrobot_zenoh.ros_sharing import RosActions, RosServices
+
     session.refuse_absent("transport.share.publish", share.publish.__contains__)
     subscribed: list[Component] = [SubscribedTopics(session, link, share.subscribe)] if share.subscribe else []
-    served: list[Component] = [SharedServices(session, link, share.services)] if share.services else []
+    served: list[Component] = []
+    services = SharedServices(session, link, share.services)
+    if share.services:
+        served += [services, RosServices(session, link, services.is_shared)]
+    if share.parameters:
+        served.append(RosParameters(session, link, services.is_shared))
+    if share.actions:
+        served.append(RosActions(session, link, share.actions))
     return [*(PublishedTopic(session, link, topic) for topic in share.publish), *subscribed, *served]
 
 
-def _topics(link: TransportLink) -> TopicTransport:
+def transport_of(link: TransportLink) -> TopicTransport:
+    """The transport of a link, which carries messages."""
     transport = link.transport
     assert isinstance(transport, TopicTransport)
     return transport
@@ -116,7 +180,7 @@ class PublishedTopic(SessionWorker):
 
     @override
     def setup(self) -> None:
-        self._transport = _topics(self._link)
+        self._transport = transport_of(self._link)
         self._silent_from_ns = self.session.clock.now_ns()
         self._subscription = self.session.bus.subscribe(self._topic, _DEPTH)
 
@@ -160,7 +224,7 @@ class SubscribedTopics(Component):
 
     @override
     def start(self) -> None:
-        transport, bus = _topics(self._link), self._session.bus
+        transport, bus = transport_of(self._link), self._session.bus
         for topic, carried in self._topics.items() if isinstance(self._topics, Mapping) else ():
             bus.expect(topic, carried)
         for topic in self._topics:
@@ -210,7 +274,7 @@ class SharedServices(Component):
 
     @override
     def start(self) -> None:
-        transport = _topics(self._link)
+        transport = transport_of(self._link)
         name = endpoint(transport.namespace)
         self._end = transport.serve_with_urgent(name, self._answer, self._is_urgent, _MOST_BYTES)
 
@@ -236,7 +300,7 @@ class SharedServices(Component):
             if call.service == SERVICES:
                 return encode_answer(Answer(self._shared()))
             name = str(call.request) if call.service == DETAILS else call.service
-            if not self._is_shared(name):
+            if not self.is_shared(name):
                 raise NotSupported(
                     f"{name} is not shared{did_you_mean(name, self._shared(), 'shared')};"
                     " transport.share.services of the robot lists what is"
@@ -262,9 +326,10 @@ class SharedServices(Component):
         }
         return {"help": service.help, "alone": service.alone, "answer": type_name(service.answer), **tables}
 
-    def _is_shared(self, service: str) -> bool:
+    def is_shared(self, service: str) -> bool:
+        """Whether other machines may call a service."""
         return any(service == name or (name.endswith("/") and service.startswith(name)) for name in self._names)
 
     def _shared(self) -> list[str]:
         """The shared services that are served at present."""
-        return [name for name in self._session.bus.services() if self._is_shared(name)]
+        return [name for name in self._session.bus.services() if self.is_shared(name)]

@@ -13,12 +13,24 @@ from typing import Any
 import zenoh
 import zenoh.ext
 from ibrobot_ros2 import decode, encode
+from ibrobot_ros2.interfaces import ServiceType
 
 from ibrobot_core.api import Context, IbrobotError, Message, TransportError
 from ibrobot_zenoh.connection import Connection, Declared, first_line
 from ibrobot_zenoh.identity import Identity, Role
 from ibrobot_zenoh.options import ZenohOptions
-from ibrobot_zenoh.ros2 import ADMIN, Node, SharedTopic, absolute, attachment, topic_key, topics_of_tokens, type_of_key
+from ibrobot_zenoh.ros2 import (
+    ADMIN,
+    Node,
+    SharedService,
+    SharedTopic,
+    absolute,
+    attachment,
+    services_of_tokens,
+    topic_key,
+    topics_of_tokens,
+    type_of_key,
+)
 from ibrobot_zenoh.workers import Workers
 
 DEPTH = 100
@@ -125,6 +137,8 @@ class Topics:
         self._lock = threading.Lock()
         self._publishers: dict[str, _Publisher] = {}
         self._number = 0
+        self._is_known = False
+        """Whether ROS 2 nodes see this node."""
 
     def publish(self, topic: str, message: Message, *, latched: bool) -> None:
         """See `TopicTransport.publish_message`."""
@@ -132,13 +146,20 @@ class Topics:
         name = absolute(topic, self.namespace)
         if self._own is not None:
             self._own.check_may_publish(name)
-        payload = encode(message).tobytes()
+        self.publish_cdr(name, message.ros_type, encode(message).tobytes(), latched=latched)
+
+    def publish_cdr(self, name: str, type_name: str, payload: bytes, *, latched: bool) -> None:
+        """Publish the bytes of a message under its full name.
+
+        Raises:
+            TransportError: if it is too large, or the topic has another type.
+        """
         if len(payload) > self.options.max_message_size:
             limit = self.options.max_message_size
             raise TransportError(f"{name}: a message of {len(payload)} bytes is larger than max_message_size, {limit}")
-        publisher = self._publisher(name, message.ros_type, latched=latched)
-        if publisher.type_name != message.ros_type:
-            raise TransportError(f"topic {name} carries {publisher.type_name}, not {message.ros_type}")
+        publisher = self._publisher(name, type_name, latched=latched)
+        if publisher.type_name != type_name:
+            raise TransportError(f"topic {name} carries {publisher.type_name}, not {type_name}")
         publisher.publish(payload)
 
     def is_heard(self, topic: str, type_name: str, timeout_s: float) -> bool:
@@ -153,25 +174,44 @@ class Topics:
         with self._lock:
             publisher = self._publishers.get(name)
             if publisher is None:
-                if not self._publishers:
-                    self.connection.declare(
-                        lambda session: session.liveliness().declare_token(self.node(session).node_token())
-                    )
+                self._be_known()
                 publisher = self._publishers[name] = _Publisher(self, name, type_name, latched=latched)
             return publisher
 
+    def _be_known(self) -> None:
+        """Declare the node, once; called with the lock held."""
+        if not self._is_known:
+            self._is_known = True
+            self.connection.declare(lambda session: session.liveliness().declare_token(self.node(session).node_token()))
+
+    def announce_server(self, name: str, kind: ServiceType) -> Callable[[], None]:
+        """Show the server of a service to ROS 2 nodes; returns a function that ends it."""
+        with self._lock:
+            self._be_known()
+        hashed = self.options.type_hashes
+        return self.connection.declare(
+            lambda session: session.liveliness().declare_token(
+                self.node(session).server_token(self.next_number(), name, kind, hashed=hashed)
+            )
+        )
+
     def subscribe(self, topic: str, callback: Callable[[Message], object]) -> tuple[Callable[[], None], Workers[Any]]:
         """See `TopicTransport`; returns a function that unsubscribes, and the thread that calls `callback`."""
-        name = absolute(topic, self.namespace)
+        return self.subscribe_cdr(
+            absolute(topic, self.namespace), lambda type_name, data: callback(decode(type_name, data))
+        )
+
+    def subscribe_cdr(
+        self, name: str, callback: Callable[[str, bytes], object]
+    ) -> tuple[Callable[[], None], Workers[Any]]:
+        """As `subscribe`, with the type and the bytes of each message; those that raise IbrobotError are skipped."""
         warn_once = _Once(self._log)
 
         def deliver(sample: zenoh.Sample) -> None:
             try:
-                message = decode(type_of_key(str(sample.key_expr)), sample.payload.to_bytes())
+                callback(type_of_key(str(sample.key_expr)), sample.payload.to_bytes())
             except IbrobotError as error:
                 warn_once.warning("a message on %s was skipped: %s", name, error)
-                return
-            callback(message)
 
         subscriber = Workers(deliver, f"a subscriber of {name}", depth=DEPTH)
 
@@ -188,17 +228,29 @@ class Topics:
 
     def shared(self, timeout_s: float) -> list[SharedTopic]:
         """See `TopicTransport.shared_topics`."""
+        return topics_of_tokens(self._settled_tokens(timeout_s))
+
+    def services(self, timeout_s: float) -> list[SharedService]:
+        """See `TopicTransport.shared_services`."""
+        return services_of_tokens(self._settled_tokens(timeout_s))
+
+    def _settled_tokens(self, timeout_s: float) -> set[str]:
         deadline = time.monotonic() + timeout_s
         tokens, before = self._tokens(timeout_s), None
         # The first answer after connecting may arrive before the other side has sent all its tokens.
         while tokens != before and time.monotonic() + _AGAIN_S < deadline:
             time.sleep(_AGAIN_S)
             tokens, before = self._tokens(timeout_s), tokens
-        return topics_of_tokens(tokens)
+        return tokens
 
     def _tokens(self, timeout_s: float) -> set[str]:
         replies = self.connection.session().liveliness().get(f"{ADMIN}/{self.options.domain}/**", timeout=timeout_s)
         return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+
+    @property
+    def node_name(self) -> str:
+        """The full name of the node."""
+        return absolute(self._name, self.namespace)
 
     def node(self, session: zenoh.Session) -> Node:
         """The node of the publishers on `session`."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, override
 
 import zenoh
+from ibrobot_ros2.interfaces import ServiceType
 
 from ibrobot_core.api import Context, Handler, Message, Payload, TransportError
 from ibrobot_core.app import HANDLER_THREADS
@@ -17,8 +18,9 @@ from ibrobot_zenoh.connection import Connection, first_line
 from ibrobot_zenoh.identity import own_identity
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.presence import Presence
-from ibrobot_zenoh.ros2 import SharedTopic
-from ibrobot_zenoh.sharing import TopicTransport
+from ibrobot_zenoh.ros2 import SharedService, SharedTopic, service_key
+from ibrobot_zenoh.ros_calls import RosServer, call
+from ibrobot_zenoh.sharing import RosHandler, TopicTransport
 from ibrobot_zenoh.topics import Topics
 from ibrobot_zenoh.workers import Workers
 
@@ -63,6 +65,7 @@ class ZenohTransport(TopicTransport):
 
     def __init__(self, options: ZenohOptions, ctx: Context) -> None:
         self._log = ctx.log
+        self._options = options
         self._largest = options.max_message_size
         own = own_identity(options)
         self._name = ANYBODY if own is None else own.name
@@ -207,6 +210,52 @@ class ZenohTransport(TopicTransport):
     @override
     def subscribe_messages(self, topic: str, callback: Callable[[Message], object]) -> Callable[[], None]:
         return self._keep(*self._topics.subscribe(topic, callback))
+
+    @override
+    def publish_cdr(self, name: str, type_name: str, payload: bytes, *, latched: bool = False) -> None:
+        self._connection.check_open()
+        self._topics.publish_cdr(name, type_name, payload, latched=latched)
+
+    @override
+    def subscribe_cdr(self, name: str, callback: Callable[[str, bytes], object]) -> Callable[[], None]:
+        return self._keep(*self._topics.subscribe_cdr(name, callback))
+
+    @override
+    def serve_ros(
+        self, name: str, kind: ServiceType, handler: RosHandler, *, urgent: bool = False
+    ) -> Callable[[], None]:
+        server = RosServer(name, kind, handler, self._log, URGENT_WAITING if urgent else REQUESTS_WAITING)
+        with self._lock:
+            if name in self._served:
+                raise TransportError(f"{name} already has a server in this process")
+            key = service_key(self._options.domain, name, kind, hashed=self._options.type_hashes)
+            end_queries = self._connection.declare(
+                lambda session: session.declare_queryable(key, server.take, complete=True)
+            )
+            self._served.add(name)
+        end_token = self._topics.announce_server(name, kind)
+
+        def end() -> None:
+            end_token()
+            end_queries()
+            with self._lock:
+                self._served.discard(name)
+
+        return self._keep(end, server.workers)
+
+    @override
+    def call_ros(self, name: str, kind: ServiceType, request: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
+        key = service_key(self._options.domain, name, kind, hashed=self._options.type_hashes)
+        return call(self._connection.session(), key, name, kind, request, timeout_s)
+
+    @override
+    def shared_services(self, timeout_s: float) -> list[SharedService]:
+        return self._topics.services(timeout_s)
+
+    @property
+    @override
+    def node_name(self) -> str:
+        return self._topics.node_name
 
     @property
     @override

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from ibrobot_testing import host_context
-from ibrobot_zenoh.options import Tls, ZenohOptions
+from ibrobot_zenoh.options import Share, Tls, ZenohOptions
 
 from ibrobot_core.api import TransportError
 from ibrobot_core.app import installed_plugins
@@ -28,6 +28,10 @@ TLS = Tls(Path("ca.pem"), Path("certificate.pem"), Path("key.pem"))
         ({"connect": ("tls/a:1",)}, "tls/a:1 needs tls"),
         ({"connect": ("tcp/a:1",), "tls": TLS}, "tcp/a:1 would not use tls; write tls/a:1"),
         ({"connect": ("tcp/a:1",), "user": "me"}, "set both user and password"),
+        (
+            {"connect": ("tcp/a:1",), "user": "me", "password": "x", "share": Share(actions=("arm",))},
+            "share.actions: a server that knows robots by name lets none of them take goals",
+        ),
         ({"mode": "router", "listen": ("tcp/0.0.0.0:1",)}, "can be reached by other machines: set tls or users, or"),
         ({"mode": "router", "listen": ("tcp/[::]:1",)}, "can be reached by other machines"),
         ({"mode": "peer", "listen": ("tcp/gpu.lab:1",)}, "can be reached by other machines"),

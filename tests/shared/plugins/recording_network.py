@@ -44,6 +44,21 @@ class Network(FakeTransport, TopicTransport):
     def shared_topics(self, timeout_s):
         return []
 
+    def publish_cdr(self, name, type_name, payload, *, latched=False):
+        self.sent.append((name, type_name, latched))
+
+    def subscribe_cdr(self, name, callback):
+        return lambda: None
+
+    def serve_ros(self, name, kind, handler, *, urgent=False):
+        return lambda: None
+
+    def call_ros(self, name, kind, request, timeout_s):
+        raise TransportError("nobody")
+
+    def shared_services(self, timeout_s):
+        return []
+
     def close(self):
         super().close()
         self.closed = True

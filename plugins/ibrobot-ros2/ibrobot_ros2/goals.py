@@ -1,15 +1,17 @@
-"""Goals of ROS's actions for the executors of a run, as ros2_control's controllers take them."""
+"""Goals of ROS's actions for the executors of a run, as ros2_control's controllers take them.
+
+What speaks to clients (a node of rclpy's, or Zenoh) passes heads: plain mappings whose key `op` says what they are.
+"""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from enum import IntEnum
-from typing import Any
+from typing import Any, Protocol
 
 import attrs
 import numpy as np
-from ibrobot_ros2 import decode
 
 from ibrobot_core.api import (
     NS_PER_S,
@@ -21,10 +23,10 @@ from ibrobot_core.api import (
     trajectory_goal,
 )
 from ibrobot_core.app import ControlState, ExecutorConfig, RunAccess
-from ibrobot_ros.options import RosOptions
-from ibrobot_ros.topics import ros_name
-from ibrobot_ros.wire import Wire
+from ibrobot_ros2.codec import decode
 
+GRIPPER_ACTIONS = ("GripperCommand", "ParallelGripperCommand")
+"""Actions of control_msgs for executors that take a position."""
 FEEDBACK_NS = NS_PER_S // 20
 """Interval of feedback, as of joint_trajectory_controller [ns]."""
 
@@ -63,30 +65,58 @@ class _Goal:
     """Whether its client canceled it."""
 
 
-def action_of(executor: ExecutorConfig, options: RosOptions) -> tuple[str, str]:
+class Wire(Protocol):
+    """Passes heads to clients. `op` is `action` (an action is offered), `decided`, `feedback` or `ended`."""
+
+    def send(self, head: Mapping[str, Any]) -> object:
+        """Pass one on."""
+
+
+def action_of(executor: ExecutorConfig, gripper_action: str) -> tuple[str, str]:
     """The name of an executor's action, and its type."""
     if executor.goals == "trajectory":
         return f"/{executor.name}/follow_joint_trajectory", "control_msgs/action/FollowJointTrajectory"
-    return f"/{executor.name}/gripper_cmd", f"control_msgs/action/{options.gripper_action}"
+    return f"/{executor.name}/gripper_cmd", f"control_msgs/action/{gripper_action}"
+
+
+def with_goals(session: RunAccess) -> dict[str, ExecutorConfig]:
+    """The executors of a run that take goals, by name."""
+    found = {}
+    for name, executor in session.config.executors.items():
+        descriptor = session.registry.find("executor", executor.type)
+        assert isinstance(descriptor, ExecutorDescriptor)
+        if not descriptor.streams:
+            found[name] = executor
+    return found
 
 
 class Actions:
     """Passes goals and cancels of ROS to control, and what becomes of them back.
 
+    Args:
+        session: the run.
+        executors: names of those that are offered.
+        named: the full name of an action, from that without namespace.
+        who: where goals come from, for the log and their names, e.g. `ros`.
+        gripper_action: the action of executors that take a position.
+
     A goal replaces the one before, of any client, as on ros2_control's controllers: also one of the run's own planner,
     which then reports its motion as replaced.
     """
 
-    def __init__(self, options: RosOptions, session: RunAccess) -> None:
-        self._options = options
+    def __init__(
+        self,
+        session: RunAccess,
+        executors: Collection[str],
+        named: Callable[[str], str],
+        who: str,
+        gripper_action: str = GRIPPER_ACTIONS[0],
+    ) -> None:
         self._session = session
-        config = session.config
-        self._executors: dict[str, ExecutorConfig] = {}
-        for name, executor in config.executors.items() if options.actions else ():
-            descriptor = session.registry.find("executor", executor.type)
-            assert isinstance(descriptor, ExecutorDescriptor)
-            if not descriptor.streams:
-                self._executors[name] = executor
+        self._named = named
+        self._who = who
+        self._gripper_action = gripper_action
+        self._executors = {name: each for name, each in with_goals(session).items() if name in executors}
         self._lock = threading.Lock()
         self._goals: dict[str, _Goal] = {}
         """Goals under way, by their name in control."""
@@ -94,22 +124,16 @@ class Actions:
         self._node = 0
         """Number of the node: goals of one that is gone are not those of the next."""
 
-    def names(self) -> list[str]:
-        """The names of the actions."""
-        return [
-            ros_name(action_of(each, self._options)[0], self._options.namespace) for each in self._executors.values()
-        ]
-
     def declare(self, wire: Wire) -> None:
         """Tell a new node which actions it offers."""
         self._wire = wire
         self._node += 1
         for executor in self._executors.values():
-            name, type_name = action_of(executor, self._options)
+            name, type_name = action_of(executor, self._gripper_action)
             wire.send(
                 {
                     "op": "action",
-                    "name": ros_name(name, self._options.namespace),
+                    "name": self._named(name),
                     "type": type_name,
                     "executor": executor.name,
                     "joints": list(executor.joints),
@@ -119,7 +143,7 @@ class Actions:
     def take_goal(self, wire: Wire, head: Mapping[str, Any], payload: bytes, stops: int) -> None:
         """Decide about a goal, which was received after `stops` emergency stops."""
         executor = self._executors[head["executor"]]
-        name = f"ros {self._node} {head['goal']}"
+        name = self._name(head["goal"])
         now_ns = self._session.clock.now_ns()
         try:
             goal = self._read(executor, head["fields"], payload)
@@ -134,7 +158,7 @@ class Actions:
             with self._lock:
                 self._goals.pop(name, None)
             code = error.code if isinstance(error, _Invalid) else TrajectoryCode.INVALID_GOAL
-            self._session.log.warning("ros: goal for %s rejected: %s: %s", executor.name, code.name, error)
+            self._session.log.warning("%s: goal for %s rejected: %s: %s", self._who, executor.name, code.name, error)
             wire.send({"op": "decided", "goal": head["goal"], "accepted": False})
         else:
             wire.send({"op": "decided", "goal": head["goal"], "accepted": True})
@@ -143,7 +167,7 @@ class Actions:
         """Cancel a goal for its client."""
         accepted = False
         with self._lock:
-            found = self._goals.get(f"ros {self._node} {number}")
+            found = self._goals.get(self._name(number))
             if found is not None:
                 found.canceled = accepted = True
         if found is not None:
@@ -151,7 +175,7 @@ class Actions:
                 self._session.control.call("cancel", executor=found.executor)
             except IbrobotError as error:
                 accepted = False
-                self._session.log.warning("ros: %s: cancel failed: %s", found.executor, error)
+                self._session.log.warning("%s: %s: cancel failed: %s", self._who, found.executor, error)
         wire.send({"op": "decided", "goal": number, "accepted": accepted})
 
     def abandon(self, why: str) -> None:
@@ -159,11 +183,11 @@ class Actions:
         with self._lock:
             abandoned = {goal.executor for goal in self._goals.values()}
         for executor in abandoned:
-            self._session.log.warning("ros: %s holds: %s", executor, why)
+            self._session.log.warning("%s: %s holds: %s", self._who, executor, why)
             try:
                 self._session.control.call("cancel", executor=executor)
             except IbrobotError as error:
-                self._session.log.warning("ros: %s: cancel failed: %s", executor, error)
+                self._session.log.warning("%s: %s: cancel failed: %s", self._who, executor, error)
 
     def take_event(self, event: Mapping[str, Any]) -> None:
         """Report the end of a goal."""
@@ -213,6 +237,10 @@ class Actions:
                     "effort": state.effort[columns].tolist(),
                 }
             )
+
+    def _name(self, number: int) -> str:
+        """The name in control of a goal of the present node."""
+        return f"{self._who} {self._node} {number}"
 
     def _index(self, executor: str) -> Any:
         return self._session.config.robot.indices(self._executors[executor].joints)

@@ -1,0 +1,277 @@
+"""Services and actions of a run for ROS 2 nodes, and for other runs, that speak rmw_zenoh's dialect."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, override
+
+import attrs
+from ibrobot_ros2 import decode, encode
+from ibrobot_ros2.goals import Actions, with_goals
+from ibrobot_ros2.interfaces import ActionType, ServiceType, action_type, service_type, to_cdr
+from ibrobot_ros2.offers import Offer, Offers
+
+from ibrobot_core.api import NS_PER_S, IbrobotError, NotSupported, did_you_mean
+from ibrobot_core.app import CONTROL, Component, RunAccess, SessionWorker, TransportLink
+from ibrobot_zenoh.ros2 import absolute
+from ibrobot_zenoh.ros_goals import ACTIONS, Kind, Status
+from ibrobot_zenoh.sharing import Reply, transport_of
+
+_ENDED_KEPT = 100
+"""Number of ended goals whose results can still be asked for."""
+_LOOK_S = 0.5
+"""How often to look for services that a mode has brought."""
+_CANCELED, _REJECTED, _UNKNOWN, _OVER = 0, 1, 2, 3
+"""Return codes of action_msgs/srv/CancelGoal."""
+
+
+class RosServices(SessionWorker):
+    """Answers calls of the shared services under types of std_srvs; those that a mode brings appear with it."""
+
+    def __init__(self, session: RunAccess, link: TransportLink, is_shared: Callable[[str], bool]) -> None:
+        super().__init__(session, "share:ros services", "services for ROS 2 nodes", (link.name,))
+        self._link = link
+        self._is_shared = is_shared
+        self._ends: dict[str, Callable[[], None]] = {}
+
+    @override
+    def setup(self) -> None:
+        self._transport = transport_of(self._link)
+        namespace = self._transport.namespace
+        self._offers = Offers(self.session, self._is_shared, lambda name: absolute(name, namespace))
+        self._look()
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        self.session.finished.wait(min(timeout_s, _LOOK_S))
+        self._look()
+
+    def _look(self) -> None:
+        for name, offer in self._offers.found().items():
+            if name not in self._ends:
+                kind, urgent = service_type(offer.type), offer.urgent
+                answer = partial(self._answer, offer)
+                self._ends[name] = self._transport.serve_ros(name, kind, answer, urgent=urgent)
+
+    def _answer(self, offer: Offer, request: dict[str, Any], reply: Reply) -> None:
+        reply(self._offers.answer(offer, request))
+
+    @override
+    def teardown(self) -> None:
+        for end in self._ends.values():
+            end()
+        self._ends.clear()
+
+
+@attrs.define(eq=False)
+class _Goal:
+    """A goal of a client."""
+
+    number: int
+    uuid: tuple[int, ...]
+    stamp_ns: int
+    server: _Server
+    status: Status = Status.ACCEPTED
+    accepted: bool = False
+    canceling: bool = False
+    result: Mapping[str, Any] | None = None
+    waiting: list[Reply] = attrs.field(factory=list)
+    """Clients that wait for the result."""
+
+
+@attrs.define(eq=False)
+class _Server:
+    """The server of an action."""
+
+    name: str
+    type: ActionType
+    kind: Kind
+    executor: str
+    joints: list[str]
+    goals: OrderedDict[tuple[int, ...], _Goal] = attrs.field(factory=OrderedDict)
+    """Goals by their ids, the oldest first."""
+
+
+class RosActions(Component):
+    """Offers executors as actions: three services and two topics each. The run decides about goals.
+
+    Raises:
+        NotSupported: for an executor that takes no goals.
+    """
+
+    sends_stops = True
+
+    def __init__(self, session: RunAccess, link: TransportLink, executors: tuple[str, ...]) -> None:
+        super().__init__("share:actions", f"goals for {', '.join(executors)}", (link.name, CONTROL))
+        self._session = session
+        self._link = link
+        known = list(with_goals(session))
+        for name in executors:
+            if name not in known:
+                hint = did_you_mean(name, known, "executors that do")
+                raise NotSupported(f"transport.share.actions: {name} is no executor that takes goals{hint}")
+        self._actions = Actions(session, executors, self._named, "zenoh")
+        self._lock = threading.RLock()
+        self._count = 0
+        self._goals: dict[int, _Goal] = {}
+        """Goals that have not ended, by number."""
+        self._decisions = threading.local()
+        self._ends: list[Callable[[], None]] = []
+
+    def _named(self, name: str) -> str:
+        return absolute(name, transport_of(self._link).namespace)
+
+    @override
+    def start(self) -> None:
+        self._transport = transport_of(self._link)
+        self._actions.declare(self)
+        self._session.on_goal.append(self._actions.take_event)
+        self._session.on_state.append(self._actions.take_state)
+
+    @override
+    def stop(self) -> None:
+        for calls, call in (
+            (self._session.on_goal, self._actions.take_event),
+            (self._session.on_state, self._actions.take_state),
+        ):
+            if call in calls:
+                calls.remove(call)  # type: ignore[arg-type]
+        ends, self._ends = self._ends, []
+        for end in ends:
+            end()
+
+    def send(self, head: Mapping[str, Any]) -> None:
+        """Take what the run says of its actions and goals."""
+        {"action": self._offer, "decided": self._decide, "feedback": self._feed, "ended": self._end}[head["op"]](head)
+
+    def _offer(self, head: Mapping[str, Any]) -> None:
+        server = _Server(
+            head["name"], action_type(head["type"]), ACTIONS[head["type"]], head["executor"], head["joints"]
+        )
+        services: tuple[tuple[str, ServiceType, Any, bool], ...] = (
+            ("send_goal", server.type.send_goal, self._take_goal, False),
+            ("cancel_goal", server.type.cancel_goal, self._cancel, True),
+            ("get_result", server.type.get_result, self._get_result, False),
+        )
+        for name, kind, handler, urgent in services:
+            self._ends.append(
+                self._transport.serve_ros(
+                    f"{server.name}/_action/{name}", kind, partial(handler, server), urgent=urgent
+                )
+            )
+        self._publish_status(server)
+
+    def _take_goal(self, server: _Server, request: dict[str, Any], reply: Reply) -> None:
+        stops, now_ns = self._session.stops, self._session.clock.now_ns()
+        uuid = tuple(request["goal_id"]["uuid"])
+        with self._lock:
+            if uuid in server.goals:
+                reply({"accepted": False})
+                return
+            self._count += 1
+            goal = server.goals[uuid] = self._goals[self._count] = _Goal(self._count, uuid, now_ns, server)
+        data = to_cdr(server.type.send_goal.request, request)
+        message: Any = decode(server.type.send_goal.request, data)
+        fields, trajectory = server.kind.request(message.goal)
+        head = {"goal": goal.number, "executor": server.executor, "fields": fields}
+        payload = encode(trajectory).tobytes() if trajectory is not None else b""
+        self._actions.take_goal(self, head, payload, stops)
+        with self._lock:
+            if self._decisions.last and goal.status is Status.ACCEPTED:
+                goal.status = Status.EXECUTING
+            elif not self._decisions.last:
+                self._goals.pop(goal.number, None)
+                server.goals.pop(uuid, None)
+        sec, nanosec = divmod(now_ns, NS_PER_S)
+        reply({"accepted": self._decisions.last, "stamp": {"sec": sec, "nanosec": nanosec}})
+        self._publish_status(server)
+
+    def _decide(self, head: Mapping[str, Any]) -> None:
+        """Note the decision, which comes in the thread that asked."""
+        self._decisions.last = head["accepted"]
+
+    def _cancel(self, server: _Server, request: dict[str, Any], reply: Reply) -> None:
+        """Cancel one goal, or all, or all up to a time, as ROS's action servers."""
+        info = request["goal_info"]
+        uuid = tuple(info["goal_id"]["uuid"])
+        until_ns = info["stamp"]["sec"] * NS_PER_S + info["stamp"]["nanosec"]
+        with self._lock:
+            one = server.goals.get(uuid)
+            running = [each for each in server.goals.values() if each.result is None]
+        if any(uuid) and one is None:
+            reply({"return_code": _UNKNOWN})
+            return
+        if any(uuid) and not until_ns and one not in running:
+            reply({"return_code": _OVER})
+            return
+        chosen = [each for each in running if self._is_meant(each, uuid, until_ns)]
+        canceling = []
+        for goal in chosen:
+            self._actions.cancel(self, goal.number)
+            if self._decisions.last:
+                with self._lock:
+                    if goal.result is None:
+                        goal.status = Status.CANCELING
+                canceling.append(_info(goal))
+        reply({"return_code": _CANCELED if canceling else _REJECTED, "goals_canceling": canceling})
+        self._publish_status(server)
+
+    @staticmethod
+    def _is_meant(goal: _Goal, uuid: tuple[int, ...], until_ns: int) -> bool:
+        if until_ns and goal.stamp_ns <= until_ns:
+            return True
+        return goal.uuid == uuid if any(uuid) else not until_ns
+
+    def _get_result(self, server: _Server, request: dict[str, Any], reply: Reply) -> None:
+        with self._lock:
+            goal = server.goals.get(tuple(request["goal_id"]["uuid"]))
+            if goal is not None and goal.result is None:
+                goal.waiting.append(reply)
+                return
+        if goal is None:
+            reply({"status": Status.UNKNOWN})
+        else:
+            reply({"status": goal.status, "result": goal.result})
+
+    def _feed(self, head: Mapping[str, Any]) -> None:
+        goal = self._goals.get(head["goal"])
+        if goal is None or goal.result is not None:
+            return
+        server = goal.server
+        feedback = {"goal_id": {"uuid": list(goal.uuid)}, "feedback": server.kind.feedback(head, server.joints)}
+        self._publish(f"{server.name}/_action/feedback", server.type.feedback, feedback)
+
+    def _end(self, head: Mapping[str, Any]) -> None:
+        with self._lock:
+            goal = self._goals.pop(head["goal"], None)
+            if goal is None:
+                return
+            server = goal.server
+            goal.status = Status[head["state"].upper()]
+            goal.result = server.kind.result(head, server.joints)
+            waiting, goal.waiting = goal.waiting, []
+            ended = [uuid for uuid, each in server.goals.items() if each.result is not None]
+            for uuid in ended[: max(0, len(ended) - _ENDED_KEPT)]:
+                del server.goals[uuid]
+        for reply in waiting:
+            reply({"status": goal.status, "result": goal.result})
+        self._publish_status(server)
+
+    def _publish_status(self, server: _Server) -> None:
+        with self._lock:
+            states = [{"goal_info": _info(each), "status": each.status} for each in server.goals.values()]
+        self._publish(f"{server.name}/_action/status", server.type.status, {"status_list": states}, latched=True)
+
+    def _publish(self, topic: str, type_name: str, message: Mapping[str, Any], *, latched: bool = False) -> None:
+        try:
+            self._transport.publish_cdr(topic, type_name, to_cdr(type_name, message), latched=latched)
+        except IbrobotError as error:
+            self._session.log.warning("%s: %s", topic, error)
+
+
+def _info(goal: _Goal) -> dict[str, Any]:
+    sec, nanosec = divmod(goal.stamp_ns, NS_PER_S)
+    return {"goal_id": {"uuid": list(goal.uuid)}, "stamp": {"sec": sec, "nanosec": nanosec}}

@@ -1,0 +1,169 @@
+"""`ibrobot action …` and `ibrobot param …` beside a machine that serves as a robot does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import attrs
+import click
+import pytest
+from click.testing import CliRunner
+from ibrobot_ros2.interfaces import action_type, to_cdr
+from ibrobot_zenoh.commands import network as network_module
+from ibrobot_zenoh.commands.action import action
+from ibrobot_zenoh.commands.param import param
+from ibrobot_zenoh.options import ZenohOptions
+from ibrobot_zenoh.ros_goals import Status
+from ibrobot_zenoh.ros_parameters import ParameterType, RosParameters, flat, from_parameter, to_parameter
+from ibrobot_zenoh.transport import ZenohTransport
+
+from ibrobot_core.api import NotSupported, TransportError
+
+from .pair import WAIT_S, free_endpoint, router
+
+GRIP = action_type("control_msgs/action/GripperCommand")
+NAME = "/grip/gripper_cmd"
+GOAL = "{command: {position: 0.5}}"
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch) -> tuple[ZenohTransport, str]:
+    """A machine on the network, and its address."""
+    from_options = network_module.options_from
+
+    def options(*arguments: Any) -> ZenohOptions:
+        return attrs.evolve(from_options(*arguments), shared_memory=False)
+
+    monkeypatch.setattr(network_module, "options_from", options)
+    monkeypatch.setattr(network_module, "_CONNECT_S", WAIT_S)
+    address = free_endpoint()
+    return router(address), address
+
+
+def run(command: click.Command, address: str, *arguments: str) -> str:
+    result = CliRunner().invoke(command, [*arguments, "--endpoint", address])
+    if result.exception is not None:
+        raise result.exception
+    return result.output
+
+
+@pytest.fixture
+def gripper(machine: tuple[ZenohTransport, str]) -> str:
+    """The server of an action whose goals beyond 1 fail, and those below 0 are rejected."""
+    transport, address = machine
+    goals: list[Any] = []
+
+    def take(request: dict[str, Any], reply: Callable[[Any], None]) -> None:
+        goals.append(request)
+        reply({"accepted": request["goal"]["command"]["position"] >= 0})
+
+    def end(request: dict[str, Any], reply: Callable[[Any], None]) -> None:
+        position = goals[-1]["goal"]["command"]["position"]
+        feedback = {"goal_id": request["goal_id"], "feedback": {"position": 0.25}}
+        transport.publish_cdr(f"{NAME}/_action/feedback", GRIP.feedback, to_cdr(GRIP.feedback, feedback))
+        status = Status.SUCCEEDED if position <= 1 else Status.ABORTED
+        reply({"status": status, "result": {"position": position, "reached_goal": position <= 1}})
+
+    transport.serve_ros(f"{NAME}/_action/send_goal", GRIP.send_goal, take)
+    transport.serve_ros(f"{NAME}/_action/get_result", GRIP.get_result, end)
+    return address
+
+
+def test_actions_are_listed(gripper: str):
+    assert run(action, gripper, "list") == f"{NAME}\n"
+    assert run(action, gripper, "list", "-t") == f"{NAME} [control_msgs/action/GripperCommand]\n"
+
+
+@pytest.mark.parametrize("word", ["send", "send_goal"])
+def test_goal_is_sent_and_its_result_shown(gripper: str, word: str):
+    shown = run(action, gripper, word, NAME, GRIP.name, GOAL, "--feedback")
+    assert shown.startswith("Goal accepted\n")
+    assert "Result:\nposition: 0.5\neffort: 0.0\nstalled: false\nreached_goal: true\n" in shown
+    assert shown.endswith("Goal finished with status: SUCCEEDED\n")
+
+
+def test_goals_that_fail_are_errors(gripper: str):
+    with pytest.raises(TransportError, match=f"{NAME}: the goal ended as ABORTED"):
+        run(action, gripper, "send", NAME, GRIP.name, "{command: {position: 2}}")
+    with pytest.raises(TransportError, match="rejected the goal"):
+        run(action, gripper, "send", NAME, GRIP.name, "{command: {position: -1}}")
+    with pytest.raises(NotSupported, match=f"{NAME} is a {GRIP.name}, not a control_msgs/action/FollowJointTrajectory"):
+        run(action, gripper, "send", NAME, "control_msgs/action/FollowJointTrajectory", "{}")
+    with pytest.raises(NotSupported, match=f"no action /other on the network; there are {NAME}"):
+        run(action, gripper, "send", "/other", GRIP.name, GOAL)
+
+
+@pytest.fixture
+def robot(machine: tuple[ZenohTransport, str]) -> tuple[Any, str]:
+    """A run that shares its parameters, and its address."""
+    transport, address = machine
+
+    def call(name: str, request: Any) -> None:
+        if request["mode"] != "teleop":
+            raise NotSupported("no such mode")
+        session.mode = request["mode"]
+
+    document = {"control": {"rate_hz": 100.0, "stop": "hold"}, "peripherals": [{"name": "top"}], "transport": None}
+    session: Any = SimpleNamespace(
+        config=SimpleNamespace(document=document), mode="idle", bus=SimpleNamespace(call=call)
+    )
+    link: Any = SimpleNamespace(name="transport", transport=transport)
+    parameters = RosParameters(session, link, lambda name: session.shared)
+    session.shared = True
+    parameters.start()
+    return session, address
+
+
+def test_parameters_are_listed_and_read(robot: tuple[Any, str]):
+    _, address = robot
+    node = run(param, address, "list").splitlines()[0].rstrip(":")
+    assert node.startswith("/ibrobot_")
+    names = ["  mode", "  control.rate_hz", "  control.stop", "  peripherals.0.name", "  transport"]
+    assert run(param, address, "list").splitlines() == [f"{node}:", *names]
+    assert run(param, address, "list", node, "--param-prefixes", "control").splitlines() == names[1:3]
+    assert run(param, address, "list", node, "--param-type").splitlines()[1] == "  control.rate_hz (type: double)"
+    assert run(param, address, "get", node, "control.rate_hz") == "Double value is: 100.0\n"
+    assert run(param, address, "get", node, "mode", "--hide-type") == "idle\n"
+    with pytest.raises(NotSupported, match="has no parameter x, or it is not set"):
+        run(param, address, "get", node, "x")
+    with pytest.raises(TransportError, match="nobody serves /nobody/get_parameters"):
+        run(param, address, "get", "/nobody", "x")
+
+
+def test_only_the_mode_can_be_set(robot: tuple[Any, str]):
+    session, address = robot
+    node = run(param, address, "list").splitlines()[0].rstrip(":")
+    assert run(param, address, "set", node, "mode", "teleop") == "Set parameter successful\n"
+    assert session.mode == "teleop"
+    refused = {
+        ("mode", "dance"): "no such mode",
+        ("control.rate_hz", "5"): r"is read when a run starts: ibrobot launch … --set control\.rate_hz=…",
+        ("x", "5"): "there is no such parameter",
+    }
+    for (name, value), reason in refused.items():
+        with pytest.raises(TransportError, match=f"{name} cannot be set: {reason}"):
+            run(param, address, "set", node, name, value)
+    session.shared = False
+    with pytest.raises(TransportError, match="/set_mode is not shared"):
+        run(param, address, "set", node, "mode", "idle")
+
+
+@pytest.mark.parametrize(
+    ("value", "kind"),
+    [
+        (True, "BOOL"), (3, "INTEGER"), (0.5, "DOUBLE"), ("a", "STRING"), ([True], "BOOL_ARRAY"),
+        ([1, 2], "INTEGER_ARRAY"), ([0.5, 1.5], "DOUBLE_ARRAY"), (["a"], "STRING_ARRAY"), (None, "NOT_SET"),
+    ],
+)  # fmt: skip
+def test_values_keep_their_types(value: Any, kind: str):
+    made = to_parameter(value)
+    assert (made["type"], from_parameter(made)) == (ParameterType[kind], value)
+
+
+def test_values_of_several_types_are_text():
+    assert from_parameter(to_parameter([1, 0.5])) == [1.0, 0.5]
+    assert from_parameter(to_parameter([1, "a"])) == "- 1\n- a"
+    assert from_parameter(to_parameter([])) == "[]"
+    assert dict(flat({"a": {"b": [1, 2]}, "c": [{"d": 1}], "e": {}})) == {"a.b": [1, 2], "c.0.d": 1, "e": {}}

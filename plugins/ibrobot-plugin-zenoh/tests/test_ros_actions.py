@@ -1,0 +1,137 @@
+"""Actions of a run over Zenoh, from a client on another machine: goals, feedback, results, cancels."""
+
+from __future__ import annotations
+
+import threading
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from ibrobot_ros2.interfaces import action_type, service_type
+from ibrobot_zenoh.ros2 import actions_of
+from ibrobot_zenoh.ros_goals import SentGoal, Status
+
+from ibrobot_core.api import NotSupported, TransportError
+
+from .pair import WAIT_S, client, free_endpoint, wait_for
+
+if TYPE_CHECKING:
+    from fake_runs import Runs
+
+pytest.importorskip("ibrobot_planning", reason="its executors take goals")
+pytestmark = pytest.mark.integration
+
+FOLLOW, GRIP = (action_type(f"control_msgs/action/{name}") for name in ("FollowJointTrajectory", "GripperCommand"))
+ARM, HAND = "/arm_trajectory/follow_joint_trajectory", "/grip_action/gripper_cmd"
+ROBOT = (
+    "executors.arm_trajectory={type: trajectory, group: arm}",
+    "executors.grip_action={type: gripper, group: gripper}",
+    "control_modes.goals={executors: [arm_trajectory, grip_action]}",
+    "control.peer_timeout=2",
+)
+
+
+def to(*positions: float, at: int = 1) -> dict[str, Any]:
+    point = {"positions": list(positions), "velocities": [0.0] * len(positions), "time_from_start": {"sec": at}}
+    return {"trajectory": {"joint_names": ["pan"], "points": [point]}}
+
+
+@pytest.fixture
+def installed(runs: Runs) -> Runs:
+    """Runs with the executors that take goals, and with Zenoh."""
+    runs.installed += [each for each in entry_points(group="ibrobot") if each.name in ("planning", "zenoh")]
+    return runs
+
+
+@pytest.fixture
+def robot(installed: Runs) -> Any:
+    """A run that takes goals, and its client."""
+    endpoint = free_endpoint()
+    transport = (
+        f"transport={{type: zenoh, mode: router, listen: [{endpoint}], shared_memory: false, "
+        "share: {actions: [arm_trajectory, grip_action], services: [/estop, /set_mode, /reset]}}"
+    )
+    runtime = installed.start(*ROBOT, transport, mode="goals", lockstep=False)
+    near = client(endpoint)
+    wait_for(lambda: {"/estop", "/set_mode/idle", "/reset"} <= {each.name for each in near.shared_services(WAIT_S)})
+    wait_for(lambda: len(actions_of(near.shared_services(WAIT_S))) == 2)
+    return runtime, near
+
+
+def test_goals_end_with_feedback_and_result(robot: Any):
+    runtime, near = robot
+    feedback: list[dict[str, Any]] = []
+    goal = SentGoal(near, ARM, FOLLOW, to(0.4), feedback.append)
+    ended = goal.result(WAIT_S)
+    assert (ended.status, ended.result["error_code"]) == (Status.SUCCEEDED, 0)
+    assert runtime.session.measured().position[0] == pytest.approx(0.4, abs=0.02)
+    assert len(feedback) >= 5
+    assert feedback[-1]["joint_names"] == ["pan"]
+    assert feedback[-1]["actual"]["positions"][0] == pytest.approx(0.4, abs=0.1)
+    assert SentGoal(near, HAND, GRIP, {"command": {"position": 0.3}}).result(WAIT_S).result["reached_goal"]
+
+
+def test_goals_are_canceled_and_replaced(robot: Any):
+    _, near = robot
+    first = SentGoal(near, ARM, FOLLOW, to(0.9, at=20))
+    assert first.cancel()
+    assert first.result(WAIT_S).status is Status.CANCELED
+    assert not first.cancel(), "it has ended"
+    old = SentGoal(near, ARM, FOLLOW, to(0.9, at=20))
+    new = SentGoal(near, ARM, FOLLOW, to(0.2))
+    ended = old.result(WAIT_S)
+    assert (ended.status, ended.result["error_code"]) == (Status.ABORTED, -1)
+    assert "replaced" in ended.result["error_string"]
+    assert new.result(WAIT_S).status is Status.SUCCEEDED
+    assert old.result(WAIT_S) == ended, "a result can be asked for again"
+
+
+def test_all_goals_are_canceled_at_once(robot: Any):
+    _, near = robot
+    goals = [SentGoal(near, ARM, FOLLOW, to(0.9, at=20)), SentGoal(near, HAND, GRIP, {"command": {"position": 0.9}})]
+    cancel = service_type("action_msgs/srv/CancelGoal")
+    answer = near.call_ros(f"{ARM}/_action/cancel_goal", cancel, {}, WAIT_S)
+    assert (answer["return_code"], len(answer["goals_canceling"])) == (0, 1)
+    assert goals[0].result(WAIT_S).status is Status.CANCELED
+    assert goals[1].result(WAIT_S).status is Status.SUCCEEDED
+    unknown = {"goal_info": {"goal_id": {"uuid": [7] * 16}}}
+    assert near.call_ros(f"{ARM}/_action/cancel_goal", cancel, unknown, WAIT_S)["return_code"] == 2
+    result = near.call_ros(f"{ARM}/_action/get_result", FOLLOW.get_result, {"goal_id": {"uuid": [7] * 16}}, WAIT_S)
+    assert result["status"] == Status.UNKNOWN
+
+
+def test_what_ros2_control_rejects_is_rejected(robot: Any, caplog: pytest.LogCaptureFixture):
+    _, near = robot
+    for goal, code in ((to(9.0), "INVALID_GOAL"), ({"trajectory": {"joint_names": ["x"]}}, "INVALID_JOINTS")):
+        with pytest.raises(TransportError, match="rejected the goal; the robot's log says why"):
+            SentGoal(near, ARM, FOLLOW, goal)
+        assert code in caplog.text
+
+
+def test_a_stop_by_service_ends_a_goal(robot: Any):
+    runtime, near = robot
+    trigger = service_type("std_srvs/srv/Trigger")
+    goal = SentGoal(near, ARM, FOLLOW, to(0.9, at=20))
+    assert near.call_ros("/estop", trigger, {}, WAIT_S)["success"]
+    ended = goal.result(WAIT_S)
+    assert (ended.status, ended.result["error_code"]) == (Status.ABORTED, -1)
+    refused = near.call_ros("/set_mode/idle", trigger, {}, WAIT_S)
+    assert (refused["success"], "refused before a reset" in refused["message"]) == (False, True)
+    assert near.call_ros("/reset", trigger, {}, WAIT_S)["success"]
+    assert not runtime.session.faults
+
+
+def test_the_status_is_latched(robot: Any):
+    _, near = robot
+    SentGoal(near, ARM, FOLLOW, to(0.1)).result(WAIT_S)
+    arrived = threading.Event()
+    near.subscribe_messages(f"{ARM}/_action/status", lambda message: arrived.set())
+    assert arrived.wait(WAIT_S)
+
+
+def test_executors_that_take_no_goals_are_refused(installed: Runs):
+    transport = "transport={type: zenoh, mode: router, share: {actions: [%s]}}"
+    with pytest.raises(NotSupported, match="arm_positoin is no executor that takes goals"):
+        installed.make(*ROBOT, transport % "arm_positoin", mode="goals", lockstep=False)
+    with pytest.raises(NotSupported, match=r"transport\.share\.actions: a lockstep run cannot take goals"):
+        installed.make(*ROBOT, transport % "arm_trajectory", mode="goals")

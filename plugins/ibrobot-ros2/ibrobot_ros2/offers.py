@@ -1,0 +1,87 @@
+"""Services of a run under types of ROS: those whose requests std_srvs can say."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import SET_MODE, RunView, Service
+from ibrobot_ros2.services import plain
+
+TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
+_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+
+
+@attrs.frozen
+class Offer:
+    """A ROS service, and the call of the bus that answers it."""
+
+    type: str
+    service: str
+    request: Mapping[str, Any]
+    """What is sent with every call."""
+    field: str = ""
+    """The key of the request that SetBool's `data` is."""
+    urgent: bool = False
+
+
+def ros_type(service: Service[Any, Any]) -> tuple[str, str] | None:
+    """The type of std_srvs that can say requests of a service, and the field that `data` is; None if there is none."""
+    fields = attrs.fields(service.request)
+    required = [field for field in fields if field.default is attrs.NOTHING]
+    if not required:
+        return TRIGGER, ""
+    if len(required) == 1 and required[0].type in (bool, "bool"):
+        return SET_BOOL, required[0].name
+    return None
+
+
+class Offers:
+    """The services that a run has, and each control mode as a service of its own.
+
+    Args:
+        session: the run.
+        is_chosen: whether a service of the bus is offered.
+        named: the full name of a service, from that on the bus.
+    """
+
+    def __init__(self, session: RunView, is_chosen: Callable[[str], bool], named: Callable[[str], str]) -> None:
+        self._session = session
+        self._is_chosen = is_chosen
+        self._named = named
+
+    def found(self) -> dict[str, Offer]:
+        """Full name -> service, of those that there are at present."""
+        found = {}
+        for name, service in self._session.bus.services().items():
+            if not self._is_chosen(name):
+                continue
+            if name == SET_MODE.name:
+                for mode in self._session.config.control_modes:
+                    found[f"{name}/{mode}"] = Offer(TRIGGER, name, {"mode": mode})
+            elif (kind := ros_type(service)) is not None:
+                found[name] = Offer(kind[0], name, {}, kind[1], service.urgent)
+        named = {self._named(name): offer for name, offer in found.items()}
+        return {name: offer for name, offer in named.items() if _NAME.fullmatch(name)}
+
+    def answer(self, offer: Offer, request: Mapping[str, Any]) -> dict[str, Any]:
+        """The response to a request: `success` and `message`; the run's own answer is its message."""
+        full = {**offer.request, **({offer.field: request["data"]} if offer.field else {})}
+        try:
+            return {"success": True, "message": _text(self._session.bus.call(offer.service, full))}
+        except IbrobotError as error:
+            return {"success": False, "message": str(error)}
+        except Exception:
+            self._session.log.exception("%s failed", offer.service)
+            return {"success": False, "message": "the service failed; the robot's log has the cause"}
+
+
+def _text(answer: Any) -> str:
+    if answer is None or isinstance(answer, str):
+        return answer or ""
+    return json.dumps(plain(answer))
