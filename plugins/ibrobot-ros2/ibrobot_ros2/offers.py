@@ -56,7 +56,7 @@ class Offers:
         self._named = named
 
     def found(self) -> dict[str, Offer]:
-        """Full name -> service, of those that there are at present."""
+        """The services that are served at present, by full name."""
         found = {}
         for name, service in self._session.bus.services().items():
             if not self._is_chosen(name):
