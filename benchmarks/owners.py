@@ -45,7 +45,7 @@ import pyarrow.parquet as pq
 from ibrobot_data import run as convert_module
 from ibrobot_data.episode import convert_episode
 from ibrobot_data.episode_start import take_next_folder
-from ibrobot_lerobot import train as training_module
+from ibrobot_lerobot import trainer as training_module
 from ibrobot_lerobot.layout import open_dataset
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.training_checkpoints import newest_checkpoint

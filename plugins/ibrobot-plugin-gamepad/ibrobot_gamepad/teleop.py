@@ -19,7 +19,8 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_gamepad.controls import Controls
-from ibrobot_gamepad.devices import Device, DeviceGone, Finder, open_first
+from ibrobot_gamepad.devices import Device, DeviceGone
+from ibrobot_gamepad.finder import Finder, open_first
 from ibrobot_gamepad.mapping import EVENTS, control_map
 from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
 from ibrobot_gamepad.reports import Kind

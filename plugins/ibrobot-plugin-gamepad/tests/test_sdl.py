@@ -11,7 +11,8 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
-from ibrobot_gamepad.devices import DeviceGone, Finder, open_first
+from ibrobot_gamepad.devices import DeviceGone
+from ibrobot_gamepad.finder import Finder, open_first
 from ibrobot_gamepad.options import GamepadOptions
 from ibrobot_gamepad.teleop import JogTeleop
 from ibrobot_testing import host_context

@@ -14,7 +14,7 @@ import attrs
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import Failed, Job, echo, emit, installed_plugins
 from ibrobot_lerobot import TRAIN
-from ibrobot_lerobot.train import progress, run_training
+from ibrobot_lerobot.trainer import progress, run_training
 from ibrobot_lerobot.training import Phase, Report, TrainOptions
 
 _KEPT = "interrupted; the newest checkpoints are kept: the same command continues from there"

@@ -18,9 +18,10 @@ import pytest
 from click.testing import CliRunner
 from ibrobot_lerobot import TRAIN
 from ibrobot_lerobot import merge as merging
-from ibrobot_lerobot import train as training
+from ibrobot_lerobot import trainer as lerobot_train
 from ibrobot_lerobot.commands import datasets
-from ibrobot_lerobot.train import arguments, progress, train
+from ibrobot_lerobot.train import train
+from ibrobot_lerobot.trainer import arguments, progress
 from ibrobot_lerobot.training import Begin, Progress, Report, TrainOptions
 from ibrobot_lerobot.training_checkpoints import newest_checkpoint
 from ibrobot_testing import ibrobot_command
@@ -38,7 +39,7 @@ FEATURES = {"observation.state": Feature("float32", (2,), ("a.pos", "b.pos")), "
 def dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A dataset; `ibrobot train` runs `trainer` in place of LeRobot's program."""
     program = install(tmp_path)
-    monkeypatch.setattr(training, "find_trainer", lambda: str(program))
+    monkeypatch.setattr(lerobot_train, "find_trainer", lambda: str(program))
     return write(tmp_path / "set", FEATURES, (3,), codec="h264")
 
 
@@ -155,9 +156,9 @@ SCRIPT = """
 import sys
 from ibrobot_lerobot import TRAIN
 from ibrobot_lerobot import merge as merging
-from ibrobot_lerobot import train as training
-training.find_trainer = lambda: sys.argv[1]
-training.train(sys.argv[2:])
+from ibrobot_lerobot import train, trainer
+trainer.find_trainer = lambda: sys.argv[1]
+train.train(sys.argv[2:])
 """
 
 

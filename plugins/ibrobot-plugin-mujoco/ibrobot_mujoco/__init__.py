@@ -15,9 +15,10 @@ from ibrobot_core.api import (
     hookimpl,
 )
 from ibrobot_core.app import Command
+from ibrobot_mujoco.check import check_world
 from ibrobot_mujoco.experts import EXPERTS
 from ibrobot_mujoco.gl import check_asked, choose
-from ibrobot_mujoco.options import CameraOptions, MujocoOptions, check_world, picture_size
+from ibrobot_mujoco.options import CameraOptions, MujocoOptions, picture_size
 from ibrobot_mujoco.scenes import SCENES
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ import click
 
 from ibrobot_core.api import TeleopError
 from ibrobot_gamepad.controls import Controls
-from ibrobot_gamepad.devices import Device, DeviceGone, Finder, Found, open_first
+from ibrobot_gamepad.devices import Device, DeviceGone, Found
+from ibrobot_gamepad.finder import Finder, open_first
 from ibrobot_gamepad.reports import KINDS, Kind
 
 _POLL_S = 0.01

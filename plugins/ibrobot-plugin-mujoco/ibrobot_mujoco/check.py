@@ -1,0 +1,40 @@
+"""Checks of the simulation's options, before a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from ibrobot_core.api import HardwareError, MissingDependency, OptionFault, Robot, did_you_mean
+from ibrobot_mujoco.gl import check_asked
+from ibrobot_mujoco.options import MujocoOptions
+
+
+def _unusable(options: MujocoOptions, robot: Robot) -> Iterator[OptionFault]:
+    """Faults found by MuJoCo: an invalid MJCF, missing joints and actuators, wrong cameras in the options."""
+    try:
+        check_asked()
+    except MissingDependency:
+        return  # MuJoCo cannot be imported; a run reports the reason
+    # It imports MuJoCo, so do it only if a run would simulate.
+    from ibrobot_mujoco.model import build_spec
+
+    try:
+        build_spec(options, robot)
+    except HardwareError as error:
+        yield OptionFault((), " ".join(str(error).split()))
+
+
+def check_world(options: MujocoOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+    """Check that the robot has an MJCF, and that the pose and joints in the options exist."""
+    poses = list(robot.description.poses)
+    if robot.description.mjcf is None:
+        yield OptionFault((), f"robot {robot.name!r} has no MJCF to simulate: set robot.description.mjcf", "mjcf")
+    elif robot.description.mjcf.is_file():  # core has reported a missing one
+        yield from _unusable(options, robot)
+    if options.start_pose not in poses:
+        message = f"unknown pose {options.start_pose!r}{did_you_mean(options.start_pose, poses, 'known')}"
+        yield OptionFault(("start_pose",), message)
+    for i, fault in enumerate(options.faults):
+        if fault.joint is not None and fault.joint not in robot.joint_names:
+            message = f"unknown joint {fault.joint!r}{did_you_mean(fault.joint, robot.joint_names, 'known')}"
+            yield OptionFault(("faults", i, "joint"), message)
