@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
-from ibrobot_core.api import HardwareError, MissingDependency, OptionFault, Robot, did_you_mean
+from ibrobot_core.api import HardwareError, MissingDependency, OptionFault, did_you_mean
 from ibrobot_mujoco.gl import check_asked
 from ibrobot_mujoco.options import MujocoOptions
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
 
 
 def _unusable(options: MujocoOptions, robot: Robot) -> Iterator[OptionFault]:
