@@ -49,6 +49,7 @@ LOCAL = {
 """Distribution -> folder."""
 EXTRAS = {
     "ibrobot-plugin-camera": "[realsense]",
+    "ibrobot-plugin-lerobot": "[hub]",
     "ibrobot-plugin-mcap": "[plot]",
     "ibrobot-plugin-mujoco": "[urdf]",
     "ibrobot-plugin-planning": "[client,obstacles,plot]",

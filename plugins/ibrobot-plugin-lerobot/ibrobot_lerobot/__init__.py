@@ -100,6 +100,6 @@ TRAIN = Command("train", "Train a policy with LeRobot.", _train, TrainOptions, E
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot datasets info`, `ibrobot export` and `ibrobot train`."""
-    yield Command("datasets", "Show and join LeRobot datasets.", _datasets, commands=(INFO,))
+    yield Command("datasets", "Show, join, upload and download LeRobot datasets.", _datasets, commands=(INFO,))
     yield Command("export", "Convert a checkpoint to run without torch.", _export)
     yield TRAIN

@@ -1,4 +1,4 @@
-"""`ibrobot datasets info` and `merge`: what a dataset contains, and joining several; `ibrobot export`."""
+"""`ibrobot datasets info`, `merge`, `push` and `pull`; `ibrobot export`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ibrobot_lerobot.contents import FeatureContents, InfoOptions
 
 @click.group()
 def datasets() -> None:
-    """Show and join LeRobot datasets."""
+    """Show, join, upload and download LeRobot datasets."""
 
 
 @datasets.command()
@@ -66,6 +66,40 @@ def merge(parts: tuple[Path, ...], out: Path) -> None:
 
     episodes = join_datasets(parts, out)
     echo(f"{episodes} episodes of {len(parts)} datasets -> {out}")
+
+
+@datasets.command()
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.argument("repository", metavar="OWNER/NAME")
+@click.option("--private", is_flag=True, help="Make a new repository private.")
+@wrong_input()
+def push(dataset: Path, repository: str, private: bool) -> None:
+    """Upload DATASET to the Hugging Face Hub.
+
+    The token is that of `hf auth login`, or HF_TOKEN. After an interruption, run the same command again.
+    """
+    from ibrobot_lerobot.hub import push as push_dataset
+
+    echo(f"{dataset} -> {push_dataset(dataset, repository, private=private)}")
+
+
+@datasets.command()
+@click.argument("repository", metavar="OWNER/NAME")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of the dataset; by default datasets/NAME.")
+@click.option("--revision", help="A branch, tag or commit; by default the newest.")
+@wrong_input()
+def pull(repository: str, out: Path | None, revision: str | None) -> None:
+    """Download a dataset from the Hugging Face Hub.
+
+    After an interruption, run the same command again.
+    """
+    from ibrobot_lerobot.hub import pull as pull_dataset
+    from ibrobot_lerobot.read_contents import dataset_contents
+
+    out = out or Path("datasets") / repository.rpartition("/")[2]
+    pull_dataset(repository, out, revision=revision)
+    contents = dataset_contents(out)
+    echo(f"{repository} -> {out}: {contents.episodes} episodes, {contents.frames} frames at {contents.fps:g} Hz")
 
 
 @click.command()
