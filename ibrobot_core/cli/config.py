@@ -145,7 +145,7 @@ def copy(context: click.Context, config: str, copy: Path, values: tuple[str, ...
     connected. The copy is checked at the end.
     """
     from ibrobot_core.config import find_config
-    from ibrobot_core.config.copying import variables, write_copy
+    from ibrobot_core.config.copying import variables_of, write_copy
 
     source = find_config(config, installed_plugins())
     chosen = {}
@@ -155,7 +155,7 @@ def copy(context: click.Context, config: str, copy: Path, values: tuple[str, ...
             raise click.BadParameter(f"expected NAME=VALUE, got {each!r}", param_hint="--value")
         chosen[name] = value
     if not defaults and sys.stdin.isatty():
-        for name, default in variables(source).items():
+        for name, default in variables_of(source).items():
             if name not in chosen:
                 chosen[name] = click.prompt(name, default=default or None, err=True)
     write_copy(source, copy, chosen)

@@ -19,7 +19,7 @@ def _read(source: Path) -> str:
         raise ConfigError([Problem(source, 0, "", f"cannot be read: {error}")]) from error
 
 
-def variables(source: Path) -> dict[str, str]:
+def variables_of(source: Path) -> dict[str, str]:
     """Variables in the values of a robot YAML, in order -> default; empty for those without.
 
     Raises:
@@ -44,7 +44,7 @@ def write_copy(source: Path, copy: Path, defaults: Mapping[str, str]) -> None:
     Raises:
         ConfigError: if `copy` exists, the file cannot be read or lacks a variable, or a default cannot stand in YAML.
     """
-    text, known = _read(source), variables(source)
+    text, known = _read(source), variables_of(source)
     for name, value in defaults.items():
         if name not in known:
             problem = f"{source} has no variable {name!r}; its variables are: {', '.join(known) or 'none'}"

@@ -28,6 +28,7 @@ from ibrobot_core.control import host
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.messages import Float64MultiArray
 from ibrobot_core.plugins import installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("prompt_threads")]
@@ -312,5 +313,6 @@ def test_one_person_records_ten_episodes_by_keys(
         reader = installed_plugins().open_episode(folder)
         (first, *_) = reader.messages(["/arm_position_controller/commands"])
         reader.close()
+        assert isinstance(first.message, Float64MultiArray)
         way = abs(first.message.data[0] - 0.1 * (1 if folder.name < "episode_000006" else 6))
         assert way <= 0.06, f"{folder.name} begins while the arm is on its way to the leader"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_camera.device import realsense_stream, require_device, video_device
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import click
 
     from ibrobot_core.api import CompressedImage, Context, Image, Robot, Sensor
-    from ibrobot_core.app import Guide
+    from ibrobot_core.app import Guide, Question
 
 
 def _opencv(options: Any, ctx: Context) -> Sensor:
@@ -88,6 +88,12 @@ def ibrobot_commands() -> Iterable[Command]:
     yield Command("camera", "List and preview cameras, and save snapshots.", _commands)
 
 
+def _camera_questions() -> Sequence[Question]:
+    from ibrobot_camera.guides import camera_questions
+
+    return camera_questions()
+
+
 def _show(answers: Mapping[str, str | bool], guide: Guide) -> None:
     from ibrobot_camera.guides import show_cameras
 
@@ -97,7 +103,8 @@ def _show(answers: Mapping[str, str | bool], guide: Guide) -> None:
 @hookimpl
 def ibrobot_guides() -> Iterable[GuideDescriptor]:
     """The cameras, with pictures."""
-    yield GuideDescriptor("cameras", "Cameras", "List the cameras, with their formats and a picture of each.", _show)
+    summary = "List the cameras, with their formats and a picture of each."
+    yield GuideDescriptor("cameras", "Cameras", summary, _show, _camera_questions)
 
 
 @hookimpl

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import cv2
 
 from ibrobot_camera import v4l2
 from ibrobot_camera.commands.sources import decoded, opened, pixels
 from ibrobot_core.api import SensorError
-from ibrobot_core.app import Guide
+from ibrobot_core.app import Guide, Question
 
 _WAIT_S = 5.0
 _QUALITY = 80
 
 
+_ALL = "all"
+
+
+def camera_questions() -> Sequence[Question]:
+    """Which camera: all, or one, as a robot YAML names it."""
+    found = tuple(camera.stable_id or camera.path for camera in v4l2.cameras())
+    return (Question("camera", "Camera", _ALL, (_ALL, *found)),)
+
+
 def show_cameras(answers: Mapping[str, str | bool], guide: Guide) -> None:
     """Show what `device` of a robot YAML may be, and a picture of each camera."""
-    found = v4l2.cameras()
+    found = [each for each in v4l2.cameras() if answers.get("camera", _ALL) in (_ALL, each.stable_id, each.path)]
     if not found:
         guide.say("No camera: there is no /dev/video*. Is it plugged in, and does `lsusb` show it?")
     for camera in found:

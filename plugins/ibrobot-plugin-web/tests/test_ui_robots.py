@@ -11,6 +11,8 @@ import pytest
 from ibrobot_web.ui.job_runner import IBROBOT
 from ui_server import UiServer, run_ui
 
+from ibrobot_core.app import GuideDescriptor, Question, installed_plugins
+
 ROBOT = """# A pan axis: it turns a camera.
 robot:
   name: pan
@@ -156,5 +158,31 @@ def test_links_out_of_the_folder_are_not_followed(folder: Path, tmp_path_factory
         assert "swordfish" not in json.dumps(listed)
         mine = {each["robot"] for each in listed if each["source"] == "folder"}
         assert mine == {"wrong.yaml", "arms/pan.yaml", "arms/arm.yaml"}, "a link within the folder is no way out of it"
+
+    run_ui([folder], test)
+
+
+def test_a_bundled_robot_is_copied_with_ports_of_what_was_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = "/dev/serial/by-id/usb-arm"
+    guide = GuideDescriptor(
+        "port", "Port", "", lambda answers, guide: None, lambda: (Question("port", "", "", (port,)),)
+    )
+    monkeypatch.setattr(type(installed_plugins()), "guides", (guide,))
+
+    async def test(server: UiServer) -> None:
+        offered = await server.get("robots/copying", robot="so101")
+        found = {each["name"]: (each["default"], each["found"]) for each in offered["variables"]}
+        assert found["IBROBOT_FOLLOWER_PORT"] == ("/dev/ttyACM0", [port])
+        assert found["IBROBOT_TOP_CAMERA"] == ("0", [])
+        values = {"IBROBOT_FOLLOWER_PORT": port, "IBROBOT_TOP_CAMERA": "4", "IBROBOT_LEADER_PORT": ""}
+        made = await server.post("robots/copy", robot="so101", file=offered["file"], values=values)
+        assert made == {"robot": "my_so101.yaml"}
+        copied = (folder / "my_so101.yaml").read_text()
+        assert f'port: "${{IBROBOT_FOLLOWER_PORT:{port}}}"' in copied
+        assert 'device: "${IBROBOT_TOP_CAMERA:4}"' in copied
+        assert '"${IBROBOT_LEADER_PORT:/dev/ttyACM1}"' in copied, "an empty field keeps the default"
+        for file, why in (("my_so101.yaml", "exists already"), ("../x.yaml", "outside"), ("x.txt", "ends with .yaml")):
+            with pytest.raises(RuntimeError, match=why):
+                await server.post("robots/copy", robot="so101", file=file, values={})
 
     run_ui([folder], test)

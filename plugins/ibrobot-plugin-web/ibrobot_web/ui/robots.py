@@ -22,6 +22,8 @@ from ibrobot_core.app import (
     load_config,
     shipped_configs,
     unavailable_modes,
+    variables_of,
+    write_copy,
 )
 from ibrobot_web.modes import modes_json
 from ibrobot_web.ui.context import Route, Ui
@@ -54,6 +56,15 @@ class Launch(NamesRobot):
     """What to launch."""
 
     mode: str = option("", help="control mode; empty: the robot's default")
+
+
+@attrs.frozen
+class CopyRobot:
+    """What to copy, and with which defaults."""
+
+    robot: str = option(help="name of a shipped robot, or path of its YAML")
+    file: str = option(help="the new file, in an opened folder")
+    values: Mapping[str, str] = option(factory=dict, help="variable -> its default in the copy")
 
 
 def listing(ui: Ui, request: NoRequest) -> list[dict[str, str]]:
@@ -166,6 +177,35 @@ def launch(ui: Ui, request: Launch) -> dict[str, int]:
     return {"number": job.number}
 
 
+def copying(ui: Ui, request: NamesRobot) -> dict[str, Any]:
+    """What a copy of a robot YAML may have of its own: a name, and variables with what was found for them.
+
+    A variable such as `IBROBOT_LEADER_PORT` is offered what the guides' question `port` offers.
+    """
+    source = find_config(robot_of(ui, request.robot), installed_plugins())
+    found: dict[str, tuple[str, ...]] = {}
+    for guide in installed_plugins().guides:
+        for question in guide.questions():
+            found.setdefault(question.name, tuple(each for each in question.choices if "/" in each))
+    return {
+        "file": f"my_{source.stem}.yaml",
+        "variables": [
+            {"name": name, "default": default, "found": found.get(name.rpartition("_")[2].lower(), ())}
+            for name, default in variables_of(source).items()
+        ],
+    }
+
+
+def copy(ui: Ui, request: CopyRobot) -> dict[str, str]:
+    """Copy a robot YAML into an opened folder, as `ibrobot config copy` does."""
+    target = ui.folders.find(request.file)
+    if target.suffix not in (".yaml", ".yml"):
+        raise IbrobotError(f"{request.file}: the name of a robot YAML ends with .yaml")
+    source = find_config(robot_of(ui, request.robot), installed_plugins())
+    write_copy(source, target, {name: value for name, value in request.values.items() if value})
+    return {"robot": ui.folders.name(target)}
+
+
 def robot_of(ui: Ui, name: str) -> str:
     """The robot that a request names: the name of a shipped one, or the path of a file in an opened folder.
 
@@ -198,5 +238,7 @@ def read_address(line: str) -> Mapping[str, Any] | None:
 ROUTES: dict[str, Route[Any]] = {
     "GET /list": Route(listing, NoRequest),
     "GET /check": Route(check, NamesRobot),
+    "GET /copying": Route(copying, NamesRobot),
+    "POST /copy": Route(copy, CopyRobot),
     "POST /launch": Route(launch, Launch),
 }

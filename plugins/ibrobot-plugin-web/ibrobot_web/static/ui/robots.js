@@ -2,6 +2,7 @@
 
 import { h, refresh } from "../dom.js";
 import { Chooser } from "./chooser.js";
+import { Copy } from "./copy.js";
 import { JobCard } from "./job.js";
 
 const KINDS = ["run", "record"];
@@ -11,6 +12,7 @@ export class View {
     this.ui = ui;
     this.cards = new Map();
     this.chooser = new Chooser(ui, () => this.enable());
+    this.copy = new Copy(ui, this.chooser);
   }
 
   mount(element) {
@@ -20,7 +22,7 @@ export class View {
     element.append(h("h2", {}, "Robots"),
       h("div", { class: "columns" },
         h("section", { class: "card", "aria-label": "Choice" }, this.chooser.fields,
-          h("div", { class: "row" }, this.launch, h("a", { class: "button", href: "#record" }, "Record episodes")), this.hint),
+          h("div", { class: "row" }, this.launch, h("a", { class: "button", href: "#record" }, "Record episodes")), this.hint, this.copy.element),
         h("section", { class: "card", "aria-label": "Check" }, this.chooser.report)),
       h("h2", {}, "Runs"), this.runs);
     this.none = h("p", { class: "note" }, "No run yet. A run opens a page of its own, which shows and drives the robot.");
@@ -34,6 +36,7 @@ export class View {
   }
 
   enable() {
+    this.copy.enable();
     this.launch.disabled = !this.chooser.ready || !this.ui.drives;
     const { found } = this.chooser;
     this.hint.textContent = found?.modes && !found.modes.some(({ jogs }) => Object.keys(jogs).length)
