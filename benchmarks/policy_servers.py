@@ -1,11 +1,14 @@
-"""Request to chunk from an openpi server, beside a bare socket that carries the same bytes.
+"""Request to chunk from an openpi, vla-eval or GR00T server, beside a bare socket that carries the same bytes.
 
-    python benchmarks/policy_servers.py [--requests 500] [--openpi PYTHON]
+    python benchmarks/policy_servers.py [--requests 500]
+        [--openpi PYTHON | --vla-eval PYTHON | --gr00t PYTHON --checkout FOLDER]
 
-The server does nothing but repeat the state. With --openpi, it is that of openpi: PYTHON is an interpreter with
-`openpi-server==0.1.0` and `openpi-client==0.1.2`, which need NumPy below 2. A request has two raw cameras of 224x224,
-the state and a prompt; the answer has 50 actions. Prints milliseconds of both, taken in turn, and exits with 1 if an
-action is not the state.
+The server does nothing but repeat the state. By default it is one of ours that speaks openpi's protocol. Otherwise it
+is the project's own, and PYTHON an interpreter of another environment: with `openpi-server==0.1.0`, `openpi-
+client==0.1.2` (which need NumPy below 2) and `typing_extensions`; with `vla-eval==0.8.0`; or with `msgpack`, `numpy`
+and `pyzmq`, where FOLDER has the module `gr00t.policy.server_client` of a checkout of Isaac GR00T. A request has two
+raw cameras of 224x224, the state and a prompt; the answer has 50 actions, or 1 with vla-eval. Prints milliseconds of
+both, taken in turn, and exits with 1 if an action is not the state.
 """
 
 from __future__ import annotations
@@ -23,9 +26,11 @@ from contextlib import closing, contextmanager
 from typing import Any
 
 import numpy as np
+from ibrobot_policy_servers.gr00t import Gr00tConnection
 from ibrobot_policy_servers.openpi import OpenpiConnection
-from ibrobot_policy_servers.options import ActionMap, ObservationMap, OpenpiOptions
+from ibrobot_policy_servers.options import ActionMap, Gr00tOptions, ObservationMap, OpenpiOptions, VlaEvalOptions
 from ibrobot_policy_servers.served import ServedPolicy
+from ibrobot_policy_servers.vla_eval import VlaEvalConnection
 from ibrobot_policy_wire import pack
 from ibrobot_testing import host_context
 from ibrobot_testing.contexts import ARM, GRIPPER
@@ -56,6 +61,28 @@ class Policy:
         return {"actions": obs["observation/state"][None].repeat(50, 0)}
 WebsocketPolicyServer(Policy(), "127.0.0.1", int(sys.argv[1]), {"server": "openpi"}).serve_forever()
 """
+VLA_EVAL = """
+import sys
+from vla_eval.model_servers.base import ModelServer
+from vla_eval.model_servers.serve import serve
+class Repeats(ModelServer):
+    async def on_observation(self, obs, ctx):
+        await ctx.send_action({"actions": obs["observation/state"]})
+    async def on_episode_start(self, config, ctx):
+        pass
+serve(Repeats(), "127.0.0.1", int(sys.argv[1]))
+"""
+GR00T = """
+import sys
+sys.path.insert(0, sys.argv[2])
+from gr00t.policy.server_client import PolicyServer
+class Repeats:
+    def get_action(self, observation, options):
+        return {"action": observation["state"]["state"].repeat(50, 1)}, {}
+    def reset(self, options):
+        return {}
+PolicyServer(Repeats(), "127.0.0.1", int(sys.argv[1])).run()
+"""
 
 
 def free_port() -> int:
@@ -65,10 +92,10 @@ def free_port() -> int:
 
 
 @contextmanager
-def served(python: str, code: str) -> Iterator[int]:
+def served(python: str, code: str, checkout: str = "") -> Iterator[int]:
     """A server in another process; its port."""
     port = free_port()
-    process = subprocess.Popen([python, "-c", code, str(port)])
+    process = subprocess.Popen([python, "-c", code, str(port), checkout], stdout=subprocess.DEVNULL)
     try:
         yield port
     finally:
@@ -76,21 +103,39 @@ def served(python: str, code: str) -> Iterator[int]:
         process.wait()
 
 
-def policy_of(port: int) -> ServedPolicy:
+def policy_of(kind: str, port: int) -> ServedPolicy:
     """The robot's side, once the server is up."""
-    options = OpenpiOptions(
-        url=f"ws://127.0.0.1:{port}",
-        observations=(
-            ObservationMap(STATE, ("observation/state",), (6,)),
-            ObservationMap(TOP, ("observation/image",), IMAGE),
-            ObservationMap(WRIST, ("observation/wrist_image",), IMAGE),
-        ),
-        actions=(ActionMap(ARM + GRIPPER),),
-        horizon=HORIZON,
-        rate_hz=30.0,
-    )
-    ctx = host_context()
-    policy = ServedPolicy(options, ctx, OpenpiConnection(options, ctx.log))
+    ctx, common = host_context(), {"horizon": 1 if kind == "vla_eval" else HORIZON, "rate_hz": 30.0}
+    if kind == "gr00t":
+        gr00t = Gr00tOptions(
+            address=f"tcp://127.0.0.1:{port}",
+            observations=(
+                ObservationMap(STATE, ("state", "state"), (6,)),
+                ObservationMap(TOP, ("video", "top"), IMAGE),
+                ObservationMap(WRIST, ("video", "wrist"), IMAGE),
+            ),
+            actions=(ActionMap(ARM + GRIPPER, ("action",)),),
+            prompt=("language", "annotation.human.task_description"),
+            **common,
+        )
+        policy = ServedPolicy(gr00t, ctx, Gr00tConnection(gr00t))
+    else:
+        mapping: dict[str, Any] = {
+            "url": f"ws://127.0.0.1:{port}",
+            "observations": (
+                ObservationMap(STATE, ("observation/state",), (6,)),
+                ObservationMap(TOP, ("observation/image",), IMAGE),
+                ObservationMap(WRIST, ("observation/wrist_image",), IMAGE),
+            ),
+            "actions": (ActionMap(ARM + GRIPPER),),
+            **common,
+        }
+        if kind == "vla_eval":
+            vla_eval = VlaEvalOptions(**mapping)
+            policy = ServedPolicy(vla_eval, ctx, VlaEvalConnection(vla_eval), stateful=True)
+        else:
+            openpi = OpenpiOptions(**mapping)
+            policy = ServedPolicy(openpi, ctx, OpenpiConnection(openpi, ctx.log))
     deadline_s = time.monotonic() + START_S
     while True:
         try:
@@ -133,18 +178,27 @@ def main() -> int:
     """Both; 1 if an answer is wrong."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--requests", type=int, default=500)
-    parser.add_argument("--openpi", metavar="PYTHON", help="interpreter with openpi-server and openpi-client")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--openpi", metavar="PYTHON", help="interpreter with openpi-server and openpi-client")
+    which.add_argument("--vla-eval", metavar="PYTHON", help="interpreter with vla-eval")
+    which.add_argument("--gr00t", metavar="PYTHON", help="interpreter with msgpack, numpy and pyzmq")
+    parser.add_argument("--checkout", metavar="FOLDER", default="", help="folder with the package gr00t")
     given = parser.parse_args()
     logging.disable(logging.CRITICAL)
-    python, code = (given.openpi, THEIRS) if given.openpi else (sys.executable, OURS)
+    kind, python, code = next(
+        (each for each in (("openpi", given.openpi, THEIRS), ("vla_eval", given.vla_eval, VLA_EVAL),
+                           ("gr00t", given.gr00t, GR00T)) if each[1]),
+        ("ours", sys.executable, OURS),
+    )  # fmt: skip
     rng, wrong = np.random.default_rng(0), 0
-    with served(python, code) as port:
-        policy = policy_of(port)
+    with served(python, code, given.checkout) as port:
+        policy = policy_of(kind, port)
+        length = policy.spec.chunk_size
         images = {key: rng.integers(0, 256, IMAGE, np.uint8) for key in (TOP, WRIST)}
         state = rng.uniform(-1, 1, 6).astype(np.float32)
         request: dict[str, Any] = {"observation/state": state, "prompt": "pick up the cube"}
         request |= {"observation/image": images[TOP], "observation/wrist_image": images[WRIST]}
-        bare = BareSocket(len(pack(request)), len(pack({"actions": np.zeros((HORIZON, 6), np.float32)})))
+        bare = BareSocket(len(pack(request)), len(pack({"actions": np.zeros((length, 6), np.float32)})))
         times_ms: dict[str, list[float]] = {"socket": [], "policy": []}
         for number in range(given.requests):
             begun_s = time.perf_counter()
@@ -156,11 +210,11 @@ def main() -> int:
             actions = policy.postprocess(policy.infer(policy.preprocess(frame)))
             times_ms["policy"].append((time.perf_counter() - made_s) * 1e3)
             times_ms["socket"].append((asked_s - begun_s) * 1e3)
-            wrong += not np.array_equal(actions, np.tile(state.astype(np.float64), (HORIZON, 1)))
+            wrong += not np.array_equal(actions, np.tile(state.astype(np.float64), (length, 1)))
         policy.close()
     medians = {name: float(np.median(values)) for name, values in times_ms.items()}
     result = {
-        "server": "openpi" if given.openpi else "ours",
+        "server": kind,
         "requests": given.requests,
         "bytes": len(pack(request)),
         **{f"{name}_p50_ms": round(medians[name], 2) for name in medians},

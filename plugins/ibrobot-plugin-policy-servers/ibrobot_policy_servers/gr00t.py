@@ -15,6 +15,9 @@ from ibrobot_core.api import PolicyError
 from ibrobot_policy_servers.connection import Connection, one_line
 from ibrobot_policy_servers.options import Gr00tOptions
 
+_ENDS = zmq.EVENT_CLOSED | zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+"""Events after which no answer comes: nobody listens, the server died, or it speaks another protocol."""
+_GONE = "no GR00T server, or it closed the connection"
 _GLANCE_MS = 50
 """How often a wait checks whether it was interrupted [ms]."""
 
@@ -44,6 +47,7 @@ class Gr00tConnection(Connection):
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE)
         # A server that restarts may have another model: a new connection asks for it.
         socket.setsockopt(zmq.RECONNECT_IVL, -1)
+        self._monitor = socket.get_monitor_socket(_ENDS)
         try:
             socket.connect(self.address)
         except zmq.ZMQError as error:
@@ -77,6 +81,8 @@ class Gr00tConnection(Connection):
         socket, self._socket = self._socket, None
         context, self._context = self._context, None
         if socket is not None:
+            socket.disable_monitor()
+            self._monitor.close(linger=0)
             socket.close(linger=0)
         if context is not None:
             context.term()
@@ -94,6 +100,8 @@ class Gr00tConnection(Connection):
             socket.send(pack_npy(message), zmq.NOBLOCK)
             self._wait(socket, timeout_s)
             answer = unpack_npy(socket.recv())
+        except zmq.Again:
+            raise PolicyError(f"{self.address}: {_GONE}") from None
         except zmq.ZMQError as error:
             raise PolicyError(f"{self.address}: the connection failed: {error}") from None
         except PolicyError as error:
@@ -103,8 +111,12 @@ class Gr00tConnection(Connection):
         return answer
 
     def _wait(self, socket: zmq.Socket[bytes], timeout_s: float) -> None:
-        deadline_s = time.monotonic() + timeout_s
-        while not socket.poll(_GLANCE_MS):
+        deadline_s, poller = time.monotonic() + timeout_s, zmq.Poller()
+        for each in (socket, self._monitor):
+            poller.register(each, zmq.POLLIN)
+        while not (ready := dict(poller.poll(_GLANCE_MS))).get(socket):
+            if ready:
+                raise PolicyError(_GONE)
             if self._interrupted.is_set():
                 raise PolicyError("was closed")
             if time.monotonic() >= deadline_s:

@@ -204,13 +204,13 @@ def test_a_late_answer_reaches_no_later_request(options: Gr00tOptions, server: G
 def test_a_server_that_is_killed_is_used_again_unless_it_has_another_model(
     options: Gr00tOptions, server: Gr00tServer
 ) -> None:
-    policy = make(attrs.evolve(options, timeout=0.2))
+    policy = make(options)
     policy.load()
     server.stop()
-    with pytest.raises(PolicyError, match=server.address):
+    with pytest.raises(PolicyError, match=f"{server.address}: .*closed the connection"):
         chunk(policy, frame())
     server.start()
-    np.testing.assert_allclose(in_time(policy, frame(9)), expected(9), atol=1e-6)
+    np.testing.assert_allclose(chunk(policy, frame(9)), expected(9), atol=1e-6)
     server.stop()
     server.description = {"action": {"modality_keys": ["other"]}}
     server.start()
@@ -218,15 +218,15 @@ def test_a_server_that_is_killed_is_used_again_unless_it_has_another_model(
         chunk(policy, frame())
     for _ in range(2):
         with pytest.raises(PolicyError, match=r"restarted with another model.*other.*previously.*single_arm"):
-            in_time(policy, frame())
+            chunk(policy, frame())
     policy.close()
 
 
 def test_no_server_is_an_error() -> None:
     with Gr00tServer() as gone:
         pass
-    policy = make(attrs.evolve(OPTIONS, address=gone.address, start_timeout=0.2))
-    with pytest.raises(PolicyError, match=f"{gone.address}: no answer within"):
+    policy = make(attrs.evolve(OPTIONS, address=gone.address))
+    with pytest.raises(PolicyError, match=f"{gone.address}: no GR00T server"):
         policy.load()
     policy.close()
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hmac
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from ibrobot_serve.client_model import ClientModel
 TASK = "annotation.human.task_description"
 _GLANCE_MS = 100
 """How often the server checks whether it was closed [ms]."""
+_UNREAD = 10
+"""Answers kept for a client that does not read."""
 _PREFIX, _PICTURES = "observation.", "observation.images."
 _ACTION = "action"
 
@@ -46,8 +49,10 @@ class Gr00tServer:
         self._places = {_place(observation): observation for observation in policy.spec.observations}
         """Modality and name -> observation."""
         self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.REP)
+        # A socket of kind REP stops answering everybody after bytes of another protocol (libzmq 4.3.5).
+        self._socket = self._context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.SNDHWM, _UNREAD)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE)
         self._socket.setsockopt(zmq.IPV6, ":" in host)
         try:
@@ -75,15 +80,19 @@ class Gr00tServer:
 
     def _serve(self) -> None:
         while not self._closed.is_set():
-            if self._socket.poll(_GLANCE_MS):
-                self._socket.send(pack_npy(self._answer(self._socket.recv_multipart())))
+            if not self._socket.poll(_GLANCE_MS):
+                continue
+            with suppress(zmq.Again):  # nothing of what came was a message
+                sender, *frames = self._socket.recv_multipart(zmq.NOBLOCK)
+                if len(frames) == 2 and not frames[0]:  # from a socket of kind REQ
+                    self._socket.send_multipart([sender, b"", pack_npy(self._answer(frames[1]))], zmq.NOBLOCK)
 
-    def _answer(self, frames: Sequence[bytes]) -> Any:
+    def _answer(self, message: bytes) -> Any:
         try:
             with self._model.contained():
-                request = unpack_npy(frames[0]) if len(frames) == 1 else None
+                request = unpack_npy(message)
                 if not isinstance(request, dict):
-                    raise PolicyError("a request must be one frame with a dictionary")
+                    raise PolicyError(f"a request must be a dictionary, got {type(request).__name__}")
                 if self._key is not None:
                     token = request.get("api_token")
                     if not isinstance(token, str) or not hmac.compare_digest(token.encode(), self._key.encode()):

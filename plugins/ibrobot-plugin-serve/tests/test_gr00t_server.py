@@ -146,6 +146,19 @@ def test_a_huge_message_is_refused_unread(client: Client, server: Gr00tServer) -
     assert client.call("ping")["status"] == "ok"
 
 
+def test_other_protocols_harm_no_client(client: Client, server: Gr00tServer) -> None:
+    random = np.random.default_rng(0)
+    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(48)
+    http = b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 99\r\n\r\n{}"
+    for _ in range(50):
+        for content in (http, greeting, b"\x16\x03\x01\x02\x00", random.bytes(2000)):
+            with socket.create_connection(("127.0.0.1", server.port)) as connection:
+                connection.sendall(content)
+    assert client.call("get_action", ZEROS)[0]["action"].shape == (1, 10, 6)
+    with Client(server) as later:
+        assert later.call("get_action", ZEROS)[0]["action"].shape == (1, 10, 6)
+
+
 def test_clients_need_the_key(policy: FakePolicy) -> None:
     server = Gr00tServer(policy, "net", "127.0.0.1", 0, "pa55word")
     try:
