@@ -105,7 +105,8 @@ def served(python: str, code: str, checkout: str = "") -> Iterator[int]:
 
 def policy_of(kind: str, port: int) -> ServedPolicy:
     """The robot's side, once the server is up."""
-    ctx, common = host_context(), {"horizon": 1 if kind == "vla_eval" else HORIZON, "rate_hz": 30.0}
+    ctx = host_context()
+    common: dict[str, Any] = {"horizon": 1 if kind == "vla_eval" else HORIZON, "rate_hz": 30.0}
     if kind == "gr00t":
         gr00t = Gr00tOptions(
             address=f"tcp://127.0.0.1:{port}",
