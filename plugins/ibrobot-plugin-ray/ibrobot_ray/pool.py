@@ -92,7 +92,7 @@ class RayPool(Pool):
         try:
             with _own_signals():
                 ray.init(**where, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False)
-        except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+        except (ray.exceptions.RayError, ConnectionError, RuntimeError, ValueError, OSError) as error:
             raise ComponentFailed(f"the Ray cluster {address or 'of this machine'} cannot be used: {error}") from error
         self._plain = ray.remote(num_cpus=1, max_retries=RETRIES)(_do)
         self._fresh = ray.remote(num_cpus=1, max_retries=RETRIES, max_calls=1)(_do)
