@@ -61,6 +61,8 @@ class Service[Q, A]:
     limits: RequestLimits = RequestLimits()
     urgent: bool = False
     """Whether it must not wait behind other requests, as an emergency stop."""
+    ros_type: str = ""
+    """The ROS 2 type with the same fields, if there is one, e.g. `ibrobot_msgs/srv/MoveToPose`."""
 
     def __attrs_post_init__(self) -> None:
         if not attrs.has(self.request):

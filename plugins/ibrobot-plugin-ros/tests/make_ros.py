@@ -20,13 +20,16 @@ INTERFACES = Path(__file__).parent / "interfaces"
 LIBRARY = Path(__file__).parents[2] / "ibrobot-ros2" / "ibrobot_ros2"
 PACKAGES = {
     "control_msgs": (
-        LIBRARY / "interfaces" / "control_msgs",
+        (LIBRARY / "interfaces/control_msgs",),
         ("builtin_interfaces", "std_msgs", "sensor_msgs", "trajectory_msgs"),
     ),
-    "tf2_msgs": (INTERFACES / "tf2_msgs", ("geometry_msgs",)),
-    "ibrobot_msgs": (LIBRARY / "msg", ("std_msgs",)),
+    "tf2_msgs": ((INTERFACES / "tf2_msgs",), ("geometry_msgs",)),
+    "ibrobot_msgs": (
+        (LIBRARY / "msg", LIBRARY / "interfaces/ibrobot_msgs"),
+        ("std_msgs", "geometry_msgs", "sensor_msgs"),
+    ),
 }
-"""Package -> folder of its texts, and the packages that these need."""
+"""Package -> folders of its texts, and the packages that these need."""
 WHEELS = [
     f"ros-jazzy-{name}"
     for name in (
@@ -108,11 +111,11 @@ def _mend(folder: Path, python: Path) -> None:
 
 
 def _build(name: str, folder: Path, python: Path) -> None:
-    texts, needs = PACKAGES[name]
+    folders, needs = PACKAGES[name]
     with tempfile.TemporaryDirectory() as made:
         source = Path(made) / name
         files = []
-        for text in sorted(texts.rglob("*.*")):
+        for text in sorted(each for texts in folders for each in texts.rglob("*.*")):
             kind = text.suffix.removeprefix(".")
             if kind in ("msg", "srv", "action"):
                 files.append(f"{kind}/{text.name}")

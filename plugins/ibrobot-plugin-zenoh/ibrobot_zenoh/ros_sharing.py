@@ -11,7 +11,7 @@ from typing import Any, override
 import attrs
 from ibrobot_ros2 import decode, encode
 from ibrobot_ros2.goals import Actions, with_goals
-from ibrobot_ros2.interfaces import ActionType, ServiceType, action_type, service_type, to_cdr
+from ibrobot_ros2.interfaces import ActionType, ServiceType, action_type, fields_of, service_type, to_cdr
 from ibrobot_ros2.offers import Offer, Offers
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, NotSupported, did_you_mean
@@ -29,7 +29,7 @@ _CANCELED, _REJECTED, _UNKNOWN, _OVER = 0, 1, 2, 3
 
 
 class RosServices(SessionWorker):
-    """Answers calls of the shared services under types of std_srvs; those that a mode brings appear with it."""
+    """Answers calls of the shared services under types of ROS; those that a mode brings appear with it."""
 
     def __init__(self, session: RunAccess, link: TransportLink, is_shared: Callable[[str], bool]) -> None:
         super().__init__(session, "share:ros services", "services for ROS 2 nodes", (link.name,))
@@ -57,7 +57,9 @@ class RosServices(SessionWorker):
                 self._ends[name] = self._transport.serve_ros(name, kind, answer, urgent=urgent)
 
     def _answer(self, offer: Offer, request: dict[str, Any], reply: Reply) -> None:
-        reply(self._offers.answer(offer, request))
+        answer = self._offers.answer(offer, request)
+        known = fields_of(service_type(offer.type).response)
+        reply({name: value for name, value in answer.items() if name in known})
 
     @override
     def teardown(self) -> None:

@@ -130,6 +130,11 @@ def _mend() -> None:
     define(standard_types(), _EVENT_INFO, text)
 
 
+def fields_of(type_name: str) -> list[str]:
+    """The names of the fields of a message, as ROS has them."""
+    return [name for name, _ in standard_types().fielddefs[type_name][1]]
+
+
 def _service(name: str, request: str, response: str) -> ServiceType:
     _mend()
     _define(f"{name}_Request", request)

@@ -1,4 +1,4 @@
-"""Services of a run under types of ROS: those whose requests std_srvs can say."""
+"""Services of a run under types of ROS: their own, or std_srvs, if that can say their requests."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import IbrobotError
+from ibrobot_core.api import NS_PER_S, IbrobotError
 from ibrobot_core.app import SET_MODE, RunView, Service
 from ibrobot_ros2.services import plain
 
@@ -31,7 +31,9 @@ class Offer:
 
 
 def ros_type(service: Service[Any, Any]) -> tuple[str, str] | None:
-    """The type of std_srvs that can say requests of a service, and the field that `data` is; None if there is none."""
+    """The type of ROS that can say requests of a service, and the field that `data` is; None if there is none."""
+    if service.ros_type:
+        return service.ros_type, ""
     fields = attrs.fields(service.request)
     required = [field for field in fields if field.default is attrs.NOTHING]
     if not required:
@@ -70,15 +72,34 @@ class Offers:
         return {name: offer for name, offer in named.items() if _NAME.fullmatch(name)}
 
     def answer(self, offer: Offer, request: Mapping[str, Any]) -> dict[str, Any]:
-        """The response to a request: `success` and `message`; the run's own answer is its message."""
+        """The response to a request, for the fields that its type has.
+
+        Of std_srvs: `success` and `message`, which is the run's own answer.
+        """
         full = {**offer.request, **({offer.field: request["data"]} if offer.field else {})}
         try:
+            if offer.type not in (TRIGGER, SET_BOOL):
+                answer: dict[str, Any] = plain(self._session.bus.call(offer.service, with_ns(request)))
+                return answer
             return {"success": True, "message": _text(self._session.bus.call(offer.service, full))}
         except IbrobotError as error:
             return {"success": False, "message": str(error)}
         except Exception:
             self._session.log.exception("%s failed", offer.service)
             return {"success": False, "message": "the service failed; the robot's log has the cause"}
+
+
+def with_ns(value: Any) -> Any:
+    """A plain request of ROS as runs take them: a time `x` is `x_ns` [ns]."""
+    if isinstance(value, Mapping):
+        found = {}
+        for name, each in value.items():
+            if isinstance(each, Mapping) and set(each) == {"sec", "nanosec"}:
+                found[f"{name}_ns"] = each["sec"] * NS_PER_S + each["nanosec"]
+            else:
+                found[name] = with_ns(each)
+        return found
+    return [with_ns(each) for each in value] if isinstance(value, list) else value
 
 
 def _text(answer: Any) -> str:

@@ -64,12 +64,14 @@ MOVE_TO_POSE = Service(
     MoveToPose,
     MoveResult,
     "Move the tool to a pose; answers when the motion has ended.",
+    ros_type="ibrobot_msgs/srv/MoveToPose",
 )
 MOVE_TO_CONFIGURATION = Service(
     "/moveit_gateway/move_to_configuration",
     MoveToConfiguration,
     MoveResult,
     "Move joints to positions; answers when the motion has ended.",
+    ros_type="ibrobot_msgs/srv/MoveToConfiguration",
 )
 CMD_POSE = "/cmd_pose"
 """geometry_msgs/msg/PoseStamped or Pose: a goal."""

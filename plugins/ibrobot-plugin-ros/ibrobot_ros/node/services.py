@@ -1,4 +1,4 @@
-"""Services of the run, as ROS services of std_srvs."""
+"""Services of the run, as ROS services."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ class Services:
         name = head["name"]
 
         def call(request: Any, response: Any) -> Any:
-            fields = {field: getattr(request, field) for field in request.get_fields_and_field_types()}
-            answer = self._ask(name, fields)
-            response.success, response.message = answer["success"], answer["message"]
+            answer = self._ask(name, _plain(request))
+            for field in response.get_fields_and_field_types():
+                if field in answer:
+                    setattr(response, field, answer[field])
             return response
 
         try:
@@ -57,3 +58,12 @@ class Services:
             return {"success": False, "message": f"{name} did not answer within {_PATIENCE_S:g} s"}
         finally:
             del self._waiting[number]
+
+
+def _plain(value: Any) -> Any:
+    """A message as JSON says it."""
+    if hasattr(value, "get_fields_and_field_types"):
+        return {field: _plain(getattr(value, field)) for field in value.get_fields_and_field_types()}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [_plain(each) for each in value] if isinstance(value, list | tuple) else value

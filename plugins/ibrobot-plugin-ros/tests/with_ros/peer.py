@@ -33,6 +33,14 @@ def profile(name):
     return QoSProfile(depth=1000, reliability=reliable, durability=latched)
 
 
+def fill(message, values):
+    for name, value in values.items():
+        if isinstance(value, dict):
+            fill(getattr(message, name), value)
+        else:
+            setattr(message, name, value)
+
+
 def until(ready, timeout_s=PATIENCE_S):
     deadline = time.monotonic() + timeout_s
     while not ready():
@@ -120,8 +128,7 @@ class Peer:
         answers = []
         for _ in range(count):
             sent = cls.Request()
-            for key, value in (request or {}).items():
-                setattr(sent, key, value)
+            fill(sent, request or {})
             answer = done(client.call_async(sent))
             answers.append([answer.success, answer.message])
         return answers
@@ -161,6 +168,11 @@ class Peer:
         goal.command.position, goal.command.max_effort = position, max_effort
         return self._send(action, "control_msgs/action/GripperCommand", goal, after_s, then)
 
+    def grip_parallel(self, action, name, position):
+        goal = find("control_msgs/action/ParallelGripperCommand").Goal()
+        goal.command.name, goal.command.position = name, position
+        return self._send(action, "control_msgs/action/ParallelGripperCommand", goal, None, "")
+
     def _send(self, action, type, goal, after_s, then):
         feedback: list[Any] = []
         handle = done(self._client(action, type).send_goal_async(goal, feedback_callback=feedback.append))
@@ -184,6 +196,8 @@ class Peer:
             value = getattr(answer.result, field)
             if isinstance(value, int | float | str):
                 found[field] = value
+            elif field == "state":
+                found[field] = [list(value.name), list(value.position)]
         return found
 
     def outcomes(self):

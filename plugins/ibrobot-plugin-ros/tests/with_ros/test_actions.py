@@ -117,6 +117,17 @@ def test_the_gripper_grasps_an_object(start, peer):
     assert peer.ask("grip", action=GRIP, position=-3.0) == {"accepted": False}
 
 
+def test_a_parallel_gripper_grasps_an_object(start, peer):
+    start("ros.gripper_action=ParallelGripperCommand")
+    opened = peer.ask("grip_parallel", action=GRIP, name=["grip"], position=[0.9])
+    assert (opened["status"], opened["reached_goal"], opened["stalled"]) == ("SUCCEEDED", True, False)
+    grasped = peer.ask("grip_parallel", action=GRIP, name=[], position=[0.05])
+    assert (grasped["status"], grasped["reached_goal"], grasped["stalled"]) == ("SUCCEEDED", False, True)
+    assert grasped["state"] == [["grip"], [pytest.approx(0.3, abs=0.01)]]
+    for wrong in ({"name": ["other"], "position": [0.5]}, {"name": ["grip"], "position": [0.5, 0.6]}):
+        assert peer.ask("grip_parallel", action=GRIP, **wrong) == {"accepted": False}
+
+
 def test_canceling_the_arm_leaves_the_gripper(start, peers, peer):
     from .conftest import Peer
 

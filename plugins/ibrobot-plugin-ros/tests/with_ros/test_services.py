@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 from types import NoneType
 
+import pytest
+
 from ibrobot_core.app import NoRequest, Service
 
 from .conftest import Peer, scaled, until
@@ -69,3 +71,17 @@ def test_an_episode_is_recorded_by_services(start, peer, tmp_path):
     assert peer.ask("call", name="/record_episode/start", type=TRIGGER)[0][0]
     assert peer.ask("call", name="/record_episode/stop", type=TRIGGER)[0][0]
     assert (tmp_path / "episodes/default/episodes/episode_000001").is_dir()
+
+
+def test_the_gateway_of_ib_robot_moves_joints(start, peer):
+    run = start(mode="plan")
+    goal = {"target_joint_state": {"name": ["pan", "lift"], "position": [0.3, -0.2]}}
+    kind = "ibrobot_msgs/srv/MoveToConfiguration"
+    service = "/moveit_gateway/move_to_configuration"
+    assert peer.ask("call", name=service, type=kind, request=goal) == [[True, ""]]
+    assert run.session.measured().position[:2] == pytest.approx([0.3, -0.2], abs=0.03)
+    goal["target_joint_state"]["position"] = [9.0, 0.0]
+    ((moved, why),) = peer.ask("call", name=service, type=kind, request=goal)
+    assert not moved
+    assert "pan" in why
+    run.check_steps()
