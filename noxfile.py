@@ -350,7 +350,7 @@ def ros(session: nox.Session) -> None:
     """
     tests = FOLDERS["ros"] / "tests"
     folder = Path(session.create_tmp()).absolute() / "jazzy"
-    install(session, "ros", "planning", "mcap", "data")
+    install(session, "ros", "planning", "mcap", "data", "zenoh")
     made = session.run("python", str(tests / "make_ros.py"), str(folder), silent=True, success_codes=[0, 3])
     if not (folder / "bin/python").exists():
         note_untested(session, f"ROS 2 is not tested: {str(made).strip()}")

@@ -1,0 +1,71 @@
+"""A recorded episode, played into a run by `ibrobot bag play`, and through it to a node of rclpy's."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ibrobot_ros2 import encode
+from ibrobot_testing.ports import free_port
+from ibrobot_zenoh.commands.bag import bag
+
+from ibrobot_core.api import String
+from ibrobot_core.app import installed_plugins
+
+from .conftest import until
+
+NOTE, COMMANDS = "/note", "/arm/commands"
+COUNT = 30
+
+
+@pytest.fixture
+def episode(start, tmp_path):
+    """An episode in which the robot moved, with notes 20 ms apart."""
+    run = start("recording={type: mcap, topics: all}", mode="teleop", by_operator=True)
+    run.session.bus.call("/record_episode/start")
+    begun = run.session.clock.now_ns()
+    for i in range(COUNT):
+        run.session.clock.sleep_until(begun + i * 20_000_000)
+        run.session.bus.publish(NOTE, String(f"note {i}"))
+    run.session.bus.call("/record_episode/stop", "success")
+    run.runtime.stop()
+    return tmp_path / "episodes/default/episodes/episode_000001"
+
+
+def test_an_episode_goes_through_a_run_to_ros(start, episode, peer):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    subscribe = f"{{{NOTE}: std_msgs/msg/String, {COMMANDS}: std_msgs/msg/Float64MultiArray}}"
+    transport = f"{{type: zenoh, mode: router, listen: [{endpoint}], share: {{subscribe: {subscribe}}}}}"
+    run = start(f"transport={transport}", mode="idle")
+    seen = run.session.bus.subscribe(NOTE, 1000)
+    commands = run.session.bus.subscribe(COMMANDS, 10_000)
+    run.session.bus.publish(NOTE, String("first"))
+    peer.ask("subscribe", topic=NOTE, type="std_msgs/msg/String")
+    until(lambda: run.session.bus.publish(NOTE, String("here?")) or peer.ask("take", topic=NOTE, timeout_s=0.1))
+    before, began = len(peer.ask("take", topic=NOTE)), run.session.measured().position.copy()
+    seen.drain()
+    for options in (["--topics", NOTE, "--rate", "2", "--start-offset", "0.1"], []):
+        played = CliRunner().invoke(bag, ["play", str(episode), "--endpoint", endpoint, *options])
+        assert played.exit_code == 0, played.output
+    assert f"not played, as they command a robot: {COMMANDS}" in played.output
+    with closing(installed_plugins().open_episode(episode)) as reader:
+        recorded = list(reader.messages((NOTE,)))
+        later = [each.message for each in reader.messages_since(reader.summary().start_ns + 100_000_000, [NOTE])]
+    notes = [each.message for each in recorded]
+    until(lambda: len(peer.ask("take", topic=NOTE)) >= before + len(later) + COUNT)
+    wire = [raw for _, raw in peer.ask("take", topic=NOTE)][before:]
+    expected = [encode(each).hex() for each in (*later, *notes)]
+    assert [raw[: len(text)] for raw, text in zip(wire, expected, strict=True)] == expected
+    received = [each for each in seen.drain() if str(each.message.data).startswith("note")]
+    assert [each.message for each in received] == [*later, *notes]
+    pace = [
+        (each[-1].received_ns - each[0].received_ns) / 1e9 for each in (received[: len(later)], received[len(later) :])
+    ]
+    spans = [(recorded[-1].received_ns - recorded[-len(later)].received_ns) / 2e9, 0.02 * (COUNT - 1)]
+    np.testing.assert_allclose(pace, spans, atol=0.5)
+    moved = {tuple(each.message.data) for each in commands.drain()}
+    assert len(moved) <= 1, "the recorded commands came on the bus"
+    np.testing.assert_allclose(run.session.measured().position, began, atol=1e-6)
+    assert not run.session.faults
