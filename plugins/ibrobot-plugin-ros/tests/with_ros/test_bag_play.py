@@ -27,8 +27,13 @@ COUNT = 30
 @pytest.fixture(scope="module", autouse=True)
 def _zenoh_runs() -> None:
     """Zenoh's own threads run, with the files that they keep."""
-    options = ZenohOptions(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",), shared_memory=False)
-    ZenohTransport(options, host_context()).close()
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    both = (
+        ZenohOptions(mode="router", listen=(endpoint,), shared_memory=False),
+        ZenohOptions(connect=(endpoint,), shared_memory=False),
+    )
+    for each in [ZenohTransport(options, host_context()) for options in both][::-1]:
+        each.close()
 
 
 @pytest.fixture
