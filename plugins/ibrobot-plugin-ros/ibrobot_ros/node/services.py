@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import itertools
 import queue
+from array import array
 from typing import Any
 
+import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 
 from ibrobot_ros.node.types import find_type
@@ -61,9 +63,11 @@ class Services:
 
 
 def _plain(value: Any) -> Any:
-    """A message as JSON says it."""
-    if hasattr(value, "get_fields_and_field_types"):
-        return {field: _plain(getattr(value, field)) for field in value.get_fields_and_field_types()}
-    if hasattr(value, "tolist"):
+    """A message, or a field of one, as JSON says it."""
+    if isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.ndarray | array):
         return value.tolist()
-    return [_plain(each) for each in value] if isinstance(value, list | tuple) else value
+    if isinstance(value, list | tuple | bytes):
+        return [_plain(each) for each in value]
+    return {field: _plain(getattr(value, field)) for field in value.get_fields_and_field_types()}
