@@ -27,6 +27,8 @@ HASHES = {
         "e4c7f0e8a831ce5625ed20abcd13796406d945f92ebc7ad5972e0b0d29b381bd",
     "control_msgs/action/ParallelGripperCommand_SendGoal":
         "567c37373fed1260adbe047415688c73e4f3e94b2e3982761ecc71fd63d710a7",
+    "ibrobot_msgs/srv/MoveToConfiguration": "06c5351baf255a8e4a390e72af937603b1cc1b614aba078b19c7339425a082da",
+    "ibrobot_msgs/srv/MoveToPose": "a3ca142ae8c253221e34abfce186bb33b1bd26399872d6033b18417f24203fad",
     "rcl_interfaces/srv/GetParameters": "bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
     "rcl_interfaces/srv/ListParameters": "3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
     "rcl_interfaces/srv/SetParameters": "56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
