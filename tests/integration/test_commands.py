@@ -49,6 +49,7 @@ WRONG_FILES = {
     "datasets info BAD": (),
     "datasets merge BAD --out new": (),
     "description srdf BAD": (),
+    "lerobot new BAD koch_follower": ("missing",),
     "episodes delete BAD --yes": (),
     "episodes export BAD /joint_states -o new.csv": (),
     "episodes export EPISODE /joint_states -o BAD": ("missing", "binary", "empty"),
@@ -95,7 +96,7 @@ WRONG_FILES = {
 """Command line -> the kinds of files that are right there."""
 WITHOUT_FILES = {
     "config schema", "plugins show", "doctor", "camera list", "feetech find-port", "gamepad list", "gamepad test",
-    "gamepad udev",
+    "gamepad udev", "lerobot list", "lerobot torque-off",
 }  # fmt: skip
 KINDS = ("missing", "folder", "binary", "unreadable", "empty")
 

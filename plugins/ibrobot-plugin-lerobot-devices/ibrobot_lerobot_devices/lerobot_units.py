@@ -1,0 +1,106 @@
+"""LeRobot's features of a robot YAML: names, units and pictures, as LeRobot's own robot of that kind has them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Self
+
+import attrs
+import numpy as np
+
+from ibrobot_core.api import Contract, JointCalibration, Vector, load_calibration
+from ibrobot_core.app import RobotConfig
+
+_IMAGES = "observation.images."
+_TURN = JointCalibration.TICKS_PER_TURN
+
+
+@attrs.frozen(eq=False)
+class RobotFeatures:
+    """The joints, in the order of the action, and the pictures of a robot.
+
+    LeRobot's value of a joint is `(radians - offset) / factor`.
+    """
+
+    joints: tuple[str, ...]
+    factor: Vector
+    offset: Vector
+    pictures: Mapping[str, tuple[int, int, int]]
+    """Name -> height, width [px] and channels."""
+    rate_hz: float
+    """Of the contract."""
+
+    @classmethod
+    def of_config(cls, config: RobotConfig, *, use_degrees: bool, calibration: str = "") -> Self:
+        """The features of a robot YAML.
+
+        Args:
+            config: the robot.
+            use_degrees: whether joints are in degrees, from the middle of their range; otherwise from -100 to 100. A
+                joint with a closed end, such as a gripper, is from 0 to 100.
+            calibration: name or path of a calibration; by default that of the hardware. Without any, as in a
+                simulation, the ranges are the limits of the joints.
+
+        Raises:
+            CalibrationError: if a calibration cannot be read.
+        """
+        contract, robot = Contract.from_config(config), config.robot
+        joints = contract.action_joints
+        names = [calibration] if calibration else [each.calibration for each in config.hardware.values()]
+        known: dict[str, JointCalibration] = {}
+        for name in names if calibration or not config.simulated else []:
+            if name is not None:
+                known |= load_calibration(name).joints
+        limits = dict(zip(robot.joint_names, zip(robot.lower, robot.upper, strict=True), strict=True))
+        # A simulation without hardware in its YAML says nothing about closed ends.
+        closed = {name: lower for name, lower, grips in zip(limits, robot.lower, robot.grips, strict=True) if grips}
+        closed = {**closed, **config.closed_ends}
+        scales = [
+            _scale(known.get(joint), limits[joint], closed.get(joint), use_degrees=use_degrees) for joint in joints
+        ]
+        pictures = {}
+        for part in contract.observation_parts:
+            if part.key.startswith(_IMAGES):
+                height, width, channels = part.feature.shape
+                pictures[part.key.removeprefix(_IMAGES)] = (height, width, channels)
+        factor, offset = np.transpose(scales)
+        return cls(joints, factor, offset, pictures, contract.rate_hz)
+
+    def values(self, radians: Vector) -> dict[str, float]:
+        """Positions [rad], shape (J,), as LeRobot's features."""
+        found = (radians - self.offset) / self.factor
+        return {f"{joint}.pos": float(value) for joint, value in zip(self.joints, found, strict=True)}
+
+    def radians(self, values: Mapping[str, float]) -> dict[str, float]:
+        """LeRobot's features as positions of joints [rad].
+
+        Raises:
+            KeyError: for a feature that is not one of its joints.
+            ValueError: for a value that is not finite.
+        """
+        indices = {f"{joint}.pos": i for i, joint in enumerate(self.joints)}
+        found = {}
+        for name, value in values.items():
+            if name not in indices:
+                raise KeyError(f"no joint {name!r}; the joints are: {', '.join(indices)}")
+            if not math.isfinite(value):
+                raise ValueError(f"{name} is {value}")
+            i = indices[name]
+            found[self.joints[i]] = float(value * self.factor[i] + self.offset[i])
+        return found
+
+
+def _scale(
+    calibration: JointCalibration | None, limits: tuple[float, float], closed_at: float | None, *, use_degrees: bool
+) -> tuple[float, float]:
+    """Factor and offset of a joint, as `ibrobot_core.contract.joint_units` converts datasets."""
+    lower, upper = limits if calibration is None else calibration.ends(closed_at)
+    if closed_at is not None:
+        return (upper - lower) / 100, lower
+    if not use_degrees:
+        return (upper - lower) / 200, (upper + lower) / 2
+    # Without a calibration there are no ticks, of which LeRobot counts one less for a turn.
+    degree = math.radians(1.0) if calibration is None else 2 * math.pi / _TURN * (_TURN - 1) / 360
+    turned = calibration is not None and calibration.inverted
+    return (-degree if turned else degree), (upper + lower) / 2

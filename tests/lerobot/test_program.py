@@ -1,0 +1,116 @@
+"""`lerobot-record`, `-replay`, `-teleoperate` and `-rollout`, unmodified, drive a robot of ibrobot in simulation."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from ibrobot_testing.site import made_up_site
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.robots.so_follower import SO101Follower, SO101FollowerConfig
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot_robot_ibrobot import IbrobotRobot, IbrobotRobotConfig
+
+from ibrobot_core.app import ComponentFailed
+
+sys.path.insert(0, str(Path(__file__).parent))
+from checkpoints import SIZE, STATE, TOP, WRIST, act, save
+
+pytestmark = pytest.mark.lerobot
+
+PLUGINS = Path(__file__).parents[1] / "shared" / "plugins"
+ROBOT = ("--robot.type=ibrobot", "--robot.config=so101_blind", "--robot.sim=true")
+WAVING = (
+    "--teleop.type=ibrobot", "--teleop.config=so101_blind", "--teleop.sim=true", "--teleop.device=waving",
+    "--teleop.overrides=['teleoperation.waving={type: waving}']",
+)  # fmt: skip
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Runs a command of LeRobot in this process, which has torch already."""
+
+    def command(name: str, *arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", [f"lerobot-{name}", *arguments])
+        importlib.import_module(f"lerobot.scripts.lerobot_{name}").main()
+
+    monkeypatch.setattr("tqdm.tqdm.monitor_interval", 0)  # no thread of tqdm's
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "home"))
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    root = logging.getLogger()
+    before = root.handlers[:], root.level
+    with made_up_site(tmp_path / "site", PLUGINS, monkeypatch) as site:
+        site.add("waving", "waving.py")
+        register_third_party_plugins()
+        yield command
+    root.handlers[:], root.level = before
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def column(dataset: Path, name: str) -> np.ndarray:
+    (file,) = (dataset / "data").rglob("*.parquet")
+    return np.array(pq.read_table(file)[name].to_pylist())
+
+
+def test_commands_drive_a_simulated_robot(run: Callable[..., None], tmp_path: Path) -> None:
+    dataset = tmp_path / "dataset"
+    data = ("--dataset.repo_id=me/wave", f"--dataset.root={dataset}")
+    run(
+        "record", *ROBOT, *WAVING, *data, "--dataset.num_episodes=1", "--dataset.episode_time_s=2",
+        "--dataset.reset_time_s=0", "--dataset.single_task=wave", "--dataset.push_to_hub=false", "--play_sounds=false",
+    )  # fmt: skip
+    info = json.loads((dataset / "meta" / "info.json").read_text())
+    theirs = SO101Follower(SO101FollowerConfig(port="/dev/null", id="any", calibration_dir=tmp_path))
+    names = list(theirs.action_features)
+    assert info["robot_type"] == "so101_follower"
+    for key in (STATE, "action"):
+        assert info["features"][key] == {"dtype": "float32", "names": names, "shape": [SIZE]}
+    actions, states = column(dataset, "action"), column(dataset, STATE)
+    assert np.ptp(actions[:, 0]) > 15.0  # degrees
+    assert np.ptp(states[:, 0]) > 10.0
+    assert np.ptp(states[:, 1:], axis=0).max() < 3.0
+
+    run("replay", *ROBOT, *data, "--dataset.episode=0", "--play_sounds=false")
+    run("teleoperate", *ROBOT, *WAVING, "--fps=30", "--teleop_time_s=1")
+
+
+def test_rollout_drives_a_simulated_robot_with_cameras(run: Callable[..., None], tmp_path: Path) -> None:
+    """A policy of the features that a dataset from LeRobot's own so101_follower with these cameras has."""
+    shapes = {STATE: (SIZE,), TOP: (3, 240, 320), WRIST: (3, 240, 320)}
+    kinds = {STATE: FeatureType.STATE, TOP: FeatureType.VISUAL, WRIST: FeatureType.VISUAL}
+    config = act(input_features={key: PolicyFeature(kinds[key], shape) for key, shape in shapes.items()})
+    joints = {"mean": np.array([0, -80, 80, 40, 0, 20], np.float32), "std": np.full(SIZE, 5.0, np.float32)}
+    pictures = {"mean": np.full((3, 1, 1), 0.5, np.float32), "std": np.full((3, 1, 1), 0.3, np.float32)}
+    policy = save(config, tmp_path / "checkpoint", {STATE: joints, TOP: pictures, WRIST: pictures, "action": joints})
+    run(
+        "rollout", "--robot.type=ibrobot", "--robot.config=so101", "--robot.sim=true", f"--policy.path={policy}",
+        "--policy.device=cpu", "--duration=1", "--task=wave", "--play_sounds=false",
+        "--return_to_initial_position=false",
+    )  # fmt: skip
+
+
+def test_a_fault_is_an_exception_with_its_text(tmp_path: Path) -> None:
+    robot = IbrobotRobot(IbrobotRobotConfig(id="any", calibration_dir=tmp_path, config="so101_blind", sim=True))
+    robot.connect()
+    try:
+        observation = robot.get_observation()
+        assert list(observation) == list(robot.observation_features)
+        robot.send_action({**observation, "shoulder_pan.pos": float("nan")})
+        with pytest.raises(ComponentFailed, match=r"shoulder_pan\.pos is nan"):
+            robot.get_observation()
+        assert robot.link._child is not None
+        os.kill(robot.link._child.pid, signal.SIGKILL)
+        with pytest.raises(ComponentFailed, match="the run has ended: killed by SIGKILL"):
+            robot.get_observation()
+    finally:
+        robot.disconnect()
