@@ -132,7 +132,7 @@ class ProgramLink:
             if not part:
                 raise ComponentFailed("the run has ended")
             content += part
-        return np.frombuffer(bytes(content), np.uint8).reshape(shape)
+        return np.frombuffer(content, np.uint8).reshape(shape)  # writable, as LeRobot wants it
 
     def _running(self) -> Child:
         if self._child is None:
