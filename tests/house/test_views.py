@@ -9,7 +9,7 @@ PLUGINS = Path(__file__).parents[2] / "plugins"
 PROGRAMS = {
     "ibrobot_gym/environment.py",
     *(f"ibrobot_eval/{name}.py" for name in ("episodes", "film", "blinded")),
-    "ibrobot_lerobot_devices/program.py",
+    "ibrobot_lerobot_program/run.py",
     "ibrobot_planning/commands/plan.py",
     "ibrobot_testing/section.py",
 }

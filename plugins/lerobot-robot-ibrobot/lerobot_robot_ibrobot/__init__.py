@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from ibrobot_lerobot_devices.program_link import ProgramLink
+from ibrobot_lerobot_program.link import ProgramLink
 from lerobot.robots import Robot, RobotConfig
 
 __all__ = ["IbrobotRobot", "IbrobotRobotConfig"]

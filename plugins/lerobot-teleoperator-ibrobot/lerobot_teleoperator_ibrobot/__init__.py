@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from ibrobot_lerobot_devices.program_teleop import ProgramTeleop
+from ibrobot_lerobot_program.teleop import ProgramTeleop
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 
 __all__ = ["IbrobotTeleoperator", "IbrobotTeleoperatorConfig"]

@@ -1,6 +1,6 @@
 """The run under a program of LeRobot's, in a process of its own: answers its requests, until it ends or dies.
 
-Started by `ProgramLink` as `python -m ibrobot_lerobot_devices.program CHANNEL PICTURES`. The run has its own control
+Started by `ProgramLink` as `python -m ibrobot_lerobot_program.run CHANNEL PICTURES`. The run has its own control
 process. If the program dies or goes silent, the arm holds.
 """
 
@@ -35,7 +35,7 @@ from ibrobot_core.app import (
     load_config,
     open_parent,
 )
-from ibrobot_lerobot_devices.lerobot_units import RobotFeatures
+from ibrobot_lerobot_program.features import RobotFeatures
 
 MODE = "lerobot"
 """The control mode that is added: a program commands the executors of the contract's actions."""

@@ -18,8 +18,8 @@ from ibrobot_core.app import (
     load_config,
     operate,
 )
-from ibrobot_lerobot_devices.lerobot_units import RobotFeatures
-from ibrobot_lerobot_devices.program_link import ProgramLink
+from ibrobot_lerobot_program.features import RobotFeatures
+from ibrobot_lerobot_program.link import ProgramLink
 
 
 class ProgramTeleop:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.app import Child, ComponentFailed
-from ibrobot_lerobot_devices.lerobot_units import RobotFeatures
-from ibrobot_lerobot_devices.program import ANSWER, READY, load_robot
+from ibrobot_lerobot_program.features import RobotFeatures
+from ibrobot_lerobot_program.run import ANSWER, READY, load_robot
 
-_MODULE = "ibrobot_lerobot_devices.program"
+_MODULE = "ibrobot_lerobot_program.run"
 _START_S = 120.0
 _ANSWER_S = 20.0
 _END_S = 20.0
