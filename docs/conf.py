@@ -16,16 +16,26 @@ from ibrobot_core import __version__
 sys.path.insert(0, str(Path(__file__).parent))
 
 import generate
+import site_pages
 from option_pages import flags_as_code
 
-generate.write(Path(__file__).parent / "reference")
+generate.write(Path(__file__).parent)
 
 project = "ibrobot"
 author = "the ibrobot authors"
 project_copyright = "2026, the ibrobot authors"
 version = release = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.doctest", "sphinx.ext.napoleon", "sphinxcontrib.mermaid"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.doctest",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+    "sphinxcontrib.mermaid",
+]
+copybutton_prompt_text = "$ "
+copybutton_line_continuation_character = "\\"
 myst_fence_as_directive = ["mermaid"]  # hosts of repositories draw ```mermaid, too
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
@@ -92,6 +102,7 @@ def _drop_plain_bases(app: Sphinx, domain: str, kind: str, content: Element) -> 
 
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
+    site_pages.connect(app, generate.PAGES)
     app.connect("autodoc-process-docstring", _require_docstring, priority=300)
     app.connect("autodoc-process-docstring", _keep_colons, priority=400)
     app.connect("autodoc-process-docstring", _types_beside_names, priority=600)

@@ -1,16 +1,19 @@
-"""Writes the reference pages that come from the code: the robot YAML, options, plugins and the command line."""
+"""The pages that come from the code and from the packages: robot YAML, options, plugins, command line, READMEs."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import click
 from api_page import api_page
-from option_pages import config_page, jobs_page, options_page, services_page
+from option_pages import config_page, jobs_page, options_of_kinds, options_page, services_page
 from plugin_index import plugin_page
 
 from ibrobot_core.cli.main import cli
+
+_LINK = re.compile(r"\[([^\]]+)\]\(([^)#\s]+)(#[\w-]+)?\)")
 
 
 def command_lines(command: click.Command, path: str) -> Iterator[str]:
@@ -38,19 +41,55 @@ def cli_page() -> Iterator[str]:
         yield from command_lines(found, f"ibrobot {name}")
 
 
-def write(directory: Path) -> None:
-    """Write all generated pages into `directory`; a page that is the same is left alone."""
-    pages = {
-        "config.md": config_page,
-        "options.md": options_page,
-        "plugins.md": plugin_page,
-        "cli.md": cli_page,
-        "api.md": api_page,
-        "jobs.md": jobs_page,
-        "services.md": services_page,
-    }
-    for name, page in pages.items():
-        text = "\n".join(page()) + "\n"
-        path = directory / name
-        if not path.exists() or path.read_text() != text:
-            path.write_text(text)
+PAGES = {
+    "reference/config": config_page,
+    "reference/options": options_page,
+    "reference/plugins": plugin_page,
+    "reference/cli": cli_page,
+    "reference/api": api_page,
+    "reference/jobs": jobs_page,
+    "reference/services": services_page,
+}
+"""The pages that come from the code, in place of short ones for readers of the repository."""
+
+
+def write(docs: Path) -> None:
+    """Write the pages that only the site has: the options of each kind of plugin, and the READMEs of the packages."""
+    _write(docs / "reference" / "options", {kind: "\n".join(page) for kind, page in options_of_kinds().items()})
+    _write(docs / "plugins", readme_pages(docs.parent))
+
+
+def _write(folder: Path, pages: dict[str, str]) -> None:
+    """Write pages into a folder of their own; one that is the same is left alone, and others are removed."""
+    folder.mkdir(exist_ok=True)
+    for path in folder.glob("*.md"):
+        if path.stem not in pages:
+            path.unlink()
+    for name, text in pages.items():
+        path = folder / f"{name}.md"
+        if not path.exists() or path.read_text() != f"{text}\n":
+            path.write_text(f"{text}\n")
+
+
+def readme_pages(root: Path) -> dict[str, str]:
+    """Package -> the text of its README, with links that are right in `docs/plugins`; and an index."""
+    pages = {}
+    for readme in sorted(root.glob("plugins/*/README.md")):
+        text = readme.read_text(encoding="utf-8")
+        pages[readme.parent.name] = _LINK.sub(lambda match, at=readme: _moved(match, at, root), text)  # type: ignore[misc]
+    lines = ["# Packages", "", "What each package of the repository does, from its README.", ""]
+    lines += [f"- [{name}]({name}.md)" for name in pages]
+    return {**pages, "index": "\n".join(lines)}
+
+
+def _moved(match: re.Match[str], readme: Path, root: Path) -> str:
+    """A link of a README, as a page in `docs/plugins` has it; one to a file that is no page becomes plain text."""
+    text, target, anchor = match[1], match[2], match[3] or ""
+    if ":" in target:
+        return match[0]
+    path = (readme.parent / target).resolve()
+    if path.name == "README.md" and path.parent.parent == root / "plugins":
+        return f"[{text}]({path.parent.name}.md{anchor})"
+    if path.is_relative_to(root / "docs") and path.suffix in (".md", ".webp"):
+        return f"[{text}](../{path.relative_to(root / 'docs')}{anchor})"
+    return text

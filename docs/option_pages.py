@@ -45,19 +45,41 @@ def options_page() -> Iterator[str]:
     """Lines of the page on the options of plugins."""
     registry = installed_plugins()
     yield "# Options of plugins\n"
-    yield "The options of every type that core and the plugins of the repository offer. For the types installed on your"
-    yield "machine, `ibrobot plugins show TYPE` prints them.\n"
-    for kind in KINDS:
-        entries = [registry.entries[kind, type_] for type_ in registry.types(kind)]
-        for entry in entries:
-            descriptor = entry.descriptor
-            yield f"({_options_anchor(kind, descriptor.type)})=\n"
-            yield f"## {kind}: `{descriptor.type}`\n"
-            yield f"From `{entry.package}`: {descriptor.summary}.\n"
-            if fields(descriptor.options):
-                yield from _class_tables(descriptor.options)
-            else:
-                yield "It has no options.\n"
+    yield "The options of every type that core and the plugins of the repository offer, on one page for each kind. For"
+    yield "the types installed on your machine, `ibrobot plugins show TYPE` prints them.\n"
+    yield "| kind | types |"
+    yield "|---|---|"
+    for kind in _kinds():
+        types = ", ".join(f"[`{type_}`](#{_options_anchor(kind, type_)})" for type_ in registry.types(kind))
+        yield f"| [{kind}](options/{kind}.md) | {types} |"
+    yield "\n```{toctree}\n:hidden:\n"
+    yield from (f"options/{kind}" for kind in _kinds())
+    yield "```\n"
+
+
+def options_of_kinds() -> dict[str, Iterator[str]]:
+    """Kind -> lines of the page on the options of its types."""
+    return {kind: _kind_page(kind) for kind in _kinds()}
+
+
+def _kinds() -> list[str]:
+    """The kinds of which a type is installed."""
+    return [kind for kind in KINDS if installed_plugins().types(kind)]
+
+
+def _kind_page(kind: str) -> Iterator[str]:
+    registry = installed_plugins()
+    yield f"# Options: {kind}\n"
+    for type_ in registry.types(kind):
+        entry = registry.entries[kind, type_]
+        descriptor = entry.descriptor
+        yield f"({_options_anchor(kind, descriptor.type)})=\n"
+        yield f"## {kind}: `{descriptor.type}`\n"
+        yield f"From `{entry.package}`: {descriptor.summary}.\n"
+        if fields(descriptor.options):
+            yield from _class_tables(descriptor.options)
+        else:
+            yield "It has no options.\n"
 
 
 def jobs_page() -> Iterator[str]:

@@ -28,7 +28,7 @@ PAGES = [
     for page in (
         ROOT / "README.md",
         ROOT / "CONTRIBUTING.md",
-        *sorted((ROOT / "docs").glob("*/*.md")),
+        *sorted(page for page in (ROOT / "docs").glob("*/*.md") if page.parent.name != "plugins"),
         *sorted((ROOT / "plugins").glob("*/README.md")),
     )
     if page not in GENERATED and page.parent.name != "decisions"

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = sorted(
     {
         *ROOT.glob("*.md"),
-        *(ROOT / "docs").glob("*/*.md"),
+        *(page for page in (ROOT / "docs").glob("*/*.md") if page.parent.name != "plugins"),
         *(ROOT / "docs").glob("*.md"),
         *(ROOT / "plugins").glob("*/README.md"),
     }

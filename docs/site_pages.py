@@ -1,0 +1,96 @@
+"""Makes pages of the site from Markdown that reads well without it, e.g. in a clone: no page has a directive.
+
+A line that is only a link to a source file becomes its documentation or its code. The pages that come from code have a
+short text of their own in the repository. Contents come from the links of an index.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+
+Page = Callable[[], Iterator[str]]
+_SOURCE = re.compile(r'^\[`([\w./-]+)`\]\(((?:\.\./)+\S+?\.(?:py|toml))(?: "(.*)")?\)$', re.MULTILINE)
+"""A line such as [`ibrobot_core.bus.Bus`](../../ibrobot_core/bus.py "members: publish"): an object or file, its source,
+and options of the directive."""
+_INCLUDED = re.compile(r"^\[[^\]]+\]\((\.\./\.\./[A-Z]+\.md)\)$", re.MULTILINE)
+_TESTED = re.compile(r"^<!-- doctest -->\n```pycon$", re.MULTILINE)
+_LINK = re.compile(r"\]\(([\w-]+(?:/index)?)\.md\)")
+_TERM = re.compile(r"^- \*\*(.+)\*\*: ", re.MULTILINE)
+
+
+def connect(app: Sphinx, generated: Mapping[str, Page]) -> None:
+    """Let Sphinx read pages this way; `generated`: name -> what a page of the repository becomes."""
+
+    def read(app: Sphinx, name: str, source: list[str]) -> None:
+        if name in generated:
+            source[0] = "\n".join(generated[name]())
+        else:
+            source[0] = site_markdown(name, source[0])
+
+    def outdated(app: Sphinx, env: BuildEnvironment, *names: set[str]) -> list[str]:
+        return [*generated]  # they come from code, which Sphinx does not watch
+
+    app.connect("source-read", read)
+    app.connect("env-get-outdated", outdated)
+
+
+def site_markdown(name: str, text: str) -> str:
+    """The text of a page with the directives of the site."""
+    text = _SOURCE.sub(lambda match: _documented(*match.groups()), text)
+    text = _INCLUDED.sub(r"```{include} \1\n```", text)
+    text = _TESTED.sub("```{doctest}", text)
+    if name == "reference/glossary":
+        return _glossary(text)
+    if name == "index" or name.endswith("/index"):
+        return text + _contents(name, text)
+    return text
+
+
+def _documented(name: str, path: str, options: str | None) -> str:
+    lines = [f":{each.strip()}" for each in (options or "").split(";") if each]
+    if "." not in name or name.endswith(Path(path).name):
+        language = "toml" if path.endswith(".toml") else "python"
+        shown = [] if "." in name else [f":pyobject: {name}"]
+        return "\n".join([f"```{{literalinclude}} {path}", f":language: {language}", *shown, "```"])
+    directive = f".. auto{_kind(name)}:: {name}"
+    return "\n".join(["```{eval-rst}", directive, *(f"   {line}" for line in lines), "```"])
+
+
+def _kind(name: str) -> str:
+    """What a dotted name is of: module, class or function."""
+    try:
+        importlib.import_module(name)
+    except ModuleNotFoundError:
+        module, _, attribute = name.rpartition(".")
+        return "class" if inspect.isclass(getattr(importlib.import_module(module), attribute)) else "function"
+    return "module"
+
+
+def _glossary(text: str) -> str:
+    """A list of `- **term**: text`, in which *term* means an entry, as a glossary."""
+    terms = _TERM.findall(text)
+    head, _, entries = text.partition("\n- **")
+    entries = _TERM.sub(r"\n\1\n  ", f"- **{entries}").lstrip()
+    known = "|".join(re.escape(term) for term in terms)
+    entries = re.sub(rf"(?<!\*)\*({known})(s?)\*(?!\*)", r"{term}`\1\2 <\1>`", entries)
+    return f"{head}\n```{{glossary}}\n{entries}```\n"
+
+
+def _contents(name: str, text: str) -> str:
+    """The table of contents of an index: the pages below it that it links, in order."""
+    if name == "index":
+        pages = [f"{folder}/index" for folder in ("tutorials", "how-to", "explanation", "reference", "decisions")]
+        pages.append("plugins/index")
+    elif name == "decisions/index":
+        pages = ["0*"]
+    else:
+        pages = list(dict.fromkeys(page for page in _LINK.findall(text) if page != "index"))
+    depth = 2 if name == "index" else 1
+    return "\n".join(["", "```{toctree}", ":hidden:", ":glob:", f":maxdepth: {depth}", "", *pages, "```", ""])
