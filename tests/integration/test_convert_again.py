@@ -83,7 +83,7 @@ def killed() -> Iterator[Killed]:
         yield run
 
 
-@pytest.mark.parametrize("append", [False, True])
+@pytest.mark.parametrize("append", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_killed_at_any_point_of_its_end_the_same_command_goes_on(
     bags: Path, tmp_path: Path, killed: Killed, append: bool
 ) -> None:

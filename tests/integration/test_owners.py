@@ -11,9 +11,10 @@ import pytest
 pytestmark = pytest.mark.integration
 
 PROGRAM = Path(__file__).parents[2] / "benchmarks/owners.py"
+LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("append", "train")]
 
 
-@pytest.mark.parametrize("name", ["trim", "append", "train"])
+@pytest.mark.parametrize("name", ["trim", *LONG])
 def test_nothing_is_lost_or_doubled_and_refusals_name_the_owner(name: str) -> None:
     command = [sys.executable, str(PROGRAM), "--times", "1", "--kills", "1", "--only", name]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)

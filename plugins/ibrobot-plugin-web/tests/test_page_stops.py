@@ -261,8 +261,8 @@ def test_a_press_that_outlives_an_event_moves_nothing(
     run(address, test)
 
 
-@pytest.mark.parametrize("held_s", [0.1, 3.0])
-@pytest.mark.parametrize("rate", [300, 700, 2000])
+@pytest.mark.parametrize("held_s", [0.1, pytest.param(3.0, marks=pytest.mark.long)])
+@pytest.mark.parametrize("rate", [300, *(pytest.param(rate, marks=pytest.mark.long) for rate in (700, 2000))])
 def test_on_a_narrow_link_motion_ends_soon_after_the_release_and_stop_is_not_late(
     address: str, rate: int, held_s: float
 ) -> None:
