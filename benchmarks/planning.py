@@ -30,7 +30,8 @@ from ibrobot_planning.planners.timing import Motion
 from ibrobot_planning.world.objects import Box, Cylinder, World
 from planning_scenes import ARM_JOINTS, KINDS, MAX_ACCELERATION, MAX_VELOCITY, MJCF, PADDING_M, Maker, Problem, so101
 
-from ibrobot_core.api import Context, JointGoal, PlanningError, PlanRequest, PlanResult, SteppedClock, Vector
+from ibrobot_core.api import Context, PlanningError, SteppedClock, Vector
+from ibrobot_core.app import JointGoal, PlanRequest, PlanResult
 
 PROOFS = Path(__file__).with_name("planning_proofs.json")
 """Kind -> seed -> a path that solves the problem [mrad]."""

@@ -11,7 +11,6 @@ from ibrobot_core.descriptors import (
     PolicyDescriptor as PolicyDescriptor,
     EngineDescriptor as EngineDescriptor,
     ExecutorDescriptor as ExecutorDescriptor,
-    PlannerDescriptor as PlannerDescriptor,
     TransportDescriptor as TransportDescriptor,
     RecorderDescriptor as RecorderDescriptor,
     ReaderDescriptor as ReaderDescriptor,
@@ -95,19 +94,7 @@ from ibrobot_core.interfaces import (
     GoalState as GoalState,
     GoalStatus as GoalStatus,
     trajectory_goal as trajectory_goal,
-    Planner as Planner,
-    PlanRequest as PlanRequest,
-    PlanResult as PlanResult,
-    AnyGoal as AnyGoal,
-    Goal as Goal,
-    JointGoal as JointGoal,
-    NamedGoal as NamedGoal,
-    PoseGoal as PoseGoal,
-    PositionGoal as PositionGoal,
-    LinearGoal as LinearGoal,
-    OrientationPolicy as OrientationPolicy,
 )
-from ibrobot_core.errors import PlanCode as PlanCode
 
 # Episodes and datasets
 from ibrobot_core.interfaces import (

@@ -90,6 +90,23 @@ from ibrobot_core.interfaces import operate as operate, begin_operation as begin
 from ibrobot_core.deadman import HOLD_S as HOLD_S
 from ibrobot_core.control.spline import Spline as Spline
 
+# Planning
+from ibrobot_core.descriptors import PlannerDescriptor as PlannerDescriptor
+from ibrobot_core.interfaces import (
+    Planner as Planner,
+    PlanRequest as PlanRequest,
+    PlanResult as PlanResult,
+    AnyGoal as AnyGoal,
+    Goal as Goal,
+    JointGoal as JointGoal,
+    NamedGoal as NamedGoal,
+    PoseGoal as PoseGoal,
+    PositionGoal as PositionGoal,
+    LinearGoal as LinearGoal,
+    OrientationPolicy as OrientationPolicy,
+)
+from ibrobot_core.errors import PlanCode as PlanCode
+
 # Topics and services
 from ibrobot_core.config.describe import described as described, type_name as type_name
 from ibrobot_core.bus import Bus as Bus, Subscription as Subscription, Received as Received

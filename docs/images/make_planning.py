@@ -19,7 +19,8 @@ from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.world.objects import Box, Cylinder, World
 from PIL import Image
 
-from ibrobot_core.api import Context, JointGoal, PlanRequest, SteppedClock, Vector
+from ibrobot_core.api import Context, SteppedClock, Vector
+from ibrobot_core.app import JointGoal, PlanRequest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from planning import motion_of

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import ExecutorDescriptor, NoOptions, OptionFault, PlannerDescriptor, did_you_mean, hookimpl
-from ibrobot_core.app import Command, SectionDescriptor, SourceDescriptor
+from ibrobot_core.api import ExecutorDescriptor, NoOptions, OptionFault, did_you_mean, hookimpl
+from ibrobot_core.app import Command, PlannerDescriptor, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.planners.options import JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
@@ -15,8 +15,8 @@ from ibrobot_planning.world.options import WorldOptions
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import Context, Executor, Planner, Robot
-    from ibrobot_core.app import Component, ControlMode, RunAccess, RunView, SourceWorker
+    from ibrobot_core.api import Context, Executor, Robot
+    from ibrobot_core.app import Component, ControlMode, Planner, RunAccess, RunView, SourceWorker
 
 
 def _joint(options: Any, ctx: Context) -> Planner:

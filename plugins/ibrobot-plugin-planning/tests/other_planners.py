@@ -14,27 +14,29 @@ from ibrobot_kinematics import KinematicsError, Target, robot_model, solve_all
 from ibrobot_planning.world.objects import Box, Sphere, World
 
 from ibrobot_core.api import (
-    AnyGoal,
     Context,
     Header,
-    JointGoal,
     JointTrajectory,
     JointTrajectoryPoint,
-    NamedGoal,
-    PlanCode,
-    Planner,
-    PlannerDescriptor,
     PlanningError,
-    PlanRequest,
-    PlanResult,
     Pose,
-    PoseGoal,
-    PositionGoal,
     Vector,
     documented,
     hookimpl,
     ns,
     option,
+)
+from ibrobot_core.app import (
+    AnyGoal,
+    JointGoal,
+    NamedGoal,
+    PlanCode,
+    Planner,
+    PlannerDescriptor,
+    PlanRequest,
+    PlanResult,
+    PoseGoal,
+    PositionGoal,
 )
 
 DT = 0.02

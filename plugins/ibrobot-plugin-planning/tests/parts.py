@@ -17,7 +17,6 @@ from ibrobot_testing.fakes import (
 from ibrobot_core.api import (
     ExecutorDescriptor,
     HardwareDescriptor,
-    PlannerDescriptor,
     PolicyDescriptor,
     Pose,
     RecorderDescriptor,
@@ -26,6 +25,7 @@ from ibrobot_core.api import (
     Vector3,
     hookimpl,
 )
+from ibrobot_core.app import PlannerDescriptor
 
 POSES = "/scene/poses"
 SCENE = (

@@ -14,18 +14,8 @@ from ibrobot_planning.client import GripperInterface, LocalNode, MoveIt2, MoveIt
 from ibrobot_planning.client.node import BaseNode
 from ibrobot_planning.client.robots import RobotNames, so101
 
-from ibrobot_core.api import (
-    Header,
-    JointState,
-    NotSupported,
-    PlanCode,
-    PlanningError,
-    Pose,
-    PoseStamped,
-    Quaternion,
-    Vector3,
-)
-from ibrobot_core.app import Runtime
+from ibrobot_core.api import Header, JointState, NotSupported, PlanningError, Pose, PoseStamped, Quaternion, Vector3
+from ibrobot_core.app import PlanCode, Runtime
 
 from .conftest import Make
 from .table_arm import ARM

@@ -16,7 +16,8 @@ from ibrobot_planning.world.engines import find_engines
 from ibrobot_planning.world.objects import World
 from ibrobot_testing import PlannerSuite
 
-from ibrobot_core.api import Context, JointGoal, MissingDependency, PlanRequest
+from ibrobot_core.api import Context, MissingDependency
+from ibrobot_core.app import JointGoal, PlanRequest
 
 from .table_arm import make_robot
 

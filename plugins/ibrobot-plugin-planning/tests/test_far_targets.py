@@ -19,8 +19,8 @@ from ibrobot_planning.goals.tool import Tool
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.tasks.runner import RUN
 
-from ibrobot_core.api import IbrobotError, PlanCode, PlanningError, Pose, PoseGoal, PositionGoal, Quaternion, Vector3
-from ibrobot_core.app import ConfigError, Runtime
+from ibrobot_core.api import IbrobotError, PlanningError, Pose, Quaternion, Vector3
+from ibrobot_core.app import ConfigError, PlanCode, PoseGoal, PositionGoal, Runtime
 
 from .conftest import Make
 from .table_arm import make_robot

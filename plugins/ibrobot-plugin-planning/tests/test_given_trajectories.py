@@ -20,20 +20,8 @@ from ibrobot_planning.planners.completion import MOST_POINTS, completed
 from ibrobot_planning.planners.timing import LONGEST_S
 from ibrobot_testing.fakes import FakePlanner
 
-from ibrobot_core.api import (
-    Header,
-    Joint,
-    JointTrajectory,
-    JointTrajectoryPoint,
-    PlanCode,
-    PlanningError,
-    PlanRequest,
-    PlanResult,
-    Robot,
-    Vector,
-    ns,
-)
-from ibrobot_core.app import Runtime, Spline
+from ibrobot_core.api import Header, Joint, JointTrajectory, JointTrajectoryPoint, PlanningError, Robot, Vector, ns
+from ibrobot_core.app import PlanCode, PlanRequest, PlanResult, Runtime, Spline
 
 from .conftest import Make
 from .table_arm import ARM, WALL, make_planner

@@ -8,17 +8,8 @@ import numpy as np
 import pytest
 from ibrobot_planning.goals.text import target
 
-from ibrobot_core.api import (
-    AnyGoal,
-    JointGoal,
-    NamedGoal,
-    PlanCode,
-    PlanningError,
-    PoseGoal,
-    PositionGoal,
-    Quaternion,
-    Vector3,
-)
+from ibrobot_core.api import PlanningError, Quaternion, Vector3
+from ibrobot_core.app import AnyGoal, JointGoal, NamedGoal, PlanCode, PoseGoal, PositionGoal
 
 from .table_arm import JOINTS, make_robot
 

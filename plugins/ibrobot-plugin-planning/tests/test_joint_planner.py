@@ -14,18 +14,8 @@ from ibrobot_planning import ibrobot_planners
 from ibrobot_planning.planners.joint import JointPlanner
 from ibrobot_planning.planners.options import JointPlannerOptions
 
-from ibrobot_core.api import (
-    Context,
-    Joint,
-    JointGoal,
-    JointTrajectory,
-    PlanningError,
-    PlanRequest,
-    Pose,
-    PoseGoal,
-    Robot,
-    SteppedClock,
-)
+from ibrobot_core.api import Context, Joint, JointTrajectory, PlanningError, Pose, Robot, SteppedClock
+from ibrobot_core.app import JointGoal, PlanRequest, PoseGoal
 
 ROBOT = Robot(
     name="three",

@@ -30,18 +30,16 @@ from ibrobot_core.api import (
     Header,
     JointState,
     NotSupported,
-    PlanCode,
     PlanningError,
     Pose,
     PoseStamped,
-    PositionGoal,
     Quaternion,
     String,
     TransportError,
     Vector,
     Vector3,
 )
-from ibrobot_core.app import RequestError, Runtime
+from ibrobot_core.app import PlanCode, PositionGoal, RequestError, Runtime
 
 from .conftest import Make
 from .table_arm import JOINTS, make_robot

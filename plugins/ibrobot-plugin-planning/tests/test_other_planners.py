@@ -19,8 +19,17 @@ from ibrobot_planning.execution.source import GO_TO
 from ibrobot_testing import PlannerSuite
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.api import Context, PlanCode, Planner
-from ibrobot_core.app import ConfigError, LaunchRequest, Runtime, Session, installed_plugins, load_config
+from ibrobot_core.api import Context
+from ibrobot_core.app import (
+    ConfigError,
+    LaunchRequest,
+    PlanCode,
+    Planner,
+    Runtime,
+    Session,
+    installed_plugins,
+    load_config,
+)
 
 from .other_planners import BatchOptions, BatchPlanner
 from .table_arm import ARM, make_robot

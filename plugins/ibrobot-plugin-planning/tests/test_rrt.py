@@ -16,22 +16,18 @@ from ibrobot_planning.planners.timing import Motion
 from ibrobot_planning.world.collision import Collisions, unchecked_pairs
 from ibrobot_planning.world.objects import Sphere, World, WorldObject
 
-from ibrobot_core.api import (
+from ibrobot_core.api import PlanningError, Pose, Quaternion, Robot, Vector3
+from ibrobot_core.app import (
     AnyGoal,
     JointGoal,
     LinearGoal,
     NamedGoal,
     PlanCode,
     Planner,
-    PlanningError,
     PlanRequest,
     PlanResult,
-    Pose,
     PoseGoal,
     PositionGoal,
-    Quaternion,
-    Robot,
-    Vector3,
 )
 
 from .table_arm import ARM, WALL, box, make_planner, make_robot, write_arm

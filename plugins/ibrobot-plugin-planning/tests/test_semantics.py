@@ -20,7 +20,8 @@ from ibrobot_planning.world.checked_arm import urdf_names
 from ibrobot_planning.world.collision import unchecked_pairs
 from ibrobot_planning.world.objects import World
 
-from ibrobot_core.api import Context, NamedGoal, PlanningError, PlanRequest, SteppedClock
+from ibrobot_core.api import Context, PlanningError, SteppedClock
+from ibrobot_core.app import NamedGoal, PlanRequest
 
 from .table_arm import ARM, make_robot
 

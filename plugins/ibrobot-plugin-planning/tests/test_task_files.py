@@ -18,8 +18,7 @@ from ibrobot_planning.world.objects import Sphere, World, WorldObject
 from ibrobot_planning.world.section import first_world, scene_objects
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.api import PoseGoal, PositionGoal
-from ibrobot_core.app import ConfigError, Registry, RobotConfig, installed_plugins, load_config
+from ibrobot_core.app import ConfigError, PoseGoal, PositionGoal, Registry, RobotConfig, installed_plugins, load_config
 
 from .table_arm import ARM, make_robot
 from .test_tasks import task_robot

@@ -29,8 +29,8 @@ from ibrobot_planning.world.section import (
 )
 from ibrobot_testing import SectionSuite, make_session
 
-from ibrobot_core.api import Context, Float64MultiArray, JointGoal, PlanningError, PlanRequest, SteppedClock
-from ibrobot_core.app import ConfigError, RequestError, single_options
+from ibrobot_core.api import Context, Float64MultiArray, PlanningError, SteppedClock
+from ibrobot_core.app import ConfigError, JointGoal, PlanRequest, RequestError, single_options
 
 from .parts import POSES
 from .table_arm import ARM, make_robot

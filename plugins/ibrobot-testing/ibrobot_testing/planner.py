@@ -10,7 +10,8 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.api import Context, JointGoal, JointTrajectory, Planner, PlanningError, PlanRequest, Vector, seconds
+from ibrobot_core.api import Context, JointTrajectory, PlanningError, Vector, seconds
+from ibrobot_core.app import JointGoal, Planner, PlanRequest
 from ibrobot_testing.suite import Suite
 
 

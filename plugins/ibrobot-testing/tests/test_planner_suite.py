@@ -10,7 +10,8 @@ import pytest
 from ibrobot_testing import PlannerSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakePlanner
 
-from ibrobot_core.api import JointGoal, PlanningError, PlanResult
+from ibrobot_core.api import PlanningError
+from ibrobot_core.app import JointGoal, PlanResult
 
 
 class TestPlanner(PlannerSuite):

@@ -9,7 +9,8 @@ from typing import Any
 
 from ibrobot_kinematics.rotations import from_quaternion, rpy
 
-from ibrobot_core.api import NotSupported, PlanCode, PlanningError, Pose, PoseStamped, Quaternion, Vector3
+from ibrobot_core.api import NotSupported, PlanningError, Pose, PoseStamped, Quaternion, Vector3
+from ibrobot_core.app import PlanCode
 from ibrobot_planning.client.node import BaseNode
 from ibrobot_planning.goals.grammar import check_frame
 

@@ -12,7 +12,8 @@ from typing import Any
 import attrs
 import numpy as np
 
-from ibrobot_core.api import Header, JointState, PlanCode, PlanningError, Pose, PoseStamped, Quaternion, Vector3
+from ibrobot_core.api import Header, JointState, PlanningError, Pose, PoseStamped, Quaternion, Vector3
+from ibrobot_core.app import PlanCode
 from ibrobot_planning.client.node import BaseNode
 
 _POLL_S = 0.02

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any, overload
 
-from ibrobot_core.api import JointState, JointTrajectory, NotSupported, PlanCode, PlanningError, PoseStamped
+from ibrobot_core.api import JointState, JointTrajectory, NotSupported, PlanningError, PoseStamped
+from ibrobot_core.app import PlanCode
 from ibrobot_planning.client.collision_objects import AnyPose, CollisionObjects, Orientation, Position, numbers
 from ibrobot_planning.client.motion import (
     ExecutionFuture,

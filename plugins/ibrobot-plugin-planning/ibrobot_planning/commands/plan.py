@@ -15,20 +15,13 @@ import attrs
 import click
 import numpy as np
 
-from ibrobot_core.api import (
-    JointTrajectory,
-    MissingDependency,
-    NotSupported,
-    PlanCode,
-    PlanningError,
-    PoseGoal,
-    PositionGoal,
-    Robot,
-    Vector,
-)
+from ibrobot_core.api import JointTrajectory, MissingDependency, NotSupported, PlanningError, Robot, Vector
 from ibrobot_core.app import (
     ControlMode,
     LaunchRequest,
+    PlanCode,
+    PoseGoal,
+    PositionGoal,
     RobotConfig,
     Session,
     echo,

@@ -15,13 +15,12 @@ from ibrobot_core.api import (
     Header,
     JointTrajectory,
     JointTrajectoryPoint,
-    Planner,
     Vector,
     ns,
     seconds,
     trajectory_goal,
 )
-from ibrobot_core.app import RunView
+from ibrobot_core.app import Planner, RunView
 from ibrobot_planning.planners.blend import Limits, braking, cut, joined
 from ibrobot_planning.planners.timing import Motion, motion_of, trajectory_of
 

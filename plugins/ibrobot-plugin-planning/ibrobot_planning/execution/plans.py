@@ -10,22 +10,21 @@ import attrs
 import numpy as np
 from ibrobot_kinematics import robot_model
 
-from ibrobot_core.api import (
+from ibrobot_core.api import IbrobotError, JointTrajectory, PlanningError, Vector, ns
+from ibrobot_core.app import (
     AnyGoal,
+    ControlMode,
     Goal,
-    IbrobotError,
     JointGoal,
-    JointTrajectory,
     PlanCode,
     Planner,
     PlannerDescriptor,
-    PlanningError,
     PlanRequest,
     PlanResult,
-    Vector,
-    ns,
+    Registry,
+    RobotConfig,
+    RunView,
 )
-from ibrobot_core.app import ControlMode, Registry, RobotConfig, RunView
 from ibrobot_planning.execution.motions import ExecutorGoal
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import GoalOptions

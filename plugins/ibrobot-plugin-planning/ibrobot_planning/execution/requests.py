@@ -8,18 +8,17 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import (
-    Goal,
     Header,
     JointState,
     JointTrajectory,
     JointTrajectoryPoint,
-    PlanCode,
     Pose,
     PoseStamped,
     Vector,
     documented,
     option,
 )
+from ibrobot_core.app import Goal, PlanCode
 from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions
 from ibrobot_planning.goals.text import Target
 

@@ -9,19 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ibrobot_core.api import (
-    Goal,
-    Header,
-    IbrobotError,
-    JointState,
-    PlanCode,
-    PlanningError,
-    PlanRequest,
-    PlanResult,
-    PoseStamped,
-    Vector,
-)
-from ibrobot_core.app import ControlMode, NoRequest, RunView, Service
+from ibrobot_core.api import Header, IbrobotError, JointState, PlanningError, PoseStamped, Vector
+from ibrobot_core.app import ControlMode, Goal, NoRequest, PlanCode, PlanRequest, PlanResult, RunView, Service
 from ibrobot_planning.execution.motions import commanded
 from ibrobot_planning.execution.plans import GoalPlans, arm_joints
 from ibrobot_planning.execution.requests import (

@@ -12,24 +12,23 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.api import (
+from ibrobot_core.api import HardwareError, NotSupported, PlanningError, Pose, PoseStamped, String, ns, seconds
+from ibrobot_core.app import (
     AnyGoal,
+    ControlMode,
+    ControlState,
     Goal,
-    HardwareError,
     JointGoal,
-    NotSupported,
+    NoRequest,
     OrientationPolicy,
     PlanCode,
-    PlanningError,
     PlanResult,
-    Pose,
     PoseGoal,
-    PoseStamped,
-    String,
-    ns,
-    seconds,
+    RequestLimits,
+    RunAccess,
+    Service,
+    SourceWorker,
 )
-from ibrobot_core.app import ControlMode, ControlState, NoRequest, RequestLimits, RunAccess, Service, SourceWorker
 from ibrobot_planning.execution.motions import Execution, commanded
 from ibrobot_planning.execution.plans import GoalPlans
 from ibrobot_planning.execution.requests import Execute, GoTo, MoveRequest, MoveToConfiguration, MoveToPose, Numbered

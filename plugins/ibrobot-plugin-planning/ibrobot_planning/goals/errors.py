@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from ibrobot_core.api import PlanCode, PlanningError
+from ibrobot_core.api import PlanningError
+from ibrobot_core.app import PlanCode
 
 
 def invalid_goal(message: str) -> PlanningError:

@@ -11,21 +11,8 @@ import numpy as np
 from ibrobot_kinematics.poses import homogeneous, matrix, pose
 from ibrobot_kinematics.rotations import from_quaternion, from_rpy
 
-from ibrobot_core.api import (
-    JointGoal,
-    LinearGoal,
-    NamedGoal,
-    OrientationPolicy,
-    PlanCode,
-    PlanningError,
-    Pose,
-    PoseGoal,
-    PositionGoal,
-    Vector,
-    Vector3,
-    documented,
-    option,
-)
+from ibrobot_core.api import PlanningError, Pose, Vector, Vector3, documented, option
+from ibrobot_core.app import JointGoal, LinearGoal, NamedGoal, OrientationPolicy, PlanCode, PoseGoal, PositionGoal
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.world.objects import World
 

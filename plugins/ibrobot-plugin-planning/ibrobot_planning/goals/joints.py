@@ -9,17 +9,8 @@ from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.srdf import GroupState, read_srdf
 from ibrobot_kinematics.urdf import read_urdf
 
-from ibrobot_core.api import (
-    AnyGoal,
-    Goal,
-    JointGoal,
-    NamedGoal,
-    PlanCode,
-    PlanningError,
-    PlanRequest,
-    Robot,
-    Vector,
-)
+from ibrobot_core.api import PlanningError, Robot, Vector
+from ibrobot_core.app import AnyGoal, Goal, JointGoal, NamedGoal, PlanCode, PlanRequest
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import scaling_fault
 

@@ -7,19 +7,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import (
-    AnyGoal,
-    Goal,
-    JointGoal,
-    JointTrajectory,
-    LinearGoal,
-    NamedGoal,
-    PlanningError,
-    Pose,
-    PoseGoal,
-    PositionGoal,
-    Robot,
-)
+from ibrobot_core.api import JointTrajectory, PlanningError, Pose, Robot
+from ibrobot_core.app import AnyGoal, Goal, JointGoal, LinearGoal, NamedGoal, PoseGoal, PositionGoal
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import DIRECTIONS, POLICIES, GoalOptions, scaling_fault
 from ibrobot_planning.goals.joints import named_pose

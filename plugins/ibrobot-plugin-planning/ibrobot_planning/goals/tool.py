@@ -10,7 +10,8 @@ from ibrobot_kinematics import KinematicModel, KinematicsError, Target, TipPose,
 from ibrobot_kinematics.poses import matrix
 from ibrobot_kinematics.rotations import between, cross, log
 
-from ibrobot_core.api import PoseGoal, PositionGoal, Vector, Vector3
+from ibrobot_core.api import Vector, Vector3
+from ibrobot_core.app import PoseGoal, PositionGoal
 from ibrobot_planning.goals.errors import invalid_goal, unreachable
 
 _PITCHES = np.linspace(-np.pi / 2, np.pi / 2, 7)

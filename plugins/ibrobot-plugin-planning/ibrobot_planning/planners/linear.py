@@ -9,7 +9,8 @@ import numpy as np
 from ibrobot_kinematics import KinematicModel, Target, UnreachableError, solve
 from ibrobot_kinematics.rotations import between, cross, exp, log
 
-from ibrobot_core.api import PoseGoal, PositionGoal, Vector
+from ibrobot_core.api import Vector
+from ibrobot_core.app import PoseGoal, PositionGoal
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.tool import Tool, pose_matrix, turned, unit, vector
 

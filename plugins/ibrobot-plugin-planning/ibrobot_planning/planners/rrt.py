@@ -12,24 +12,18 @@ import attrs
 import numpy as np
 from ibrobot_kinematics import KinematicModel, robot_model
 
-from ibrobot_core.api import (
+from ibrobot_core.api import Context, JointTrajectory, PlanningError, Pose, Vector, Vector3, seconds
+from ibrobot_core.app import (
     AnyGoal,
-    Context,
     JointGoal,
-    JointTrajectory,
     LinearGoal,
     NamedGoal,
     PlanCode,
     Planner,
-    PlanningError,
     PlanRequest,
     PlanResult,
-    Pose,
     PoseGoal,
     PositionGoal,
-    Vector,
-    Vector3,
-    seconds,
 )
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.joints import checked_start, joint_target

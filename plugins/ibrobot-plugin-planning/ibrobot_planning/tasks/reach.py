@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ibrobot_core.api import AnyGoal, Goal, LinearGoal, PlanningError, PoseGoal, PositionGoal, Robot, Vector
+from ibrobot_core.api import PlanningError, Robot, Vector
+from ibrobot_core.app import AnyGoal, Goal, LinearGoal, PoseGoal, PositionGoal
 
 if TYPE_CHECKING:
     from ibrobot_planning.goals.tool import Tool

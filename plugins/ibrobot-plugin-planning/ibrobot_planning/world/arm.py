@@ -16,7 +16,8 @@ import numpy as np
 from ibrobot_kinematics.poses import homogeneous
 from ibrobot_kinematics.rotations import from_quaternion
 
-from ibrobot_core.api import PlanCode, PlanningError, Robot, Vector
+from ibrobot_core.api import PlanningError, Robot, Vector
+from ibrobot_core.app import PlanCode
 from ibrobot_planning.world.coal_shapes import convex, geometry
 from ibrobot_planning.world.objects import Box, Capsule, Cylinder, Plane, Shape, Sphere
 

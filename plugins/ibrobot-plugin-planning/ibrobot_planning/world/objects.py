@@ -12,8 +12,8 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector
-from ibrobot_core.app import Bus, NoRequest, Service
+from ibrobot_core.api import PlanningError, Pose, Vector
+from ibrobot_core.app import Bus, NoRequest, PlanCode, Service
 
 FLOOR = "floor"
 """Name of the object that the option `floor` of a planner adds."""

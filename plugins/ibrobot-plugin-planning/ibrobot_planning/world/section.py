@@ -15,7 +15,6 @@ from ibrobot_kinematics.poses import matrix, pose, pose_at
 from ibrobot_core.api import (
     Float64MultiArray,
     HardwareDescriptor,
-    PlanCode,
     PlanningError,
     Pose,
     Quaternion,
@@ -25,7 +24,7 @@ from ibrobot_core.api import (
     did_you_mean,
     resolve_path,
 )
-from ibrobot_core.app import Component, NoRequest, Registry, RobotConfig, RunView, Service, Subscription
+from ibrobot_core.app import Component, NoRequest, PlanCode, Registry, RobotConfig, RunView, Service, Subscription
 from ibrobot_planning.world.objects import (
     FLOOR,
     SNAPSHOT,

@@ -13,17 +13,12 @@ from ibrobot_core.api import (
     Frame,
     Header,
     Image,
-    JointGoal,
     JointReading,
     JointTrajectory,
     JointTrajectoryPoint,
     Message,
     OperatorEvent,
-    PlanCode,
-    Planner,
     PlanningError,
-    PlanRequest,
-    PlanResult,
     Policy,
     PolicyError,
     PolicySpec,
@@ -38,7 +33,17 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_core.app import ControlMode, RunAccess, SourceWorker, Subscription
+from ibrobot_core.app import (
+    ControlMode,
+    JointGoal,
+    PlanCode,
+    Planner,
+    PlanRequest,
+    PlanResult,
+    RunAccess,
+    SourceWorker,
+    Subscription,
+)
 
 
 class FakeSensor(Sensor):
