@@ -6,6 +6,7 @@ import shlex
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import override
 
 import numpy as np
@@ -17,10 +18,12 @@ from ibrobot_core.api import (
     Hardware,
     HardwareError,
     Holding,
+    IbrobotError,
     JointReading,
     Signal,
     Torque,
     Vector,
+    calibration_path,
     load_calibration,
     nan_vector,
     ns,
@@ -32,6 +35,7 @@ from ibrobot_feetech.bus import RETURN_DELAY_S, FeetechBus
 from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, ServoFault, TorqueStaysOn
 from ibrobot_feetech.health import Health, Measured, SteadyLoad
 from ibrobot_feetech.options import TOOL, FollowerOptions, check_follower
+from ibrobot_feetech.port import no_such_port
 from ibrobot_feetech.protocol import OVER_CURRENT, OVERLOAD, faults
 from ibrobot_feetech.supply import supply
 from ibrobot_feetech.sync import Replies, SyncReader, SyncWriter
@@ -73,7 +77,13 @@ class FeetechFollower(Hardware):
         lower = dict(zip(ctx.joints, ctx.robot.lower[order], strict=True))
         for fault in check_follower(options, ctx.robot, ctx.joints):
             raise HardwareError(f"{ctx.name}: {fault.option[0]}: {fault.message}")
-        calibration = load_calibration(options.calibration, ctx.joints, tool=TOOL)
+        try:
+            calibration = load_calibration(options.calibration, ctx.joints, tool=TOOL)
+        except IbrobotError as error:
+            is_there = calibration_path(options.calibration).exists() or Path(options.port).exists()
+            if is_there or options.port.startswith("/dev/"):
+                raise
+            raise HardwareError(f"{options.port}: {no_such_port(options.port)}, which makes the calibration") from error
         closed = {joint: float(lower[joint]) for joint in options.anchored if joint in lower}
         self._arm = Arm(ctx.joints, calibration, closed)
         self._bus = FeetechBus(

@@ -25,6 +25,14 @@ _MOST_AWAITED = 255
 """Maximum number of bytes for which the kernel can delay waking a reader."""
 
 
+def no_such_port(path: str) -> str:
+    """What to say of a port that does not exist; one outside /dev is that of an emulator."""
+    known = "there is no such port"
+    if path.startswith("/dev/"):
+        return known
+    return f"{known}; for an emulated arm run `ibrobot feetech emulate --link {path}` in another terminal"
+
+
 class SerialPort:
     """One open serial port.
 
@@ -209,7 +217,7 @@ class SerialPort:
 def _why_closed(place: Place, error: Exception) -> PortError:
     number = getattr(error, "errno", None)
     if number == errno.ENOENT:
-        return PortError(place, "there is no such port")
+        return PortError(place, no_such_port(place.port))
     if number in (errno.EACCES, errno.EPERM):
         return PortForbidden(place, "no permission")
     if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "exclusively lock" in str(error):

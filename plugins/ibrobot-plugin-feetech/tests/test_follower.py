@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -184,6 +185,12 @@ class TestSetUp:
         file = save_calibration(Calibration(joints), tmp_path / "short.json")
         with pytest.raises(CalibrationError, match="has no joint 'gripper'"), rig_of(file):
             pass
+
+    def test_without_an_emulator_the_error_names_its_command(self, tmp_path: Path) -> None:
+        options = FollowerOptions(port=str(tmp_path / "arm"), calibration=str(tmp_path / "none.json"))
+        command = f"run `ibrobot feetech emulate --link {options.port}` in another terminal"
+        with pytest.raises(HardwareError, match=re.escape(command)):
+            FeetechFollower(options, control_context())
 
     def test_no_port_says_what_to_do(self, calibration_file: Path) -> None:
         options = FollowerOptions(port="/dev/ttyNONE", calibration=str(calibration_file))
