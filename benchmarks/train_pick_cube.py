@@ -1,14 +1,16 @@
 """The whole path of a policy: record demonstrations, convert them, train on them, run the result, and count.
 
-    python benchmarks/train_pick_cube.py [--episodes 100] [--steps 5000] [--trials 100] [--work pick_cube]
+    python benchmarks/train_pick_cube.py [--episodes 100] [--steps 5000] [--trials 100] [--work pick_cube] [--onnx]
 
 1. `ibrobot record`: the scripted pick in simulation, in lockstep, without cameras; the cube's pose is an observation.
 2. `ibrobot convert`: a LeRobot dataset of the successes.
 3. `lerobot-train`: a small ACT (0.5 million parameters) on the CPU; the rate of learning falls to nothing.
-4. `ibrobot eval`: the trained policy in the same simulation, with cubes at places that were in no demonstration.
+4. `ibrobot eval`: the trained policy in the same simulation, with cubes at places that were in no demonstration; with
+   --onnx, also what `ibrobot export` makes of it, with the same seeds.
 
 Needs LeRobot in the same environment: `pip install 'lerobot[dataset,training]>=0.6.1,<0.7'`. A stage whose result is in
-the folder `--work` is not done again. Prints one JSON object with the successes and their 95 % interval.
+the folder `--work` is not done again. Prints one JSON object with the successes and their 95 % interval, and with
+--onnx the successes of the exported policy and the number of seeds with different outcomes.
 """
 
 from __future__ import annotations
@@ -64,9 +66,11 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=5000, help="of training")
     parser.add_argument("--trials", type=int, default=100, help="runs of the trained policy")
     parser.add_argument("--work", type=Path, default=Path("pick_cube"), help="folder of all that comes to be")
+    parser.add_argument("--onnx", action="store_true", help="also run the exported policy")
     arguments = parser.parse_args()
     work = arguments.work.absolute()
-    episodes, dataset, trained = work / "episodes", work / "dataset", work / "train"
+    episodes, dataset, trained, onnx = work / "episodes", work / "dataset", work / "train", work / "onnx"
+    policy = trained / "checkpoints/last/pretrained_model"
     times_s = {}
     stages = {
         "record": (
@@ -83,21 +87,32 @@ def main() -> int:
         ),
         "train": (trained, lambda: train(dataset, trained, arguments.steps)),
     }  # fmt: skip
+    models: tuple[str | Path, ...] = ("--model", "act", "--set", f"models.act.path={policy}")
+    if arguments.onnx:
+        stages["export"] = (onnx, lambda: run("ibrobot", "export", policy, "--to", "onnx", "--out", onnx))
+        models += ("--model", "onnx", "--set", f"models.onnx={{type: onnx, path: {onnx}}}")
     for name, (result, work_on) in stages.items():
         if not result.exists():
             begin = perf_counter()
             work_on()
             times_s[name] = round(perf_counter() - begin)
     begin = perf_counter()
-    model = f"models.act.path={trained}/checkpoints/last/pretrained_model"
     printed = run(
         "ibrobot", "eval", CONFIG, "--sim", "--mode", "learned", "--episodes", str(arguments.trials), "--json",
-        "--set", model, "--videos", "0", "--out", work / "evaluation",
+        *models, "--videos", "0", "--out", work / "evaluation",
     )  # fmt: skip
-    (found,) = json.loads(printed)["policies"]
+    report = json.loads(printed)
+    found, *exported = report["policies"]
     times_s["run"] = round(perf_counter() - begin)
     ends = [round(found["wilson"][end], 3) for end in ("low", "high")]
-    print(json.dumps({"successes": found["successes"], "trials": found["episodes"], "interval": ends, "s": times_s}))
+    result = {"successes": found["successes"], "trials": found["episodes"], "interval": ends, "s": times_s}
+    for other in exported:
+        outcomes: dict[int, set[bool]] = {}
+        for episode in report["episodes"]:
+            outcomes.setdefault(episode["seed"], set()).add(episode["success"])
+        result["onnx_successes"] = other["successes"]
+        result["seeds_with_different_outcomes"] = sum(len(each) == 2 for each in outcomes.values())
+    print(json.dumps(result))
     return 0
 
 
