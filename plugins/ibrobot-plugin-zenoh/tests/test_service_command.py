@@ -7,6 +7,8 @@ from typing import Any
 import attrs
 import pytest
 from click.testing import CliRunner
+from ibrobot_ros2 import CodecError
+from ibrobot_ros2.interfaces import service_type
 from ibrobot_ros2.services import Answer, decode_call, encode_answer, endpoint
 from ibrobot_zenoh.commands import network as network_module
 from ibrobot_zenoh.commands.service import service
@@ -38,6 +40,10 @@ def network(monkeypatch: pytest.MonkeyPatch) -> str:
         return encode_answer(Answer(["/a", "/b"] if call.service == "/rosapi/services" else call.request))
 
     robot.serve(endpoint("arm1"), answer)
+    switch = service_type("std_srvs/srv/SetBool")
+    robot.serve_ros("/arm1/b", switch, lambda request, reply: reply({"success": request["data"], "message": "done"}))
+    cancel = service_type("action_msgs/srv/CancelGoal")
+    robot.serve_ros("/arm1/x/_action/cancel_goal", cancel, lambda request, reply: None)
     return address
 
 
@@ -49,16 +55,31 @@ def run(address: str, *arguments: str) -> str:
 
 
 def test_services_are_listed_and_called(network: str):
-    assert run(network, "list") == "/a\n/b\n"
+    assert run(network, "list") == "/a\n/arm1/b\n/b\n"
     assert run(network, "call", "/a", "{x: 1, y: [2.5, home]}") == "x: 1\ny:\n- 2.5\n- home\n"
     assert run(network, "call", "/a", "home") == "home\n"
     assert run(network, "call", "/a", "--text", "5") == "5\n"
     assert run(network, "call", "/a") == ""
 
 
+def test_services_of_ros_2_are_called_by_their_type(network: str):
+    assert run(network, "list", "-t") == "/a\n/arm1/b [std_srvs/srv/SetBool]\n/b\n"
+    answer = "success: true\nmessage: done\n"
+    assert run(network, "call", "/b", "std_srvs/srv/SetBool", "{data: true}") == answer
+    assert run(network, "call", "/b", "std_srvs/srv/SetBool") == answer.replace("true", "false")
+    with pytest.raises(CodecError, match="data: expected true or false, got 3"):
+        run(network, "call", "/b", "std_srvs/srv/SetBool", "{data: 3}")
+    with pytest.raises(
+        CodecError, match="'std_srvs/srv/No' is not defined here; defined are action_msgs/srv/CancelGoal"
+    ):
+        run(network, "call", "/b", "std_srvs/srv/No")
+    with pytest.raises(SystemExit):
+        run(network, "call", "/b", "{x:", "1}")
+
+
 def test_refusals_and_missing_robots_are_errors(network: str):
     with pytest.raises(NotSupported, match="the robot says no"):
         run(network, "call", "/no")
-    result = CliRunner().invoke(service, ["list", "--endpoint", network, "--namespace", "arm2"])
+    result = CliRunner().invoke(service, ["show", "/a", "--endpoint", network, "--namespace", "arm2"])
     assert isinstance(result.exception, TransportError)
     assert "nobody serves arm2/services" in str(result.exception)

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import click
+from ibrobot_ros2.interfaces import service_type
 from ibrobot_ros2.services import DETAILS, SERVICES, Call, decode_answer, encode_call, endpoint
 
-from ibrobot_core.api import NotSupported
+from ibrobot_core.api import NotSupported, TransportError
 from ibrobot_core.app import dump_yaml, echo, parse_yaml
 from ibrobot_zenoh.commands.network import connected, network_options
+from ibrobot_zenoh.ros2 import HIDDEN, absolute
 from ibrobot_zenoh.transport import ZenohTransport
+
+_LIST_S = 2.0
+_TYPE = re.compile(r"\w+/srv/\w+")
 
 
 @click.group()
@@ -41,10 +47,19 @@ def _ask(transport: ZenohTransport, namespace: str, call: Call, timeout_s: float
 
 
 @_command
-def list_(transport: ZenohTransport, namespace: str) -> None:
-    """List the shared services."""
-    for name in _ask(transport, namespace, Call(SERVICES), 5.0):
-        echo(name)
+@click.option("-t", "--show-types", "typed", is_flag=True, help="Show types: those that ROS 2 nodes can call have one.")
+def list_(transport: ZenohTransport, namespace: str, typed: bool) -> None:
+    """List the services of the robot, and of ROS 2 nodes."""
+    types = {each.name: each.type for each in transport.shared_services(_LIST_S) if each.servers}
+    try:
+        own = _ask(transport, namespace, Call(SERVICES), 5.0)
+    except TransportError:
+        if not types:
+            raise
+        own = []  # the network has ROS 2 nodes alone
+    shown = {name for name in types if HIDDEN not in name}  # as in ros2: not those of actions
+    for name in sorted({*own, *shown}):
+        echo(f"{name} [{types[name]}]" if typed and name in types else name)
 
 
 @_command
@@ -73,19 +88,30 @@ def _key_line(key: Mapping[str, Any]) -> str:
 
 @_command
 @click.argument("name", metavar="SERVICE")
-@click.argument("request", default="null")
+@click.argument("words", metavar="[TYPE] [REQUEST]", nargs=-1)
 @click.option("--timeout", default=60.0, show_default=True, type=click.FloatRange(0.01), help="Longest wait [s].")
 @click.option("--text", is_flag=True, help="Send REQUEST as text, unparsed.")
-def call(transport: ZenohTransport, namespace: str, name: str, request: str, timeout: float, text: bool) -> None:
+def call(
+    transport: ZenohTransport, namespace: str, name: str, words: tuple[str, ...], timeout: float, text: bool
+) -> None:
     """Call SERVICE with REQUEST, as YAML, and print the answer.
 
-    E.g. `ibrobot service call /planning/go_to home` or `… /world/remove '{name: can}'`.
+    E.g. `ibrobot service call /planning/go_to home` or `… /world/remove '{name: can}'`. With TYPE, it calls a service
+    of a ROS 2 node, or of a robot under that type, e.g. `… /estop std_srvs/srv/Trigger`.
     """
+    is_ros = bool(words) and _TYPE.fullmatch(words[0]) is not None
+    if len(words) > 1 + is_ros:
+        raise click.UsageError(f"got {len(words)} words after {name}; quote REQUEST")
+    request = words[is_ros] if len(words) > is_ros else "null"
     value = request
     if not text:
         document = parse_yaml(request, "REQUEST")
         document.raise_problems()
         value = document.root
-    answer = _ask(transport, namespace, Call(name, value), timeout)
+    if is_ros:
+        full = absolute(name, namespace)
+        answer: Any = transport.call_ros(full, service_type(words[0]), value or {}, timeout)
+    else:
+        answer = _ask(transport, namespace, Call(name, value), timeout)
     if answer is not None:
         echo(dump_yaml(answer).removesuffix("\n") if isinstance(answer, dict | list) else str(answer))

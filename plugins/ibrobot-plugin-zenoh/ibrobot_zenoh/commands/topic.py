@@ -17,6 +17,7 @@ from ibrobot_core.api import Message, TransportError
 from ibrobot_core.app import echo
 from ibrobot_zenoh.commands.network import connected, network_options
 from ibrobot_zenoh.commands.text import message_from, shown
+from ibrobot_zenoh.ros2 import HIDDEN
 from ibrobot_zenoh.transport import ZenohTransport
 
 _LIST_S = 2.0
@@ -50,7 +51,7 @@ def _command(function: Callable[..., None]) -> click.Command:
 )
 def list_(transport: ZenohTransport, types: bool) -> None:
     """List the shared topics."""
-    shared = transport.shared_topics(_LIST_S)
+    shared = [each for each in transport.shared_topics(_LIST_S) if HIDDEN not in each.name]
     if not shared:
         echo("no topics are shared", err=True)
     for each in shared:
