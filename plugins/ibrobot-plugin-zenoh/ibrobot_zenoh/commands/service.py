@@ -103,7 +103,7 @@ def call(
     if len(words) > 1 + is_ros:
         raise click.UsageError(f"got {len(words)} words after {name}; quote REQUEST")
     request = words[is_ros] if len(words) > is_ros else "null"
-    value = request
+    value: Any = request
     if not text:
         document = parse_yaml(request, "REQUEST")
         document.raise_problems()
