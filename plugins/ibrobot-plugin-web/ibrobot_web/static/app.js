@@ -243,7 +243,7 @@ page.stream.addEventListener("connection", ({ detail }) => {
 });
 page.drive.addEventListener("operator", update);
 page.drive.addEventListener("connection", showConnection);
-page.drive.addEventListener("refused", ({ detail }) => toast(detail, "error"));
+page.drive.addEventListener("refused", ({ detail }) => toast(detail, "error", false));
 
 function update() {
   showHeader();

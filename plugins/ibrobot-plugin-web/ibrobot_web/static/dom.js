@@ -29,11 +29,11 @@ let announced;
 // Removes all messages, e.g. when another view is shown.
 export function clearToasts() { announced?.replaceChildren(); }
 
-// A message for a few seconds; errors stay until the next one or a click.
-export function toast(text, kind = "info") {
+// A message for a few seconds; one that `stays`, as errors do, until the next one or a click.
+export function toast(text, kind = "info", stays = kind === "error") {
   announced ??= document.body.appendChild(h("div", { class: "toasts", role: "status", "aria-live": "polite" }));
   const item = h("div", { class: `toast ${kind}` }, h("p", {}, text),
     h("button", { "aria-label": "Close", onclick: () => item.remove() }, "×"));
   announced.replaceChildren(...[...announced.children].slice(-2), item);
-  if (kind !== "error") setTimeout(() => item.remove(), 5000);
+  if (!stays) setTimeout(() => item.remove(), 5000);
 }

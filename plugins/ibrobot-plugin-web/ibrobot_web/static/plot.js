@@ -26,9 +26,10 @@ export function drawPlot(canvas, { times, lines, begin, end, labels, cursor = nu
   const y = (value) => TOP + height * (high - value) / (high - low);
   context.font = "12px system-ui";
   context.fillStyle = context.strokeStyle = style.getPropertyValue("--muted");
+  const digits = Math.min(6, Math.max(0, 2 - Math.floor(Math.log10(high - low)))); // two or three that differ
   for (let i = 0; i <= 4; i += 1) {
     const value = low + (high - low) * i / 4;
-    context.fillText(Number(value.toPrecision(3)).toString(), 4, y(value) + 4);
+    context.fillText(Math.abs(value) < 1e5 ? Number(value.toFixed(digits)).toString() : value.toPrecision(3), 4, y(value) + 4);
     context.globalAlpha = 0.25;
     context.strokeRect(LEFT, y(value), width, 0);
     context.globalAlpha = 1;

@@ -17,7 +17,7 @@ export class Record {
     section.append(this.line, this.time, this.problem);
   }
 
-  update({ episode, services, episodes, successes }) {
+  update({ episode, services, episodes, successes, ended }) {
     const { page } = this;
     this.section.hidden = !episode && !episodes;
     if (!episode) {
@@ -35,7 +35,7 @@ export class Record {
     this.time.value = Math.min(1, episode.elapsed_s / episode.max_duration_s);
     const redo = services.includes("redo") && episode.can_redo;
     const { recording, waiting, by_mode: byMode } = episode;
-    refresh(this.line, [recording, waiting, byMode, redo, page.operating], () => [this.facts, ...this.controls(episode, redo)]);
+    refresh(this.line, [recording, waiting, byMode, redo, page.operating, ended], () => [this.facts, ...(ended ? [] : this.controls(episode, redo))]);
   }
 
   controls({ recording, waiting, by_mode: byMode, prompt: before }, redo) {
