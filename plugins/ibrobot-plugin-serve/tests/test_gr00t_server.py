@@ -20,7 +20,7 @@ from ibrobot_testing.fakes import FakePolicy
 from ibrobot_core.api import Frame, PolicyError
 
 STATE = "observation.state"
-ZEROS = {"observation": {"state": {"state": np.zeros((1, 1, 6), np.float32)}}, "options": None}
+ZEROS: dict[str, Any] = {"observation": {"state": {"state": np.zeros((1, 1, 6), np.float32)}}, "options": None}
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_the_other_endpoints_answer_as_the_clients_expect(client: Client) -> Non
         ({"observation": {"state": {"state": np.zeros((2, 1, 6), np.float32)}}}, "one batch and one time step"),
         ({"observation": {"state": {"state": [0.0] * 6}}}, "an array is list"),
         ({"observation": {"state": {"stat": np.zeros((1, 1, 6))}}}, "state.stat unknown; there are state.state"),
-        ({"observation": {**ZEROS["observation"], "language": {TASK: [["a"], ["b"]]}}}, "must be one text"),  # type: ignore[dict-item]
+        ({"observation": {**ZEROS["observation"], "language": {TASK: [["a"], ["b"]]}}}, "must be one text"),
     ],
 )
 def test_a_wrong_request_is_answered_by_an_error_and_the_next_one_by_a_chunk(
