@@ -75,7 +75,7 @@ def made(**types):
         DiagnosticArray(HEADER, (DiagnosticStatus(1, "x", "y", "z", (KeyValue("k", "v"),)),)),
     ]
     examples |= {type(each).__name__: each for each in many}
-    for name in ("Variant", "VariantsList", "RobotStatus"):
+    for name in ("Variant", "VariantsList", "RobotStatus", "ModelAnswer"):
         examples[name] = _default(MESSAGE_TYPES[f"ibrobot_msgs/msg/{name}"])
     return examples
 
@@ -85,6 +85,11 @@ def _default(cls):
         return cls("key", "uint8", (2,), [1, 2])
     if cls.__name__ == "VariantsList":
         return cls(HEADER, (_default(MESSAGE_TYPES["ibrobot_msgs/msg/Variant"]),))
+    if cls.__name__ == "ModelAnswer":
+        times = {"observed_ns": 1_700_000_000_000_000_001, "step_ns": 50_000_000}
+        texts = dict.fromkeys(("model", "server", "weights", "prompt", "outcome", "error"), "text")
+        numbers = {"request": 3, "latency_ms": 1.5, "infer_ms": 2.5, "queue_ms": 0.5}
+        return cls(HEADER, **times, **texts, **numbers, joint_names=("a", "b"), actions=[1.0, 2.0])
     return cls(HEADER, "mini", "teleop", active_executors=("a",), faults=("one",), episode=2)
 
 
