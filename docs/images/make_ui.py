@@ -32,9 +32,10 @@ def main() -> None:
     def shot(page: Any, name: str) -> None:
         page.evaluate("window.scrollTo(0, 0)")
         for _ in range(100):
-            if "Loading" not in page.locator("main").inner_text():
+            shown = page.locator("main").inner_text()
+            if not ("Loading" in shown or "The server makes" in shown or page.locator(".toast").count()):
                 break
-            page.wait_for_timeout(100)
+            page.wait_for_timeout(200)
         page.wait_for_timeout(1500)
         path = here / f"ui_{name}.webp"
         Image.open(BytesIO(page.screenshot())).save(path, quality=85)
@@ -44,6 +45,8 @@ def main() -> None:
         folder = Path(made) / "arm"
         folder.mkdir()
         own_robot(folder, "width: 320, height: 240, fps: 30")
+        own = folder / "my_arm.yaml"  # a picture takes long where software draws
+        own.write_text(own.read_text(encoding="utf-8").replace("max_duration_s: 20", "max_duration_s: 90"), "utf-8")
         with ui_process(folder) as address:
             chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
             page = chromium.new_context(viewport={"width": _WIDTH, "height": 800}).new_page()

@@ -38,7 +38,7 @@ WRONG = """robot:
     - {name: pan, lower: 1.0, upper: -1.0, max_velocty: 3.0, max_acceleration: 20.0}
 hardware: {type: feetech_so100, port: /dev/ttyACM0}
 """
-POLICY = ("    inference: {model: scripted_pick}", "    inference: {model: scripted_pick, intervene: page}")
+POLICY = ("    inference: {model: scripted_pick}", "    inference: {model: scripted_pick, intervene: web}")
 """What lets an operator take the robot from the policy by the page."""
 
 
@@ -261,9 +261,7 @@ def look_at_policy(chromium: Any, look: Look) -> None:
         config = Path(made) / "corrected.yaml"
         content = (Path(__file__).parents[3] / "configs/so101_pick_cube.yaml").read_text(encoding="utf-8")
         assert POLICY[0] in content
-        config.write_text(
-            content.replace(*POLICY) + "\nteleoperation:\n  page: {type: web}\nepisodes: {takeover: deadman}\n", "utf-8"
-        )
+        config.write_text(content.replace(*POLICY) + "\nepisodes: {takeover: deadman}\n", "utf-8")
         with page_run(str(config), "--sim", "--episodes", "50") as address:
             page = ready(chromium, address)
             page.wait_for_timeout(3000)

@@ -37,6 +37,8 @@ class Wave(Teleop):
         self._options = options
         self._index = int(ctx.robot.indices([options.joint])[0])
         self._connected = False
+        self._centre = 0.0
+        self._start_ns: int | None = None
 
     @override
     def connect(self) -> None:
@@ -49,7 +51,7 @@ class Wave(Teleop):
     @override
     def activate(self, measured: JointReading) -> None:
         self._centre = float(measured.position[self._index])
-        self._start_ns: int | None = None
+        self._start_ns = None
 
     @override
     def read(self, measured: JointReading) -> TeleopCommand:
