@@ -34,7 +34,7 @@ from ibrobot_core.interfaces import Frame, Policy
 LIMIT = 1e-4
 STATE, TOP = "observation.state", "observation.images.top"
 MEMORY = """
-import resource, sys
+import sys
 from pathlib import Path
 from ibrobot_testing import host_context
 path, threads = Path(sys.argv[2]), int(sys.argv[3])
@@ -47,7 +47,8 @@ else:
     from ibrobot_lerobot.policy import LeRobotPolicy
     policy = LeRobotPolicy(LeRobotPolicyOptions(path, device="cpu", threads=threads), host_context())
 policy.load()
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+status = Path("/proc/self/status").read_text()  # ru_maxrss is the parent's, if that was larger
+print(int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) // 1024)
 """
 
 
