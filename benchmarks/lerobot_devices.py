@@ -129,7 +129,7 @@ def follow(hardware: Hardware, clock: RealClock, seconds: float, pid: int | None
 def made(config: Mapping[str, str], clock: RealClock, **options: Any) -> LeRobotHardware:
     """A connected arm of LeRobot's."""
     arm = LeRobotHardware(RobotOptions("so101_follower", config, **options), control_context("lerobot", clock=clock))
-    for left in reversed(range(5)):  # LeRobot writes once, and waits 50 ms for the answer
+    for left in reversed(range(30)):  # LeRobot writes once, and waits 50 ms for the answer
         try:
             arm.connect()
             break

@@ -13,15 +13,17 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import attrs
 
-from ibrobot_core.app import Channel, ComponentFailed, Failure, open_parent, raise_thread_priority
+from ibrobot_core.app import Channel, ComponentFailed, Failure, open_parent
 from ibrobot_lerobot_devices.stand_in import replace_torch
 
 _FAREWELL_S = 1.0
 """How long a call may go on after the parent has ended or died [s]."""
+_NICE = -10
 _PICTURE_MS = 200
 """Longest time to wait for a picture before an answer without one [ms]."""
 READY, ANSWER, DONE = "ready", "answer", "done"
@@ -53,7 +55,6 @@ class Requests:
                 return newest
 
     def _take(self) -> None:
-        raise_thread_priority()
         try:
             while True:
                 for request in self.channel.wait(None):
@@ -188,8 +189,21 @@ def _send(pipe: int, content: memoryview) -> None:
         content = content[os.write(pipe, content) :]
 
 
+def prefer() -> None:
+    """Run before other programs, as far as the machine permits it, but not in real time, as the parent may.
+
+    LeRobot's buses spin while they wait for replies: in real time they would keep the kernel from passing these on.
+    """
+    with contextlib.suppress(AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with contextlib.suppress(OSError):
+        os.nice(_NICE - os.nice(0))
+        Path("/proc/self/autogroup").write_text(str(_NICE), encoding="ascii")  # Linux compares sessions first
+
+
 def main(parent: int, pictures: int) -> int:
     """Run with the parent's channel; returns the exit status."""
+    prefer()
     channel = open_parent(parent)
     order = channel.wait(None)[0]
     requests = Requests(channel)
@@ -208,7 +222,6 @@ def main(parent: int, pictures: int) -> int:
         requests.start()
         try:
             found = device.connect()
-            raise_thread_priority()  # the control loop waits for its readings
             channel.send({"event": READY, "found": found})
             serve(device, requests)
         finally:

@@ -14,6 +14,7 @@ from ibrobot_core.api import HardwareError, did_you_mean
 from ibrobot_core.app import load_config
 from ibrobot_lerobot_devices.link import INSTALL, DeviceLink, DeviceProblem
 from ibrobot_lerobot_devices.registry import registry
+from ibrobot_lerobot_devices.stand_in import NEEDS_TORCH
 from ibrobot_lerobot_devices.units import OTHERS, POSITION, Choices, Mapped, UnitProblem, bases, map_joints
 
 _START_S = 60.0
@@ -35,6 +36,8 @@ class NewRobot:
     """Whether the limits are those of its calibration."""
     leader: str
     """A teleoperator with the same joints; empty if LeRobot has none of that name."""
+    torch: bool
+    """Whether it needs torch."""
 
 
 def describe_robot(type_: str, id_: str) -> NewRobot:
@@ -52,11 +55,14 @@ def describe_robot(type_: str, id_: str) -> NewRobot:
         if type_ not in found["robot"]:
             raise HardwareError(f"LeRobot has no robot {type_!r}{did_you_mean(type_, list(found['robot']), 'it has')}")
         config = {**_required(found["robot"][type_]["fields"], ""), "id": id_}
-        link = DeviceLink("robot", type_, config, only_make=True)
+        torch = False
         try:
-            facts = link.start(_START_S)
-        finally:
-            link.end()
+            facts = _facts(type_, config, torch=torch)
+        except DeviceProblem as problem:
+            if NEEDS_TORCH not in str(problem):
+                raise
+            torch = True
+            facts = _facts(type_, config, torch=torch)
     except DeviceProblem as problem:
         raise HardwareError(f"{problem}; LeRobot is installed by {INSTALL}") from None
     joints = list(bases(facts["action_features"], POSITION))
@@ -71,7 +77,17 @@ def describe_robot(type_: str, id_: str) -> NewRobot:
     measured = all("range_min" in facts["motors"].get(name, {}) for name in joints)
     limits = {each.joint: _limits(each, facts["motors"].get(each.feature, {})) for each in mapped}
     leader = type_.replace("follower", "leader")
-    return NewRobot(type_, config, mapped, units, limits, measured, leader if leader in found["teleoperator"] else "")
+    known = leader if leader in found["teleoperator"] else ""
+    return NewRobot(type_, config, mapped, units, limits, measured, known, torch)
+
+
+def _facts(type_: str, config: Mapping[str, Any], *, torch: bool) -> Mapping[str, Any]:
+    """What LeRobot's object says about itself."""
+    link = DeviceLink("robot", type_, config, torch=torch, only_make=True)
+    try:
+        return link.start(_START_S)
+    finally:
+        link.end()
 
 
 def _required(fields: Mapping[str, Any], prefix: str) -> dict[str, Any]:
@@ -133,6 +149,7 @@ def robot_yaml(found: NewRobot) -> str:
         "limits are the ends of the calibrated ranges" if found.measured else "limits are guesses: LeRobot says none"
     )
     extra = f", units: {json.dumps(dict(found.units))}" if found.units else ""
+    extra += ", torch: true" if found.torch else ""
     extra += f", anchored: [{', '.join(gripper)}]" if gripper and gripper != ["gripper"] else ""
     options = f"config: {_leader_config(found)}{_leader_options(found, gripper)}"
     leader = f"{{type: lerobot, teleop: {found.leader}, {options}}}"

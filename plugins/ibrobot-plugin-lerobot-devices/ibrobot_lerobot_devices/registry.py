@@ -55,7 +55,8 @@ def _registry(key: str) -> Mapping[str, Any]:
     try:
         found: Mapping[str, Any] = json.loads(cache.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        link = DeviceLink("describe", "LeRobot", {})
+        # Packages of others may use torch.
+        link = DeviceLink("describe", "LeRobot", {}, torch=bool(third_parties(distributions())))
         try:
             found = link.start(_TIMEOUT_S)
         finally:

@@ -14,6 +14,8 @@ from types import ModuleType
 from typing import Any, NoReturn, override
 
 _NAME = "torch"
+NEEDS_TORCH = "torch is not loaded for this device: set torch: true"
+"""In the error of what calls a name of the stand-in."""
 
 
 class _Placeholder(type):
@@ -31,9 +33,7 @@ class _Placeholder(type):
     __ror__ = __or__
 
     def __call__(cls, *arguments: Any, **options: Any) -> NoReturn:
-        raise RuntimeError(
-            f"calls {cls.__module__}.{cls.__qualname__}, and torch is not loaded for this device: set torch: true"
-        )
+        raise RuntimeError(f"calls {cls.__module__}.{cls.__qualname__}, and {NEEDS_TORCH}")
 
 
 def _placeholder(name: str, module: str) -> Any:
