@@ -33,7 +33,9 @@ PAGES = [
     )
     if page not in GENERATED and page.parent.name != "decisions"
 ]
-OF_OTHERS = {"--cap-add", "--ulimit", "--pause", "--find-links"}
+OF_OTHER_PROGRAMS = {"CONTRIBUTING.md", "come-from-lerobot.md", "use-ibrobot-from-lerobot.md"}
+"""Pages with options of nox and of LeRobot."""
+OF_OTHERS = {"--cap-add", "--ulimit", "--pause", "--find-links", "--ray", "--teleop"}
 """Options in the running text that are of other programs."""
 NOT_CHECKED = {"of two arms", "of another program", "needs the plugin of this page"}
 """Notes above YAML blocks that no robot YAML here can hold."""
@@ -134,7 +136,8 @@ def test_every_option_in_the_text_exists() -> None:
     named = [
         (option, f"{page.relative_to(ROOT)}:{line}")
         for page in PAGES
-        if page.name not in ("CONTRIBUTING.md", "come-from-lerobot.md")  # of nox, and of LeRobot
+        if page.name
+        not in ("CONTRIBUTING.md", "come-from-lerobot.md", "use-ibrobot-from-lerobot.md")  # of nox, and of LeRobot
         for line, match in _found(page, r"(?<!`)`(--[a-z][^`\n]*)`")
         for option in re.findall(r"(?<!\S)--[a-z-]+", match[1])
     ]

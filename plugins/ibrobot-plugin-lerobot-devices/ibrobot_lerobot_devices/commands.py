@@ -26,7 +26,10 @@ def lerobot() -> None:
 @lerobot.command("list")
 @click.argument("type_", metavar="[TYPE]", required=False)
 def list_devices(type_: str | None) -> None:
-    """List the devices of LeRobot and of installed third-party packages, or the config of TYPE."""
+    """List devices of LeRobot, or the config of TYPE.
+
+    Those of installed third-party packages are among them.
+    """
     found = _registry()
     if type_ is None:
         echo(f"LeRobot {found['version']}")
@@ -54,7 +57,7 @@ def _show(fields: Mapping[str, Any], indent: str) -> None:
 @click.argument("robot")
 @click.option("--id", "id_", metavar="ID", help="LeRobot's id of it, the name of its calibration.  [default: ROBOT]")
 def new(out: Path, robot: str, id_: str | None) -> None:
-    """Write a robot YAML for ROBOT, e.g. koch_follower, to the new file OUT."""
+    """Write a robot YAML for ROBOT, e.g. koch_follower, to OUT."""
     from ibrobot_lerobot_devices.new_robot import write_robot
 
     with wrong_input():

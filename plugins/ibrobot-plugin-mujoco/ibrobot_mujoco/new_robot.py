@@ -39,7 +39,7 @@ def new(
     context: click.Context, out: Path, urdf: Path | None, lerobot: str | None, tip: str | None,
     packages: tuple[str, ...],
 ) -> None:  # fmt: skip
-    """Write a robot YAML for the arm in a URDF, or for a robot of LeRobot's.
+    """Write a robot YAML for an arm in a URDF, or of LeRobot's.
 
     OUT is a new file, e.g. arm.yaml. Beside it, the folder arm_model holds an MJCF and the meshes. The YAML states
     every value that was guessed.
