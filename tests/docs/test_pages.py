@@ -136,8 +136,7 @@ def test_every_option_in_the_text_exists() -> None:
     named = [
         (option, f"{page.relative_to(ROOT)}:{line}")
         for page in PAGES
-        if page.name
-        not in ("CONTRIBUTING.md", "come-from-lerobot.md", "use-ibrobot-from-lerobot.md")  # of nox, and of LeRobot
+        if page.name not in OF_OTHER_PROGRAMS
         for line, match in _found(page, r"(?<!`)`(--[a-z][^`\n]*)`")
         for option in re.findall(r"(?<!\S)--[a-z-]+", match[1])
     ]
