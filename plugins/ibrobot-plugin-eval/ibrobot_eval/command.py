@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import click
 
-from ibrobot_core.app import Failed, declared, echo, emit, run_options, wrong_input
+from ibrobot_core.app import Failed, declared, echo, emit, installed_plugins, run_options, wrong_input
 from ibrobot_eval import EVAL
 from ibrobot_eval.blinded import Blinded, reset_of
 from ibrobot_eval.episodes import Result
@@ -49,6 +49,7 @@ def evaluate(
     with wrong_input():
         policies = find_policies(options.config, options.mode, options.model, overrides, options.vary, sim=options.sim)
         trials = _checked(options, policies)
+        installed_plugins().check_pool(options.on)
         reset = reset_of(options)
         request = Request(
             options.out, tuple(policies), len(options.seeds), options.seeds[0], options.until_decided, options.margin,
