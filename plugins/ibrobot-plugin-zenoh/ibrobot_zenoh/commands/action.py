@@ -9,7 +9,7 @@ import click
 from ibrobot_ros2.interfaces import action_type
 
 from ibrobot_core.api import NotSupported, TransportError
-from ibrobot_core.app import dump_yaml, echo, parse_yaml
+from ibrobot_core.app import dump_yaml, echo, parse_yaml, wrong_input
 from ibrobot_zenoh.commands.network import connected, network_options
 from ibrobot_zenoh.ros2 import absolute, actions_of
 from ibrobot_zenoh.ros_goals import Ended, SentGoal, Status
@@ -50,7 +50,8 @@ def send(
     """
     document = parse_yaml(text, "GOAL")
     document.raise_problems()
-    kind = action_type(type_name)
+    with wrong_input():
+        kind = action_type(type_name)
     with connected(config, endpoints, domain) as transport:
         _check_type(transport, absolute(name), type_name)
         shown: Callable[[dict[str, Any]], object] = lambda each: echo(f"Feedback:\n{dump_yaml(each)}")  # noqa: E731

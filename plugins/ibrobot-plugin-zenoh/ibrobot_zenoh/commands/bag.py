@@ -28,7 +28,7 @@ from ibrobot_core.api import (
     did_you_mean,
     ns,
 )
-from ibrobot_core.app import EpisodePath, echo, installed_plugins
+from ibrobot_core.app import EpisodePath, echo, installed_plugins, wrong_input
 from ibrobot_zenoh.commands.network import connected, network_options
 
 CLOCK = "/clock"
@@ -69,7 +69,9 @@ def play(
     twists, and names with cmd, command, goal or target. To look at one, give it another name with --remap.
     """
     names = dict(_renaming(each) for each in renamed)
-    with closing(installed_plugins().open_episode(episode)) as reader:
+    with wrong_input():
+        opened = installed_plugins().open_episode(episode)
+    with closing(opened) as reader:
         summary = reader.summary()
         chosen = choose(summary, topics, exclude_topics, names)
         start_ns = summary.start_ns + ns(start_offset)
