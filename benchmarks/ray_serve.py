@@ -17,7 +17,6 @@ from typing import Any
 
 import ray
 from ray import serve
-from starlette.requests import Request
 
 PAYLOADS = {"2x640x480 uint8": 2 * 640 * 480 * 3, "2x224x224 float32": 2 * 3 * 224 * 224 * 4, "2 JPEGs": 2 * 38_400}
 """Bytes of the pictures; joint positions and names add 200."""
@@ -29,8 +28,8 @@ WARM_UP = 20
 class Null:
     """Answers with zeros."""
 
-    async def __call__(self, request: Request) -> bytes:
-        """Over HTTP."""
+    async def __call__(self, request: Any) -> bytes:
+        """Over HTTP: `request` is Starlette's."""
         await request.body()
         return bytes(CHUNK_BYTES)
 
@@ -60,7 +59,8 @@ def main() -> None:
     given = parser.parse_args()
     ray.init(num_cpus=2, include_dashboard=False, logging_level=logging.ERROR, log_to_driver=False)
     serve.start(http_options={"host": "127.0.0.1", "port": given.port}, logging_config={"log_level": "ERROR"})
-    handle = serve.run(Null.bind(), logging_config={"log_level": "ERROR"})
+    null: Any = Null  # a Deployment, which Ray's types do not say
+    handle = serve.run(null.bind(), logging_config={"log_level": "ERROR"})
     connection = http.client.HTTPConnection("127.0.0.1", given.port)
     for payload, size in PAYLOADS.items():
         body = bytes(size + 200)

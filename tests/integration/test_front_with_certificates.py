@@ -106,8 +106,8 @@ def front(ibrobot: tuple[str, ...], openpi: OpenpiServer, tmp_path: Path) -> Ite
 def certificates(lab: Path, name: str) -> Tls:
     folder = lab / name
     robots = folder / "robots.txt"
-    files = (folder / file for file in ("ca.pem", "certificate.pem", "key.pem"))
-    return Tls(*files, robots if robots.exists() else None)
+    ca, certificate, key = (folder / file for file in ("ca.pem", "certificate.pem", "key.pem"))
+    return Tls(ca, certificate, key, robots if robots.exists() else None)
 
 
 @contextmanager
@@ -132,7 +132,7 @@ def test_robots_are_who_their_certificates_say_and_others_get_nothing(front: Fro
             for number in range(1, 4):
                 state = np.full(6, number / 10 + (name == "robot2"), np.float32)
                 answer = engine.infer({STATE: state}, number, time.monotonic_ns() + 60_000_000_000)
-                np.testing.assert_allclose(answer["action"], np.tile(state, (10, 1)), atol=1e-6)
+                np.testing.assert_allclose(np.asarray(answer["action"], float), np.tile(state, (10, 1)), atol=1e-6)
             assert openpi.url in engine.stats.server
     with urllib.request.urlopen(front.metrics, timeout=60) as page:
         metrics = page.read().decode()
