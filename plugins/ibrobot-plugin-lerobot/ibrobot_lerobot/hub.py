@@ -136,9 +136,10 @@ def _errors_of(repository: str) -> Iterator[None]:
 
 def _hub() -> Any:
     try:
+        import httpx  # noqa: F401  # of the versions of huggingface_hub that are meant
         import huggingface_hub
     except ImportError:
         raise MissingDependency(
-            "the Hub needs huggingface_hub", remedy='pip install "ibrobot-plugin-lerobot[hub]"'
+            "the Hub needs huggingface_hub 1", remedy='pip install "ibrobot-plugin-lerobot[hub]"'
         ) from None
     return huggingface_hub

@@ -12,13 +12,15 @@ import pytest
 from ibrobot_ros2 import encode
 from ibrobot_testing.contexts import host_context
 from ibrobot_testing.ports import free_port
-from ibrobot_zenoh.options import ZenohOptions
-from ibrobot_zenoh.transport import ZenohTransport
 
 from ibrobot_core.api import String
 from ibrobot_core.app import installed_plugins
 
 from .conftest import until
+
+pytest.importorskip("ibrobot_zenoh")
+from ibrobot_zenoh.options import ZenohOptions
+from ibrobot_zenoh.transport import ZenohTransport
 
 NOTE, COMMANDS = "/note", "/arm/commands"
 COUNT = 30
