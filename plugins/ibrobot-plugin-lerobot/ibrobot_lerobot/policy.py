@@ -65,7 +65,7 @@ class LeRobotPolicy(Policy):
         self._expected: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
         """Tensors of a request without a prefix: dtypes and shapes, with -1 for any size."""
         self._seed = ctx.seed
-        self._weights = ""
+        self._weights = self._identity = ""
 
     @override
     def check_weights(self) -> None:
@@ -84,6 +84,7 @@ class LeRobotPolicy(Policy):
             for name, array in tensors.items()
         }
         self._model, self._weights = model, weights
+        self._identity = f"lerobot {version('lerobot')}, torch {version('torch')}"
 
     @override
     def reset(self, seed: int) -> None:
@@ -104,7 +105,7 @@ class LeRobotPolicy(Policy):
     @override
     def identity(self) -> str:
         """Versions of LeRobot and torch; empty before `load`."""
-        return "" if self._model is None else f"lerobot {version('lerobot')}, torch {version('torch')}"
+        return self._identity
 
     @override
     def picture_codec(self, quality: int = 90) -> PictureCodec | None:

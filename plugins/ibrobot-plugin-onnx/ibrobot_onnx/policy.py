@@ -48,7 +48,7 @@ class OnnxPolicy(Policy):
             self._expected[SEED] = (np.dtype(np.uint64), (2,))
         self._sessions: list[Any] = []
         self._seed = ctx.seed
-        self._weights = ""
+        self._weights = self._identity = ""
 
     @override
     def check_weights(self) -> None:
@@ -84,6 +84,7 @@ class OnnxPolicy(Policy):
                 f"{manifest.action_size} values in at least {least} actions"
             )
         self._weights = digest.hexdigest()[:32]
+        self._identity = f"onnxruntime {version('onnxruntime')}, {sessions[0].get_providers()[0]}"
         self._log.info("%s on %s", manifest.type, sessions[0].get_providers()[0])
 
     @override
@@ -105,7 +106,7 @@ class OnnxPolicy(Policy):
     @override
     def identity(self) -> str:
         """Version of ONNX Runtime, and the provider; empty before `load`."""
-        return f"onnxruntime {version('onnxruntime')}, {self._sessions[0].get_providers()[0]}" if self._sessions else ""
+        return self._identity
 
     @override
     def preprocess(self, frame: Frame) -> Tensors:

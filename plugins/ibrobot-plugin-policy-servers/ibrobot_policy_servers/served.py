@@ -57,6 +57,7 @@ class ServedPolicy(Policy):
         self._connected = False
         self._metadata: Mapping[str, Any] | None = None
         """What the server stated at first."""
+        self._weights = self._identity = ""
 
     @override
     def load(self) -> None:
@@ -91,12 +92,12 @@ class ServedPolicy(Policy):
     @override
     def weights(self) -> str:
         """Hash of the server's metadata, the only thing known of its model."""
-        return "" if self._metadata is None else _hash(self._metadata)
+        return self._weights
 
     @override
     def identity(self) -> str:
         """The server's address and metadata; empty before `load`."""
-        return "" if self._metadata is None else f"{self._connection.address[:500]} {_shown(self._metadata)}"
+        return self._identity
 
     @override
     def preprocess(self, frame: Frame) -> Tensors:
@@ -193,6 +194,7 @@ class ServedPolicy(Policy):
             self._disconnect()
             raise
         self._metadata, self._connected = metadata, True
+        self._weights, self._identity = _hash(metadata), f"{self._connection.address[:500]} {_shown(metadata)}"
 
     def _check_metadata(self, metadata: Mapping[str, Any]) -> None:
         wrong = []
@@ -204,7 +206,7 @@ class ServedPolicy(Policy):
             raise PolicyError(
                 "\n".join([f"{self._connection.address}: is not the server that the robot expects:", *wrong])
             )
-        if self._metadata is not None and _hash(metadata) != _hash(self._metadata):
+        if self._metadata is not None and _hash(metadata) != self._weights:
             change = (
                 f"{self._connection.address}: the server restarted with another model: it states {_shown(metadata)}, "
                 f"previously {_shown(self._metadata)}"
