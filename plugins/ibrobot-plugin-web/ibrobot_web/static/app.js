@@ -22,8 +22,10 @@ const $ = (id) => document.getElementById(id);
 
 // What all parts of the page share.
 const page = {
-  stream: new Stream(), drive: new Drive(), line: new StopLine(), status: null, state: null, links: {}, role: "watch",
-  arrived: 0, unconfirmed: "",
+  stream: new Stream(), drive: new Drive(), line: new StopLine(), status: null, state: null, links: {}, arrived: 0,
+  unconfirmed: "",
+  // "drive", "watch", or "" until the run has said it: Esc and STOP work from the start.
+  get role() { return this.drive.facts.role; },
   get operating() { return this.drive.facts.operating && !this.status?.ended; },
   get mode() { return this.status?.robot.modes.find((mode) => mode.name === this.status.mode); },
   // The devices with which the operator can jog from this page now; and the one that moves the tool.
@@ -258,8 +260,7 @@ function update() {
 }
 
 setInterval(showConnection, 500);
-fetch("/api/session").then((response) => response.json()).then(({ role, links }) => {
-  page.role = role;
+fetch("/api/session").then((response) => response.json()).then(({ links }) => {
   page.links = links;
   update();
 });

@@ -98,7 +98,7 @@ export class Drive extends EventTarget {
     this.waiting = new Map();
     this.clock = new Clock();
     this.stops = null; // number of emergency stops that the page has seen
-    this.facts = { operating: false, operator: "", role: "watch", pages: 0 };
+    this.facts = { operating: false, operator: "", role: "", pages: 0 };
     this.connect();
     setInterval(() => this.call("time").catch(() => {}), ASK_MS);
   }
