@@ -42,8 +42,9 @@ class TemporalSmoother:
         enabled: whether chunks blend.
         lead_in: makes the new plan, shape (M, A), continue from the old one, given as its actions at the first two
             steps of the new plan, shape (2, A), or, after the plan ran dry, as the held last action, shape (1, A). A
-            plan that begins just where the last one ended continues it. None if the arm does not hold the last action.
-        continues: whether a chunk that replaces a running plan is also adjusted by `lead_in` to continue it.
+            plan that begins just where the last one ended continues it. A chunk that arrives before the lead-in has
+            ended replaces the plan, led in as well. None if the arm does not hold the last action.
+        continues: whether `lead_in` adjusts every chunk that meets a running plan.
 
     Raises:
         ValueError: for a step or a size below one, or a coefficient out of range.
@@ -74,6 +75,8 @@ class TemporalSmoother:
         self._now_ns: int | None = None
         self._held: Vector | None = None if held is None else held[None]
         self._ended_ns: int | None = None
+        self._led_until_ns = 0
+        """The time of the last action that `lead_in` changed [ns]."""
 
     def plan(self) -> tuple[int, Vector]:
         """The time of the first action [ns] and the actions, shape (M, A), read-only; `(0, empty)` without a plan."""
@@ -138,11 +141,11 @@ class TemporalSmoother:
         offset = max(offset, 0)
         if not len(actions):
             return 0
-        if self.enabled:
+        first_ns = self._start_ns + offset * self.step_ns
+        if self.enabled and first_ns > self._led_until_ns:
             self._blend(actions, offset)
         else:
-            if self._continues and offset < length:
-                actions = self._led(self._positions[offset : offset + 2], actions)
+            actions = self._led(self._positions[offset : offset + 2], actions, first_ns)
             counts = np.ones(offset + len(actions), dtype=np.intp)
             counts[:offset] = self._counts[:offset]
             self._set(self._start_ns, np.concatenate((self._positions[:offset], actions)), counts)
@@ -155,17 +158,20 @@ class TemporalSmoother:
         if rest <= 0:
             return 0
         plan, first_ns = actions[past:].copy(), start_ns + past * self.step_ns
-        if not len(self._positions):
-            dry = self._ended_ns is None or first_ns - self._ended_ns > self.step_ns // 2
-            if dry or self._continues:
-                plan = self._led(self._held, plan)
-        elif self._continues:
-            plan = self._led(self._positions[:2], plan)
+        before = self._positions[:2] if len(self._positions) else self._held
+        dry = not len(self._positions) and (self._ended_ns is None or first_ns - self._ended_ns > self.step_ns // 2)
+        plan = self._led(before, plan, first_ns, dry)
         self._set(first_ns, plan, np.ones(rest, dtype=np.intp))
         return rest
 
-    def _led(self, before: Vector | None, actions: Vector) -> Vector:
-        return actions if before is None or self._lead_in is None else self._lead_in(before, actions)
+    def _led(self, before: Vector | None, actions: Vector, start_ns: int, dry: bool = False) -> Vector:
+        joins = dry or self._continues or start_ns <= self._led_until_ns
+        if before is None or not len(before) or self._lead_in is None or not joins:
+            return actions
+        led = self._lead_in(before, actions)
+        changed = np.flatnonzero((led != actions).any(axis=1))
+        self._led_until_ns = start_ns + int(changed.max(initial=-1)) * self.step_ns
+        return led
 
     def _blend(self, actions: Vector, offset: int) -> None:
         """Blend `actions` into the plan from step `offset` on; append those beyond its end."""

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ibrobot_core.dispatch.resume import LeadIn
 from ibrobot_core.dispatch.smoother import TemporalSmoother
 
 STEP = 33_333_333
@@ -144,6 +145,30 @@ def test_a_chunk_that_begins_after_the_arm_was_held_leads_in() -> None:
     smoother.trim(begin)
     smoother.update(chunk(2, 5), begin)
     np.testing.assert_array_equal(smoother.plan()[1], np.zeros((5, 3)))
+
+
+@settings(deadline=None)
+@given(
+    enabled=st.booleans(), late=st.integers(0, 10), every=st.integers(1, 20),
+    distance=st.floats(-2, 2), coeff=coefficients,
+)  # fmt: skip
+def test_after_a_hold_no_step_is_faster_than_the_joint(
+    enabled: bool, late: int, every: int, distance: float, coeff: float
+) -> None:
+    """Chunks of a sine that the arm is away from; each describes the sine, not the lead-in to it."""
+    step_s, fastest = STEP / 1e9, 2.0
+    lead_in = LeadIn(step_s, np.array([fastest]), np.array([20.0]))
+    smoother = TemporalSmoother(STEP, 1, coeff=coeff, enabled=enabled, lead_in=lead_in)
+    smoother.reset(np.array([distance]))
+    at = [distance]
+    for step in range(late, 150):
+        now = T0 + step * STEP
+        smoother.trim(now)
+        if (step - late) % every == 0:
+            seen = step - late + np.arange(40)
+            smoother.update(0.4 * np.sin(2.0 * seen * step_s)[:, None], now - late * STEP)
+        at.append(smoother.plan()[1][0, 0])
+    assert np.abs(np.diff(at)).max() <= fastest * step_s
 
 
 def test_a_chunk_that_begins_where_the_plan_ends_is_appended() -> None:
