@@ -109,10 +109,11 @@ class LeaderTeleop(Teleop):
                 "--headless and without redirecting its input, or set deadman: none, so that the robot follows once "
                 "the leader arm is moved"
             )
-        bus = FeetechBus(self._options.port, baud_rate=self._options.baud_rate, joints=self._arm.names)
+        port, baud_rate, retries = self._options.port, self._options.baud_rate, self._options.retries
+        bus = FeetechBus(port, baud_rate=baud_rate, joints=self._arm.names, retries=retries)
         try:
             bus.open()
-            check_adapter(self._arm.calibration, self._options.port)
+            check_adapter(self._arm.calibration, port)
             self._prepare(bus)
         except HardwareError as error:
             bus.close()

@@ -122,6 +122,7 @@ class LeaderOptions:
     )
     deadman_key: str = option("space", help="key of the deadman; two leaders may have the same or different ones")
     lost_replies: int = option(3, unit="reads", ge=0, help="consecutive replies of a servo that may be missing")
+    retries: int = option(2, ge=0, help="retries of requests when the mode begins")
 
     def __attrs_post_init__(self) -> None:
         if self.prefix and self.joints:

@@ -12,6 +12,17 @@ from pathlib import Path
 import pytest
 from ibrobot_testing import ibrobot_command
 
+PATIENCE = (
+    "control.state_timeout=60",
+    "control.peer_timeout=5",
+    *(
+        f"{arm}.{option}"
+        for arm in ("hardware", "teleoperation.leader")
+        for option in ("retries=200", "lost_replies=2000")
+    ),
+)
+"""A busy machine may not run an emulator for tens of milliseconds."""
+
 
 @contextmanager
 def emulated(name: str, environment: dict[str, str]) -> Iterator[str]:
@@ -33,10 +44,9 @@ def test_launch_of_the_bundled_robot_needs_no_other_package(name: str, tmp_path:
     environment = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path)}
     with emulated("so101_follower", environment) as follower, emulated("so101_leader", environment) as leader:
         ports = {"IBROBOT_FOLLOWER_PORT": follower, "IBROBOT_LEADER_PORT": leader}
-        command = (
-            *ibrobot_command(), "launch", name, "--headless", "--duration", "0.5",
-            "--set", "teleoperation.leader.deadman=none",
-        )  # fmt: skip
+        command = [*ibrobot_command(), "launch", name, "--headless", "--duration", "0.5"]
+        for setting in ("teleoperation.leader.deadman=none", *PATIENCE):
+            command += ["--set", setting]
         ran = subprocess.run(
             command, env={**environment, **ports}, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
         )
