@@ -20,7 +20,17 @@ from ibrobot_core.convert import is_array, is_literal, is_mapping, is_sequence, 
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import LaunchRequest, Session
-from ibrobot_core.messages import MESSAGE_TYPES, CameraInfo, Header, Image, Message, PointCloud2, PointField
+from ibrobot_core.messages import (
+    MESSAGE_TYPES,
+    CameraInfo,
+    Header,
+    Image,
+    Message,
+    ModelAnswer,
+    PointCloud2,
+    PointField,
+    RobotStatus,
+)
 from ibrobot_core.options import fields
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.services import RequestLimits, Service
@@ -56,6 +66,10 @@ BASES: Mapping[str, Message] = {
         ),
         Image(Header(0, "base"), 4, 6, "16UC1", 12, np.full(24, 300, np.uint16).view(np.uint8)),
         CameraInfo(Header(0, "base"), 4, 6, "plumb_bob", np.zeros(5), np.array([5.0, 0, 3, 0, 5, 2, 0, 0, 1])),
+        RobotStatus(Header(0, ""), "so101", "idle"),
+        ModelAnswer(
+            Header(0, ""), 1, 0, "act", "", "", "", "used", "", 20.0, 10.0, 0.0, 33_333_333, ("gripper",), np.zeros(1)
+        ),
     )
 }  # fmt: skip
 """Messages that make sense; generated ones differ from them in some fields."""
