@@ -17,9 +17,18 @@ from ibrobot_feetech.options import FollowerOptions
 from ibrobot_lerobot_devices import hardware
 from ibrobot_lerobot_devices.hardware import LeRobotHardware
 from ibrobot_lerobot_devices.options import RobotOptions
-from ibrobot_testing.contexts import control_context
+from ibrobot_testing.contexts import control_context, make_robot
 
-from ibrobot_core.api import Calibration, HardwareError, JointCalibration, RealClock, SteppedClock, Torque
+from ibrobot_core.api import (
+    Calibration,
+    HardwareError,
+    Joint,
+    JointCalibration,
+    RealClock,
+    Robot,
+    SteppedClock,
+    Torque,
+)
 
 pytestmark = [pytest.mark.lerobot, pytest.mark.usefixtures("patient_buses")]
 
@@ -49,12 +58,22 @@ class PatientConfig(SOFollowerRobotConfig):
 
 class Patient(SOFollower):
     config_class = PatientConfig
+
+from lerobot.robots.lekiwi import LeKiwi, LeKiwiConfig
+
+@RobotConfig.register_subclass("patient_lekiwi")
+@dataclass
+class PatientKiwiConfig(LeKiwiConfig):
+    pass
+
+class PatientKiwi(LeKiwi):
+    config_class = PatientKiwiConfig
 """
-"""A package for LeRobot: its so101_follower, which waits longer for servos that a busy machine keeps from answering."""
+"""A package for LeRobot: its robots, which wait longer for servos that a busy machine keeps from answering."""
 
 
 @pytest.fixture(autouse=True)
-def patient_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def patient_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     site = tmp_path / "site"
     metadata = site / "lerobot_robot_patient-1.0.dist-info"
     metadata.mkdir(parents=True)
@@ -65,6 +84,8 @@ def patient_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(hardware, "_WAIT", PATIENCE_S * 100)
+    if "clock" in request.fixturenames:  # the real age of an answer would be one of another clock
+        monkeypatch.setattr(hardware, "age_ns", lambda answer: 0)
     monkeypatch.setattr(hardware, "_RELAX_S", PATIENCE_S)
     monkeypatch.setattr(hardware, "_RECONNECT_S", PATIENCE_S)
 
@@ -151,3 +172,41 @@ def test_an_arm_without_its_cable_is_named_and_comes_back(emulator: Emulator, fo
         arm.disconnect()
     with emulator.lock:
         assert [emulator.servos[servo].get("torque_enable") for servo in range(1, 7)] == [1] * 6
+
+
+def test_lekiwi_drives_and_measures_its_way(clock: SteppedClock, tmp_path: Path) -> None:
+    """A turn and a way ahead by LeRobot's kinematics of three wheels, as joints; then it stands."""
+    wheels = ("base_left_wheel", "base_back_wheel", "base_right_wheel")
+    calibration = {f"arm_{name}": joint for name, joint in CALIBRATION.items()}
+    calibration |= {name: JointCalibration(servo, 0, 0, 0, 4095) for servo, name in enumerate(wheels, 7)}
+    save_calibration(Calibration(calibration), tmp_path / "kiwi.json")
+    axes = tuple(Joint(name, -1000.0, 1000.0, 0.5, 5.0) for name in ("x", "y", "theta"))
+    arm = make_robot().joints
+    robot = Robot("kiwi", (*arm, *axes))
+    with Emulator(9, clock=clock) as emulator:
+        for joint in calibration.values():
+            servo = emulator.servos[joint.id]
+            servo.set("homing_offset", joint.homing_offset)
+            servo.set("min_position_limit", joint.range_min)
+            servo.set("max_position_limit", joint.range_max)
+            servo.turn(joint.range_middle + joint.homing_offset)
+        config = {"port": emulator.port, "id": "kiwi", "calibration_dir": str(tmp_path), "cameras": {}}
+        names = {f"arm_{name}": name for name in JOINTS}
+        kiwi = LeRobotHardware(
+            RobotOptions("patient_lekiwi", config, names),
+            control_context("kiwi", robot=robot, joints=robot.joint_names, clock=clock),
+        )
+        kiwi.connect()
+        try:
+            begun = kiwi.read().position
+            velocity = np.array([*[0.0] * 6, 0.15, 0.0, -0.3])
+            for tick in range(1, 51):
+                kiwi.write(begun + tick * 0.01 * velocity)
+                clock.advance(10_000_000)
+                reading = kiwi.read()
+            np.testing.assert_allclose(reading.position[6:], 0.5 * velocity[6:], atol=0.02)
+            np.testing.assert_allclose(reading.velocity[6:], velocity[6:], atol=0.03)
+            kiwi.relax()
+        finally:
+            kiwi.disconnect()
+        assert [emulator.servos[servo].get("goal_velocity") for servo in (7, 8, 9)] == [0, 0, 0]

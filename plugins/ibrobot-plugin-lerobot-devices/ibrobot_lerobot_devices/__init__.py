@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import Check, HardwareDescriptor, OptionFault, SensorDescriptor, TeleopDescriptor, hookimpl
 from ibrobot_core.app import Command
-from ibrobot_lerobot_devices.options import CameraOptions, RobotOptions, TeleopOptions
+from ibrobot_lerobot_devices.options import CameraOptions, CmdVelOptions, RobotOptions, TeleopOptions
 
 if TYPE_CHECKING:
     import click
@@ -43,6 +43,12 @@ def _check_teleop(options: TeleopOptions, robot: Robot, joints: tuple[str, ...])
     yield from check_joints(options, robot)
 
 
+def _cmd_vel(options: Any, ctx: Context) -> Teleop:
+    from ibrobot_lerobot_devices.cmd_vel import CmdVelTeleop
+
+    return CmdVelTeleop(options, ctx)
+
+
 def _camera(options: Any, ctx: Context) -> Sensor:
     from ibrobot_lerobot_devices.camera import LeRobotCamera
 
@@ -73,12 +79,17 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
 
 @hookimpl
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
-    """Teleoperators with joint positions."""
+    """Teleoperators with joint positions, and twists for a base."""
     yield TeleopDescriptor(
         type="lerobot", options=TeleopOptions, make=_teleop, check_options=_check_teleop, devices=_port,
         keys=lambda options, robot: {} if options.deadman == "none" else {options.deadman_key: "deadman"},
         needs_terminal=lambda options: options.deadman != "none",
         summary="a teleoperator of LeRobot's with joint positions, e.g. a leader arm", label="follow LeRobot's device",
+    )  # fmt: skip
+
+    yield TeleopDescriptor(
+        type="cmd_vel", options=CmdVelOptions, make=_cmd_vel, summary="drives a base by a topic of twists",
+        label="drive the base by twists on a topic",
     )  # fmt: skip
 
 

@@ -20,15 +20,19 @@ import attrs
 
 from ibrobot_core.app import Channel, ComponentFailed, Failure, open_parent
 from ibrobot_lerobot_devices.stand_in import replace_torch
+from ibrobot_lerobot_devices.units import driven
 
 _FAREWELL_S = 1.0
 """How long a call may go on after the parent has ended or died [s]."""
+_SILENCE_S = 0.25
+"""A base that drives stands again when no action has come for this long [s]."""
 _NICE = -10
 _PICTURE_MS = 200
 """Longest time to wait for a picture before an answer without one [ms]."""
 READY, ANSWER, DONE = "ready", "answer", "done"
 """Events: the device is connected; a reading or why there is none; a request is carried out."""
 _END: dict[str, Any] = {"do": "end"}
+_STAND: dict[str, Any] = {"do": "stand"}
 
 
 @attrs.define
@@ -44,10 +48,13 @@ class Requests:
         """Take requests in a thread, which ends the process if a call outlives the parent."""
         threading.Thread(target=self._take, daemon=True).start()
 
-    def next(self) -> dict[str, Any]:
-        """The next request; waits for it."""
+    def next(self, timeout_s: float | None) -> dict[str, Any]:
+        """The next request; one to stand if none comes within `timeout_s` [s], which is unlimited if it is None."""
         while True:
-            request = self._waiting.get()
+            try:
+                request = self._waiting.get(timeout=timeout_s)
+            except queue.Empty:
+                return _STAND
             if request["do"] not in ("act", "read"):
                 return request
             newest = self._newest.pop(request["do"], None)
@@ -84,7 +91,9 @@ class Device:
         self._order = order
         self._pictures = pictures
         self._device: Any = None
-        self._broken = False
+        self._driving: dict[str, float] = {}
+        """The last action, if a base drives by it."""
+        self._acted_s = 0.0
 
     def make(self) -> dict[str, Any]:
         """Make LeRobot's object; return what it says about itself without being connected."""
@@ -130,7 +139,21 @@ class Device:
 
     def act(self, action: Mapping[str, float]) -> dict[str, Any]:
         """Send an action."""
+        self._driving, self._acted_s = {}, time.monotonic()
+        if any(action[name] for name in driven(list(action)).values()):
+            self._driving = dict(action)
         self._device.send_action(dict(action))
+        return {}
+
+    @property
+    def patience_s(self) -> float | None:
+        """How long a base may still drive without another action [s]; None if it stands."""
+        return max(0.0, self._acted_s + _SILENCE_S - time.monotonic()) if self._driving else None
+
+    def stand(self) -> dict[str, Any]:
+        """Let the base stand."""
+        if self._driving:
+            self.act(self._driving | dict.fromkeys(driven(list(self._driving)).values(), 0.0))
         return {}
 
     def relax(self) -> dict[str, Any]:
@@ -141,7 +164,9 @@ class Device:
 
     def hold(self) -> dict[str, Any]:
         """Switch the torque on, with the present positions as goals."""
-        self.act({name: value for name, value in self.read().items() if name in self._device.action_features})
+        features = self._device.action_features
+        here = {name: value for name, value in self.read().items() if name in features}
+        self.act(here | dict.fromkeys(driven(list(features)).values(), 0.0))
         for owner in self._library.torque_switches(self._device):
             owner.enable_torque()
         return {}
@@ -153,7 +178,9 @@ class Device:
 
     def disconnect(self) -> None:
         """Release the device; its torque stays as it is."""
-        with contextlib.suppress(Exception):  # e.g. since it is not connected, or since its cable is out
+        with contextlib.suppress(Exception):  # e.g. since its cable is out
+            self.stand()
+        with contextlib.suppress(Exception):  # also since it is not connected
             self._device.disconnect()
 
 
@@ -165,7 +192,7 @@ def _one_line(error: BaseException) -> str:
 def serve(device: Device, requests: Requests) -> None:
     """Carry requests out until the parent ends or dies."""
     channel = requests.channel
-    while (request := requests.next())["do"] != "end":
+    while (request := requests.next(device.patience_s))["do"] != "end":
         what = request["do"]
         begun_ns = time.monotonic_ns()
         answer: dict[str, Any] = {"event": ANSWER if what in ("read", "picture") else DONE, "id": request.get("id")}
@@ -180,7 +207,7 @@ def serve(device: Device, requests: Requests) -> None:
             _send(device._pictures, content)
         elif what == "read":
             channel.send(answer | {"values": found, "made_ns": (begun_ns + time.monotonic_ns()) // 2})
-        elif what != "act":
+        elif what not in ("act", "stand"):
             channel.send(answer | {"do": what, "found": found})
 
 

@@ -22,9 +22,20 @@ from ibrobot_core.api import (
     nan_vector,
     seconds,
 )
+from ibrobot_lerobot_devices.base import Base
 from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem, age_ns
 from ibrobot_lerobot_devices.options import RobotOptions
-from ibrobot_lerobot_devices.units import EFFORT, POSITION, VELOCITY, UnitProblem, bases, columns, map_joints
+from ibrobot_lerobot_devices.units import (
+    EFFORT,
+    POSITION,
+    VELOCITY,
+    UnitProblem,
+    bases,
+    columns,
+    driven,
+    map_axes,
+    map_joints,
+)
 
 _WAIT = 0.4
 """Fraction of a tick for which a reading is waited for; a later one counts in the next tick."""
@@ -58,6 +69,7 @@ class LeRobotHardware(Hardware):
         self._starting = False
         self._newest: JointReading | None = None
         self._lost = 0
+        self._base = Base((), {}, (), np.zeros(0), seconds(ctx.period_ns))
         self._on = False
         self._has_torque = False
         self._relaxed = False
@@ -111,8 +123,10 @@ class LeRobotHardware(Hardware):
             if self._relaxed:
                 self._link.call("hold", _RELAX_S)
                 self._relaxed, self._on = False, True
-            values = (position - self._offset) / self._factor
-            self._link.act({**self._rest, **dict(zip(self._features, values.tolist(), strict=True))})
+                self._base.forget()
+            values = (position[self._turned] - self._offset) / self._factor
+            driven_at = self._base.drive(position[self._rolled])
+            self._link.act({**self._rest, **driven_at, **dict(zip(self._features, values.tolist(), strict=True))})
         except DeviceProblem as problem:
             raise self._fail(problem) from None
 
@@ -178,15 +192,25 @@ class LeRobotHardware(Hardware):
         """
         robot, order = self._ctx.robot, self._ctx.robot.indices(self.joints)
         limits = dict(zip(self.joints, zip(robot.lower[order], robot.upper[order], strict=True), strict=True))
-        mapped = map_joints(found["action_features"], found["motors"], self._options.choices(), self.joints, limits)
+        actions, choices = found["action_features"], self._options.choices()
+        axes = map_axes(actions, choices, self.joints)
+        rolled = [each.joint for each in axes]
+        turned = [joint for joint in self.joints if joint not in rolled]
+        mapped = map_joints(actions, found["motors"], choices, turned, limits)
         self._factor, self._offset = columns(mapped)
-        actions = found["action_features"]
+        self._turned = [self.joints.index(joint) for joint in turned]
+        self._rolled = [self.joints.index(joint) for joint in rolled]
+        fastest, period_s = robot.max_velocity[robot.indices(rolled)], seconds(self._ctx.period_ns)
+        base = Base(axes, driven(actions), found["observation_features"], fastest, period_s)
+        if again:
+            base.way = self._base.way
+        self._base = base
         named = {end: bases(found["observation_features"], end) for end in (POSITION, VELOCITY, EFFORT)}
         bare = [each.feature for each in mapped]
         self._features = [bases(actions, POSITION)[base] for base in bare]
         self._columns = [[named[end].get(base) for base in bare] for end in (POSITION, VELOCITY, EFFORT)]
-        # Wheels of a base stand; joints that the robot YAML lacks stay where they are.
-        self._rest = {name: 0.0 for name in actions if name.endswith(VELOCITY) and name not in self._features}
+        # A base without joints in the robot YAML stands; other joints that it lacks stay where they are.
+        self._rest = {name: 0.0 for name in driven(actions).values() if name not in self._base.features}
         self._unmapped = [name for name in bases(actions, POSITION).values() if name not in self._features]
         self._history: deque[tuple[int, Vector]] = deque(maxlen=_SPAN)
         self._newest, self._lost = None, 0
@@ -205,7 +229,8 @@ class LeRobotHardware(Hardware):
         if self._unmapped:
             log.warning("%s: %s of LeRobot's robot are no joints here, and stay", name, ", ".join(self._unmapped))
         if self._rest:
-            log.warning("%s: %s are always 0: the base stands", name, ", ".join(self._rest))
+            axes = ", ".join(self._rest)
+            log.warning("%s: %s are always 0: the base stands, unless its axes are joints of the robot", name, axes)
         if not found["keeps_torque"]:
             log.warning("%s: LeRobot's %s may switch its torque off at the end", name, self._options.robot)
 
@@ -215,14 +240,24 @@ class LeRobotHardware(Hardware):
             np.array([np.nan if name is None else values.get(name, np.nan) for name in names])
             for names in self._columns
         )
-        position = self._factor * position + self._offset
+        stamp_ns = self._ctx.clock.now_ns() - age_ns(answer)
+        turned = self._factor * position + self._offset
+        self._base.measure(values, stamp_ns)
+        position = self._whole(turned, self._base.way)
         if not np.isfinite(position).all():
             raise self._fail(f"LeRobot gave no finite position of {self.joints[int(np.argmin(np.isfinite(position)))]}")
-        stamp_ns = self._ctx.clock.now_ns() - age_ns(answer)
         self._history.append((stamp_ns, position))
         measured = self._differences()
-        velocity = np.where(np.isfinite(velocity), self._factor * velocity, measured)
+        velocity = self._whole(self._factor * velocity, self._base.velocity)
+        velocity = np.where(np.isfinite(velocity), velocity, measured)
+        effort = self._whole(effort, np.full(len(self._rolled), np.nan))
         return JointReading(stamp_ns, position, velocity, effort)
+
+    def _whole(self, turned: Vector, rolled: Vector) -> Vector:
+        """Values of all joints, shape (J,), from those of the arm and those of the base."""
+        whole = np.empty(len(self.joints))
+        whole[self._turned], whole[self._rolled] = turned, rolled
+        return whole
 
     def _differences(self) -> Vector:
         """Velocity over the last readings [rad/s], shape (J,)."""

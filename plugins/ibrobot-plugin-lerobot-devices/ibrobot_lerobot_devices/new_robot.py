@@ -15,12 +15,27 @@ from ibrobot_core.app import load_config
 from ibrobot_lerobot_devices.link import INSTALL, DeviceLink, DeviceProblem
 from ibrobot_lerobot_devices.registry import registry
 from ibrobot_lerobot_devices.stand_in import NEEDS_TORCH
-from ibrobot_lerobot_devices.units import OTHERS, POSITION, Choices, Mapped, UnitProblem, bases, map_joints
+from ibrobot_lerobot_devices.units import (
+    AXES,
+    METRES,
+    OTHERS,
+    POSITION,
+    Choices,
+    Mapped,
+    UnitProblem,
+    bases,
+    driven,
+    map_joints,
+)
 
 _START_S = 60.0
 _GUESS = math.pi / 2
 """Limit of a joint whose range LeRobot does not say [rad]."""
 _PORT = "/dev/ttyACM0"
+_WAY = 1000.0
+"""Limit of the way of a base, which has none [m, rad]."""
+_SPEEDS = "max_velocity: 0.3, max_acceleration: 2.0", "max_velocity: 1.5, max_acceleration: 10.0"
+"""Guesses for an axis along which a base drives [m/s, m/s^2], and about which it turns [rad/s, rad/s^2]."""
 
 
 @attrs.frozen
@@ -38,6 +53,8 @@ class NewRobot:
     """A teleoperator with the same joints; empty if LeRobot has none of that name."""
     torch: bool
     """Whether it needs torch."""
+    axes: tuple[str, ...]
+    """The axes of its base."""
 
 
 def describe_robot(type_: str, id_: str) -> NewRobot:
@@ -78,7 +95,9 @@ def describe_robot(type_: str, id_: str) -> NewRobot:
     limits = {each.joint: _limits(each, facts["motors"].get(each.feature, {})) for each in mapped}
     leader = type_.replace("follower", "leader")
     known = leader if leader in found["teleoperator"] else ""
-    return NewRobot(type_, config, mapped, units, limits, measured, known, torch)
+    wheels = driven(facts["action_features"])
+    axes = tuple(name for name in wheels if name in AXES and wheels[name] in facts["observation_features"])
+    return NewRobot(type_, config, mapped, units, limits, measured, known, torch, axes)
 
 
 def _facts(type_: str, config: Mapping[str, Any], *, torch: bool) -> Mapping[str, Any]:
@@ -132,14 +151,20 @@ def robot_yaml(found: NewRobot) -> str:
     gripper = [name for name in names if "gripper" in name]
     arm = [name for name in names if name not in gripper] or names
     gripper = [name for name in gripper if name not in arm]
-    groups = f"{{arm: [{', '.join(arm)}]" + (f", gripper: [{', '.join(gripper)}]" if gripper else "") + "}"
+    members = {"arm": arm, "gripper": gripper, "base": found.axes}
+    groups = ", ".join(f"{name}: [{', '.join(each)}]" for name, each in members.items() if each)
     joints = "\n".join(
         f"    - {{name: {name}, lower: {found.limits[name][0]:.4f}, upper: {found.limits[name][1]:.4f}, "
         "max_velocity: 1.5, max_acceleration: 15.0}"
         for name in names
     )
+    joints += "".join(
+        f"\n    - {{name: {name}, lower: {-_WAY}, upper: {_WAY}, {_SPEEDS[AXES[name] != METRES]}}}"
+        for name in found.axes
+    )
     streams = ["arm_position", *(["gripper_position"] if gripper else [])]
-    executors = "\n".join(f"  {name}: {{type: position, group: {name.split('_')[0]}}}" for name in streams)
+    moved = [*streams, *(["base_position"] if found.axes else [])]
+    executors = "\n".join(f"  {name}: {{type: position, group: {name.split('_')[0]}}}" for name in moved)
     actions = "\n".join(
         f"    - {{key: action, executor: {name}, topic: /{name}_controller/commands, "
         "type: std_msgs/msg/Float64MultiArray}"
@@ -153,8 +178,13 @@ def robot_yaml(found: NewRobot) -> str:
     extra += f", anchored: [{', '.join(gripper)}]" if gripper and gripper != ["gripper"] else ""
     options = f"config: {_leader_config(found)}{_leader_options(found, gripper)}"
     leader = f"{{type: lerobot, teleop: {found.leader}, {options}}}"
-    devices = f"teleoperation:\n  leader: {leader}\n\n" if found.leader else ""
+    devices = f"  leader: {leader}\n" if found.leader else ""
     mode = f"  teleop:\n    executors: [{', '.join(streams)}]\n    teleop: leader\n" if found.leader else ""
+    if found.axes:
+        devices += "  cmd_vel: {type: cmd_vel}\n"
+        mode += "  drive:                                  # by twists on /cmd_vel; the arm holds\n"
+        mode += f"    executors: [{', '.join(moved)}]\n    teleop: {{base: cmd_vel}}\n"
+    devices = f"teleoperation:\n{devices}\n" if devices else ""
     return f"""\
 # {found.type} of LeRobot, made by `ibrobot config new --lerobot {found.type}`. Units are SI: radians, seconds.
 # Check all joints before the first motion: limits are {limits}; max_velocity and
@@ -164,7 +194,7 @@ robot:
   robot_type: {found.type}
   joints:                                 # order here = order in every vector
 {joints}
-  groups: {groups}
+  groups: {{{groups}}}
 
 hardware: {{type: lerobot, robot: {found.type}, config: {json.dumps(dict(found.config))}{extra}}}
 

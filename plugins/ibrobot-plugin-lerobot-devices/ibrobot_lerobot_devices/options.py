@@ -46,6 +46,11 @@ def _joint_options() -> dict[str, Any]:
     }
 
 
+def _is_topic(instance: object, attribute: attrs.Attribute[Any], value: str) -> None:
+    if not value.startswith("/") or value.endswith("/") or " " in value:
+        raise ValueError(f"{value!r} is not a topic: a topic begins with /, e.g. {attribute.default}")
+
+
 _JOINTS = _joint_options()
 _START = option(40.0, unit="s", gt=0, help="how long LeRobot may take to start and to connect")
 _LOST = option(3, ge=0, help="consecutive readings that LeRobot may fail to give")
@@ -117,6 +122,18 @@ class TeleopOptions:
     def choices(self) -> Choices:
         """What the options say about the conversion of units."""
         return Choices(self.joints, self.units, self.zero_at, (), self.inverted, self.scaled)
+
+
+@documented
+@attrs.frozen
+class CmdVelOptions:
+    """Options of teleop `type: cmd_vel`: a topic of twists that drives a base, whose axes are joints of the robot."""
+
+    topic: str = option("/cmd_vel", validator=_is_topic, help="topic of geometry_msgs/msg/Twist or TwistStamped")
+    frame: str = option("base_link", help="frame of twists with a header, if that names one")
+    x: str = option("x", help="joint for linear.x, ahead; a base may lack one of the three")
+    y: str = option("y", help="joint for linear.y, to the left")
+    theta: str = option("theta", help="joint for angular.z, counterclockwise")
 
 
 @documented

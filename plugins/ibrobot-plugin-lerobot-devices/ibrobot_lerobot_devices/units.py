@@ -16,8 +16,12 @@ POSITION = (".pos", ".q")
 VELOCITY = (".vel", ".dq")
 EFFORT = (".torque", ".tau", ".effort", ".eff")
 DEGREES, RADIANS, SYMMETRIC, PERCENT = "degrees", "radians", "range_m100_100", "range_0_100"
-UNITS = (DEGREES, RADIANS, SYMMETRIC, PERCENT)
-"""LeRobot's units of joints: `range_m100_100` and `range_0_100` are shares of the calibrated range."""
+METRES = "metres"
+UNITS = (DEGREES, RADIANS, SYMMETRIC, PERCENT, METRES)
+"""LeRobot's units of joints: `range_…` are shares of the calibrated range; bases have metres."""
+AXES = {"x": METRES, "y": METRES, "theta": DEGREES}
+"""The axes of a base, with the units per second in which LeRobot's robots are driven along and about them."""
+_DRIVEN = {DEGREES: math.pi / 180, RADIANS: 1.0, METRES: 1.0}
 
 OTHERS = "*"
 """In the option `units`: the joints whose unit neither LeRobot nor the option says."""
@@ -64,6 +68,33 @@ class UnitProblem(Exception):
 def bases(features: Sequence[str], ends: Sequence[str]) -> dict[str, str]:
     """Name without its end -> whole name, of the features with one of these ends."""
     return {name.removesuffix(end): name for name in features for end in ends if name.endswith(end)}
+
+
+def driven(features: Sequence[str]) -> dict[str, str]:
+    """Name without its end -> whole name, of the velocities without a position: the axes of a base."""
+    positions = bases(features, POSITION)
+    return {base: name for base, name in bases(features, VELOCITY).items() if base not in positions}
+
+
+def map_axes(features: Sequence[str], choices: Choices, wanted: Sequence[str]) -> list[Mapped]:
+    """Those of the joints `wanted` that are axes of a base, in that order; `features` are names of LeRobot's.
+
+    Raises:
+        UnitProblem: if the unit of an axis is not known.
+    """
+    by_joint = {choices.joints.get(base, base): base for base in driven(features)}
+    found = []
+    for joint in wanted:
+        if (base := by_joint.get(joint)) is None:
+            continue
+        unit = choices.units.get(base) or AXES.get(base, "")
+        if unit not in _DRIVEN:
+            raise UnitProblem(
+                f"give the unit of the base's {base!r}, e.g. units: {{{base}: metres}}, for metres a second"
+            )
+        turned = -1.0 if joint in choices.inverted else 1.0
+        found.append(Mapped(base, joint, unit, Scale(turned * _DRIVEN[unit])))
+    return found
 
 
 def map_joints(

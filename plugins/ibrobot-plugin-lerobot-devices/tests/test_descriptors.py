@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from ibrobot_lerobot_devices import link, registry
 from ibrobot_lerobot_devices.commands import lerobot
-from ibrobot_lerobot_devices.options import CameraOptions, RobotOptions, TeleopOptions
+from ibrobot_lerobot_devices.options import CameraOptions, CmdVelOptions, RobotOptions, TeleopOptions
 from ibrobot_testing.contexts import make_robot
 from ibrobot_testing.descriptor import check_descriptor
 
@@ -28,11 +28,12 @@ from .conftest import JOINTS, Motors
     [
         ("ibrobot_hardware", RobotOptions("fake_arm", {"port": "/dev/ttyACM0"})),
         ("ibrobot_teleop", TeleopOptions("fake_leader", {"port": "/dev/ttyACM1"})),
+        ("ibrobot_teleop", CmdVelOptions()),
         ("ibrobot_sensors", CameraOptions("fake_still", {"path": "picture", "height": 24, "width": 32})),
     ],
 )
 def test_functions_of_the_descriptors(hook: str, options: Any) -> None:
-    (descriptor,) = getattr(ibrobot_lerobot_devices, hook)()
+    (descriptor,) = (each for each in getattr(ibrobot_lerobot_devices, hook)() if isinstance(options, each.options))
     check_descriptor(descriptor, options)
     assert list(descriptor.check_options(options, make_robot(), make_robot().joint_names)) == []
 
@@ -83,7 +84,7 @@ def test_doctor_says_what_lerobot_does_not_report() -> None:
 class TestCommands:
     def test_list(self) -> None:
         result = CliRunner().invoke(lerobot, ["list"], catch_exceptions=False)
-        assert "robots: hardware of type lerobot: fake_arm\n" in result.output
+        assert "robots: hardware of type lerobot: fake_arm, fake_base\n" in result.output
         assert "teleoperators: teleop of type lerobot: fake_leader, fake_stick\n" in result.output
 
     def test_list_of_a_type_has_its_config(self) -> None:
@@ -121,6 +122,14 @@ class TestNew:
         expected = [(700 - 2048) * tick] * 2 + [(2048 - 3300) * tick] + [(700 - 2048) * tick] * 2 + [0.0]
         np.testing.assert_allclose(config.robot.lower, expected, atol=1e-3)
         assert config.hardware["hardware"].options.config["id"] == "fake_arm"
+
+    def test_a_base_is_driven_in_a_mode_of_its_own(self, tmp_path: Path) -> None:
+        out = tmp_path / "base.yaml"
+        CliRunner().invoke(lerobot, ["new", str(out), "fake_base"], catch_exceptions=False)
+        config = load_config(out)
+        assert config.robot.joint_names == ("gripper", "x", "y", "theta")
+        assert config.control_modes["drive"].devices == {"base": "cmd_vel"}
+        assert config.executors["base_position"].joints == ("x", "y", "theta")
 
     def test_an_existing_file_is_not_overwritten(self, tmp_path: Path) -> None:
         out = tmp_path / "arm.yaml"

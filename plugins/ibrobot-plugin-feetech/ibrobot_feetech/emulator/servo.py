@@ -13,6 +13,8 @@ _EPROM_END = register("torque_enable").address
 _TORQUE = register("torque_enable").address
 _MIDDLE = 128
 """Writing it to `torque_enable` makes the present position the middle of the turn."""
+_WHEEL = 1
+"""Operating mode in which the servo turns at its goal velocity."""
 _MAX_VELOCITY = 3073
 """Maximum speed at 12 V without load [ticks/s]: 0.222 s for 60 degrees."""
 _DUTY_PER_TICK = 8.0
@@ -170,10 +172,12 @@ class EmulatedServo:
     def advance(self, elapsed_s: float) -> None:
         """Advance by `elapsed_s` [s]: the joint moves towards its goal, and lasting high load causes an overload."""
         if not self._driven:
-            if self.torque and not self.blocked and self.get("operating_mode") == 0:
+            mode = self.get("operating_mode") if self.torque and not self.blocked else None
+            if mode == 0:
                 self._follow(elapsed_s)
             else:
-                self.velocity = 0.0
+                self.velocity = float(self.get("goal_velocity")) if mode == _WHEEL else 0.0
+                self.encoder += self.velocity * elapsed_s
         self._protect(elapsed_s)
         self._publish()
 
@@ -228,7 +232,8 @@ class EmulatedServo:
         most = min(self.get("max_torque"), self.get("torque_limit"))
         if self._overload:
             most = min(most, 10 * self.get("protective_torque"))
-        wanted = most if self.burdened else self._way() * _DUTY_PER_TICK * self.get("p_coefficient") / 32
+        way = 0.0 if self.get("operating_mode") == _WHEEL else self._way()
+        wanted = most if self.burdened else way * _DUTY_PER_TICK * self.get("p_coefficient") / 32
         return max(-most, min(most, wanted))
 
     def _make_middle(self) -> None:
