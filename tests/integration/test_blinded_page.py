@@ -137,6 +137,7 @@ def second_day(page: Any, seen: Seen) -> None:
     seen.look()
 
 
+@pytest.mark.long
 def test_operator_judges_blind_on_the_page_and_goes_on_after_a_crash(site: Site, tmp_path: Path) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
     from ui_path import FLAGS, ui_process

@@ -181,6 +181,7 @@ def test_statistics_are_lerobots(bags: Path, tmp_path: Path) -> None:
             np.testing.assert_allclose(found[name], wanted[name], rtol=1e-2, atol=1e-4, err_msg=f"{key} {name}")
 
 
+@pytest.mark.long
 def test_act_trains_on_it(bags: Path, tmp_path: Path) -> None:
     converted(bags, tmp_path / "set", labels=True)
     command = [

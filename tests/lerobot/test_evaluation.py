@@ -75,6 +75,7 @@ def test_successes_are_equal_seed_by_seed(checkpoint: Path, ours: Path, tmp_path
     assert task["metrics"]["successes"] == outcomes
 
 
+@pytest.mark.long
 def test_observations_are_equal_bit_by_bit(checkpoint: Path, ours: Path, tmp_path: Path) -> None:
     episodes = json.loads((ours / "report.json").read_text())["episodes"]
     seed = next(each["seed"] for each in episodes if not each["success"])  # a success ends its episode at once

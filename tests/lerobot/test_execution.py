@@ -45,7 +45,7 @@ default_control_mode: idle
 """
 
 
-@pytest.fixture(params=["act", "diffusion"])
+@pytest.fixture(params=["act", pytest.param("diffusion", marks=pytest.mark.long)])
 def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return save(CONFIGS[request.param](), tmp_path / request.param)
 

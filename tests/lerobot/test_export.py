@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +34,21 @@ TOLERANCE = 2e-5
 OBSERVATIONS = 100
 
 
+LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("act", "diffusion")]
+
+
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Path]]:
-    """Type -> checkpoint, and what it was exported to."""
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path, Path]]:
+    """Gives the checkpoint of a type, and what it was exported to."""
     root = tmp_path_factory.mktemp("exported")
-    found = {}
-    for name, config in CONFIGS.items():
-        checkpoint = save(config(), root / name)
+
+    @cache
+    def export(name: str) -> tuple[Path, Path]:
+        checkpoint = save(CONFIGS[name](), root / name)
         assert export_onnx(checkpoint, root / f"{name}-onnx").largest_difference < TOLERANCE
-        found[name] = checkpoint, root / f"{name}-onnx"
-    return found
+        return checkpoint, root / f"{name}-onnx"
+
+    return export
 
 
 def onnx_policy(path: Path) -> OnnxPolicy:
@@ -91,11 +98,11 @@ class Drawn:
         return (probabilities.cumsum(-1) <= uniform).sum(-1, keepdim=True).clamp_max(probabilities.shape[-1] - 1)
 
 
-@pytest.mark.parametrize("name", ["act", "diffusion", "vqbet"])
+@pytest.mark.parametrize("name", ["vqbet", *LONG])
 def test_chunks_are_those_of_torch(
-    exported: dict[str, tuple[Path, Path]], name: str, monkeypatch: pytest.MonkeyPatch, record_property: Any
+    exported: Callable[[str], tuple[Path, Path]], name: str, monkeypatch: pytest.MonkeyPatch, record_property: Any
 ) -> None:
-    checkpoint, folder = exported[name]
+    checkpoint, folder = exported(name)
     ours, theirs = onnx_policy(folder), torch_policy(checkpoint)
     drawn = Drawn(json.loads((folder / "onnx_policy.json").read_text()))
     largest, chunks = 0.0, []
@@ -119,24 +126,25 @@ def test_chunks_are_those_of_torch(
     assert np.ptp(np.stack(chunks), axis=0).max() > 1e-4, "the network answers to what it sees"
 
 
-def test_spec_is_that_of_the_checkpoint(exported: dict[str, tuple[Path, Path]]) -> None:
-    for checkpoint, folder in exported.values():
-        theirs = LeRobotPolicy(LeRobotPolicyOptions(checkpoint), host_context()).spec
-        assert onnx_policy(folder).spec == theirs
+@pytest.mark.parametrize("name", ["vqbet", *LONG])
+def test_spec_is_that_of_the_checkpoint(exported: Callable[[str], tuple[Path, Path]], name: str) -> None:
+    checkpoint, folder = exported(name)
+    assert onnx_policy(folder).spec == LeRobotPolicy(LeRobotPolicyOptions(checkpoint), host_context()).spec
 
 
+@pytest.mark.long
 def test_ddim_is_exported_too(tmp_path: Path) -> None:
     config = diffusion(noise_scheduler_type="DDIM", prediction_type="sample")
     export_onnx(save(config, tmp_path / "ddim"), tmp_path / "onnx")
     assert json.loads((tmp_path / "onnx/onnx_policy.json").read_text())["denoising_steps"][0][-1] == 0.0
 
 
-def test_a_run_needs_no_torch(exported: dict[str, tuple[Path, Path]]) -> None:
+def test_a_run_needs_no_torch(exported: Callable[[str], tuple[Path, Path]]) -> None:
     code = (
         "import sys; from pathlib import Path\n"
         "from ibrobot_onnx.options import OnnxPolicyOptions; from ibrobot_onnx.policy import OnnxPolicy\n"
         "from ibrobot_testing.contexts import host_context\n"
-        f"policy = OnnxPolicy(OnnxPolicyOptions(Path({str(exported['act'][1])!r})), host_context()); policy.load()\n"
+        f"policy = OnnxPolicy(OnnxPolicyOptions(Path({str(exported('vqbet')[1])!r})), host_context()); policy.load()\n"
         "print(sorted({'torch', 'lerobot'} & sys.modules.keys()))"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

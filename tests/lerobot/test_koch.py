@@ -95,6 +95,7 @@ def moved_by_hand(bus: DynamixelBus) -> Iterator[None]:
         thread.join()
 
 
+@pytest.mark.long
 def test_koch_from_calibration_to_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(PATIENT_SDK)

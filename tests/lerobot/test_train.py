@@ -80,9 +80,9 @@ def ended(output: list[str]) -> list[dict[str, object]]:
 @pytest.mark.parametrize(
     ("when", "number"),
     [
-        (lambda out: True, signal.SIGKILL),
+        pytest.param(lambda out: True, signal.SIGKILL, marks=pytest.mark.long),
         (lambda out: (out / "checkpoints/000003/pretrained_model").exists(), signal.SIGKILL),
-        (lambda out: newest_checkpoint(out) is not None, signal.SIGINT),
+        pytest.param(lambda out: newest_checkpoint(out) is not None, signal.SIGINT, marks=pytest.mark.long),
     ],
     ids=["while torch loads", "in the first save", "after a checkpoint"],
 )

@@ -29,6 +29,7 @@ def test_equal_outcomes_differ_by_no_more_than_the_margin_after_enough_episodes(
     assert (found.verdict, found.words) == (SAME, "a and b differ by no more than 10 points")
 
 
+@pytest.mark.long
 def test_at_most_ten_of_200_comparisons_of_a_policy_with_itself_find_a_difference():
     rng = np.random.default_rng(0)
     different = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
@@ -59,6 +60,10 @@ class TestZstd(McapSuite):
 
 class TestInSmallSplits(McapSuite):
     options = McapOptions(split_duration=0.7, chunk_size=1024)
+
+    @pytest.mark.long
+    def test_loses_nothing_of_a_long_episode(self, tmp_path):
+        super().test_loses_nothing_of_a_long_episode(tmp_path)
 
 
 class StillClock(RealClock):
