@@ -134,6 +134,11 @@ class Share:
         help="executors of this robot that take goals of others, as actions of ROS 2, e.g. arm_trajectory for "
         "/arm_trajectory/follow_joint_trajectory",
     )
+    gripper_action: str = option(
+        "GripperCommand",
+        choices=("GripperCommand", "ParallelGripperCommand"),
+        help="type of the action of executors that take a position",
+    )
     parameters: bool = option(
         False,
         help="whether others may read this file's values, but for secrets, as parameters of the ROS 2 node "

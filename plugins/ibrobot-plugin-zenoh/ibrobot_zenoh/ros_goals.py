@@ -85,9 +85,28 @@ class _Gripper(Kind):
         return {"position": head["position"], "effort": head["effort"], **_ends(head)}
 
 
+class _ParallelGripper(Kind):
+    def request(self, goal: Any) -> tuple[dict[str, Any], Message | None]:
+        command = goal.command
+        return {
+            "names": list(command.name),
+            "position": list(command.position),
+            "velocity": list(command.velocity),
+            "max_effort": list(command.effort),
+        }, None
+
+    def feedback(self, head: Mapping[str, Any], joints: list[str]) -> dict[str, Any]:
+        return {"state": {"name": joints, "position": head["actual"], "effort": head["effort"]}}
+
+    def result(self, head: Mapping[str, Any], joints: list[str]) -> dict[str, Any]:
+        state = {"name": joints, "position": [head["position"]], "effort": [head["effort"]]}
+        return {"state": state, **_ends(head)}
+
+
 ACTIONS: dict[str, Kind] = {
     "control_msgs/action/FollowJointTrajectory": _Trajectory(),
     "control_msgs/action/GripperCommand": _Gripper(),
+    "control_msgs/action/ParallelGripperCommand": _ParallelGripper(),
 }
 
 

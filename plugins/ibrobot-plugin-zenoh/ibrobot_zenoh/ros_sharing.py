@@ -106,7 +106,7 @@ class RosActions(Component):
 
     sends_stops = True
 
-    def __init__(self, session: RunAccess, link: TransportLink, executors: tuple[str, ...]) -> None:
+    def __init__(self, session: RunAccess, link: TransportLink, executors: tuple[str, ...], gripper_action: str) -> None:
         super().__init__("share:actions", f"goals for {', '.join(executors)}", (link.name, CONTROL))
         self._session = session
         self._link = link
@@ -115,7 +115,7 @@ class RosActions(Component):
             if name not in known:
                 hint = did_you_mean(name, known, "executors that do")
                 raise NotSupported(f"transport.share.actions: {name} is no executor that takes goals{hint}")
-        self._actions = Actions(session, executors, self._named, "zenoh")
+        self._actions = Actions(session, executors, self._named, "zenoh", gripper_action)
         self._lock = threading.RLock()
         self._count = 0
         self._goals: dict[int, _Goal] = {}

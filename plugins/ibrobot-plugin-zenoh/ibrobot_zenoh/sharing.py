@@ -156,7 +156,7 @@ def components(share: Share, session: RunAccess, link: TransportLink) -> list[Co
     if share.parameters:
         served.append(RosParameters(session, link, services.is_shared))
     if share.actions:
-        served.append(RosActions(session, link, share.actions))
+        served.append(RosActions(session, link, share.actions, share.gripper_action))
     return [*(PublishedTopic(session, link, topic) for topic in share.publish), *subscribed, *served]
 
 

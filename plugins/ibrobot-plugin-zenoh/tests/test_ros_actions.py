@@ -43,16 +43,20 @@ def installed(runs: Runs) -> Runs:
     return runs
 
 
-@pytest.fixture
-def robot(installed: Runs) -> Any:
+def start(installed: Runs, *overrides: str) -> Any:
     """A run that takes goals, and its client."""
     endpoint = free_endpoint()
     transport = (
         f"transport={{type: zenoh, mode: router, listen: [{endpoint}], shared_memory: false, "
         "share: {actions: [arm_trajectory, grip_action], services: [/estop, /set_mode, /reset]}}"
     )
-    runtime = installed.start(*ROBOT, transport, mode="goals", lockstep=False)
-    near = client(endpoint)
+    runtime = installed.start(*ROBOT, transport, *overrides, mode="goals", lockstep=False)
+    return runtime, client(endpoint)
+
+
+@pytest.fixture
+def robot(installed: Runs) -> Any:
+    runtime, near = start(installed)
     wait_for(lambda: {"/estop", "/set_mode/idle", "/reset"} <= {each.name for each in near.shared_services(WAIT_S)})
     wait_for(lambda: len(actions_of(near.shared_services(WAIT_S))) == 2)
     return runtime, near
@@ -69,6 +73,21 @@ def test_goals_end_with_feedback_and_result(robot: Any):
     assert feedback[-1]["joint_names"] == ["pan"]
     assert feedback[-1]["actual"]["positions"][0] == pytest.approx(0.4, abs=0.1)
     assert SentGoal(near, HAND, GRIP, {"command": {"position": 0.3}}).result(WAIT_S).result["reached_goal"]
+
+
+def test_a_gripper_as_parallel_gripper_command(installed: Runs, caplog: pytest.LogCaptureFixture):
+    _, near = start(installed, "transport.share.gripper_action=ParallelGripperCommand")
+    kind = action_type("control_msgs/action/ParallelGripperCommand")
+    wait_for(lambda: (HAND, kind.name) in actions_of(near.shared_services(WAIT_S)))
+    feedback: list[dict[str, Any]] = []
+    ended = SentGoal(near, HAND, kind, {"command": {"name": ["grip"], "position": [0.3]}}, feedback.append).result(WAIT_S)
+    assert (ended.status, ended.result["reached_goal"], ended.result["stalled"]) == (Status.SUCCEEDED, True, False)
+    assert ended.result["state"]["name"] == feedback[-1]["state"]["name"] == ["grip"]
+    assert ended.result["state"]["position"] == pytest.approx([0.3], abs=0.02)
+    for wrong, why in (({"name": ["pan"], "position": [0.3]}, "names must be grip"), ({}, "needs one position")):
+        with pytest.raises(TransportError, match="rejected the goal"):
+            SentGoal(near, HAND, kind, {"command": wrong})
+        assert why in caplog.text
 
 
 def test_goals_are_canceled_and_replaced(robot: Any):
