@@ -62,6 +62,8 @@ class Descriptor[T]:
     calibration: Callable[[Any], str | None] = attrs.field(default=lambda options: None, kw_only=True)
     """Name or path of the calibration in the options, for `load_calibration`; recordings contain that of hardware. None
     without a calibration."""
+    offers: Callable[[Any, str], bool] = attrs.field(default=lambda options, service: False, kw_only=True)
+    """Whether other programs can call a service of the run, by its name, through a component with these options."""
     default: bool = attrs.field(default=False, kw_only=True)
     """Whether commands use this type by default; at most one type of each kind."""
 

@@ -344,24 +344,6 @@ class DiagnosticArray(Message, ros_type="diagnostic_msgs/msg/DiagnosticArray"):
 
 
 @attrs.frozen
-class Variant(Message, ros_type="ibrobot_msgs/msg/Variant"):
-    """ibrobot_msgs/msg/Variant: one named tensor; `data` in C order as bytes of `dtype` with `shape`."""
-
-    key: str
-    dtype: str
-    shape: tuple[int, ...]
-    data: NDArray[np.uint8] = attrs.field(converter=_uint8s, eq=_EQUAL)
-
-
-@attrs.frozen
-class VariantsList(Message, ros_type="ibrobot_msgs/msg/VariantsList"):
-    """ibrobot_msgs/msg/VariantsList: named tensors of one instant."""
-
-    header: Header
-    variants: tuple[Variant, ...]
-
-
-@attrs.frozen
 class RobotStatus(Message, ros_type="ibrobot_msgs/msg/RobotStatus"):
     """ibrobot_msgs/msg/RobotStatus: mode, faults and state of the robot."""
 

@@ -62,7 +62,11 @@ class Service[Q, A]:
     urgent: bool = False
     """Whether it must not wait behind other requests, as an emergency stop."""
     ros_type: str = ""
-    """The ROS 2 type with the same fields, if there is one, e.g. `ibrobot_msgs/srv/MoveToPose`."""
+    """The ROS 2 type with the same fields, if there is one, e.g. `ibrobot_msgs/srv/MoveToPose`, or an action."""
+    progress: Service[NoRequest, Any] | None = None
+    """For a service that takes its time: answers with what it has done so far, which is an action's feedback."""
+    cancel: Service[NoRequest, Any] | None = None
+    """For a service that takes its time: ends it early; it then answers its caller."""
 
     def __attrs_post_init__(self) -> None:
         if not attrs.has(self.request):

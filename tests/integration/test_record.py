@@ -92,4 +92,4 @@ def test_without_a_terminal_it_says_what_to_add(tmp_path: Path, ibrobot: tuple[s
     command = [*ibrobot, "record", "so101_blind", "--sim", "--headless", "--mode", "teleop"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 2
-    assert "nothing can begin an episode: there is no terminal for keys, and no device of mode teleop" in done.stderr
+    assert "nothing can begin an episode: there is no terminal for keys, no device of mode teleop" in done.stderr

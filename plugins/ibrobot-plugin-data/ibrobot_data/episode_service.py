@@ -14,7 +14,7 @@ from ibrobot_core.api import NS_PER_S, Contract, NotSupported, RecorderError, do
 from ibrobot_core.app import DiskFull, Episodes, NoRequest, RunAccess, Service, wrong_input
 from ibrobot_data.conversion import OUTCOMES
 from ibrobot_data.cues import Cue
-from ibrobot_data.episode_dataset import EpisodeDataset
+from ibrobot_data.episode_dataset import EpisodeDataset, count_complete
 from ibrobot_data.episode_start import is_kept
 from ibrobot_data.prompt import check_prompt
 
@@ -67,6 +67,41 @@ class EpisodeStatus:
     failure: str = option(help="the error that cut short the present or last episode; empty without one")
 
 
+@documented
+@attrs.frozen
+class RecordEpisode:
+    """A request to `/record_episode`."""
+
+    prompt: str = option("", help="description of the task; empty: that of the last episode")
+
+
+@documented
+@attrs.frozen
+class RecordedEpisode:
+    """What has become of an episode."""
+
+    success: bool = option(help="whether it is complete and kept")
+    message: str = option(help="where it is, or why it is not kept")
+
+
+@documented
+@attrs.frozen
+class RecordProgress:
+    """How the present episode goes on."""
+
+    seconds_remaining: int = option(unit="s", help="time until it ends by itself")
+    feedback_message: str = option(help="its number, and what was lost")
+
+
+@documented
+@attrs.frozen
+class DatasetInfo:
+    """Where episodes go."""
+
+    path: str = option(help="folder of the dataset")
+    episodes: int = option(help="number of complete episodes in it")
+
+
 START = Service("/record_episode/start", StartEpisode, NoneType, "Begin an episode.", alone="prompt")
 STOP = Service("/record_episode/stop", StopEpisode, NoneType, "End the episode.", alone="outcome")
 REDO = Service(
@@ -75,6 +110,19 @@ REDO = Service(
 )  # fmt: skip
 DISCARD = Service("/record_episode/discard", NoRequest, NoneType, "End the episode, and delete it.")
 STATUS = Service("/record_episode/status", NoRequest, EpisodeStatus, "The state of recording, for a user interface.")
+INFO = Service("/record_episode/get_info", NoRequest, DatasetInfo, "Where episodes go, as IB-Robot's recorder says.")
+CANCEL = Service(
+    "/record_episode/cancel", NoRequest, NoneType, "End the episode early, and keep it, as IB-Robot's recorder does."
+)
+PROGRESS = Service("/record_episode/progress", NoRequest, RecordProgress, "How the present episode goes on.")
+RECORD = Service(
+    "/record_episode", RecordEpisode, RecordedEpisode, "Record an episode, and answer when it has ended.",
+    alone="prompt", ros_type="ibrobot_msgs/action/RecordEpisode", progress=PROGRESS, cancel=CANCEL,
+)  # fmt: skip
+_GLANCE_S = 0.05
+"""Interval at which the end of an episode is looked for [s]."""
+_LAST_GLANCES = 60
+"""How often it is still looked for once the run ends."""
 _MIB = 1 << 20
 _PAUSED_NS = NS_PER_S // 10
 """A robot that has not followed for this time is paused [ns]."""
@@ -188,12 +236,41 @@ class EpisodeService(Episodes):
             NotSupported: if the mode begins episodes itself.
         """
         with self._lock:
-            self._check_by_operator()
-            if self.running:
-                raise RecorderError("an episode is being recorded; end it first")
-            self._check_ready()
-            self.prompt = self.last_prompt if prompt is None else check_prompt(prompt)
-            self._begin(wait=wait, again=False)
+            self._start(prompt, wait=wait)
+
+    def record(self, prompt: str = "") -> RecordedEpisode:
+        """Record an episode, and wait until it has ended, however it ends, and is written.
+
+        Args:
+            prompt: description of the task; empty repeats the last prompt.
+
+        Raises:
+            RecorderError: as `start`.
+            DiskFull: as `start`.
+            NotSupported: if the mode begins episodes itself, or in the thread of a lockstep run.
+        """
+        if self._session.request.lockstep:
+            raise NotSupported(f"this service waits for the episode: in lockstep call {START.name} and {STOP.name}")
+        before = self._recording.kept
+        with self._lock:
+            self._start(prompt or None, wait=False)
+            number = self.number
+        pause, left = threading.Event(), _LAST_GLANCES
+        while left and ((self.running and self.number == number) or self.writing):
+            left -= self._session.finished.is_set()  # the end of the run ends the episode
+            pause.wait(_GLANCE_S)
+        if self.failure is not None:
+            return RecordedEpisode(False, str(self.failure))
+        kept = self._recording.kept
+        if kept == before:
+            return RecordedEpisode(False, f"episode {number} was discarded")
+        return RecordedEpisode(True, f"episode {number} is {kept}")
+
+    def progress(self) -> RecordProgress:
+        """How the present episode goes on."""
+        left_s = self._session.config.contract.max_duration_s - self.elapsed_s() if self.running else 0.0
+        lost = sum(self._recording.lost().values())
+        return RecordProgress(max(0, int(left_s)), f"episode {self.number}, {lost} messages lost")
 
     def redo(self) -> None:
         """Record the present episode again, or else the last one of this run, which is deleted once that is saved.
@@ -256,6 +333,14 @@ class EpisodeService(Episodes):
         followed_ns = self._session.followed_ns
         return by_hand and (not followed_ns or followed_ns < since_ns)
 
+    def _start(self, prompt: str | None, *, wait: bool) -> None:
+        self._check_by_operator()
+        if self.running:
+            raise RecorderError("an episode is being recorded; end it first")
+        self._check_ready()
+        self.prompt = self.last_prompt if prompt is None else check_prompt(prompt)
+        self._begin(wait=wait, again=False)
+
     def _check_ready(self) -> None:
         """Check that an episode can begin.
 
@@ -316,10 +401,14 @@ class EpisodeService(Episodes):
         bus.serve(STOP, lambda request: self.stop(request.outcome))
         bus.serve(DISCARD, lambda _: self.discard())
         bus.serve(STATUS, lambda _: self.status())
+        bus.serve(RECORD, lambda request: self.record(request.prompt))
+        bus.serve(PROGRESS, lambda _: self.progress())
+        bus.serve(CANCEL, lambda _: self.stop())
+        bus.serve(INFO, lambda _: DatasetInfo(str(self.folder), count_complete(self.folder)))
 
     def unserve(self) -> None:
         """Remove the services from the bus."""
-        for service in (START, STOP, REDO, DISCARD, STATUS):
+        for service in (START, STOP, REDO, DISCARD, STATUS, RECORD, PROGRESS, CANCEL, INFO):
             self._session.bus.unserve(service)
 
     def _end(self, outcome: str) -> None:

@@ -9,7 +9,7 @@ from typing import override
 from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, TeleopDescriptor, ViewerDescriptor, seconds
 from ibrobot_core.app import DiskFull, Event, RunAccess, RunHooks
 from ibrobot_data.cues import ENDING_S, Cues
-from ibrobot_data.episode_service import EpisodeService
+from ibrobot_data.episode_service import RECORD, START, EpisodeService
 from ibrobot_data.plural import plural
 from ibrobot_data.recording_session import Session as SessionEvent
 
@@ -48,8 +48,8 @@ class Operator(RunHooks):
             raise NotSupported(f"--continuous: mode {run.mode} begins and ends its episodes itself")
         if not (service.by_mode or auto or continuous or keys or _has_start_button(run)):
             raise NotSupported(
-                f"nothing can begin an episode: there is no terminal for keys, and no device of mode {run.mode} has a "
-                "button `start`; add --auto"
+                f"nothing can begin an episode: there is no terminal for keys, no device of mode {run.mode} has a "
+                f"button `start`, and no other program may call {START.name}; add --auto"
             )
         self._run = run
         self._service = service
@@ -286,12 +286,17 @@ class Operator(RunHooks):
 
 
 def _has_start_button(run: RunAccess) -> bool:
-    """Whether the viewer, or a teleoperation device of the mode, can begin episodes."""
+    """Whether the viewer, a teleoperation device of the mode, or another program can begin episodes."""
     if (viewer := run.config.viewer) is not None:
         shown_by = run.registry.find("viewer", viewer.type)
         assert isinstance(shown_by, ViewerDescriptor)
         if shown_by.begins_episodes:
             return True
+    others = [(each.offers, options) for each, options in run.registry.sections(run.config) if options is not None]
+    if (transport := run.config.transport) is not None:
+        others.append((run.registry.find("transport", transport.type).offers, transport.options))
+    if any(offers(options, service.name) for offers, options in others for service in (START, RECORD)):
+        return True
     for name in run.config.control_modes[run.mode].devices.values():
         device = run.config.teleoperation[name]
         descriptor = run.registry.find("teleop", device.type)

@@ -92,7 +92,7 @@ class RecordingWorker(SessionWorker):
         """Ends of episodes that were requested and are not carried out yet."""
         self._again = False
         """Whether the present episode replaces the one kept last."""
-        self._kept: Path | None = None
+        self.kept: Path | None = None
         """The folder of the episode kept last."""
         self.failure: RecorderError | None = None
         """The error that cut short the recording of the present or last episode; None without an error."""
@@ -265,7 +265,7 @@ class RecordingWorker(SessionWorker):
             self._provisional -= provisional and not again
             self._whole += kept and not replaced
         if kept:
-            self._kept = folder
+            self.kept = folder
             self.episodes.play("saved")
         with self._pending_lock:
             self._ending -= 1
@@ -273,11 +273,11 @@ class RecordingWorker(SessionWorker):
 
     def _remove_kept(self) -> bool:
         """Delete the episode kept last; return whether it is gone. One that another program uses stays."""
-        if self._kept is None:
+        if self.kept is None:
             return False
         try:
-            with Ownership(self._kept, "is being deleted", wait_s=0.0):
-                shutil.rmtree(self._kept)
+            with Ownership(self.kept, "is being deleted", wait_s=0.0):
+                shutil.rmtree(self.kept)
         except (OSError, IbrobotError) as error:
             self.session.log.warning("the episode that was recorded again stays: %s", error_line(error))
             return False

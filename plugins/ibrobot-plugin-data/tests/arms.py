@@ -19,6 +19,7 @@ from ibrobot_core.api import (
     TeleopDescriptor,
     hookimpl,
 )
+from ibrobot_core.app import Component, SectionDescriptor
 
 STICKS: list[Stick] = []
 """Those made so far."""
@@ -86,6 +87,22 @@ def ibrobot_policies() -> Iterator[PolicyDescriptor]:
 @hookimpl
 def ibrobot_recorders() -> Iterator[RecorderDescriptor]:
     yield RecorderDescriptor("lines", lambda options, ctx: FakeRecorder(ctx), "lines of JSON")
+
+
+class Phone(Component):
+    """Lets other programs call services, in the imagination."""
+
+    def start(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+
+@hookimpl
+def ibrobot_sections() -> Iterator[SectionDescriptor]:
+    yield SectionDescriptor(
+        type="phone", make=lambda options, session: Phone("phone", "a phone"), summary="a phone",
+        offers=lambda options, service: service == "/record_episode",
+    )  # fmt: skip
 
 
 @hookimpl

@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 import json
+import queue
 import threading
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import attrs
 import pytest
 import yaml
 from ibrobot_data.episode_dataset import EpisodeDataset
-from ibrobot_data.episode_service import DISCARD, START, STATUS, STOP, EpisodeService
+from ibrobot_data.episode_service import (
+    CANCEL,
+    DISCARD,
+    INFO,
+    PROGRESS,
+    RECORD,
+    START,
+    STATUS,
+    STOP,
+    DatasetInfo,
+    EpisodeService,
+    RecordedEpisode,
+)
 
 from ibrobot_core.api import Contract, IbrobotError, NotSupported, RecorderError
 from ibrobot_core.app import ESTOP, RESET, ConfigError, DiskFull, InUse, Ownership, RequestError
@@ -96,6 +110,77 @@ def test_services_begin_end_and_discard_episodes(run: Runtime, runs: Runs):
     assert isinstance(service, EpisodeService)
     assert service.saved == 1
     assert folders(runs) == ["episode_000001"]
+
+
+@pytest.fixture
+def threaded(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> Iterator[Runtime]:
+    """A run in real time, whose topics are heard."""
+    monkeypatch.chdir(runs.folder)
+    runtime = runs.start(RECORDING, mode="teleop", by_operator=True, lockstep=False)
+    until(lambda: not runtime.session.bus.call(STATUS).silent)
+    yield runtime
+    runtime.stop()
+
+
+def until(ready: Callable[[], object]) -> None:
+    pause = threading.Event()
+    for _ in range(2000):
+        if ready():
+            return
+        pause.wait(0.01)
+    raise AssertionError("it did not happen")
+
+
+def recorded(runtime: Runtime, act: Callable[[], object], prompt: str = "") -> RecordedEpisode:
+    """What `/record_episode` answers if something is done meanwhile."""
+    bus, answers = runtime.session.bus, queue.SimpleQueue[RecordedEpisode]()
+    thread = threading.Thread(target=lambda: answers.put(bus.call(RECORD, prompt)))
+    thread.start()
+    until(lambda: bus.call(STATUS).recording)
+    act()
+    answer = answers.get(timeout=20.0)
+    thread.join()
+    return answer
+
+
+def test_an_episode_is_recorded_in_one_call(threaded: Runtime, runs: Runs):
+    bus = threaded.session.bus
+
+    def look_and_cancel() -> None:
+        progress = bus.call(PROGRESS)
+        assert 0 <= progress.seconds_remaining <= threaded.session.config.contract.max_duration_s
+        assert progress.feedback_message == "episode 1, 0 messages lost"
+        bus.call(CANCEL)
+
+    answer = recorded(threaded, look_and_cancel, "pick")
+    folder = runs.folder / "kept" / "pick" / "episodes" / "episode_000001"
+    assert (answer.success, answer.message.endswith("pick/episodes/episode_000001")) == (True, True)
+    assert (folder / "metadata.json").is_file(), "it is written when the answer comes"
+    assert json.loads((folder / "metadata.json").read_text())["prompt"] == "pick"
+    assert bus.call(PROGRESS).seconds_remaining == 0
+    assert recorded(threaded, lambda: bus.call(STOP, "success")).success, "however it ends"
+    assert bus.call(STATUS).prompt == "pick", "the last one"
+
+
+def test_the_one_call_says_why_an_episode_is_not_kept(threaded: Runtime):
+    bus = threaded.session.bus
+    assert recorded(threaded, lambda: bus.call(DISCARD)) == RecordedEpisode(False, "episode 1 was discarded")
+
+    def ask_again_and_discard() -> None:
+        with pytest.raises(RecorderError, match="an episode is being recorded; end it first"):
+            bus.call(RECORD, "place")
+        bus.call(DISCARD)
+
+    assert not recorded(threaded, ask_again_and_discard).success
+
+
+def test_the_one_call_waits_so_that_lockstep_refuses_it(run: Runtime):
+    with pytest.raises(NotSupported, match=r"in lockstep call /record_episode/start and /record_episode/stop"):
+        run.session.bus.call(RECORD, "pick")
+
+
+def test_ib_robots_recorder_says_where_episodes_go(run: Runtime, runs: Runs):
+    assert run.session.bus.call(INFO) == DatasetInfo("kept/pick", 0)
 
 
 def test_metadata_describe_how_the_episode_was_made(run: Runtime, runs: Runs):

@@ -11,7 +11,7 @@ from typing import Any
 import attrs
 import pytest
 from ibrobot_data.cues import Cues
-from ibrobot_data.episode_service import EpisodeService
+from ibrobot_data.episode_service import CANCEL, START, EpisodeService
 from ibrobot_data.operator import Operator
 from ibrobot_testing.fakes import FakeRecorder
 from ibrobot_testing.site import made_up_site
@@ -407,8 +407,23 @@ def test_without_a_terminal_the_buttons_of_a_device_begin_and_end_episodes(recor
     assert run.ended == [(1, "success")]
 
 
+def test_without_a_terminal_other_programs_begin_and_end_episodes(record: Record):
+    Path("mini.yaml").write_text(f"{ROBOT}phone: {{}}\n")
+    run = record(keys=False, prompt="pick")
+    bus = run.runtime.session.bus
+    bus.call(START, "place")
+    run.step(3)
+    bus.call(CANCEL)
+    run.step(3)
+    assert (run.ended, run.service.saved) == ([(1, "unknown")], 1)
+
+
 def test_nobody_can_begin_an_episode_without_keys_buttons_and_auto(record: Record):
-    message = "nothing can begin an episode: there is no terminal for keys, and no device of mode teleop has a button"
-    with pytest.raises(NotSupported, match=f"{message} `start`; add --auto") as caught:
+    message = (
+        "nothing can begin an episode: there is no terminal for keys, no device of mode teleop has a button `start`"
+    )
+    with pytest.raises(
+        NotSupported, match=f"{message}, and no other program may call /record_episode/start; add --"
+    ) as caught:
         record(keys=False)
     assert caught.value.exit_code == 2

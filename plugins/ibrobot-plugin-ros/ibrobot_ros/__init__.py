@@ -24,8 +24,9 @@ def _node(options: RosOptions, session: RunAccess) -> Component:
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """The node beside a run."""
     yield SectionDescriptor(
-        type="ros", options=RosOptions, make=_node, summary="a ROS 2 node beside the run: topics, services and actions"
-    )
+        type="ros", options=RosOptions, make=_node, offers=RosOptions.offers,
+        summary="a ROS 2 node beside the run: topics, services and actions",
+    )  # fmt: skip
 
 
 def _ros2_control(options: Ros2ControlOptions, ctx: Context) -> Hardware:

@@ -121,6 +121,10 @@ class RosOptions(RosInstallation):
         help="type of the action of executors that take a position",
     )
 
+    def offers(self, service: str) -> bool:
+        """Whether a service of the run is offered in ROS."""
+        return self.services == "all" or service in self.services
+
 
 def _check_controller(instance: object, attribute: attrs.Attribute[str], value: str) -> None:
     check_name("/" + value.strip("/"))

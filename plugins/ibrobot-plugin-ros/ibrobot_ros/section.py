@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any, override
 
+from ibrobot_ros2.calls import Calls
 from ibrobot_ros2.goals import Actions, with_goals
 
 from ibrobot_core.api import DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
@@ -51,6 +52,7 @@ class RosNode(Component):
             "ros", options.gripper_action,
         )  # fmt: skip
         self._services = Services(options, session)
+        self._calls = Calls(session, options.offers, lambda name: ros_name(name, options.namespace), "ros")
         self._node: NodeProcess | None = None
         self._wire: Wire | None = None
         self._ending = threading.Event()
@@ -128,6 +130,7 @@ class RosNode(Component):
             self._send_rest(wire)
         self.topics.close()
         self._services.close()
+        self._calls.close()
         if wire is not None:
             wire.send({"op": "end"})
             wire.flush(1.0)
@@ -143,6 +146,7 @@ class RosNode(Component):
         self._services.declare(wire)
         if not self._lockstep:
             self._actions.declare(wire)
+            self._calls.declare(wire)
         self._wire = wire
 
     def _send(self) -> None:
@@ -185,6 +189,7 @@ class RosNode(Component):
             self._pinged_s = now_s
             wire.send({"op": "ping"})
             self._services.refresh(wire)
+            self._calls.refresh(wire)
         silent_s = now_s - self._heard_s
         if silent_s > _SILENT_S and not self._trouble:
             assert self._node is not None
@@ -230,14 +235,20 @@ class RosNode(Component):
             "matched": lambda: self.topics.take_subscribers(head["topic"], head["subscribers"]),
             "dropped": lambda: self._note_flood(head["topic"], head["count"]),
             "trouble": lambda: self.topics.tell(f"{head['topic']}: {head['what']}"),
-            "goal": lambda: self._services.submit(
-                self._actions.take_goal, wire, head, payload, self._session.stops
+            "goal": lambda: self._take_goal(wire, head, payload),
+            "cancel": lambda: self._services.submit(
+                self._calls.cancel if "service" in head else self._actions.cancel, wire, head["goal"]
             ),
-            "cancel": lambda: self._services.submit(self._actions.cancel, wire, head["goal"]),
             "call": lambda: self._services.take_call(wire, head),
             "pong": lambda: None,
         }  # fmt: skip
         takes[head["op"]]()
+
+    def _take_goal(self, wire: Wire, head: dict[str, Any], payload: bytes) -> None:
+        if "service" in head:
+            self._services.submit(self._calls.take_goal, wire, head)
+        else:
+            self._services.submit(self._actions.take_goal, wire, head, payload, self._session.stops)
 
     def _note_flood(self, topic: str, count: int) -> None:
         self.topics.counts[f"dropped {topic}"] += count

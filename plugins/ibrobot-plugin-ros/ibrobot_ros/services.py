@@ -23,7 +23,7 @@ class Services:
         self._session = session
         self._found = Offers(
             session,
-            lambda name: options.services == "all" or name in options.services,
+            options.offers,
             lambda name: ros_name(name, options.namespace),
         )
         self._offers: dict[str, Offer] = {}

@@ -2,11 +2,13 @@
 
     python make_ros.py FOLDER
 
-It is a virtual environment, for x86-64 only; a second call does nothing. Needs uv, CMake and a C++ compiler.
+It is a virtual environment, for x86-64 only; a second call builds only types that have changed. Needs uv, CMake and a
+C++ compiler.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import re
@@ -26,7 +28,7 @@ PACKAGES = {
     "tf2_msgs": ((INTERFACES / "tf2_msgs",), ("geometry_msgs",)),
     "ibrobot_msgs": (
         (LIBRARY / "msg", LIBRARY / "interfaces/ibrobot_msgs"),
-        ("std_msgs", "geometry_msgs", "sensor_msgs"),
+        ("builtin_interfaces", "std_msgs", "geometry_msgs", "sensor_msgs"),
     ),
 }
 """Package -> folders of its texts, and the packages that these need."""
@@ -85,17 +87,30 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def make(folder: Path) -> Path:
-    """Make it, unless it is there; returns its interpreter."""
+    """Make what is not there yet; returns its interpreter."""
     python = folder / "bin" / "python"
-    if (folder / _DONE).exists():
-        return python
-    subprocess.run(["uv", "venv", "--quiet", "--clear", "--python", "3.12", str(folder)], check=True)
-    subprocess.run(["uv", "pip", "install", "--quiet", "--python", str(python), *WHEELS, *TOOLS], check=True)
-    _mend(folder, python)
+    if not (folder / _DONE).exists():
+        subprocess.run(["uv", "venv", "--quiet", "--clear", "--python", "3.12", str(folder)], check=True)
+        subprocess.run(["uv", "pip", "install", "--quiet", "--python", str(python), *WHEELS, *TOOLS], check=True)
+        _mend(folder, python)
+        (folder / _DONE).touch()
     for name in PACKAGES:
-        _build(name, folder, python)
-    (folder / _DONE).touch()
+        built, digest = folder / f"{_DONE}-{name}", digest_of(name)
+        if not built.exists() or built.read_text(encoding="utf-8") != digest:
+            _build(name, folder, python)
+            built.write_text(digest, encoding="utf-8")
     return python
+
+
+def digest_of(name: str) -> str:
+    """What changes with the texts of a package."""
+    text = b"".join(file.name.encode() + file.read_bytes() for file in _texts(name))
+    return hashlib.sha256(text).hexdigest()
+
+
+def _texts(name: str) -> list[Path]:
+    """The files with the types of a package."""
+    return sorted(each for folder in PACKAGES[name][0] for each in folder.rglob("*.*"))
 
 
 def _mend(folder: Path, python: Path) -> None:
@@ -111,11 +126,11 @@ def _mend(folder: Path, python: Path) -> None:
 
 
 def _build(name: str, folder: Path, python: Path) -> None:
-    folders, needs = PACKAGES[name]
+    needs = PACKAGES[name][1]
     with tempfile.TemporaryDirectory() as made:
         source = Path(made) / name
         files = []
-        for text in sorted(each for texts in folders for each in texts.rglob("*.*")):
+        for text in _texts(name):
             kind = text.suffix.removeprefix(".")
             if kind in ("msg", "srv", "action"):
                 files.append(f"{kind}/{text.name}")

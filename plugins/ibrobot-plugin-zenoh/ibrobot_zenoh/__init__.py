@@ -34,7 +34,7 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
     yield TransportDescriptor(
         type="zenoh", options=ZenohOptions, make=_zenoh, default=True, listen=server_options, components=_components,
         used=lambda options: options.share != Share(), check_options=check_files,
-        publishes=_subscribed,
+        publishes=_subscribed, offers=lambda options, service: options.share.offers(service),
         summary="between machines, including ROS 2 nodes with rmw_zenoh",
     )  # fmt: skip
 

@@ -145,6 +145,10 @@ class Share:
         "ibrobot_NAME; the parameter mode can be set if services has /set_mode",
     )
 
+    def offers(self, service: str) -> bool:
+        """Whether other machines may call a service."""
+        return any(service == name or (name.endswith("/") and service.startswith(name)) for name in self.services)
+
     def __attrs_post_init__(self) -> None:
         if both := [topic for topic in self.publish if topic in self.subscribe]:
             raise ValueError(f"{both[0]} is both published and subscribed; it can only go one way")

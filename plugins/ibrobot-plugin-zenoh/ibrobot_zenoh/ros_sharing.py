@@ -6,16 +6,17 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, override
+from typing import Any, Literal, override
 
 import attrs
 from ibrobot_ros2 import decode, encode
+from ibrobot_ros2.calls import Calls
 from ibrobot_ros2.goals import Actions, with_goals
 from ibrobot_ros2.interfaces import ActionType, ServiceType, action_type, fields_of, service_type, to_cdr
 from ibrobot_ros2.offers import Offer, Offers
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, NotSupported, did_you_mean
-from ibrobot_core.app import CONTROL, Component, RunAccess, SessionWorker, TransportLink
+from ibrobot_core.app import CONTROL, RunAccess, SessionWorker, TransportLink
 from ibrobot_zenoh.ros2 import absolute
 from ibrobot_zenoh.ros_goals import ACTIONS, Kind, Status
 from ibrobot_zenoh.sharing import Reply, transport_of
@@ -90,25 +91,38 @@ class _Server:
 
     name: str
     type: ActionType
-    kind: Kind
-    executor: str
+    kind: Kind | None
+    """None for an action that a service of the run is."""
+    target: str
+    """The executor, or the service."""
     joints: list[str]
     goals: OrderedDict[tuple[int, ...], _Goal] = attrs.field(factory=OrderedDict)
     """Goals by their ids, the oldest first."""
 
 
-class RosActions(Component):
-    """Offers executors as actions: three services and two topics each. The run decides about goals.
+class RosActions(SessionWorker):
+    """Offers executors and services as actions: three services and two topics each. The run decides about goals.
+
+    Args:
+        session: the run.
+        link: the network.
+        executors: executors that take goals of others.
+        gripper_action: type of the action of those that take a position.
+        is_shared: whether others may call a service; those that take their time are actions.
 
     Raises:
         NotSupported: for an executor that takes no goals.
     """
 
+    session: RunAccess
     sends_stops = True
 
-    def __init__(self, session: RunAccess, link: TransportLink, executors: tuple[str, ...], gripper_action: str) -> None:
-        super().__init__("share:actions", f"goals for {', '.join(executors)}", (link.name, CONTROL))
-        self._session = session
+    def __init__(
+        self, session: RunAccess, link: TransportLink, executors: tuple[str, ...], gripper_action: str,
+        is_shared: Callable[[str], bool],
+    ) -> None:  # fmt: skip
+        summary = f"goals for {', '.join(executors) or 'services'}"
+        super().__init__(session, "share:actions", summary, (link.name, CONTROL))
         self._link = link
         known = list(with_goals(session))
         for name in executors:
@@ -116,6 +130,7 @@ class RosActions(Component):
                 hint = did_you_mean(name, known, "executors that do")
                 raise NotSupported(f"transport.share.actions: {name} is no executor that takes goals{hint}")
         self._actions = Actions(session, executors, self._named, "zenoh", gripper_action)
+        self._calls = Calls(session, is_shared, self._named, "zenoh")
         self._lock = threading.RLock()
         self._count = 0
         self._goals: dict[int, _Goal] = {}
@@ -127,32 +142,41 @@ class RosActions(Component):
         return absolute(name, transport_of(self._link).namespace)
 
     @override
-    def start(self) -> None:
+    def setup(self) -> None:
         self._transport = transport_of(self._link)
         self._actions.declare(self)
-        self._session.on_goal.append(self._actions.take_event)
-        self._session.on_state.append(self._actions.take_state)
+        self._calls.declare(self)
+        self.session.on_goal.append(self._actions.take_event)
+        self.session.on_state.append(self._actions.take_state)
 
     @override
-    def stop(self) -> None:
+    def work(self, timeout_s: float) -> None:
+        self.session.finished.wait(min(timeout_s, _LOOK_S))
+        self._calls.refresh(self)
+
+    @override
+    def teardown(self) -> None:
         for calls, call in (
-            (self._session.on_goal, self._actions.take_event),
-            (self._session.on_state, self._actions.take_state),
+            (self.session.on_goal, self._actions.take_event),
+            (self.session.on_state, self._actions.take_state),
         ):
             if call in calls:
                 calls.remove(call)  # type: ignore[arg-type]
+        self._calls.close()
         ends, self._ends = self._ends, []
         for end in ends:
             end()
 
     def send(self, head: Mapping[str, Any]) -> None:
         """Take what the run says of its actions and goals."""
-        {"action": self._offer, "decided": self._decide, "feedback": self._feed, "ended": self._end}[head["op"]](head)
+        takes = {"action": self._offer, "decided": self._decide, "feedback": self._feed, "ended": self._conclude}
+        takes[head["op"]](head)
 
     def _offer(self, head: Mapping[str, Any]) -> None:
         server = _Server(
-            head["name"], action_type(head["type"]), ACTIONS[head["type"]], head["executor"], head["joints"]
-        )
+            head["name"], action_type(head["type"]), ACTIONS.get(head["type"]), head.get("executor") or head["service"],
+            head.get("joints", []),
+        )  # fmt: skip
         services: tuple[tuple[str, ServiceType, Any, bool], ...] = (
             ("send_goal", server.type.send_goal, self._take_goal, False),
             ("cancel_goal", server.type.cancel_goal, self._cancel, True),
@@ -167,7 +191,7 @@ class RosActions(Component):
         self._publish_status(server)
 
     def _take_goal(self, server: _Server, request: dict[str, Any], reply: Reply) -> None:
-        stops, now_ns = self._session.stops, self._session.clock.now_ns()
+        stops, now_ns = self.session.stops, self.session.clock.now_ns()
         uuid = tuple(request["goal_id"]["uuid"])
         with self._lock:
             if uuid in server.goals:
@@ -175,12 +199,14 @@ class RosActions(Component):
                 return
             self._count += 1
             goal = server.goals[uuid] = self._goals[self._count] = _Goal(self._count, uuid, now_ns, server)
-        data = to_cdr(server.type.send_goal.request, request)
-        message: Any = decode(server.type.send_goal.request, data)
-        fields, trajectory = server.kind.request(message.goal)
-        head = {"goal": goal.number, "executor": server.executor, "fields": fields}
-        payload = encode(trajectory).tobytes() if trajectory is not None else b""
-        self._actions.take_goal(self, head, payload, stops)
+        if server.kind is None:
+            self._calls.take_goal(self, {"goal": goal.number, "service": server.target, "fields": request["goal"]})
+        else:
+            message: Any = decode(server.type.send_goal.request, to_cdr(server.type.send_goal.request, request))
+            fields, trajectory = server.kind.request(message.goal)
+            head = {"goal": goal.number, "executor": server.target, "fields": fields}
+            payload = encode(trajectory).tobytes() if trajectory is not None else b""
+            self._actions.take_goal(self, head, payload, stops)
         with self._lock:
             if self._decisions.last and goal.status is Status.ACCEPTED:
                 goal.status = Status.EXECUTING
@@ -212,7 +238,7 @@ class RosActions(Component):
         chosen = [each for each in running if self._is_meant(each, uuid, until_ns)]
         canceling = []
         for goal in chosen:
-            self._actions.cancel(self, goal.number)
+            (self._actions if server.kind is not None else self._calls).cancel(self, goal.number)
             if self._decisions.last:
                 with self._lock:
                     if goal.result is None:
@@ -243,17 +269,17 @@ class RosActions(Component):
         if goal is None or goal.result is not None:
             return
         server = goal.server
-        feedback = {"goal_id": {"uuid": list(goal.uuid)}, "feedback": server.kind.feedback(head, server.joints)}
+        feedback = {"goal_id": {"uuid": list(goal.uuid)}, "feedback": _fields(server, head, "feedback")}
         self._publish(f"{server.name}/_action/feedback", server.type.feedback, feedback)
 
-    def _end(self, head: Mapping[str, Any]) -> None:
+    def _conclude(self, head: Mapping[str, Any]) -> None:
         with self._lock:
             goal = self._goals.pop(head["goal"], None)
             if goal is None:
                 return
             server = goal.server
             goal.status = Status[head["state"].upper()]
-            goal.result = server.kind.result(head, server.joints)
+            goal.result = _fields(server, head, "result")
             waiting, goal.waiting = goal.waiting, []
             ended = [uuid for uuid, each in server.goals.items() if each.result is not None]
             for uuid in ended[: max(0, len(ended) - _ENDED_KEPT)]:
@@ -271,7 +297,16 @@ class RosActions(Component):
         try:
             self._transport.publish_cdr(topic, type_name, to_cdr(type_name, message), latched=latched)
         except IbrobotError as error:
-            self._session.log.warning("%s: %s", topic, error)
+            self.session.log.warning("%s: %s", topic, error)
+
+
+def _fields(server: _Server, head: Mapping[str, Any], part: Literal["feedback", "result"]) -> dict[str, Any]:
+    """The fields of feedback or a result, without those that its type lacks."""
+    if server.kind is not None:
+        fields = server.kind.feedback if part == "feedback" else server.kind.result
+        return fields(head, server.joints)
+    known = fields_of(f"{server.type.name}_{part.capitalize()}")
+    return {name: value for name, value in head["values"].items() if name in known}
 
 
 def _info(goal: _Goal) -> dict[str, Any]:

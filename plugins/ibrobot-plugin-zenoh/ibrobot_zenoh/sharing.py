@@ -150,13 +150,12 @@ def components(share: Share, session: RunAccess, link: TransportLink) -> list[Co
     session.refuse_absent("transport.share.publish", share.publish.__contains__)
     subscribed: list[Component] = [SubscribedTopics(session, link, share.subscribe)] if share.subscribe else []
     served: list[Component] = []
-    services = SharedServices(session, link, share.services)
     if share.services:
-        served += [services, RosServices(session, link, services.is_shared)]
+        served += [SharedServices(session, link, share), RosServices(session, link, share.offers)]
     if share.parameters:
-        served.append(RosParameters(session, link, services.is_shared))
-    if share.actions:
-        served.append(RosActions(session, link, share.actions, share.gripper_action))
+        served.append(RosParameters(session, link, share.offers))
+    if share.actions or share.services:
+        served.append(RosActions(session, link, share.actions, share.gripper_action, share.offers))
     return [*(PublishedTopic(session, link, topic) for topic in share.publish), *subscribed, *served]
 
 
@@ -265,11 +264,11 @@ class SharedServices(Component):
     and `/rosapi/service_request_details` describes one.
     """
 
-    def __init__(self, session: RunView, link: TransportLink, names: tuple[str, ...]) -> None:
-        super().__init__("share:services", f"{', '.join(names)} for other machines", (link.name,))
+    def __init__(self, session: RunView, link: TransportLink, share: Share) -> None:
+        super().__init__("share:services", f"{', '.join(share.services)} for other machines", (link.name,))
         self._session = session
         self._link = link
-        self._names = names
+        self._share = share
         self._end: Callable[[], None] | None = None
 
     @override
@@ -300,7 +299,7 @@ class SharedServices(Component):
             if call.service == SERVICES:
                 return encode_answer(Answer(self._shared()))
             name = str(call.request) if call.service == DETAILS else call.service
-            if not self.is_shared(name):
+            if not self._share.offers(name):
                 raise NotSupported(
                     f"{name} is not shared{did_you_mean(name, self._shared(), 'shared')};"
                     " transport.share.services of the robot lists what is"
@@ -326,10 +325,6 @@ class SharedServices(Component):
         }
         return {"help": service.help, "alone": service.alone, "answer": type_name(service.answer), **tables}
 
-    def is_shared(self, service: str) -> bool:
-        """Whether other machines may call a service."""
-        return any(service == name or (name.endswith("/") and service.startswith(name)) for name in self._names)
-
     def _shared(self) -> list[str]:
         """The shared services that are served at present."""
-        return [name for name in self._session.bus.services() if self.is_shared(name)]
+        return [name for name in self._session.bus.services() if self._share.offers(name)]

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
+import attrs
 import pytest
 from ibrobot_ros2.interfaces import action_type, service_type
 from ibrobot_zenoh.ros2 import actions_of
 from ibrobot_zenoh.ros_goals import SentGoal, Status
 
 from ibrobot_core.api import NotSupported, TransportError
+from ibrobot_core.app import NoRequest, Service
 
 from .pair import WAIT_S, client, free_endpoint, wait_for
 
@@ -80,7 +83,8 @@ def test_a_gripper_as_parallel_gripper_command(installed: Runs, caplog: pytest.L
     kind = action_type("control_msgs/action/ParallelGripperCommand")
     wait_for(lambda: (HAND, kind.name) in actions_of(near.shared_services(WAIT_S)))
     feedback: list[dict[str, Any]] = []
-    ended = SentGoal(near, HAND, kind, {"command": {"name": ["grip"], "position": [0.3]}}, feedback.append).result(WAIT_S)
+    goal = {"command": {"name": ["grip"], "position": [0.3]}}
+    ended = SentGoal(near, HAND, kind, goal, feedback.append).result(WAIT_S)
     assert (ended.status, ended.result["reached_goal"], ended.result["stalled"]) == (Status.SUCCEEDED, True, False)
     assert ended.result["state"]["name"] == feedback[-1]["state"]["name"] == ["grip"]
     assert ended.result["state"]["position"] == pytest.approx([0.3], abs=0.02)
@@ -138,6 +142,45 @@ def test_a_stop_by_service_ends_a_goal(robot: Any):
     assert (refused["success"], "refused before a reset" in refused["message"]) == (False, True)
     assert near.call_ros("/reset", trigger, {}, WAIT_S)["success"]
     assert not runtime.session.faults
+
+
+@attrs.frozen
+class Task:
+    prompt: str = ""
+
+
+@attrs.frozen
+class Ending:
+    success: bool
+    message: str
+
+
+@attrs.frozen
+class Left:
+    seconds_remaining: int
+    feedback_message: str
+
+
+def test_services_that_take_their_time_are_actions(installed: Runs):
+    runtime, near = start(installed, "transport.share.services=[/record_episode]")
+    ended, bus = threading.Event(), runtime.session.bus
+    progress = Service("/record_episode/progress", NoRequest, Left)
+    cancel = Service("/record_episode/cancel", NoRequest, type(None))
+    name, kind = "/record_episode", action_type("ibrobot_msgs/action/RecordEpisode")
+    service = Service(name, Task, Ending, ros_type=kind.name, progress=progress, cancel=cancel)
+    bus.serve(progress, lambda _: Left(7, "going on"))
+    bus.serve(cancel, lambda _: ended.set())
+    bus.serve(service, lambda task: Ending(ended.wait(WAIT_S), task.prompt))
+    wait_for(lambda: (name, kind.name) in actions_of(near.shared_services(WAIT_S)))
+    assert not [each for each in near.shared_services(WAIT_S) if each.name == name], "not a service as well"
+    fed = queue.SimpleQueue[dict[str, Any]]()
+    goal = SentGoal(near, name, kind, {"prompt": "pick"}, fed.put)
+    assert fed.get(timeout=WAIT_S) == {"seconds_remaining": 7, "feedback_message": "going on"}
+    assert goal.cancel()
+    outcome = goal.result(WAIT_S)
+    assert (outcome.status, outcome.result) == (Status.CANCELED, {"success": True, "message": "pick"})
+    outcome = SentGoal(near, name, kind, {"prompt": "place"}).result(WAIT_S)
+    assert (outcome.status, outcome.result["message"]) == (Status.SUCCEEDED, "place")
 
 
 def test_the_status_is_latched(robot: Any):

@@ -41,9 +41,6 @@ _LEFT_OUT: dict[str, dict[str, Any]] = {
 }
 """Fields that core does not have: their value, or the type whose zeros they are."""
 
-_TUPLES = {("ibrobot_msgs/msg/Variant", "shape")}
-"""Numbers that core has in a tuple rather than an array."""
-
 
 def core_class(type_name: str) -> type[Any] | None:
     """Core's class of a type; None where it has none."""
@@ -126,8 +123,6 @@ def decoder(type_name: str, cls: type[Any], types: Typestore, class_of: Callable
                 parts.append((part, _chain(attrgetter(name), _decode_field(part, part_desc, types, class_of))))
             continue
         part_of = _decode_field(name, desc, types, class_of)
-        if (type_name, name) in _TUPLES:
-            part_of = _chain(part_of, lambda array: tuple(array.tolist()))
         parts.append((_core_name(name, desc), part_of))
     return lambda ros: cls(**{name: part(ros) for name, part in parts})
 

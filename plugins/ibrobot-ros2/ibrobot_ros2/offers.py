@@ -33,7 +33,7 @@ class Offer:
 def ros_type(service: Service[Any, Any]) -> tuple[str, str] | None:
     """The type of ROS that can say requests of a service, and the field that `data` is; None if there is none."""
     if service.ros_type:
-        return service.ros_type, ""
+        return (service.ros_type, "") if "/srv/" in service.ros_type else None
     fields = attrs.fields(service.request)
     required = [field for field in fields if field.default is attrs.NOTHING]
     if not required:

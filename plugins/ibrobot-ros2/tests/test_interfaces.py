@@ -27,6 +27,14 @@ HASHES = {
         "e4c7f0e8a831ce5625ed20abcd13796406d945f92ebc7ad5972e0b0d29b381bd",
     "control_msgs/action/ParallelGripperCommand_SendGoal":
         "567c37373fed1260adbe047415688c73e4f3e94b2e3982761ecc71fd63d710a7",
+    "ibrobot_msgs/action/DispatchInfer_FeedbackMessage":
+        "4c012d4d10b4cec7343da79b3424c22e6ab6184ba77572658d334fc6f83ab428",
+    "ibrobot_msgs/action/DispatchInfer_GetResult": "42e50b38ce7c90d4ec1b4255e2d0c761d3a0f6446288a14c479d3da9bb12d58f",
+    "ibrobot_msgs/action/DispatchInfer_SendGoal": "729b599f3daeaede3ac331641a9a7bd69d856090084cb9db1199502c5aeb05d8",
+    "ibrobot_msgs/action/RecordEpisode_FeedbackMessage":
+        "e52cb04e80702e201776db3d7e6564fc5b0146d8993fc74d291334b9c5c8e7ae",
+    "ibrobot_msgs/action/RecordEpisode_GetResult": "63ee7464c7c4806429348e5a5b6758164c70255442361265b3397367c7592fe5",
+    "ibrobot_msgs/action/RecordEpisode_SendGoal": "cfc69b39a60ae39d402bf28d90b5a5551d93bfc9423c72924a3d7db032493581",
     "ibrobot_msgs/srv/MoveToConfiguration": "06c5351baf255a8e4a390e72af937603b1cc1b614aba078b19c7339425a082da",
     "ibrobot_msgs/srv/MoveToPose": "a3ca142ae8c253221e34abfce186bb33b1bd26399872d6033b18417f24203fad",
     "rcl_interfaces/srv/GetParameters": "bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",

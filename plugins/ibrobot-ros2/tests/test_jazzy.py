@@ -17,8 +17,6 @@ from ibrobot_core.api import MESSAGE_TYPES
 JAZZY = json.loads((Path(__file__).parent / "jazzy.json").read_text())
 NOT_THERE = {
     "tf2_msgs/msg/TFMessage",
-    "ibrobot_msgs/msg/Variant",
-    "ibrobot_msgs/msg/VariantsList",
     "ibrobot_msgs/msg/RobotStatus",
     "ibrobot_msgs/msg/ModelAnswer",
 }

@@ -1,4 +1,7 @@
-"""Action servers, as ros2_control's controllers offer them. The run decides about goals; the node reports for it."""
+"""Action servers. The run decides about goals; the node reports for it.
+
+Those of executors are as ros2_control's controllers offer them, those of services have the fields of their requests.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.serialization import serialize_message
 
-from ibrobot_ros.node.types import find_type
+from ibrobot_ros.node.types import fill, find_type, plain
 from ibrobot_ros.wire import Wire
 
 _PATIENCE_S = 10.0
@@ -37,8 +40,9 @@ class _Server:
     """What differs between the types of actions."""
 
     def __init__(self, head: dict[str, Any]) -> None:
-        self.executor: str = head["executor"]
-        self.joints: list[str] = head["joints"]
+        self.address: dict[str, Any] = {key: head[key] for key in ("executor", "service") if key in head}
+        """What of the run it is for."""
+        self.joints: list[str] = head.get("joints", [])
         self.type = find_type(head["type"])
 
     def request(self, goal: Any) -> tuple[dict[str, Any], bytes]:
@@ -129,7 +133,23 @@ class _ParallelGripper(_Gripper):
         return found
 
 
-_SERVERS = {
+class _Call(_Server):
+    """An action that a service of the run is."""
+
+    def request(self, goal: Any) -> tuple[dict[str, Any], bytes]:
+        return plain(goal), b""
+
+    def feedback(self, head: dict[str, Any]) -> Any:
+        return fill(self.type.Feedback(), head["values"])
+
+    def result(self, head: dict[str, Any]) -> Any:
+        try:
+            return fill(self.type.Result(), head["values"])
+        except LookupError as error:  # this ROS has another definition
+            return fill(self.type.Result(), {"success": False, "message": str(error)})
+
+
+_SERVERS: dict[str, type[_Server]] = {
     "FollowJointTrajectory": _Trajectory,
     "GripperCommand": _Gripper,
     "ParallelGripperCommand": _ParallelGripper,
@@ -149,7 +169,8 @@ class Actions:
     def add(self, head: dict[str, Any], payload: bytes) -> None:
         """Offer an action."""
         try:
-            server = _SERVERS[head["type"].rpartition("/")[2]](head)
+            kind = _Call if "service" in head else _SERVERS[head["type"].rpartition("/")[2]]
+            server = kind(head)
         except LookupError as error:
             self._wire.send({"op": "trouble", "topic": head["name"], "what": f"not in ROS: {error}"})
             return
@@ -197,10 +218,10 @@ class Actions:
             self._count += 1
             goal = self._goals[self._count] = _Goal(server, self._count)
         fields, payload = server.request(request)
-        self._wire.send({"op": "goal", "goal": goal.number, "executor": server.executor, "fields": fields}, payload)
+        self._wire.send({"op": "goal", "goal": goal.number, **server.address, "fields": fields}, payload)
         if self._decision(goal):
             return goal
-        self._wire.send({"op": "cancel", "goal": goal.number})  # should the run accept it too late
+        self._wire.send({"op": "cancel", "goal": goal.number, **server.address})  # should the run accept it too late
         del self._goals[goal.number]
         return None
 
@@ -214,7 +235,7 @@ class Actions:
         goal = next((each for each in list(self._goals.values()) if each.handle is handle), None)
         if goal is None or goal.end.is_set():
             return CancelResponse.REJECT
-        self._wire.send({"op": "cancel", "goal": goal.number})
+        self._wire.send({"op": "cancel", "goal": goal.number, **goal.server.address})
         return CancelResponse.ACCEPT if self._decision(goal) else CancelResponse.REJECT
 
     def _execute(self, goal: _Goal) -> Any:

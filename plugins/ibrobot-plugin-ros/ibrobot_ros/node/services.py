@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import itertools
 import queue
-from array import array
 from typing import Any
 
-import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 
-from ibrobot_ros.node.types import find_type
+from ibrobot_ros.node.types import fill, find_type, plain
 from ibrobot_ros.wire import Wire
 
 _PATIENCE_S = 120.0
@@ -31,11 +29,7 @@ class Services:
         name = head["name"]
 
         def call(request: Any, response: Any) -> Any:
-            answer = self._ask(name, _plain(request))
-            for field in response.get_fields_and_field_types():
-                if field in answer:
-                    setattr(response, field, answer[field])
-            return response
+            return fill(response, self._ask(name, plain(request)))
 
         try:
             self._nodes[head["urgent"]].create_service(
@@ -60,14 +54,3 @@ class Services:
             return {"success": False, "message": f"{name} did not answer within {_PATIENCE_S:g} s"}
         finally:
             del self._waiting[number]
-
-
-def _plain(value: Any) -> Any:
-    """A message, or a field of one, as JSON says it."""
-    if isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, np.ndarray | array):
-        return value.tolist()
-    if isinstance(value, list | tuple | bytes):
-        return [_plain(each) for each in value]
-    return {field: _plain(getattr(value, field)) for field in value.get_fields_and_field_types()}

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import importlib
+from array import array
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from rclpy.type_support import check_for_type_support
 
 
@@ -22,3 +25,37 @@ def find_type(name: str) -> Any:
     except (ImportError, AttributeError) as error:
         raise LookupError(f"this ROS has no {name}: {error}") from error
     return found
+
+
+def fill(message: Any, values: Mapping[str, Any]) -> Any:
+    """Set the fields of a message that `values` has; returns the message. Others stay as they are.
+
+    Raises:
+        LookupError: for a value that does not fit its field.
+    """
+    for field, kind in message.get_fields_and_field_types().items():
+        if field not in values:
+            continue
+        value = values[field]
+        if isinstance(value, Mapping):
+            fill(getattr(message, field), value)
+            continue
+        if value and isinstance(value, list) and isinstance(value[0], Mapping):
+            item = find_type(kind.removeprefix("sequence<").partition("[")[0].rstrip(">").replace("/", "/msg/", 1))
+            value = [fill(item(), each) for each in value]
+        try:
+            setattr(message, field, value)
+        except AssertionError as error:
+            raise LookupError(f"{type(message).__name__}.{field}: {error}") from error
+    return message
+
+
+def plain(value: Any) -> Any:
+    """A message, or a field of one, as JSON says it."""
+    if isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.ndarray | array):
+        return value.tolist()
+    if isinstance(value, list | tuple | bytes):
+        return [plain(each) for each in value]
+    return {field: plain(getattr(value, field)) for field in value.get_fields_and_field_types()}

@@ -173,6 +173,12 @@ class Peer:
         goal.command.name, goal.command.position = name, position
         return self._send(action, "control_msgs/action/ParallelGripperCommand", goal, None, "")
 
+    def send(self, action, type, request, after_s=None, then=""):
+        """Send a goal of any action, whose fields `request` has."""
+        goal = find(type).Goal()
+        fill(goal, request)
+        return self._send(action, type, goal, after_s, then)
+
     def _send(self, action, type, goal, after_s, then):
         feedback: list[Any] = []
         handle = done(self._client(action, type).send_goal_async(goal, feedback_callback=feedback.append))
@@ -196,6 +202,10 @@ class Peer:
             value = getattr(answer.result, field)
             if isinstance(value, int | float | str):
                 found[field] = value
+            elif field == "action_chunk":
+                (variant,) = value.variants
+                sizes = [each.size for each in variant.float_64_array.layout.dim]
+                found[field] = [variant.key, variant.type, sizes, list(variant.float_64_array.data)]
             elif field == "state":
                 found[field] = [list(value.name), list(value.position)]
         return found

@@ -75,16 +75,12 @@ def made(**types):
         DiagnosticArray(HEADER, (DiagnosticStatus(1, "x", "y", "z", (KeyValue("k", "v"),)),)),
     ]
     examples |= {type(each).__name__: each for each in many}
-    for name in ("Variant", "VariantsList", "RobotStatus", "ModelAnswer"):
+    for name in ("RobotStatus", "ModelAnswer"):
         examples[name] = _default(MESSAGE_TYPES[f"ibrobot_msgs/msg/{name}"])
     return examples
 
 
 def _default(cls):
-    if cls.__name__ == "Variant":
-        return cls("key", "uint8", (2,), [1, 2])
-    if cls.__name__ == "VariantsList":
-        return cls(HEADER, (_default(MESSAGE_TYPES["ibrobot_msgs/msg/Variant"]),))
     if cls.__name__ == "ModelAnswer":
         times = {"observed_ns": 1_700_000_000_000_000_001, "step_ns": 50_000_000}
         texts = dict.fromkeys(("model", "server", "weights", "prompt", "outcome", "error"), "text")

@@ -1,0 +1,154 @@
+"""Services of a run that take their time, as actions of ROS: the request is the goal, and the answer is the result.
+
+Heads are as in `goals`; their key `service` is the service, and `values` are the fields of a result or of feedback.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import RunView, Service
+from ibrobot_ros2.goals import Wire
+from ibrobot_ros2.offers import with_ns
+from ibrobot_ros2.services import plain
+
+_FEEDBACK_S = 0.5
+_MOST = 8
+"""Most goals under way; further ones are rejected."""
+_END_S = 5.0
+
+
+@attrs.define(eq=False)
+class _Goal:
+    """A call under way."""
+
+    wire: Wire
+    number: int
+    service: Service[Any, Any]
+    canceled: bool = False
+    ended: threading.Event = attrs.field(factory=threading.Event)
+
+
+def is_action(service: Service[Any, Any]) -> bool:
+    """Whether a service is an action in ROS."""
+    return "/action/" in service.ros_type
+
+
+class Calls:
+    """Passes goals to services, and their progress and answers back.
+
+    Args:
+        session: the run.
+        is_offered: whether a service of the bus is offered.
+        named: the full name of a service in ROS, from that on the bus.
+        who: where goals come from, for the log.
+
+    A goal is accepted at once. It ends as `succeeded`; as `aborted`, with the error as its `message`, if the service
+    raises or says that it had no success; as `canceled`, with the service's answer, if its client canceled it.
+    """
+
+    def __init__(
+        self, session: RunView, is_offered: Callable[[str], bool], named: Callable[[str], str], who: str
+    ) -> None:  # fmt: skip
+        self._session = session
+        self._is_offered = is_offered
+        self._named = named
+        self._who = who
+        self._lock = threading.Lock()
+        self._declared: set[str] = set()
+        self._goals: dict[tuple[Wire, int], _Goal] = {}
+        self._threads: set[threading.Thread] = set()
+
+    def declare(self, wire: Wire) -> None:
+        """Tell a new node which actions it offers."""
+        self._declared.clear()
+        self.refresh(wire)
+
+    def refresh(self, wire: Wire) -> None:
+        """Tell the node which actions are new."""
+        for name, service in self._session.bus.services().items():
+            if is_action(service) and name not in self._declared and self._is_offered(name):
+                self._declared.add(name)
+                wire.send({"op": "action", "name": self._named(name), "type": service.ros_type, "service": name})
+
+    def take_goal(self, wire: Wire, head: Mapping[str, Any]) -> None:
+        """Call a service, in a thread of its own."""
+        number, service = head["goal"], self._session.bus.services().get(head["service"])
+        with self._lock:
+            accepted = service is not None and len(self._goals) < _MOST
+            if service is not None and accepted:
+                goal = self._goals[wire, number] = _Goal(wire, number, service)
+        wire.send({"op": "decided", "goal": number, "accepted": accepted})
+        if not accepted:
+            why = f"{_MOST} goals are under way" if service is not None else "nobody serves it now"
+            self._session.log.warning("%s: goal for %s rejected: %s", self._who, head["service"], why)
+            return
+        self._start(self._call, goal, with_ns(head["fields"]))
+        if goal.service.progress is not None:
+            self._start(self._report, goal, goal.service.progress)
+
+    def cancel(self, wire: Wire, number: int) -> None:
+        """Cancel a goal for its client."""
+        with self._lock:
+            goal = self._goals.get((wire, number))
+            accepted = goal is not None and goal.service.cancel is not None
+            if goal is not None:
+                goal.canceled = accepted
+        if goal is not None and goal.service.cancel is not None:
+            try:
+                self._session.bus.call(goal.service.cancel)
+            except IbrobotError as error:
+                with self._lock:
+                    # One that has ended meanwhile has ended as canceled.
+                    accepted = goal.ended.is_set()
+                    goal.canceled = accepted
+                self._session.log.warning("%s: %s: cancel failed: %s", self._who, goal.service.name, error)
+        wire.send({"op": "decided", "goal": number, "accepted": accepted})
+
+    def close(self) -> None:
+        """Wait for the calls under way, which end with the run."""
+        for thread in list(self._threads):
+            thread.join(_END_S)
+
+    def _start(self, work: Callable[..., None], *arguments: Any) -> None:
+        def run() -> None:
+            try:
+                work(*arguments)
+            finally:
+                self._threads.discard(threading.current_thread())
+
+        thread = threading.Thread(target=run, name=f"{self._who} goal", daemon=True)
+        self._threads.add(thread)
+        thread.start()
+
+    def _call(self, goal: _Goal, request: Mapping[str, Any]) -> None:
+        state, name = "succeeded", goal.service.name
+        try:
+            values = plain(self._session.bus.call(name, request))
+            if not values.get("success", True):
+                state = "aborted"
+        except IbrobotError as error:
+            state, values = "aborted", {"success": False, "message": str(error)}
+        except Exception:
+            self._session.log.exception("%s failed", name)
+            state, values = "aborted", {"success": False, "message": "it failed; the robot's log has the cause"}
+        with self._lock:
+            del self._goals[goal.wire, goal.number]
+            goal.ended.set()
+            if goal.canceled:
+                state = "canceled"
+        goal.wire.send({"op": "ended", "goal": goal.number, "state": state, "values": values})
+
+    def _report(self, goal: _Goal, progress: Service[Any, Any]) -> None:
+        """Send feedback until the call has ended."""
+        while not goal.ended.wait(_FEEDBACK_S):
+            try:
+                values = plain(self._session.bus.call(progress))
+            except IbrobotError:  # it ends just now
+                return
+            goal.wire.send({"op": "feedback", "goal": goal.number, "values": values})
