@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -37,18 +35,13 @@ OBSERVATIONS = 100
 LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("act", "diffusion")]
 
 
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path, Path]]:
-    """Gives the checkpoint of a type, and what it was exported to."""
-    root = tmp_path_factory.mktemp("exported")
-
-    @cache
-    def export(name: str) -> tuple[Path, Path]:
-        checkpoint = save(CONFIGS[name](), root / name)
-        assert export_onnx(checkpoint, root / f"{name}-onnx").largest_difference < TOLERANCE
-        return checkpoint, root / f"{name}-onnx"
-
-    return export
+@pytest.fixture(scope="module", params=["vqbet", *LONG])
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The checkpoint of a policy, and what it was exported to."""
+    root = tmp_path_factory.mktemp(request.param)
+    checkpoint, folder = save(CONFIGS[request.param](), root / "checkpoint"), root / "onnx"
+    assert export_onnx(checkpoint, folder).largest_difference < TOLERANCE
+    return checkpoint, folder
 
 
 def onnx_policy(path: Path) -> OnnxPolicy:
@@ -98,11 +91,10 @@ class Drawn:
         return (probabilities.cumsum(-1) <= uniform).sum(-1, keepdim=True).clamp_max(probabilities.shape[-1] - 1)
 
 
-@pytest.mark.parametrize("name", ["vqbet", *LONG])
 def test_chunks_are_those_of_torch(
-    exported: Callable[[str], tuple[Path, Path]], name: str, monkeypatch: pytest.MonkeyPatch, record_property: Any
+    exported: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, record_property: Any
 ) -> None:
-    checkpoint, folder = exported(name)
+    checkpoint, folder = exported
     ours, theirs = onnx_policy(folder), torch_policy(checkpoint)
     drawn = Drawn(json.loads((folder / "onnx_policy.json").read_text()))
     largest, chunks = 0.0, []
@@ -111,8 +103,7 @@ def test_chunks_are_those_of_torch(
         patched.setattr("diffusers.schedulers.scheduling_ddpm.randn_tensor", drawn.normal)
         patched.setattr("ibrobot_lerobot.draws.Draws.__enter__", lambda draws: draws)
         patched.setattr("ibrobot_lerobot.draws.Draws.__exit__", lambda *_: None)
-        if name == "diffusion":
-            patched.setattr("torch.randn", drawn.normal)
+        patched.setattr("torch.randn", drawn.normal)
         for frame in frames(ours, OBSERVATIONS):
             found = ours.postprocess(ours.infer(ours.preprocess(frame)))
             drawn.begin(frame)
@@ -121,14 +112,13 @@ def test_chunks_are_those_of_torch(
             largest = max(largest, float(np.abs(found - expected).max()))
             chunks.append(found)
     record_property("largest_difference", largest)
-    print(f"{name}: largest difference {largest:.2g} on {OBSERVATIONS} observations")
+    print(f"largest difference {largest:.2g} on {OBSERVATIONS} observations")
     assert largest < TOLERANCE
     assert np.ptp(np.stack(chunks), axis=0).max() > 1e-4, "the network answers to what it sees"
 
 
-@pytest.mark.parametrize("name", ["vqbet", *LONG])
-def test_spec_is_that_of_the_checkpoint(exported: Callable[[str], tuple[Path, Path]], name: str) -> None:
-    checkpoint, folder = exported(name)
+def test_spec_is_that_of_the_checkpoint(exported: tuple[Path, Path]) -> None:
+    checkpoint, folder = exported
     assert onnx_policy(folder).spec == LeRobotPolicy(LeRobotPolicyOptions(checkpoint), host_context()).spec
 
 
@@ -139,12 +129,12 @@ def test_ddim_is_exported_too(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "onnx/onnx_policy.json").read_text())["denoising_steps"][0][-1] == 0.0
 
 
-def test_a_run_needs_no_torch(exported: Callable[[str], tuple[Path, Path]]) -> None:
+def test_a_run_needs_no_torch(exported: tuple[Path, Path]) -> None:
     code = (
         "import sys; from pathlib import Path\n"
         "from ibrobot_onnx.options import OnnxPolicyOptions; from ibrobot_onnx.policy import OnnxPolicy\n"
         "from ibrobot_testing.contexts import host_context\n"
-        f"policy = OnnxPolicy(OnnxPolicyOptions(Path({str(exported('vqbet')[1])!r})), host_context()); policy.load()\n"
+        f"policy = OnnxPolicy(OnnxPolicyOptions(Path({str(exported[1])!r})), host_context()); policy.load()\n"
         "print(sorted({'torch', 'lerobot'} & sys.modules.keys()))"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
