@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -56,21 +57,39 @@ def groups(floor: ModuleType) -> Iterator[tuple[str, list[str]]]:
 
 
 def api_page() -> Iterator[str]:
-    """Lines of the page."""
+    """Lines of the page, which has a page for each group."""
     yield STABILITY
     for floor in (api, app):
         yield f"## {floor.__name__}\n"
         for title, names in groups(floor):
-            yield f"### {title}\n"
-            homes = {name: floor.home_of(name) for name in names}
-            for module, page in ELSEWHERE.items():
-                found = [name for name, home in homes.items() if f"{home}.".startswith(f"{module}.")]
-                if found:
-                    listed = ", ".join(f"`{name}`" for name in found)
-                    yield f"[{page.capitalize()}]({page}.md) describes: {listed}.\n"
-                homes = {name: home for name, home in homes.items() if name not in found}
-            if homes:
-                yield from _described(floor, homes)
+            yield f"- [{title}](api/{_part(floor, title)}.md): {', '.join(f'`{name}`' for name in names)}"
+        yield ""
+    yield "```{toctree}\n:hidden:\n"
+    yield from (f"api/{name}" for name in api_parts())
+    yield "```\n"
+
+
+def api_parts() -> dict[str, Iterator[str]]:
+    """Name -> lines of the page on a group."""
+    return {_part(floor, title): _group_page(floor, title, names) for floor in (api, app) for title, names in groups(floor)}
+
+
+def _part(floor: ModuleType, title: str) -> str:
+    return re.sub(r"\W+", "-", f"{floor.__name__.rpartition('.')[2]} {title}".lower())
+
+
+def _group_page(floor: ModuleType, title: str, names: list[str]) -> Iterator[str]:
+    yield f"# {title}\n"
+    yield f"Names of `{floor.__name__}`.\n"
+    homes = {name: floor.home_of(name) for name in names}
+    for module, page in ELSEWHERE.items():
+        found = [name for name, home in homes.items() if f"{home}.".startswith(f"{module}.")]
+        if found:
+            listed = ", ".join(f"`{name}`" for name in found)
+            yield f"[{page.capitalize()}](../{page}.md) describes: {listed}.\n"
+        homes = {name: home for name, home in homes.items() if name not in found}
+    if homes:
+        yield from _described(floor, homes)
 
 
 def _described(floor: ModuleType, homes: dict[str, str]) -> Iterator[str]:

@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import click
-from api_page import api_page
+from api_page import api_page, api_parts
 from option_pages import config_page, jobs_page, options_of_kinds, options_page, services_page
 from plugin_index import plugin_page
+from site_pages import sections_apart
 
 from ibrobot_core.cli.main import cli
 
@@ -23,22 +24,39 @@ def command_lines(command: click.Command, path: str) -> Iterator[str]:
     yield "```text"
     yield command.get_help(context)
     yield "```\n"
-    if isinstance(command, click.Group) and command is not cli:
+    if isinstance(command, click.Group):
         for name in command.list_commands(context):
             found = command.get_command(context, name)
             assert found is not None
             yield from command_lines(found, f"{path} {name}")
 
 
-def cli_page() -> Iterator[str]:
-    """Lines of the page on the command line."""
-    yield "# Command line\n"
-    yield from command_lines(cli, "ibrobot")
+def _commands() -> dict[str, click.Command]:
     context = click.Context(cli)
-    for name in cli.list_commands(context):
-        found = cli.get_command(context, name)
-        assert found is not None
-        yield from command_lines(found, f"ibrobot {name}")
+    found = {name: cli.get_command(context, name) for name in cli.list_commands(context)}
+    return {name: command for name, command in found.items() if command is not None}
+
+
+def cli_page() -> Iterator[str]:
+    """Lines of the page on the command line, which has a page for each command."""
+    yield "# Command line\n"
+    yield "`ibrobot COMMAND --help` prints what the page of the command has.\n"
+    yield "| command | |"
+    yield "|---|---|"
+    for name, command in _commands().items():
+        yield f"| [`ibrobot {name}`](cli/{name}.md) | {command.get_short_help_str(200)} |"
+    yield "\n```{toctree}\n:hidden:\n"
+    yield from (f"cli/{name}" for name in _commands())
+    yield "```\n"
+
+
+def _cli_parts() -> dict[str, str]:
+    """Command -> the text of its page."""
+    parts = {}
+    for name, command in _commands().items():
+        _, *lines = command_lines(command, f"ibrobot {name}")
+        parts[name] = "\n".join([f"# `ibrobot {name}`\n", *lines])
+    return parts
 
 
 PAGES = {
@@ -54,8 +72,14 @@ PAGES = {
 
 
 def write(docs: Path) -> None:
-    """Write the pages that only the site has: the options of each kind of plugin, and the READMEs of the packages."""
-    _write(docs / "reference" / "options", {kind: "\n".join(page) for kind, page in options_of_kinds().items()})
+    """Write the pages that only the site has: the parts of long reference pages, and the READMEs of the packages."""
+    reference = docs / "reference"
+    _write(reference / "options", {kind: "\n".join(page) for kind, page in options_of_kinds().items()})
+    _write(reference / "cli", _cli_parts())
+    _write(reference / "api", {name: "\n".join(page) for name, page in api_parts().items()})
+    for name in ("interfaces", "testing"):
+        _, parts = sections_apart(name, (reference / f"{name}.md").read_text(encoding="utf-8"))
+        _write(reference / name, parts)
     _write(docs / "plugins", readme_pages(docs.parent))
 
 

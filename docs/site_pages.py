@@ -48,9 +48,29 @@ def site_markdown(name: str, text: str) -> str:
     text = _TESTED.sub("```{doctest}", text)
     if name == "reference/glossary":
         return _glossary(text)
+    if name in ("reference/interfaces", "reference/testing"):
+        return site_markdown("", sections_apart(name.removeprefix("reference/"), text)[0])
     if name == "index" or name.endswith("/index"):
         return text + _contents(name, text)
     return text
+
+
+def sections_apart(name: str, text: str) -> tuple[str, dict[str, str]]:
+    """A page of the site whose sections on one source file each are pages of their own, and these: name -> text."""
+    head, *sections = re.split(r"^## ", text, flags=re.MULTILINE)
+    parts, links = {}, []
+    for section in sections:
+        title, _, body = section.partition("\n")
+        found = _SOURCE.fullmatch(body.strip())
+        if found is None:
+            head += f"## {section}"
+            continue
+        part = re.sub(r"\W+", "-", title.lower())
+        first = (importlib.import_module(found[1]).__doc__ or "").strip().splitlines()[0]
+        links.append(f"- [{title}]({name}/{part}.md): {first}")
+        parts[part] = f"# {title}\n\n{body.strip().replace('](', '](../')}"
+    contents = ["", "```{toctree}", ":hidden:", "", *(f"{name}/{part}" for part in parts), "```", ""]
+    return "\n".join([head, *links, *contents]), parts
 
 
 def _documented(name: str, path: str, options: str | None) -> str:

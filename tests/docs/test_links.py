@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-MADE = (ROOT / "docs/reference/options", ROOT / "docs/plugins", ROOT / "docs/_build")
+PARTS = ("api", "cli", "interfaces", "options", "testing")
+MADE = (*(ROOT / "docs/reference" / name for name in PARTS), ROOT / "docs/plugins", ROOT / "docs/_build")
 """What only a build of the site has."""
 PAGES = [
     page

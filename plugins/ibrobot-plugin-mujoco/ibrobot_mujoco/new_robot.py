@@ -107,7 +107,10 @@ def robot_yaml(model: UrdfModel, urdf: Path, folder: str) -> str:
     notes = "\n".join(f"# - {note}" for note in model.notes)
     stream = "arm_position, gripper_position" if gripper else "arm_position"
     plan = "arm_trajectory, gripper_action" if len(gripper) == 1 else "arm_trajectory"
-    executors = ["arm_position: {type: position, group: arm}", "arm_trajectory: {type: trajectory, group: arm}"]
+    executors = [
+        "arm_position: {type: position, group: arm}",
+        "arm_trajectory: {type: trajectory, group: arm, goal_tolerance: 0.005}",  # the guessed drives come closer
+    ]
     if gripper:
         executors.append("gripper_position: {type: position, group: gripper}")
     if len(gripper) == 1:

@@ -185,8 +185,10 @@ function showFaults() {
       ended && !failure ? h("div", { class: "ended" }, h("strong", {}, "The run has ended"), h("span", {}, results(status)), ...onwards(status)) : null,
       ...conditions.map((each) => h("div", { class: "warning" },
         h("strong", {}, `${each.joint}: `), h("span", {}, each.message ?? ""))),
-      ...absent.map(({ name, why }) => h("div", { class: "warning" },
-        h("strong", {}, `${name} is missing: `), h("span", {}, why))),
+      ...[...new Set(absent.map(({ why }) => why))].map((why) => {
+        const names = absent.filter((each) => each.why === why).map(({ name }) => name);
+        return h("div", { class: "warning" }, h("strong", {}, `${names.join(", ")} ${names.length > 1 ? "are" : "is"} missing: `), h("span", {}, why));
+      }),
     ].filter(Boolean);
   });
 }

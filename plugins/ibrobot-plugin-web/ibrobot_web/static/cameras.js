@@ -34,7 +34,7 @@ export class Cameras {
     const canvas = h("canvas", { width: "4", height: "3", role: "img", "aria-label": `Camera ${name}` });
     const caption = h("figcaption", {}, `${name}: waiting for its first picture …`);
     const element = h("figure", { class: "picture", "data-name": name }, canvas, caption);
-    this.views.set(channel, { canvas, caption, element, context: canvas.getContext("2d"), name, rate: "" });
+    this.views.set(channel, { canvas, caption, facts: h("span", { class: "facts" }), element, context: canvas.getContext("2d"), name, rate: "" });
     this.page.stream.show(channel, true);
     return element;
   }
@@ -54,7 +54,8 @@ export class Cameras {
     counted.count += 1;
     counted.ages.push(age);
     if (counted.ages.length > 500) counted.ages.shift();
-    view.caption.textContent = `${view.name} · ${view.rate}${age < 60000 ? ` · ${Math.max(0, age).toFixed(0)} ms` : ""}`;
+    view.facts.textContent = ` · ${view.rate}${age < 60000 ? ` · ${Math.max(0, age).toFixed(0)} ms` : ""}`;
+    refresh(view.caption, view.name, () => [view.name, view.facts]);
   }
 }
 

@@ -45,7 +45,7 @@ export class Motion {
       page.jogs.length > 1 ? h("div", { class: "row", role: "group", "aria-label": "Arm" }, page.jogs.map((device) => h("button", {
         "aria-pressed": String(device === page.device), onclick: () => page.setDevice(device),
       }, page.groupOf(device)))) : null,
-      h("p", { class: "note" }, "Hold a button or a slider to move; Enter holds it, too."),
+      h("p", { class: "note" }, "Hold a button, a slider or Enter to move."),
       ...(status.robot.tool ? [h("h3", {}, "Tool"), h("div", { class: "pad" }, TOOL.map(([name, motion]) => hold(name, motion)))] : []),
       h("h3", {}, "Poses"),
       h("div", { class: "row" }, Object.keys(status.robot.poses).map((pose) => hold(pose, { pose }))),
@@ -61,7 +61,7 @@ export class Motion {
       const taken = status.commander !== "policy";
       found.push(h("p", { class: "note" }, COMMANDS[status.commander] ?? ""), h("div", { class: "row" },
         h("button", { class: taken ? "" : "primary", disabled: !page.operating || taken,
-          onclick: () => page.command("intervene", { take: true }) }, "Take the robot from the policy"),
+          onclick: () => page.command("intervene", { take: true }) }, "Take the robot"),
         h("button", { class: taken ? "primary" : "", disabled: !page.operating || !taken,
           onclick: () => page.command("intervene", { take: false }) }, "Give it back")));
     }

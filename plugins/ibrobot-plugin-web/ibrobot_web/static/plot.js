@@ -29,7 +29,8 @@ export function drawPlot(canvas, { times, lines, begin, end, labels, cursor = nu
   const digits = Math.min(6, Math.max(0, 2 - Math.floor(Math.log10(high - low)))); // two or three that differ
   for (let i = 0; i <= 4; i += 1) {
     const value = low + (high - low) * i / 4;
-    context.fillText(Math.abs(value) < 1e5 ? Number(value.toFixed(digits)).toString() : value.toPrecision(3), 4, y(value) + 4);
+    const text = Math.abs(value) < 1e5 ? Number(value.toFixed(digits)).toString() : value.toPrecision(3);
+    context.fillText(text.replace("-", "−"), 4, y(value) + 4);
     context.globalAlpha = 0.25;
     context.strokeRect(LEFT, y(value), width, 0);
     context.globalAlpha = 1;
@@ -75,3 +76,6 @@ export function timeAt(canvas, event, begin, end) {
 export function kindOf(name) {
   return /^[^.[]+(?=[.[])/.exec(name)?.[0] ?? /^(lateness|latency)(?=_)/.exec(name)?.[0] ?? "values";
 }
+
+// The name of a value among those of its kind: shoulder_pan of position.shoulder_pan.
+export function shortOf(name) { return name.startsWith(`${kindOf(name)}.`) ? name.slice(kindOf(name).length + 1) : name; }

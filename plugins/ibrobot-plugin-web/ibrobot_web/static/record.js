@@ -20,9 +20,9 @@ export class Record {
   update({ episode, services, episodes, successes, ended }) {
     const { page } = this;
     this.section.hidden = !episode && !episodes;
+    this.time.hidden = !episode;
     if (!episode) {
       say(this.facts, `${count(episodes)}, ${successes} successful`);
-      this.time.classList.add("idle");
       refresh(this.line, "none", () => [this.facts]);
       return;
     }

@@ -51,6 +51,7 @@ class Ui extends EventTarget {
       else if (ended) opened.close();
       else opened.document.body.textContent = `The robot starts … ${job?.lines.at(-1) ?? ""}`;
       if (ended || job?.facts.url) this.removeEventListener("job", follow);
+      if (job?.state === "failed") document.querySelector(".job .problem")?.scrollIntoView({ block: "center" });
     };
     this.addEventListener("job", follow);
     follow();

@@ -1,7 +1,7 @@
 // Plots of any numbers on any topic while this tab is shown, and of the run's counters, such as latencies, all the time.
 
 import { h, refresh } from "../dom.js";
-import { COLORS, drawPlot, kindOf } from "../plot.js";
+import { COLORS, drawPlot, kindOf, shortOf } from "../plot.js";
 
 const SAMPLES = 2;
 const KEPT_S = 180;
@@ -84,7 +84,7 @@ export class PlotsPanel {
     refresh(this.legend, lines.map(([name]) => name), () => lines.map(([name], i) => {
       const mark = h("i", {});
       mark.style.background = COLORS[i];
-      return h("span", {}, mark, name);
+      return h("span", {}, mark, shortOf(name));
     }));
   }
 }

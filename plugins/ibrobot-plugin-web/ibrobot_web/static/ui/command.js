@@ -41,7 +41,9 @@ export class View {
   async start(values) {
     this.form.button.disabled = true;
     localStorage.setItem(this.key, JSON.stringify(values));
-    await this.ui.attempt(() => this.ui.post("jobs/start", { command: this.command, values }));
+    const started = await this.ui.attempt(() => this.ui.post("jobs/start", { command: this.command, values }));
+    const show = () => this.cards.get(started.number)?.element.scrollIntoView({ block: "nearest" });
+    if (started) setTimeout(show, 300); // once its card is there
     this.form.button.disabled = !this.ui.drives;
   }
 

@@ -1,7 +1,7 @@
 // Plays an episode: 3D, camera pictures and plots on one time line. Pictures are asked for by time, the newest only.
 
 import { h, refresh, say } from "../dom.js";
-import { COLORS, drawPlot, kindOf, timeAt } from "../plot.js";
+import { COLORS, drawPlot, kindOf, shortOf, timeAt } from "../plot.js";
 import { View3D } from "../view3d.js";
 
 const STEP_S = 0.05;
@@ -229,7 +229,7 @@ export class Player {
     refresh(this.legend, [this.topic.value, lines.map(([name]) => name)], () => lines.map(([name], i) => {
       const mark = h("i", {});
       mark.style.background = COLORS[i];
-      return h("span", {}, mark, name);
+      return h("span", {}, mark, shortOf(name));
     }));
   }
 }

@@ -29,7 +29,10 @@ export class View {
   async show(shown, rest) {
     if (!shown) return;
     await this.load();
-    if (rest) { this.checkpoint.value = rest; this.checkpoint.focus(); }
+    if (!rest || rest === this.shown) return;
+    this.shown = rest;
+    this.checkpoint.value = rest;
+    if (this.checkpoint.value && this.robot.value) this.preview();
   }
 
   async load() {
