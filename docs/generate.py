@@ -10,7 +10,7 @@ import click
 from api_page import api_page, api_parts
 from option_pages import config_page, jobs_page, options_of_kinds, options_page, services_page
 from plugin_index import plugin_page
-from site_pages import sections_apart
+from site_pages import SPLIT, sections_apart
 
 from ibrobot_core.cli.main import cli
 
@@ -77,7 +77,8 @@ def write(docs: Path) -> None:
     _write(reference / "options", {kind: "\n".join(page) for kind, page in options_of_kinds().items()})
     _write(reference / "cli", _cli_parts())
     _write(reference / "api", {name: "\n".join(page) for name, page in api_parts().items()})
-    for name in ("interfaces", "testing"):
+    for page in SPLIT:
+        name = page.removeprefix("reference/")
         _, parts = sections_apart(name, (reference / f"{name}.md").read_text(encoding="utf-8"))
         _write(reference / name, parts)
     _write(docs / "plugins", readme_pages(docs.parent))

@@ -22,6 +22,8 @@ and options of the directive."""
 _INCLUDED = re.compile(r"^\[[^\]]+\]\((\.\./\.\./[A-Z]+\.md)\)$", re.MULTILINE)
 _TESTED = re.compile(r"^<!-- doctest -->\n```pycon$", re.MULTILINE)
 _LINK = re.compile(r"\]\(([\w-]+(?:/index)?)\.md\)")
+SPLIT = ("reference/interfaces", "reference/testing")
+"""Pages whose sections on one source file each are pages of their own on the site."""
 _TERM = re.compile(r"^- \*\*(.+)\*\*: ", re.MULTILINE)
 
 
@@ -35,7 +37,7 @@ def connect(app: Sphinx, generated: Mapping[str, Page]) -> None:
             source[0] = site_markdown(name, source[0])
 
     def outdated(app: Sphinx, env: BuildEnvironment, *names: set[str]) -> list[str]:
-        return [*generated]  # they come from code, which Sphinx does not watch
+        return [*generated, *SPLIT]  # they come from code, which Sphinx does not watch
 
     app.connect("source-read", read)
     app.connect("env-get-outdated", outdated)
@@ -43,13 +45,13 @@ def connect(app: Sphinx, generated: Mapping[str, Page]) -> None:
 
 def site_markdown(name: str, text: str) -> str:
     """The text of a page with the directives of the site."""
+    if name in SPLIT:
+        text, _ = sections_apart(name.removeprefix("reference/"), text)
     text = _SOURCE.sub(lambda match: _documented(*match.groups()), text)
     text = _INCLUDED.sub(r"```{include} \1\n```", text)
     text = _TESTED.sub("```{doctest}", text)
     if name == "reference/glossary":
         return _glossary(text)
-    if name in ("reference/interfaces", "reference/testing"):
-        return site_markdown("", sections_apart(name.removeprefix("reference/"), text)[0])
     if name == "index" or name.endswith("/index"):
         return text + _contents(name, text)
     return text

@@ -1,6 +1,6 @@
 // Camera pictures, each drawn when it arrives. Cameras that are not shown are not sent.
 
-import { h, refresh } from "./dom.js";
+import { h, say } from "./dom.js";
 
 export class Cameras {
   // `changed` is called when there are other cameras.
@@ -32,9 +32,9 @@ export class Cameras {
   add({ channel, topic }) {
     const name = nameOf(topic);
     const canvas = h("canvas", { width: "4", height: "3", role: "img", "aria-label": `Camera ${name}` });
-    const caption = h("figcaption", {}, `${name}: waiting for its first picture …`);
-    const element = h("figure", { class: "picture", "data-name": name }, canvas, caption);
-    this.views.set(channel, { canvas, caption, facts: h("span", { class: "facts" }), element, context: canvas.getContext("2d"), name, rate: "" });
+    const caption = h("span", {}, `${name}: waiting for its first picture …`), age = h("span", { class: "rate" });
+    const element = h("figure", { class: "picture", "data-name": name }, canvas, h("figcaption", {}, caption, age));
+    this.views.set(channel, { canvas, caption, age, element, context: canvas.getContext("2d"), name, rate: "" });
     this.page.stream.show(channel, true);
     return element;
   }
@@ -42,7 +42,7 @@ export class Cameras {
   draw({ channel, bitmap, stamp }) {
     const view = this.views.get(channel);
     if (!view) return;
-    if (!bitmap) { view.caption.textContent = `${view.name}: damaged picture`; return; }
+    if (!bitmap) { say(view.caption, `${view.name}: damaged picture`); return; }
     if (view.canvas.width !== bitmap.width || view.canvas.height !== bitmap.height) {
       view.canvas.width = bitmap.width;
       view.canvas.height = bitmap.height;
@@ -54,8 +54,8 @@ export class Cameras {
     counted.count += 1;
     counted.ages.push(age);
     if (counted.ages.length > 500) counted.ages.shift();
-    view.facts.textContent = ` · ${view.rate}${age < 60000 ? ` · ${Math.max(0, age).toFixed(0)} ms` : ""}`;
-    refresh(view.caption, view.name, () => [view.name, view.facts]);
+    say(view.caption, view.name);
+    say(view.age, ` · ${view.rate}${age < 60000 ? ` · ${Math.max(0, age).toFixed(0)} ms` : ""}`);
   }
 }
 

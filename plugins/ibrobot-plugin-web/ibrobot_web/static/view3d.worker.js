@@ -10,6 +10,7 @@ const HANDLE_PX = 26, HANDLE_M = 0.012;
 const REACH_M = 0.05; // distance at which dragging the tool reaches full speed
 const GHOST_RAD = 0.03; // a command this close to the measured position has no ghost
 const FIELD_DEG = 40;
+const WIDE = 1.6; // width by height of a picture below which it counts as narrow
 const FRUSTUM_M = 0.05;
 const OBJECT = [0.55, 0.6, 0.66, 0.75];
 const FRAME_MS = 40; // 25 frames a second leave a small machine time for the rest
@@ -69,6 +70,9 @@ function load({ scene }) {
   orbit.target = scene.centre;
   dirty = true;
 }
+
+// Half the height of what is seen at a distance of 1: more in a narrow picture, so that its width shows as much.
+function half() { return Math.tan(FIELD_DEG * Math.PI / 360) * Math.max(1, WIDE * size[1] / size[0]); }
 
 // The view of a camera, which looks along its -z: lines from it to the corners of its picture, and the picture's edge.
 function frustum(fovy) {
@@ -141,7 +145,7 @@ function look() {
   const { azimuth, elevation, distance, target } = orbit;
   const flat = distance * Math.cos(elevation);
   const from = add(target, [flat * Math.cos(azimuth), flat * Math.sin(azimuth), distance * Math.sin(elevation)]);
-  view = { from, ...looking(from, target), projection: perspective(FIELD_DEG, size[0] / size[1], 0.02 * distance, 50 * distance) };
+  view = { from, ...looking(from, target), projection: perspective(360 / Math.PI * Math.atan(half()), size[0] / size[1], 0.02 * distance, 50 * distance) };
 }
 
 function draw(now = 0) {
@@ -175,7 +179,7 @@ function turn(by) {
 }
 
 function pan(dx, dy) {
-  const scale = 2 * orbit.distance * Math.tan(FIELD_DEG * Math.PI / 360) / size[1];
+  const scale = 2 * orbit.distance * half() / size[1];
   orbit.target = add(add(orbit.target, view.right, -dx * scale), view.up, dy * scale);
   dirty = true;
 }
@@ -189,13 +193,13 @@ function zoom(factor) {
 function seen(point) {
   const [x, y, z] = transform(view.matrix, point);
   if (z > -1e-6) return null;
-  const f = size[1] / (2 * Math.tan(FIELD_DEG * Math.PI / 360));
+  const f = size[1] / (2 * half());
   return [size[0] / 2 - f * x / z, size[1] / 2 + f * y / z];
 }
 
 // The point under a pixel, on the plane through a point that faces the camera.
 function under(at, point) {
-  const f = 2 * Math.tan(FIELD_DEG * Math.PI / 360) / size[1];
+  const f = 2 * half() / size[1];
   const ray = add(add(view.ahead, view.right, (at[0] - size[0] / 2) * f), view.up, (size[1] / 2 - at[1]) * f);
   const depth = dot(subtract(point, view.from), view.ahead);
   return add(view.from, ray, depth);

@@ -34,6 +34,8 @@ VIEWS = {
 """Name -> title in the navigation. The module `ibrobot_web.ui.NAME` has the view's `ROUTES`; `static/ui/NAME.js` shows
 it. Each command that runs as a job has a view, too, all by `static/ui/command.js`; each kind of report has one, all by
 `static/ui/reports.js`."""
+SHOWN = {"episodes": "episodes", "dataset": "datasets", "policy": "policies"}
+"""What a command works on -> the view that shows it."""
 ROUTED = (*VIEWS, "reports")
 """The modules with `ROUTES`."""
 LARGEST_REQUEST = 1 << 20
@@ -67,7 +69,11 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
             {"name": f"report-{each.name}", "title": each.title, "module": "reports", "report": each.name}
             for each in installed_plugins().reports
         ]
-        views[-1:-1] = [*jobs, *reports]  # before the last one, which shows all jobs
+        for job in jobs:  # after the view of what it works on, in the order of the work
+            names = [view["name"] for view in views]
+            taken = next((SHOWN[kind] for kind in job["takes"] if kind in SHOWN), names[-2])
+            views.insert(names.index(taken) + 1, job)
+        views[-1:-1] = reports  # before the last one, which shows all jobs
         return web.json_response({"role": guard.role(request), "folders": folders, "views": views})
 
     async def follow(request: web.Request) -> web.StreamResponse:

@@ -20,8 +20,8 @@ export class View {
       keyed("Previous", "p", () => this.go(-1)), keyed("Next", "n", () => this.go(1)),
       h("button", { onclick: () => this.play(null) }, "Close")), this.problem, this.player.element);
     document.addEventListener("keydown", (event) => { if (this.shown && !this.playing.hidden) press(event, this.playing, this.player); });
-    element.append(h("h2", {}, "Datasets"), h("div", { class: "row" }, h("label", { for: "dataset" }, "Dataset"), this.choice),
-      this.note, this.playing, this.facts);
+    this.choices = h("div", { class: "row" }, h("label", { for: "dataset" }, "Dataset"), this.choice);
+    element.append(h("h2", {}, "Datasets"), this.choices, this.note, this.playing, this.facts);
   }
 
   // Plays the next or the previous episode.
@@ -38,7 +38,8 @@ export class View {
     if (!found) return;
     const chosen = rest || this.path || found[0];
     refresh(this.choice, [found, chosen], () => found.map((path) => h("option", { value: path, selected: path === chosen }, path)));
-    say(this.note, found.length ? "" : "No datasets in the opened folders. Convert episodes into one, in the view Convert.");
+    this.choices.hidden = !found.length;
+    this.note.replaceChildren(...(found.length ? [] : ["No datasets in the opened folders. ", h("a", { href: "#job-convert" }, "Convert episodes into one"), "."]));
     if (chosen && found.includes(chosen)) await this.open(chosen);
     else if (rest) say(this.note, `${rest}: there is no such dataset in the opened folders`);
   }
@@ -100,5 +101,8 @@ function rows({ key, dtype, shape, unit, names, stats, picture }) {
   return Array.from({ length: count }, (_, i) => h("tr", {}, i ? h("td", {}) : h("th", { scope: "row" }, key),
     ...(i ? ["", "", ""] : [dtype, shape.join(" × "), unit]).map((text) => h("td", {}, text)),
     h("td", {}, picture && count === 3 ? colors[i] : names[i] ?? (count > 1 ? String(i) : "")),
-    ...["min", "mean", "max", "std"].map((name) => h("td", {}, (stats[name]?.[i] ?? null) === null ? "" : Number(stats[name][i].toPrecision(4)).toString()))));
+    ...["min", "mean", "max", "std"].map((name) => h("td", {}, (stats[name]?.[i] ?? null) === null ? "" : rounded(stats[name][i])))));
 }
+
+// Four digits, of which at most four are decimals.
+function rounded(value) { return Number(Math.abs(value) < 1 ? value.toFixed(4) : value.toPrecision(4)).toString().replace("-", "−"); }
