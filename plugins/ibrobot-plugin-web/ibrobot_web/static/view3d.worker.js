@@ -10,7 +10,7 @@ const HANDLE_PX = 26, HANDLE_M = 0.012;
 const REACH_M = 0.05; // distance at which dragging the tool reaches full speed
 const GHOST_RAD = 0.03; // a command this close to the measured position has no ghost
 const FIELD_DEG = 40;
-const WIDE = 1.6; // width by height of a picture below which it counts as narrow
+const WIDE = 1.3; // width by height of a picture below which it counts as narrow
 const FRUSTUM_M = 0.05;
 const OBJECT = [0.55, 0.6, 0.66, 0.75];
 const FRAME_MS = 40; // 25 frames a second leave a small machine time for the rest
