@@ -2,9 +2,9 @@
 
     python benchmarks/page_clicks.py [--episodes 10] [--steps 50] [--no-training]
 
-Needs Chromium and playwright, and LeRobot to train. Walks the way that a person takes who wants the fewest inputs, with the
-simulated SO-101 without cameras: records and judges episodes, converts them, trains, and launches the result. A choice
-from a list counts as two clicks, a button that is held as one. Prints a table.
+Needs Chromium and playwright, and LeRobot to train. Walks the way with the fewest inputs, with the simulated SO-101
+without cameras: records and judges episodes, converts them, trains, and launches the result. A choice from a list
+counts as two clicks, a button that is held as one. Prints a table.
 """
 
 from __future__ import annotations
@@ -121,7 +121,8 @@ def move(hand: Hand, run: Any, number: int) -> None:
     """Move a joint, to the other side each time."""
     button = run.get_by_label(f"wrist_roll {('up', 'down')[number % 2]}, hold to move")
     before = run.evaluate("ibrobot.state.position")[4]
-    hand.hold(run, button, f"ibrobot.status.episode.elapsed_s > 1 && Math.abs(ibrobot.state.position[4] - {before}) > 0.1")
+    moved = f"Math.abs(ibrobot.state.position[4] - {before}) > 0.1"
+    hand.hold(run, button, f"ibrobot.status.episode.elapsed_s > 1 && {moved}")
 
 
 def convert(hand: Hand, page: Any) -> None:

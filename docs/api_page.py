@@ -71,7 +71,9 @@ def api_page() -> Iterator[str]:
 
 def api_parts() -> dict[str, Iterator[str]]:
     """Name -> lines of the page on a group."""
-    return {_part(floor, title): _group_page(floor, title, names) for floor in (api, app) for title, names in groups(floor)}
+    return {
+        _part(floor, title): _group_page(floor, title, names) for floor in (api, app) for title, names in groups(floor)
+    }
 
 
 def _part(floor: ModuleType, title: str) -> str:
