@@ -34,6 +34,11 @@ _CONVERTERS: Mapping[Format, Callable[[Source], dict[str, Any]]] = {
     CALIBRATION: lerobot.convert_calibration,
 }
 
+_TO_LAUNCH = (
+    "To launch such a robot, copy its observations into the contract of a robot YAML (`ibrobot config copy so101 "
+    "my.yaml`), whose actions name the executors"
+)
+
 
 @attrs.frozen
 class Imported:
@@ -81,6 +86,7 @@ def import_(file: Path, out: Path | None, contract: bool) -> None:
         echo(f"note: {note}")
     if found.alone:
         echo(f"use it: ibrobot convert BAG --config {target} --out DATASET")
+        echo(f"not for ibrobot launch: {_missing(target)}. {_TO_LAUNCH}")
     else:
         echo(f"try it: ibrobot launch {target} --sim --mode web --web")
 
@@ -114,6 +120,8 @@ def convert_file(path: Path, *, contract: bool = False) -> Imported:
     draft = Draft()
     draft.comment(f"Made by `ibrobot config import` from {path.name}, {format_.name}. Units are SI.")
     draft.comment("`line N: KEY` is where a line comes from; all others are marked.")
+    if alone := set(sections) == {"contract"}:
+        draft.comment(f"A contract alone, for `ibrobot convert --config`. {_TO_LAUNCH}.")
     refused = [each for each in verdicts if each.fate is Fate.REFUSED]
     draft.comment("Without a counterpart:" if refused else "Nothing is left out.")
     for each in refused:
@@ -122,10 +130,20 @@ def convert_file(path: Path, *, contract: bool = False) -> Imported:
         if value:
             draft.add("")
             draft.block({name: value})
-    if set(sections) == {"contract"}:
+    if alone:
         return Imported(format_, draft, verdicts, True, path.stem)
     name = "".join(c if c.isalnum() or c in "-_" else "_" for c in str(sections["robot"]["name"].value))
     return Imported(format_, draft, verdicts, False, name, _types(sections))
+
+
+def _missing(target: Path) -> str:
+    """What a file lacks of a robot YAML."""
+    try:
+        load_config(target)
+    except ConfigError as error:
+        keys = [each.path for each in error.problems if each.message == "required key is missing"]
+        return f"it has no {', '.join((*keys, 'hardware'))}"
+    raise AssertionError(f"{target} is a robot YAML")
 
 
 def _types(sections: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 import yaml
-from ibrobot_import.command import convert_file, write
+from click.testing import CliRunner
+from ibrobot_import.command import convert_file, import_, write
 from ibrobot_import.draft import scalar
 from ibrobot_import.source import Fate
 
@@ -115,6 +116,15 @@ def test_contract_alone_of_robot_without_driver(name: str, tmp_path: Path) -> No
     found = convert_file(FILES / name)
     assert found.alone
     write(found, FILES / name, tmp_path / "new.yaml")
+
+
+def test_what_a_contract_alone_lacks_for_a_launch_is_printed(tmp_path: Path) -> None:
+    done = CliRunner().invoke(import_, [str(FILES / "ib_robot_contract.yaml"), str(tmp_path / "new.yaml")])
+    assert done.exit_code == 0, done.output
+    assert "12 values taken, 0 changed, 7 without a counterpart" in done.output
+    lacks = "it has no robot, executors, control_modes, default_control_mode, hardware"
+    assert f"not for ibrobot launch: {lacks}. To launch such a robot, copy its observations" in done.output
+    assert "# A contract alone, for `ibrobot convert --config`." in (tmp_path / "new.yaml").read_text()
 
 
 def test_sources_and_signals_of_rosetta() -> None:
