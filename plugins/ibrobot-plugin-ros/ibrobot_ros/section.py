@@ -9,6 +9,7 @@ from typing import Any, override
 
 from ibrobot_ros2.calls import Calls
 from ibrobot_ros2.goals import Actions, with_goals
+from ibrobot_ros2.inference import serve_chunks
 
 from ibrobot_core.api import DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
 from ibrobot_core.app import CONTROL, Component, ComponentFailed, RunAccess, error_line
@@ -53,6 +54,7 @@ class RosNode(Component):
         )  # fmt: skip
         self._services = Services(options, session)
         self._calls = Calls(session, options.offers, lambda name: ros_name(name, options.namespace), "ros")
+        self._end_chunks: Callable[[], None] = lambda: None
         self._node: NodeProcess | None = None
         self._wire: Wire | None = None
         self._ending = threading.Event()
@@ -91,6 +93,8 @@ class RosNode(Component):
         session.log.info("ros: node /%s: %s", self._options.name, self._node.hello)
         self.topics.open()
         self._services.open()
+        if not self._lockstep:
+            self._end_chunks = serve_chunks(session)
         self._declare(self._node.wire)
         if self._lockstep:
             return
@@ -130,6 +134,7 @@ class RosNode(Component):
             self._send_rest(wire)
         self.topics.close()
         self._services.close()
+        self._end_chunks()
         self._calls.close()
         if wire is not None:
             wire.send({"op": "end"})

@@ -12,6 +12,7 @@ import attrs
 from ibrobot_ros2 import decode, encode
 from ibrobot_ros2.calls import Calls
 from ibrobot_ros2.goals import Actions, with_goals
+from ibrobot_ros2.inference import serve_chunks
 from ibrobot_ros2.interfaces import ActionType, ServiceType, action_type, fields_of, service_type, to_cdr
 from ibrobot_ros2.offers import Offer, Offers
 
@@ -144,6 +145,7 @@ class RosActions(SessionWorker):
     @override
     def setup(self) -> None:
         self._transport = transport_of(self._link)
+        self._ends.append(serve_chunks(self.session))
         self._actions.declare(self)
         self._calls.declare(self)
         self.session.on_goal.append(self._actions.take_event)
@@ -162,10 +164,10 @@ class RosActions(SessionWorker):
         ):
             if call in calls:
                 calls.remove(call)  # type: ignore[arg-type]
-        self._calls.close()
         ends, self._ends = self._ends, []
         for end in ends:
             end()
+        self._calls.close()
 
     def send(self, head: Mapping[str, Any]) -> None:
         """Take what the run says of its actions and goals."""

@@ -203,9 +203,15 @@ class Peer:
             if isinstance(value, int | float | str):
                 found[field] = value
             elif field == "action_chunk":
-                (variant,) = value.variants
-                sizes = [each.size for each in variant.float_64_array.layout.dim]
-                found[field] = [variant.key, variant.type, sizes, list(variant.float_64_array.data)]
+                found[field] = [
+                    [
+                        each.key,
+                        each.type,
+                        [d.size for d in each.float_64_array.layout.dim],
+                        len(each.float_64_array.data),
+                    ]
+                    for each in value.variants
+                ]
             elif field == "state":
                 found[field] = [list(value.name), list(value.position)]
         return found

@@ -52,3 +52,21 @@ def test_what_is_discarded_or_cannot_begin_is_aborted(recording, peer):
     until(lambda: recording.session.faults)
     outcome = peer.ask("send", **RECORD, request={})
     assert (outcome["status"], "reset it first" in outcome["message"]) == ("ABORTED", True)
+
+
+def test_chunks_of_the_model_that_acts(start, peer):
+    run = start(mode="policy")
+    infer = {"action": "/act_inference_node/DispatchInfer", "type": "ibrobot_msgs/action/DispatchInfer"}
+    outcome = peer.ask("send", **infer, request={"inference_id": "one"})
+    ((key, kind, (count, joints), values),) = outcome["action_chunk"]
+    assert (outcome["status"], outcome["success"]) == ("SUCCEEDED", True)
+    assert (key, kind, joints, outcome["chunk_size"]) == ("action", "float_64_array", 4, count)
+    assert values == count * joints
+    assert "pan, lift, roll, grip" in outcome["message"]
+    run.runtime.switch_mode("idle")
+    outcome = peer.ask("send", **infer, request={})
+    assert (outcome["status"], outcome["message"], outcome["action_chunk"]) == (
+        "ABORTED",
+        "no model acts in mode idle",
+        [],
+    )
