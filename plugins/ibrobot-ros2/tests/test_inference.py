@@ -21,12 +21,13 @@ PATIENCE_S = 10.0
 
 
 def answer(observed_ns: int, actions: Any = ((1.0, 2.0), (3.0, 4.0)), **fields: Any) -> ModelAnswer:
-    texts = {"server": "", "weights": "", "prompt": "pick", "outcome": "used", "error": "", **fields}
     values = np.array(actions, dtype=float).ravel()
-    numbers = {"latency_ms": 12.5, "infer_ms": 10.0, "queue_ms": 0.0, "step_ns": 50_000_000}
-    return ModelAnswer(
-        Header(observed_ns + 9), 3, observed_ns, "net", **texts, **numbers, joint_names=("a", "b"), actions=values
-    )
+    made = ModelAnswer(
+        Header(observed_ns + 9), request=3, observed_ns=observed_ns, model="net", server="", weights="", prompt="pick",
+        outcome="used", error="", latency_ms=12.5, infer_ms=10.0, queue_ms=0.0, step_ns=50_000_000,
+        joint_names=("a", "b"), actions=values,
+    )  # fmt: skip
+    return attrs.evolve(made, **fields)
 
 
 @attrs.define
