@@ -5,8 +5,8 @@
 `nox -s ros` makes that interpreter. First it prints the lateness of the simulated SO-101's control loop in each of
 these cases: without a node, without one beside two busy processes, with an idle node, with one that is flooded with
 messages and calls by two processes, with one that is stopped, and with one that is killed again and again. Then it
-prints the age of images of 640x480 pixels at 30 Hz when rclpy gets them in another process: of those that a run
-publishes, and of those that rclpy itself publishes.
+prints the age of images of 640x480 pixels at 30 Hz when rclpy gets them in another process, and how many are lost from
+the first one on: of those that a run publishes, and of those that rclpy itself publishes.
 """
 
 from __future__ import annotations
@@ -156,15 +156,16 @@ def ratios(rounds: list[dict[str, dict[str, float]]]) -> dict[str, float]:
 
 
 def ages(peer: Peer, topic: str, publish: Callable[[], None], count: int) -> dict[str, float]:
-    """Ages of `count` images [ms] when they come to `peer`."""
+    """Ages of up to `count` images [ms] when they come to `peer`, and the share of those that are lost."""
     peer.ask("subscribe", topic=topic, type="sensor_msgs/msg/Image", qos="sensor_data", head=16)
     publish()
     taken = peer.ask("take", topic=topic, count=count, timeout_s=2 * count / 30)
-    values = []
-    for at_ns, raw in taken[10:]:
-        sec, nanosec = _STAMP.unpack(bytes.fromhex(raw)[: _STAMP.size])
-        values.append((at_ns - sec * 1_000_000_000 - nanosec) / 1e6)
-    return {"p50": np.quantile(values, 0.5), "p99": np.quantile(values, 0.99), "images": float(len(taken))}
+    stamps = [_STAMP.unpack(bytes.fromhex(raw)[: _STAMP.size]) for _, raw in taken]
+    begun = np.array([sec * 1_000_000_000 + nanosec for sec, nanosec in stamps])
+    values = (np.array([at_ns for at_ns, _ in taken]) - begun)[10:] / 1e6
+    sent = round((begun[-1] - begun[0]) * 30 / 1e9) + 1
+    lost = 100 * (1 - len(taken) / sent)
+    return {"p50": np.quantile(values, 0.5), "p99": np.quantile(values, 0.99), "lost %": lost}
 
 
 def images(python: str, seconds: float) -> dict[str, dict[str, float]]:

@@ -20,6 +20,8 @@ REMEDY = (
     "source a ROS 2 (. /opt/ros/jazzy/setup.bash), or set ros.python or ros.setup; on x86-64 with Python 3.12 "
     "`uv pip install ros-jazzy-rclpy ros-jazzy-rmw-fastrtps-cpp` brings one without an installation"
 )
+_PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+"""Where Fast DDS, the new one and that of Humble, reads its settings from; other middleware ignores them."""
 
 
 @attrs.frozen
@@ -89,4 +91,6 @@ def environment(options: RosInstallation, interpreter: Interpreter) -> dict[str,
             found.pop("ROS_STATIC_PEERS", None)
     if options.rmw is not None:
         found["RMW_IMPLEMENTATION"] = options.rmw
+    if not any(name in found for name in (*_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")):
+        found |= dict.fromkeys(_PROFILES, str(Path(__file__).with_name("fast_dds.xml")))
     return found
