@@ -14,15 +14,19 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from ibrobot_feetech.calibration import save_calibration
+from ibrobot_feetech.emulator import Emulator
 from ibrobot_testing.site import made_up_site
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.robots.so_follower import SO101Follower, SO101FollowerConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_robot_ibrobot import IbrobotRobot, IbrobotRobotConfig
 
+from ibrobot_core.api import Calibration, JointCalibration
 from ibrobot_core.app import ComponentFailed
 
 sys.path.insert(0, str(Path(__file__).parent))
+import made_up_camera  # noqa: F401 - registers itself
 from checkpoints import SIZE, STATE, TOP, WRIST, act, save
 
 pytestmark = pytest.mark.lerobot
@@ -97,6 +101,59 @@ def test_rollout_drives_a_simulated_robot_with_cameras(run: Callable[..., None],
         "--policy.device=cpu", "--duration=1", "--task=wave", "--play_sounds=false",
         "--return_to_initial_position=false",
     )  # fmt: skip
+
+
+@pytest.fixture
+def follower(tmp_path: Path) -> Iterator[tuple[str, ...]]:
+    """The options of LeRobot's own so101_follower on an emulated bus, with cameras as the simulated robot has."""
+    names = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+    calibration = {name: JointCalibration(servo, 0, 0, 700, 3400) for servo, name in enumerate(names, 1)}
+    save_calibration(Calibration(calibration), tmp_path / "arm.json")
+    with Emulator() as emulator:
+        for servo in emulator.servos.values():
+            servo.set("min_position_limit", 700)
+            servo.set("max_position_limit", 3400)
+        camera = "{type: made_up, width: 320, height: 240, fps: 30}"
+        yield (
+            "--robot.type=so101_follower", f"--robot.port={emulator.port}", "--robot.id=arm",
+            f"--robot.calibration_dir={tmp_path}", f"--robot.cameras={{top: {camera}, wrist: {camera}}}",
+        )  # fmt: skip
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("patient_buses")
+def test_datasets_have_the_features_of_lerobots_own_and_policies_of_one_run_on_the_other(
+    run: Callable[..., None], follower: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Two recordings, two trainings of two steps, two rollouts: one to three minutes."""
+    simulated = ("--robot.type=ibrobot", "--robot.config=so101", "--robot.sim=true")
+    robots = {"ours": simulated, "theirs": follower}
+    features, policies = {}, {}
+    small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 32, "n_encoder_layers": 1, "n_vae_encoder_layers": 1}
+    for name, robot in robots.items():
+        out = tmp_path / "out" / name
+        dataset = (f"--dataset.repo_id=me/{name}", f"--dataset.root={tmp_path / name}")
+        run(
+            "record", *robot, *WAVING, "--teleop.pose=home", *dataset,
+            "--dataset.num_episodes=1", "--dataset.episode_time_s=2",
+            "--dataset.reset_time_s=0", "--dataset.single_task=wave", "--dataset.push_to_hub=false",
+            "--play_sounds=false",
+        )  # fmt: skip
+        info = json.loads((tmp_path / name / "meta" / "info.json").read_text())
+        features[name] = info["features"]
+        run(
+            "train", *dataset, "--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false",
+            "--policy.pretrained_backbone_weights=null", *(f"--policy.{key}={value}" for key, value in small.items()),
+            "--steps=2", "--save_freq=2", "--batch_size=2", "--num_workers=0", f"--output_dir={out}",
+        )  # fmt: skip
+        policies[name] = out / "checkpoints" / "last" / "pretrained_model"
+    assert features["ours"] == features["theirs"]
+    for name, robot in robots.items():
+        (other,) = (policy for of, policy in policies.items() if of != name)
+        run(
+            "rollout", *robot, f"--policy.path={other}", "--policy.device=cpu", "--duration=1", "--task=wave",
+            "--play_sounds=false", "--return_to_initial_position=false",
+        )  # fmt: skip
 
 
 def test_a_fault_is_an_exception_with_its_text(tmp_path: Path) -> None:

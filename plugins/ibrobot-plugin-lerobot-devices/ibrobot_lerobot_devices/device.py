@@ -29,10 +29,40 @@ _SILENCE_S = 0.25
 _NICE = -10
 _PICTURE_MS = 200
 """Longest time to wait for a picture before an answer without one [ms]."""
-READY, ANSWER, DONE = "ready", "answer", "done"
-"""Events: the device is connected; a reading or why there is none; a request is carried out."""
+READY, ANSWER, DONE, TRAFFIC = "ready", "answer", "done", "traffic"
+"""Events: it is connected; a reading or why there is none; a request is carried out; what its ports received."""
 _END: dict[str, Any] = {"do": "end"}
 _STAND: dict[str, Any] = {"do": "stand"}
+
+
+@attrs.define
+class Traffic:
+    """What the present call of LeRobot's has received from serial ports."""
+
+    reads: int = 0
+    received: int = 0
+    """[bytes]."""
+
+    def begin(self) -> None:
+        """Forget the call before."""
+        self.reads = self.received = 0
+
+    def watch(self) -> None:
+        """Count what every serial port of this process receives; LeRobot's buses all use pyserial."""
+        try:
+            import serial
+        except ImportError:
+            return
+        port_class: Any = serial.Serial
+        read = port_class.read
+
+        def counting(port: Any, size: int = 1) -> Any:
+            content = read(port, size)
+            self.reads += 1
+            self.received += len(content)
+            return content
+
+        port_class.read = counting
 
 
 @attrs.define
@@ -40,6 +70,7 @@ class Requests:
     """Requests of the parent, in order; of actions and of requests to read only the newest counts."""
 
     channel: Channel
+    traffic: Traffic = attrs.field(factory=Traffic)
     _waiting: queue.SimpleQueue[dict[str, Any]] = attrs.field(factory=queue.SimpleQueue)
     _newest: dict[str, dict[str, Any]] = attrs.field(factory=dict)
     ended: threading.Event = attrs.field(factory=threading.Event)
@@ -67,6 +98,9 @@ class Requests:
                 for request in self.channel.wait(None):
                     if request["do"] == "end":
                         raise ComponentFailed("ended")
+                    if request["do"] == TRAFFIC:  # whatever LeRobot's call does
+                        self.channel.send({"event": TRAFFIC, **attrs.asdict(self.traffic)})
+                        continue
                     if request["do"] in ("act", "read"):
                         self._newest[request["do"]] = request
                     self._waiting.put(request)
@@ -194,6 +228,7 @@ def serve(device: Device, requests: Requests) -> None:
     channel = requests.channel
     while (request := requests.next(device.patience_s))["do"] != "end":
         what = request["do"]
+        requests.traffic.begin()
         begun_ns = time.monotonic_ns()
         answer: dict[str, Any] = {"event": ANSWER if what in ("read", "picture") else DONE, "id": request.get("id")}
         try:
@@ -246,6 +281,7 @@ def main(parent: int, pictures: int) -> int:
         if order["only_make"]:
             channel.send({"event": READY, "found": device.make()})
             return 0
+        requests.traffic.watch()
         requests.start()
         try:
             found = device.connect()

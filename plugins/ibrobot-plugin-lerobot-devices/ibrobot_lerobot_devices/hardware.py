@@ -102,9 +102,11 @@ class LeRobotHardware(Hardware):
             self._lost = 0
             self._newest = self._reading(answer)
             return self._newest
-        blocked_s = self._link.blocked_s
-        if blocked_s > self._options.blocked:
-            raise self._fail(f"LeRobot's {self._options.robot}.get_observation does not return for {blocked_s:.2f} s")
+        if self._link.blocked_s > self._options.blocked:
+            try:
+                raise self._fail(self._link.blockage("get_observation"))
+            except DeviceProblem as problem:
+                raise self._fail(problem) from None
         newest = self._newest
         if newest is None:
             now_ns, size = self._ctx.clock.now_ns(), len(self.joints)

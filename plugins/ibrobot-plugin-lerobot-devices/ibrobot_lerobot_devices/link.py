@@ -10,13 +10,15 @@ from importlib.util import find_spec
 from typing import Any
 
 from ibrobot_core.app import Child, ComponentFailed
-from ibrobot_lerobot_devices.device import ANSWER, DONE, READY
+from ibrobot_lerobot_devices.device import ANSWER, DONE, READY, TRAFFIC
 
 INSTALL = "pip install 'lerobot>=0.6.1,<0.7'"
 """The command that installs LeRobot; its devices need extras, e.g. `lerobot[feetech]`."""
 _MODULE = "ibrobot_lerobot_devices.device"
 _END_S = 1.5
 """How long a device process may take to end [s]; then it is killed."""
+_TRAFFIC_S = 0.02
+"""How long a fault waits for what the ports received [s]."""
 _MANY = 1 << 16
 """Unread bytes from which on actions are dropped: LeRobot's call has blocked for seconds."""
 
@@ -144,6 +146,29 @@ class DeviceLink:
     def blocked_s(self) -> float:
         """How long the present call of LeRobot's has taken, if a reading waits for it [s]."""
         return 0.0 if self._asked_s is None else time.monotonic() - self._asked_s
+
+    def blockage(self, call: str) -> str:
+        """What is known of the present call of LeRobot's, e.g. `get_observation`, which does not return.
+
+        Raises:
+            DeviceProblem: if the process has died.
+        """
+        text = f"LeRobot's {self.type}.{call} does not return for {self.blocked_s:.2f} s"
+        self._running().channel.send({"do": TRAFFIC})
+        deadline_s = time.monotonic() + _TRAFFIC_S
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            message = self._message(left_s)
+            if message is None or message["event"] != TRAFFIC:
+                continue
+            if message["received"]:
+                return (
+                    f"{text}: {message['received']} bytes have come from its port, but no valid answer of all motors; "
+                    "check the cables, and that no other program uses the port"
+                )
+            if message["reads"]:
+                return f"{text}: nothing comes from its port; check the motors' power and cable"
+            return text
+        return f"{text}, and its process does not respond"
 
     def act(self, action: Mapping[str, float]) -> None:
         """Send an action; LeRobot gets the newest one when its present call has returned.

@@ -187,7 +187,7 @@ def robot_yaml(found: NewRobot) -> str:
     devices = f"teleoperation:\n{devices}\n" if devices else ""
     return f"""\
 # {found.type} of LeRobot, made by `ibrobot config new --lerobot {found.type}`. Units are SI: radians, seconds.
-# Check all joints before the first motion: limits are {limits}; max_velocity and
+# Check all joints before the first motion: {limits}; max_velocity and
 # max_acceleration are guesses, too. LeRobot reports no torque, temperature or voltage.
 robot:
   name: {found.type}

@@ -78,8 +78,11 @@ class LeRobotTeleop(Teleop):
         if engaged is not None:
             self.deadman.report(engaged, self._ctx.clock.now_ns() - age_ns(answer or {}))
         elif self._link.blocked_s > self._options.blocked:
-            blocked_s, self._pose = self._link.blocked_s, None
-            raise self._error(f"LeRobot's {self._options.teleop}.get_action does not return for {blocked_s:.2f} s")
+            self._pose = None
+            try:
+                raise self._error(self._link.blockage("get_action"))
+            except DeviceProblem as problem:
+                raise self._error(problem) from None
         if not self.deadman.allows(now_ns) or self._pose is None:
             self._setpoint = None
             if not self.deadman.armed:

@@ -12,6 +12,7 @@ from typing import Any, override
 
 import numpy as np
 import pytest
+from ibrobot_lerobot_devices import link
 from ibrobot_lerobot_devices.hardware import LeRobotHardware
 from ibrobot_lerobot_devices.options import RobotOptions
 from ibrobot_testing.contexts import control_context
@@ -19,7 +20,7 @@ from ibrobot_testing.hardware import HardwareSuite
 
 from ibrobot_core.api import Context, Hardware, HardwareError, JointReading, RealClock, Torque
 
-from .conftest import JOINTS, Motors, install
+from .conftest import JOINTS, PATIENCE_S, Motors, install
 
 TURN = 2 * math.pi
 
@@ -152,6 +153,25 @@ def reset(hardware: LeRobotHardware) -> None:
 
 
 class TestBlocked:
+    @pytest.mark.parametrize(
+        ("fault", "text"),
+        [
+            ("block", r"does not return for 0\.\d+ s$"),
+            ("silent", r"0\.\d+ s: nothing comes from its port; check the motors' power and cable$"),
+            ("garbage", r"0\.\d+ s: \d+ bytes have come from its port, but no valid answer of all motors; check"),
+        ],
+    )
+    def test_a_silent_port_and_garbage_are_told_apart(
+        self, motors: Motors, fault: str, text: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(link, "_TRAFFIC_S", PATIENCE_S)
+        with connected(motors, blocked=0.2) as hardware:
+            fresh(hardware)
+            motors.suffer(fault)
+            with pytest.raises(HardwareError, match=text):
+                [hardware.read() for _ in range(100_000)]
+            motors.suffer("")
+
     def test_a_blocked_call_is_named_and_the_arm_keeps_its_last_goal(self, motors: Motors) -> None:
         with connected(motors, blocked=0.05) as hardware:
             reading = fresh(hardware)

@@ -7,7 +7,9 @@ import time
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
+
+from serial import Serial
 
 
 class MotorNormMode(Enum):
@@ -39,7 +41,7 @@ class MotorCalibration:
 class Bus:
     """The motors at a port, which is a file with their positions and their torque.
 
-    A file beside it with the suffix `.fault` says what is wrong: `block`, `fail` or `nan`.
+    A file beside it with the suffix `.fault` says what is wrong: `block`, `silent`, `garbage`, `fail` or `nan`.
     """
 
     apply_drive_mode = True
@@ -79,7 +81,11 @@ class Bus:
 
     def _suffer(self) -> None:
         fault = self.port.with_suffix(".fault")
-        while (what := fault.read_text() if fault.exists() else "") == "block":
+        port: Any = Serial()
+        while (what := fault.read_text() if fault.exists() else "") in ("block", "silent", "garbage"):
+            port.content = b"?" if what == "garbage" else b""
+            if what != "block":
+                port.read(8)
             time.sleep(0.002)
         if what == "fail":
             raise ConnectionError("the motors do not answer")
