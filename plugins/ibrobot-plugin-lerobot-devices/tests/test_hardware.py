@@ -161,7 +161,7 @@ class TestBlocked:
             ("garbage", r"0\.\d+ s: \d+ bytes have come from its port, but no valid answer of all motors; check"),
         ],
     )
-    def test_a_silent_port_and_garbage_are_told_apart(
+    def test_a_silent_port_and_garbage_have_different_messages(
         self, motors: Motors, fault: str, text: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(link, "_TRAFFIC_S", PATIENCE_S)
