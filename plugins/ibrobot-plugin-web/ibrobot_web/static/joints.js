@@ -71,7 +71,8 @@ export class Joints {
         : this.degrees ? `${signed(position[i] * DEGREES, 0)}°` : `${signed(position[i], 2)} rad`);
       row.bar.style.width = share(position[i]);
       row.command.style.left = share(command[i]);
-      row.element.classList.toggle("outside", position[i] < lower || position[i] > upper);
+      const beyond = (upper - lower) / 200; // a joint that rests at its limit is not outside
+      row.element.classList.toggle("outside", position[i] < lower - beyond || position[i] > upper + beyond);
       if (document.activeElement !== row.slider || !this.page.deadman.held) row.slider.value = position[i];
     });
   }

@@ -59,7 +59,7 @@ export class PlotsPanel {
 
   update(status) {
     const { dispatch, loop } = status.counts;
-    this.latency.textContent = (dispatch ? `policy latency p50 ${dispatch.latency_p50_ms} ms, p99 ${dispatch.latency_p99_ms} ms, `
+    this.latency.textContent = (dispatch ? `policy latency p50 ${Math.round(dispatch.latency_p50_ms)} ms, p99 ${Math.round(dispatch.latency_p99_ms)} ms, `
       + `plan ${dispatch.plan_length}, holds ${dispatch.holds} · ` : "")
       + (loop?.ticks ? `loop late p50 ${Math.round(loop.lateness_p50_us)} µs, p99 ${Math.round(loop.lateness_p99_us)} µs` : "");
     const now = (this.page.state?.stamp ?? 0) / 1e9;

@@ -22,23 +22,24 @@ export class View {
       h("label", { for: "use-model" }, "Model"), this.model, h("label", { for: "use-mode" }, "Mode"), this.mode),
     h("div", { class: "row" }, this.look));
     form.addEventListener("submit", (event) => { event.preventDefault(); this.preview(); });
-    for (const each of [this.checkpoint, this.robot, this.model, this.mode]) each.addEventListener("change", () => this.change.replaceChildren());
+    for (const each of [this.checkpoint, this.robot, this.model, this.mode]) each.addEventListener("change", () => this.renew());
     return h("section", { class: "card", "aria-labelledby": "use-title" }, h("h3", { id: "use-title" }, "Use a trained policy"), this.none, form, this.change);
   }
 
   async show(shown, rest) {
     if (!shown) return;
     await this.load();
-    if (!rest || rest === this.shown) return;
-    this.shown = rest;
+    if (!rest || rest === this.linked) return;
+    this.linked = rest; // a policy that was just trained: its change is shown at once
     this.checkpoint.value = rest;
-    if (this.checkpoint.value && this.robot.value) this.preview();
+    this.renew();
   }
 
   async load() {
     const [found, robots] = await Promise.all([
       this.ui.attempt(() => this.ui.get("policies/list")), this.ui.attempt(() => this.ui.get("robots/list"))]);
     if (!found || !robots) return;
+    robots.sort((one, other) => (other.source === "folder") - (one.source === "folder")); // own ones first
     fill(this.checkpoint, found.map(({ path }) => path),
       found.map(({ path, changed_s: at }) => `${path} (${new Date(at * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`));
     const first = !this.robot.value;
@@ -53,15 +54,23 @@ export class View {
     return { checkpoint: this.checkpoint.value, robot: this.robot.value, model: this.model.value.trim(), mode: this.mode.value.trim() };
   }
 
+  // What was shown is of another choice.
+  renew() {
+    this.change.replaceChildren();
+    if (this.linked && this.checkpoint.value && this.robot.value) this.preview();
+  }
+
   async preview() {
     const { request } = this;
+    const chosen = () => JSON.stringify(this.request) === JSON.stringify(request);
     let found;
     try {
       found = await this.ui.get("policies/preview", request);
     } catch (error) {
-      this.change.replaceChildren(h("div", { class: "problem", role: "alert" }, error.message));
+      if (chosen()) this.change.replaceChildren(h("div", { class: "problem", role: "alert" }, error.message));
       return;
     }
+    if (!chosen()) return; // another choice meanwhile
     const write = h("button", {
       class: "primary", disabled: !this.ui.drives || found.problems.length > 0 || !found.diff.length,
       onclick: () => this.write(request, found),
