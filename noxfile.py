@@ -56,6 +56,8 @@ EXTRAS = {
     "ibrobot-plugin-zenoh": "[interop]",
 }
 """Distribution -> extras that its tests use."""
+THIRD_PARTIES = ("lerobot-robot-dummy==1.0.1", "lerobot-robot-lekiwi-pincopen==0.1.2")
+"""Packages of others that add robots to LeRobot; these run without their device, or name what they lack."""
 PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-apple-darwin")
 """Where everything must install without a compiler: PCs, robots' own computers (e.g. Jetson), and Macs."""
 # A fixed seed: the same checks give the same result; `nox -s core -- --hypothesis-seed=random` explores.
@@ -210,8 +212,12 @@ def lerobot(session: nox.Session) -> None:
     """LeRobot itself, unmodified, against what the plugins offer; the one session with torch."""
     lerobot = "lerobot[damiao,dataset,diffusion,dynamixel,evaluation,feetech,rebot,smolvla,training]>=0.6.1,<0.7"
     install(session, *PLUGINS, options=(lerobot, "onnxscript"))  # the latter exports policies
+    # Beside the environment: LeRobot imports them wherever it runs, with torch.
+    others = Path(session.create_tmp()).absolute() / "third_parties"
+    session.install("--no-deps", "--target", str(others), *THIRD_PARTIES)
     system_libraries(session)
-    session.run(*PYTEST, "-m", f"lerobot{SHORT}", *marked("lerobot"), *session.posargs)
+    folder = {"IBROBOT_THIRD_PARTIES": str(others)}
+    session.run(*PYTEST, "-m", f"lerobot{SHORT}", *marked("lerobot"), *session.posargs, env=folder)
 
 
 def check_wheels(session: nox.Session, folder: Path) -> None:
