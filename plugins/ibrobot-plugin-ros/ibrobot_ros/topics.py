@@ -7,8 +7,9 @@ from collections import Counter
 from collections.abc import Mapping
 
 from ibrobot_ros2 import decode, encode
+from ibrobot_ros2.interfaces import fields_of
 
-from ibrobot_core.api import NS_PER_S, IbrobotError, JointState
+from ibrobot_core.api import MESSAGE_TYPES, NS_PER_S, IbrobotError, JointState
 from ibrobot_core.app import Received, RunView, Subscription
 from ibrobot_ros.options import NAME, Ros2ControlOptions, RosOptions
 from ibrobot_ros.wire import Frame, Wire
@@ -46,6 +47,11 @@ def ros_name(name: str, namespace: str) -> str:
     """The name of a topic or service in ROS."""
     prefix = namespace.strip("/")
     return name if name in GLOBAL or not prefix else f"/{prefix}{name}"
+
+
+def _fields(type_name: str) -> list[str]:
+    """The fields that a type has here; none for one that only a bag defines."""
+    return fields_of(type_name) if type_name in MESSAGE_TYPES else []
 
 
 class Topics:
@@ -89,9 +95,8 @@ class Topics:
         for topic, type_name in self._options.subscribe.items():
             qos = profile(topic, type_name, self._options.qos)
             name = ros_name(topic, self._options.namespace)
-            wire.send(
-                {"op": "subscriber", "topic": name, "type": type_name, "qos": qos, "rate_hz": self._options.rate_hz}
-            )
+            head = {"op": "subscriber", "topic": name, "type": type_name, "fields": _fields(type_name), "qos": qos}
+            wire.send({**head, "rate_hz": self._options.rate_hz})
         for received in self._session.bus.latched().values():
             wire.send_all(self._frames(received, wire.backlog))
 
@@ -155,7 +160,8 @@ class Topics:
             else:
                 latched = topic in self._session.bus.latched()
                 qos = profile(topic, type_name, self._options.qos, latched=latched)
-                frames.append(({"op": "publisher", "topic": name, "type": type_name, "qos": qos}, b""))
+                head = {"op": "publisher", "topic": name, "type": type_name, "fields": _fields(type_name), "qos": qos}
+                frames.append((head, b""))
         if type_name in LARGE and not self._subscribers.get(name):
             return frames
         if backlog > BACKLOG:

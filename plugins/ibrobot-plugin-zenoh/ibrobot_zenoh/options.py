@@ -106,7 +106,8 @@ def _check_subscribed(
 
 def _check_services(instance: Any, attribute: attrs.Attribute[tuple[str, ...]], value: tuple[str, ...]) -> None:
     for service in value:
-        _check_name("name of a service", service.removesuffix("/"), tuple(each.removesuffix("/") for each in value))
+        alike = [each.removesuffix("/") for each in value if each.endswith("/") == service.endswith("/")]
+        _check_name("name of a service", service.removesuffix("/"), tuple(alike))
 
 
 @documented

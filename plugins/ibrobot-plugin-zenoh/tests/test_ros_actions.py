@@ -162,7 +162,7 @@ class Left:
 
 
 def test_services_that_take_their_time_are_actions(installed: Runs):
-    runtime, near = start(installed, "transport.share.services=[/record_episode]")
+    runtime, near = start(installed, "transport.share.services=[/record_episode, /record_episode/]")
     ended, bus = threading.Event(), runtime.session.bus
     progress = Service("/record_episode/progress", NoRequest, Left)
     cancel = Service("/record_episode/cancel", NoRequest, type(None))

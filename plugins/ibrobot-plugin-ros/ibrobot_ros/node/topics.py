@@ -11,7 +11,7 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from ibrobot_ros.node.types import find_type
+from ibrobot_ros.node.types import find_message
 from ibrobot_ros.wire import Wire
 
 BACKLOG = 16 << 20
@@ -78,7 +78,7 @@ class Topics:
             lambda: self._publishers.setdefault(
                 topic,
                 self._node.create_publisher(
-                    find_type(head["type"]), topic, profile(head["qos"]),
+                    find_message(head["type"], head.get("fields", ())), topic, profile(head["qos"]),
                     event_callbacks=PublisherEventCallbacks(matched=matched),
                 ),
             ),
@@ -104,8 +104,9 @@ class Topics:
             self._report(found.topic, "a publisher offers another QoS than this subscriber asks for; set qos")
 
         def make() -> None:
+            kind = find_message(found.type_name, head.get("fields", ()))
             self._node.create_subscription(
-                find_type(found.type_name), found.topic, take, profile(head["qos"]), raw=True,
+                kind, found.topic, take, profile(head["qos"]), raw=True,
                 event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
             )  # fmt: skip
             self._inputs.append(found)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,19 @@ def find_type(name: str) -> Any:
             check_for_type_support(found)
     except (ImportError, AttributeError) as error:
         raise LookupError(f"this ROS has no {name}: {error}") from error
+    return found
+
+
+def find_message(name: str, fields: Sequence[str]) -> Any:
+    """The class of a message type whose serialised messages are passed on as they are.
+
+    Raises:
+        LookupError: as `find_type`, or if its fields are not the run's `fields`, in their order.
+    """
+    found = find_type(name)
+    theirs = list(found.get_fields_and_field_types())
+    if fields and theirs != list(fields):
+        raise LookupError(f"{name} has other fields in this ROS: {', '.join(theirs)}")
     return found
 
 

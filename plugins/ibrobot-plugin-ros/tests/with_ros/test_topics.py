@@ -10,6 +10,7 @@ from ibrobot_ros2 import encode
 
 from ibrobot_core.api import (
     MESSAGE_TYPES,
+    Bool,
     CameraInfo,
     CompressedImage,
     DiagnosticArray,
@@ -173,3 +174,14 @@ def test_wrong_messages_are_named(start, peer, caplog, trouble):
         expected = "cannot be decoded"
     until(lambda: expected in caplog.text)
     assert not run.session.faults
+
+
+def test_a_type_with_other_fields_is_left_out(start, peer, caplog, monkeypatch):
+    """IB-Robot's `ibrobot_msgs` has a RobotStatus of its own; here, it is ours that differs."""
+    monkeypatch.setattr("ibrobot_ros.topics.fields_of", lambda name: ["data", "more"] if name.endswith("Bool") else [])
+    run = start("ros.subscribe={/lamp: std_msgs/msg/Bool}")
+    run.session.bus.publish("/light", Bool(True))
+    for topic in ("/lamp", "/light"):
+        expected = f"{topic}: not in ROS: std_msgs/msg/Bool has other fields in this ROS: data"
+        until(lambda expected=expected: expected in caplog.text)
+    assert not {"/lamp", "/light"} & set(peer.ask("topics"))
