@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import signal
 import subprocess
+import threading
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -123,6 +126,55 @@ def robot(front: Front, tls: Tls | None, says: str = "so101") -> Iterator[Remote
     finally:
         engine.close()
         network.close()
+
+
+def metric(front: Front, name: str) -> float:
+    """The value of a metric of the server."""
+    with urllib.request.urlopen(front.metrics, timeout=60) as page:
+        (value,) = re.findall(rf"^ibrobot_serve_{name}{{.*}} (\S+)$", page.read().decode(), re.MULTILINE)
+    return float(value)
+
+
+def test_a_greedy_robot_waits_in_one_place_whatever_names_it_gives(front: Front, openpi: OpenpiServer) -> None:
+    """Three requests of one certificate, by three names: the newest takes the place of the one that waits."""
+    gate = threading.Semaphore(0)
+
+    def slow(request: dict[str, Any]) -> dict[str, Any]:
+        gate.acquire()
+        return echo(request)
+
+    with contextlib.ExitStack() as stack:
+        engines = [
+            stack.enter_context(robot(front, certificates(front.lab, name), says))
+            for name, says in (("robot1", "a"), ("robot1", "b"), ("robot1", "c"), ("robot2", "d"))
+        ]
+        for engine in engines:
+            engine.start()
+        begun, openpi.answer = len(openpi.requests), slow
+        pool = stack.enter_context(ThreadPoolExecutor(4))
+        stack.callback(gate.release, 4)
+
+        def asked(number: int) -> Future[Any]:
+            state = np.full(6, number, np.float32)
+            return pool.submit(engines[number].infer, {STATE: state}, number, time.monotonic_ns() + 200_000_000_000)
+
+        def until(done: Callable[[], bool]) -> None:
+            while not done():
+                time.sleep(0.02)
+
+        first = asked(0)
+        until(lambda: len(openpi.requests) > begun)
+        second = asked(1)
+        until(lambda: metric(front, "waiting") == 1)
+        third = asked(2)
+        with pytest.raises(PolicyError, match="replaced by the newer request"):
+            second.result(120)
+        other = asked(3)
+        until(lambda: metric(front, "waiting") == 2)
+        gate.release(4)
+        for number, future in ((0, first), (2, third), (3, other)):
+            assert np.asarray(future.result(120)["action"])[0, 0] == number
+    assert [request["state"][0] for request in openpi.requests[begun:]] == [0, 2, 3]
 
 
 def test_robots_are_who_their_certificates_say_and_others_get_nothing(front: Front, openpi: OpenpiServer) -> None:
