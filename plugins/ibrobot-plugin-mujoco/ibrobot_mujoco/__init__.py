@@ -103,7 +103,7 @@ def _new() -> click.Command:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot config new`."""
-    yield Command("config new", "Write a robot YAML for the arm in a URDF.", _new)
+    yield Command("config new", "Write a robot YAML for the arm in a URDF or MJCF.", _new)
 
 
 @hookimpl

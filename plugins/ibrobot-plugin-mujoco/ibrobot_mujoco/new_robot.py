@@ -15,7 +15,8 @@ from ibrobot_core.app import (
     official_plugins,
     wrong_input,
 )
-from ibrobot_mujoco.urdf_model import UrdfModel, make_model
+from ibrobot_mujoco.mjcf_model import complete_model
+from ibrobot_mujoco.urdf_model import RobotModel, make_model
 
 
 @click.command("new")
@@ -25,8 +26,15 @@ from ibrobot_mujoco.urdf_model import UrdfModel, make_model
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="URDF or xacro file of the arm.",
 )
+@click.option(
+    "--mjcf",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="Instead of a URDF: an MJCF of the arm, whose drives stay.",
+)
 @click.option("--lerobot", metavar="ROBOT", help="Instead of a URDF: a robot of LeRobot's, e.g. koch_follower.")
-@click.option("--tip", metavar="LINK", help="Link whose frame is the tool's.  [default: found by its name]")
+@click.option(
+    "--tip", metavar="LINK", help="Link, body or site whose frame is the tool's.  [default: found by its name]"
+)
 @click.option(
     "--package",
     "packages",
@@ -36,20 +44,21 @@ from ibrobot_mujoco.urdf_model import UrdfModel, make_model
 )
 @click.pass_context
 def new(
-    context: click.Context, out: Path, urdf: Path | None, lerobot: str | None, tip: str | None,
+    context: click.Context, out: Path, urdf: Path | None, mjcf: Path | None, lerobot: str | None, tip: str | None,
     packages: tuple[str, ...],
 ) -> None:  # fmt: skip
-    """Write a robot YAML for an arm in a URDF, or of LeRobot's.
+    """Write a robot YAML for an arm in a URDF or an MJCF, or of LeRobot's.
 
     OUT is a new file, e.g. arm.yaml. Beside it, the folder arm_model holds an MJCF and the meshes. The YAML states
     every value that was guessed.
     """
-    if (urdf is None) == (lerobot is None):
-        raise click.UsageError("give one of --urdf and --lerobot")
+    if sum(each is not None for each in (urdf, mjcf, lerobot)) != 1:
+        raise click.UsageError("give one of --urdf, --mjcf and --lerobot")
     if lerobot is not None:
         context.invoke(_command_of_lerobot(), out=out, robot=lerobot, id_=None)
         return
-    assert urdf is not None
+    source = urdf or mjcf
+    assert source is not None
     folders = {}
     for each in packages:
         name, equals, place = each.partition("=")
@@ -60,15 +69,15 @@ def new(
         folders[name] = Path(place)
     folder = out.with_name(f"{out.stem}_model")
     try:
-        urdf.read_bytes()
+        source.read_bytes()
     except OSError as error:
-        raise click.FileError(str(urdf), hint=error.strerror) from error
+        raise click.FileError(str(source), hint=error.strerror) from error
     with wrong_input():
         for path in (out, folder):
             if path.exists():
                 raise HardwareError(f"{path} exists already, and is not overwritten")
-        model = make_model(urdf, folder, folders, tip)
-    out.write_text(robot_yaml(model, urdf, folder.name), encoding="utf-8")
+        model = make_model(urdf, folder, folders, tip) if urdf else complete_model(source, folder, tip)
+    out.write_text(robot_yaml(model, source, folder.name), encoding="utf-8")
     load_config(out, sim=True)
     arm = [joint.name for joint in model.joints if not joint.gripper]
     echo(f"{out}: {model.name}, {len(arm)} joints{' and a gripper' if len(arm) < len(model.joints) else ''}")
@@ -88,12 +97,12 @@ def _command_of_lerobot() -> click.Command:
     return commands.commands["new"]
 
 
-def robot_yaml(model: UrdfModel, urdf: Path, folder: str) -> str:
+def robot_yaml(model: RobotModel, source: Path, folder: str) -> str:
     """The robot YAML of a model.
 
     Args:
         model: the model.
-        urdf: the file that it was made from.
+        source: the file that it was made from.
         folder: name of the folder with the model, beside the YAML.
     """
     arm = [joint.name for joint in model.joints if not joint.gripper]
@@ -117,8 +126,8 @@ def robot_yaml(model: UrdfModel, urdf: Path, folder: str) -> str:
         executors.append("gripper_action: {type: gripper, group: gripper}")
     lines = "\n".join(f"  {each}" for each in executors)
     return f"""\
-# {model.name}, made by `ibrobot config new` from {urdf.name}. Units are SI: radians, metres, seconds.
-# What the URDF does not say is a guess:
+# {model.name}, made by `ibrobot config new` from {source.name}. Units are SI: radians, metres, seconds.
+# What that file does not say is a guess:
 {notes}
 # A real arm needs a section `hardware` with a plugin for it.
 robot:
@@ -128,7 +137,7 @@ robot:
   groups: {groups}
   description:
     mjcf: {folder}/model.xml
-    tip: tip
+    tip: {model.tip}
     poses:
       home: [{", ".join(f"{value:g}" for value in model.home)}]
 

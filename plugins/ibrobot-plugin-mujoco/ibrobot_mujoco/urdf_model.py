@@ -29,14 +29,14 @@ _FREQUENCY_HZ = 8.0
 _ARMATURE = 1e-3
 """Guessed inertia of a drive, for each N m (or N) of its effort [kg m^2, kg]."""
 _LEAST_ARMATURE = 5e-3
-_EFFORT, _VELOCITY = 20.0, 1.0
+EFFORT, VELOCITY = 20.0, 1.0
 """Effort and velocity of joints without them in the URDF [N m or N; rad/s or m/s]."""
-_TURN_RAD = 2 * math.pi
+TURN_RAD = 2 * math.pi
 _DRAWS = 300
 _OFTEN = 0.95
 """Two bodies that touch in a larger fraction of random poses always touch: their meshes overlap."""
-_FINGER = re.compile(r"finger|gripper|knuckle|jaw|claw", re.IGNORECASE)
-_TIP = re.compile(r"tcp|tool|tip|grasp|ee_|_ee|hand", re.IGNORECASE)
+FINGER = re.compile(r"finger|gripper|knuckle|jaw|claw", re.IGNORECASE)
+TIP = re.compile(r"tcp|tool|tip|grasp|ee_|_ee|hand", re.IGNORECASE)
 
 
 @attrs.frozen
@@ -53,8 +53,8 @@ class DrivenJoint:
 
 
 @attrs.frozen
-class UrdfModel:
-    """A model made from a URDF."""
+class RobotModel:
+    """A model made from a URDF or an MJCF."""
 
     mjcf: Path
     name: str
@@ -63,9 +63,11 @@ class UrdfModel:
     """A pose without contacts [rad or m], in the order of the joints."""
     notes: tuple[str, ...]
     """The guesses, one sentence each."""
+    tip: str = "tip"
+    """The site of the tool."""
 
 
-def make_model(urdf: Path, folder: Path, packages: Mapping[str, Path], tip: str | None = None) -> UrdfModel:
+def make_model(urdf: Path, folder: Path, packages: Mapping[str, Path], tip: str | None = None) -> RobotModel:
     """Write `folder/model.xml` and the meshes that it needs.
 
     Args:
@@ -87,13 +89,13 @@ def make_model(urdf: Path, folder: Path, packages: Mapping[str, Path], tip: str 
         spec = _load(root, folder)
         joints = _drive(spec, root, notes)
         _set_tip(spec, root, links, joints, tip, notes)
-        home = _settle(spec, joints, notes)
+        home = settle(spec, joints, notes)
         mjcf = folder / "model.xml"
         mjcf.write_text(spec.to_xml(), encoding="utf-8")
     except BaseException:
         shutil.rmtree(folder)
         raise
-    return UrdfModel(mjcf, name, joints, home, tuple(notes))
+    return RobotModel(mjcf, name, joints, home, tuple(notes))
 
 
 def _parse(urdf: Path) -> Element:
@@ -211,7 +213,7 @@ def _drive(spec: mujoco.MjSpec, root: Element, notes: list[str]) -> tuple[Driven
         velocity = float(limit.get("velocity", 0)) if limit is not None else 0.0
         if not effort or not velocity:
             unknown.append(joint.name)
-        effort, velocity = effort or _EFFORT, velocity or _VELOCITY
+        effort, velocity = effort or EFFORT, velocity or VELOCITY
         armature = max(_LEAST_ARMATURE, _ARMATURE * effort)
         joint.armature = armature
         if mimic is not None:
@@ -224,21 +226,21 @@ def _drive(spec: mujoco.MjSpec, root: Element, notes: list[str]) -> tuple[Driven
             followers.append(joint.name)
             continue
         if element.get("type") == "continuous":
-            joint.limited, joint.range = True, [-_TURN_RAD, _TURN_RAD]
+            joint.limited, joint.range = True, [-TURN_RAD, TURN_RAD]
             turning.append(joint.name)
         efforts[joint.name] = effort
         lower, upper = map(float, joint.range)
-        gripper = bool(_FINGER.search(joint.name)) or joint.type == mujoco.mjtJoint.mjJNT_SLIDE
+        gripper = bool(FINGER.search(joint.name)) or joint.type == mujoco.mjtJoint.mjJNT_SLIDE
         # From full speed, a joint brakes to a stand within 75 ms, so that every stop takes less than 100 ms.
         joints.append(DrivenJoint(joint.name, lower, upper, velocity, round(velocity / 0.075, 1), gripper))
     if not any(not each.gripper for each in joints):
         raise HardwareError("the URDF has no joint that moves an arm")
-    _add_servos(spec, joints, efforts)
+    add_servos(spec, joints, efforts)
     notes.append(f"Each drive is a position servo of {_FREQUENCY_HZ:g} Hz, critically damped, with the URDF's effort.")
     notes.append("max_acceleration is such that each joint brakes from its full speed within 75 ms.")
     if unknown:
         notes.append(
-            f"The URDF states no effort or no speed for {', '.join(unknown)}: {_EFFORT:g} N m and {_VELOCITY:g} rad/s."
+            f"The URDF states no effort or no speed for {', '.join(unknown)}: {EFFORT:g} N m and {VELOCITY:g} rad/s."
         )
     if turning:
         notes.append(f"Without end in the URDF, here one turn to each side: {', '.join(turning)}.")
@@ -247,7 +249,7 @@ def _drive(spec: mujoco.MjSpec, root: Element, notes: list[str]) -> tuple[Driven
     return tuple(joints)
 
 
-def _add_servos(spec: mujoco.MjSpec, joints: list[DrivenJoint], efforts: Mapping[str, float]) -> None:
+def add_servos(spec: mujoco.MjSpec, joints: list[DrivenJoint], efforts: Mapping[str, float]) -> None:
     """Position servos whose gains fit the largest inertia that each moves in some poses."""
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -283,7 +285,7 @@ def _set_tip(
         grips = {each.name for each in joints if each.gripper}
         last = [each.name for each in joints if not each.gripper][-1]
         arm = [link for link in names if _comes_after(link, last, links, grips)]
-        tip = next((link for link in reversed(arm) if _TIP.search(link)), arm[-1])
+        tip = next((link for link in reversed(arm) if TIP.search(link)), arm[-1])
         notes.append(f"The tool is the frame of the link {tip}; --tip LINK sets another one.")
     elif tip not in names:
         raise HardwareError(f"the URDF has no link {tip!r}; it has: {', '.join(names)}")
@@ -302,7 +304,7 @@ def _comes_after(link: str, joint: str, links: Mapping[str, Element], grips: set
     return False
 
 
-def _settle(spec: mujoco.MjSpec, joints: tuple[DrivenJoint, ...], notes: list[str]) -> tuple[float, ...]:
+def settle(spec: mujoco.MjSpec, joints: tuple[DrivenJoint, ...], notes: list[str]) -> tuple[float, ...]:
     """Exclude contacts of bodies that always touch; returns a pose without contacts."""
     model = spec.compile()
     data = mujoco.MjData(model)

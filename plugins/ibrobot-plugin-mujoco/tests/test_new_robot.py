@@ -117,3 +117,43 @@ def test_nothing_is_overwritten(small: Path, tmp_path: Path) -> None:
     (tmp_path / "arm.yaml").write_text("mine")
     assert "exists already" in new(tmp_path / "arm.yaml", "--urdf", small).stderr
     assert (tmp_path / "arm.yaml").read_text() == "mine"
+
+
+TWO = """<mujoco model="two"><worldbody><body name="base"><geom type="box" size=".05 .05 .05"/>
+<body name="upper" pos="0 0 .1"><joint name="lift" axis="0 1 0"/>
+<geom type="capsule" size=".02" fromto="0 0 .05 0 0 .3"/>
+<body name="hand" pos="0 0 .35"><joint name="bend" axis="0 1 0" range="-90 90" limited="true"/>
+<geom type="capsule" size=".02" fromto="0 0 .05 0 0 .2"/></body></body></body></worldbody></mujoco>"""
+
+
+def test_mjcf_without_drives_gets_them(tmp_path: Path) -> None:
+    (tmp_path / "two.xml").write_text(TWO)
+    done = new(tmp_path / "arm.yaml", "--mjcf", tmp_path / "two.xml")
+    assert done.returncode == 0, done.stderr
+    assert "8 Hz and 20 N m, which hold the arm's weight (gravcomp), drive lift, bend." in done.stdout
+    robot = load_config(tmp_path / "arm.yaml", sim=True).robot
+    assert [round(joint.upper, 3) for joint in robot.joints] == [6.283, 1.571]
+    model = mujoco.MjModel.from_xml_path(str(robot.description.mjcf))
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.5
+    mujoco.mj_step(model, data, 1000)
+    assert np.abs(data.qpos - 0.5).max() < 2e-3
+
+
+def test_mjcf_keeps_its_drives_and_meshes(tmp_path: Path) -> None:
+    source = files("so101_nexus") or ()
+    mjcf = next(each for each in source if each.parts[-2:] == ("SO101_menagerie", "so101.xml")).locate()
+    done = new(tmp_path / "arm.yaml", "--mjcf", mjcf)
+    assert done.returncode == 0, done.stderr
+    robot = load_config(tmp_path / "arm.yaml", sim=True).robot
+    assert robot.description.tip == "gripperframe"
+    before = mujoco.MjModel.from_xml_path(str(mjcf))
+    model = mujoco.MjModel.from_xml_path(str(robot.description.mjcf))
+    assert np.array_equal(model.actuator_gainprm, before.actuator_gainprm)
+
+
+def test_mjcf_without_an_arm_leaves_nothing_behind(tmp_path: Path) -> None:
+    path = tmp_path / "none.xml"
+    path.write_text("<mujoco><worldbody><body name='base'><geom size='1'/></body></worldbody></mujoco>")
+    assert "no joint that moves an arm" in new(tmp_path / "arm.yaml", "--mjcf", path).stderr
+    assert list(tmp_path.iterdir()) == [path]
