@@ -91,7 +91,9 @@ def make(folder: Path) -> Path:
     python = folder / "bin" / "python"
     if not (folder / _DONE).exists():
         subprocess.run(["uv", "venv", "--quiet", "--clear", "--python", "3.12", str(folder)], check=True)
-        subprocess.run(["uv", "pip", "install", "--quiet", "--python", str(python), *WHEELS, *TOOLS], check=True)
+        # Copies: `_mend` writes into files that would otherwise be those of uv's cache.
+        install = ["uv", "pip", "install", "--quiet", "--link-mode", "copy", "--python", str(python)]
+        subprocess.run([*install, *WHEELS, *TOOLS], check=True)
         _mend(folder, python)
         (folder / _DONE).touch()
     for name in PACKAGES:
