@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
-
-import numpy as np
 
 from ibrobot_core.units import NS_PER_S
 
@@ -36,8 +35,12 @@ class LatencyEstimate:
     def quantile_ns(self, share: float) -> int:
         """The quantile `share` (0..1) of the latencies [ns], interpolated; 0 before the first answer."""
         ordered = self._ordered
-        last = len(ordered) - 1
-        return round(float(np.interp(share * last, range(len(ordered)), ordered))) if ordered else 0
+        if not ordered:
+            return 0
+        place = share * (len(ordered) - 1)
+        low = math.floor(place)
+        high = min(low + 1, len(ordered) - 1)
+        return ordered[low] + round((place - low) * (ordered[high] - ordered[low]))
 
     @property
     def upper_ns(self) -> int:

@@ -75,8 +75,8 @@ class TemporalSmoother:
         self._now_ns: int | None = None
         self._held: Vector | None = None if held is None else held[None]
         self._ended_ns: int | None = None
-        self._led_until_ns = 0
-        """The time of the last action that `lead_in` changed [ns]."""
+        self._led_until_ns = -1
+        """The time of the last action that `lead_in` changed [ns]; before any other without one."""
 
     def plan(self) -> tuple[int, Vector]:
         """The time of the first action [ns] and the actions, shape (M, A), read-only; `(0, empty)` without a plan."""

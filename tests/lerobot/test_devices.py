@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib import invalidate_caches
 from pathlib import Path
 
@@ -99,14 +99,19 @@ def clock() -> SteppedClock:
 def emulator(clock: SteppedClock) -> Iterator[Emulator]:
     """An arm at the middle of its ranges, with its calibration."""
     with Emulator(clock=clock) as served:
-        with served.lock:
-            for joint in CALIBRATION.values():
-                servo = served.servos[joint.id]
-                servo.set("homing_offset", joint.homing_offset)
-                servo.set("min_position_limit", joint.range_min)
-                servo.set("max_position_limit", joint.range_max)
-                servo.turn(joint.range_middle + joint.homing_offset)
+        calibrate(served, CALIBRATION)
         yield served
+
+
+def calibrate(emulator: Emulator, calibration: Mapping[str, JointCalibration]) -> None:
+    """Write a calibration into the servos, and turn them to the middle of their ranges."""
+    with emulator.lock:
+        for joint in calibration.values():
+            servo = emulator.servos[joint.id]
+            servo.set("homing_offset", joint.homing_offset)
+            servo.set("min_position_limit", joint.range_min)
+            servo.set("max_position_limit", joint.range_max)
+            servo.turn(joint.range_middle + joint.homing_offset)
 
 
 @pytest.fixture
@@ -184,12 +189,7 @@ def test_lekiwi_drives_and_measures_its_way(clock: SteppedClock, tmp_path: Path)
     arm = make_robot().joints
     robot = Robot("kiwi", (*arm, *axes))
     with Emulator(9, clock=clock) as emulator:
-        for joint in calibration.values():
-            servo = emulator.servos[joint.id]
-            servo.set("homing_offset", joint.homing_offset)
-            servo.set("min_position_limit", joint.range_min)
-            servo.set("max_position_limit", joint.range_max)
-            servo.turn(joint.range_middle + joint.homing_offset)
+        calibrate(emulator, calibration)
         config = {"port": emulator.port, "id": "kiwi", "calibration_dir": str(tmp_path), "cameras": {}}
         names = {f"arm_{name}": name for name in JOINTS}
         kiwi = LeRobotHardware(

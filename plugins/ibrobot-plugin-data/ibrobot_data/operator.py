@@ -46,7 +46,7 @@ class Operator(RunHooks):
     ) -> None:  # fmt: skip
         if service.by_mode and continuous:
             raise NotSupported(f"--continuous: mode {run.mode} begins and ends its episodes itself")
-        if not (service.by_mode or auto or continuous or keys or _has_start_button(run)):
+        if not (service.by_mode or auto or continuous or keys or _can_begin(run)):
             raise NotSupported(
                 f"nothing can begin an episode: there is no terminal for keys, no device of mode {run.mode} has a "
                 f"button `start`, and no other program may call {START.name}; add --auto"
@@ -285,7 +285,7 @@ class Operator(RunHooks):
         self._not_before_s = self._clock_s() + self._reset_time_s
 
 
-def _has_start_button(run: RunAccess) -> bool:
+def _can_begin(run: RunAccess) -> bool:
     """Whether the viewer, a teleoperation device of the mode, or another program can begin episodes."""
     if (viewer := run.config.viewer) is not None:
         shown_by = run.registry.find("viewer", viewer.type)

@@ -104,9 +104,10 @@ class LeRobotHardware(Hardware):
             return self._newest
         if self._link.blocked_s > self._options.blocked:
             try:
-                raise self._fail(self._link.blockage("get_observation"))
+                why: object = self._link.blockage("get_observation")
             except DeviceProblem as problem:
-                raise self._fail(problem) from None
+                why = problem
+            raise self._fail(why)
         newest = self._newest
         if newest is None:
             now_ns, size = self._ctx.clock.now_ns(), len(self.joints)

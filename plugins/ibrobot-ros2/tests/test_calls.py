@@ -61,7 +61,7 @@ class Client:
 
 
 class Robot:
-    """A run whose task lasts until it is told to end."""
+    """A run with a task that ends only on request."""
 
     def __init__(self) -> None:
         self.session = make_session()
