@@ -256,10 +256,10 @@ def test_an_episode_is_converted_and_its_dataset_shown_and_played(tmp_path: Path
             ["pan.pos", "tilt.pos"],
         )
         assert feature["stats"]["max"] == pytest.approx([1.0, 2.0], abs=0.1)
-        facts = await server.get("datasets/open", path="datasets/pick:0")
+        facts = await server.get("episodes/open", path="datasets/pick:0")
         assert facts["motion"]["positions"][-1] == pytest.approx([1.0, 2.0], abs=0.1)
         with pytest.raises(RuntimeError, match="has no episode 7"):
-            await server.get("datasets/open", path="datasets/pick:7")
+            await server.get("episodes/open", path="datasets/pick:7")
         with pytest.raises(RuntimeError, match="outside the opened folders"):
             await server.get("datasets/info", path="..")
         server.ui.view_state["recordings"].forget()

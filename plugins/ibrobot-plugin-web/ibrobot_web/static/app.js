@@ -1,9 +1,9 @@
 // The page of a run: header, faults, pictures, recording, driving, and panels that fold away.
 
-import { h, refresh, say, toast } from "./dom.js";
+import { h, refresh, say, switchTheme, toast } from "./dom.js";
 import { Deadman } from "./hold.js";
 import { Drive, StopLine, Stream } from "./link.js";
-import { View3D, isDark } from "./view3d.js";
+import { View3D } from "./view3d.js";
 import { Dock } from "./dock.js";
 import { Joints } from "./joints.js";
 import { Modes } from "./modes.js";
@@ -48,15 +48,6 @@ const page = {
       return false;
     }
   },
-};
-// Asks in a dialog; resolves with whether it was confirmed.
-page.confirm = (title, text, yes, danger = true, no = "Cancel") => {
-  const dialog = $("dialog");
-  dialog.replaceChildren(h("h2", { id: "dialog-title" }, title), h("p", {}, text), h("form", { method: "dialog", class: "row" },
-    h("button", { class: danger ? "danger" : "primary", value: "yes" }, yes), h("button", { value: "no", autofocus: true }, no)));
-  dialog.returnValue = "no";
-  dialog.showModal();
-  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
 };
 page.deadman = new Deadman(page.drive);
 window.ibrobot = page; // for tests and for the console
@@ -120,11 +111,7 @@ $("operate").addEventListener("click", () => {
   if (page.operating) page.command("resign");
   else page.command("operate", { take_over: true });
 });
-$("theme").addEventListener("click", () => {
-  const theme = isDark() ? "light" : "dark";
-  document.documentElement.dataset.theme = theme;
-  localStorage.setItem("theme", theme);
-});
+$("theme").addEventListener("click", switchTheme);
 // Keys of recording and of pictures, unless something is typed or asked.
 window.addEventListener("keydown", (event) => {
   if (event.repeat || event.ctrlKey || event.altKey || event.metaKey || event.defaultPrevented) return;

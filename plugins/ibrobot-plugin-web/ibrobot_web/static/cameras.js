@@ -1,6 +1,6 @@
 // Camera pictures, each drawn when it arrives. Cameras that are not shown are not sent.
 
-import { h, say } from "./dom.js";
+import { h, paint, say } from "./dom.js";
 
 export class Cameras {
   // `changed` is called when there are other cameras.
@@ -34,7 +34,7 @@ export class Cameras {
     const canvas = h("canvas", { width: "4", height: "3", role: "img", "aria-label": `Camera ${name}` });
     const caption = h("span", {}, `${name}: waiting for its first picture …`), age = h("span", { class: "rate" });
     const element = h("figure", { class: "picture", "data-name": name }, canvas, h("figcaption", {}, caption, age));
-    this.views.set(channel, { canvas, caption, age, element, context: canvas.getContext("2d"), name, rate: "" });
+    this.views.set(channel, { canvas, caption, age, element, name, rate: "" });
     this.page.stream.show(channel, true);
     return element;
   }
@@ -43,12 +43,7 @@ export class Cameras {
     const view = this.views.get(channel);
     if (!view) return;
     if (!bitmap) { say(view.caption, `${view.name}: damaged picture`); return; }
-    if (view.canvas.width !== bitmap.width || view.canvas.height !== bitmap.height) {
-      view.canvas.width = bitmap.width;
-      view.canvas.height = bitmap.height;
-    }
-    view.context.drawImage(bitmap, 0, 0);
-    bitmap.close();
+    paint(view.canvas, bitmap);
     const age = Date.now() - stamp;
     const counted = this.frames[view.name] ??= { count: 0, ages: [] };
     counted.count += 1;

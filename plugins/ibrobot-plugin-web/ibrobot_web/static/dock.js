@@ -1,6 +1,6 @@
 // Panels that fold away: plots, health, log; and what ends the run.
 
-import { h, refresh } from "./dom.js";
+import { confirm, h, refresh } from "./dom.js";
 
 const KEY = "panel";
 
@@ -53,7 +53,7 @@ export class Dock {
   }
 
   async end() {
-    const { page } = this;
-    if (await page.confirm("End the run?", "The robot stops as its YAML says. This page then shows nothing new.", "End the run", true, "Keep it running")) page.command("finish");
+    const text = "The robot stops as its YAML says. This page then shows nothing new.";
+    if (await confirm("End the run?", text, "End the run", { no: "Keep it running" })) this.page.command("finish");
   }
 }

@@ -25,6 +25,62 @@ export function refresh(element, description, make) {
   element.replaceChildren(...[make()].flat());
 }
 
+// A table: the names of its columns, and its rows.
+export function table(columns, rows, caption = null) {
+  return h("table", {}, caption && h("caption", {}, caption),
+    columns && h("thead", {}, h("tr", {}, columns.map((name) => h("th", { scope: "col" }, name)))), h("tbody", {}, rows));
+}
+
+// A row of a table: texts, elements, or cells; the first one names the row.
+export function row(cells, properties = {}) {
+  return h("tr", properties, cells.map((cell, i) => {
+    if (cell instanceof HTMLTableCellElement) return cell;
+    return i ? h("td", {}, cell) : h("th", { scope: "row" }, cell);
+  }));
+}
+
+// A part that scrolls, by keys too.
+export function scroll(label, ...content) {
+  return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": label }, ...content);
+}
+
+export function problem(text) { return h("div", { class: "problem", role: "alert" }, text); }
+
+export function capital(text) { return text.charAt(0).toUpperCase() + text.slice(1); }
+
+// A time since 1970 [s] as date and time of day.
+export function when(seconds) { return new Date(seconds * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" }); }
+
+// Draws a bitmap on a canvas, which takes its size; returns whether that changed.
+export function paint(canvas, bitmap) {
+  const resized = canvas.width !== bitmap.width || canvas.height !== bitmap.height;
+  if (resized) Object.assign(canvas, { width: bitmap.width, height: bitmap.height });
+  canvas.getContext("2d").drawImage(bitmap, 0, 0);
+  bitmap.close();
+  return resized;
+}
+
+// A question in the page's dialog; resolves with whether it was confirmed.
+export function confirm(title, text, yes, { danger = true, no = "Cancel" } = {}) {
+  const dialog = document.getElementById("dialog");
+  dialog.replaceChildren(h("h2", { id: "dialog-title" }, title), h("p", {}, text), h("form", { method: "dialog", class: "row" },
+    h("button", { class: danger ? "danger" : "primary", value: "yes" }, yes), h("button", { value: "no", autofocus: true }, no)));
+  dialog.returnValue = "no";
+  dialog.showModal();
+  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
+}
+
+export function isDark() {
+  const { theme } = document.documentElement.dataset;
+  return theme ? theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+}
+
+export function switchTheme() {
+  const theme = isDark() ? "light" : "dark";
+  document.documentElement.dataset.theme = theme;
+  localStorage.setItem("theme", theme);
+}
+
 let announced;
 // Removes all messages, e.g. when another view is shown.
 export function clearToasts() { announced?.replaceChildren(); }

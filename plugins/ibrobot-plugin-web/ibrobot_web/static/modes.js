@@ -1,6 +1,6 @@
 // The choice of the mode: each by what it does, and why it cannot be chosen where it cannot.
 
-import { h, refresh } from "./dom.js";
+import { capital, confirm, h, refresh } from "./dom.js";
 
 export class Modes {
   constructor(section, page) {
@@ -24,10 +24,8 @@ export class Modes {
   async choose(mode) {
     this.element.open = false;
     const { page } = this;
-    if (mode.policy && !await page.confirm(`${capital(mode.label)}?`,
-      "The robot moves by itself as soon as it is in this mode, until you stop it or change the mode.", "Let it move", false)) return;
+    if (mode.policy && !await confirm(`${capital(mode.label)}?`,
+      "The robot moves by itself as soon as it is in this mode, until you stop it or change the mode.", "Let it move", { danger: false })) return;
     page.command("mode", { mode: mode.name }, mode.label);
   }
 }
-
-export function capital(text) { return text.charAt(0).toUpperCase() + text.slice(1); }

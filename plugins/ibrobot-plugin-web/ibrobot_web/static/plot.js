@@ -1,12 +1,13 @@
 // Draws lines over time on a canvas.
 
+import { h } from "./dom.js";
+
 export const COLORS = ["#1478c8", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#0e7490", "#be185d", "#4b5563"];
 const LEFT = 56, BOTTOM = 22, TOP = 8;
 
 // `lines`: [[name, values], …], with null where a value is missing. `begin` and `end`: the span of the time axis, whose
-// ends are labelled with `labels`. `marks`: times of vertical lines; `cursor`: the time of a thick one. `shade`: spans
-// of time that are drawn grey.
-export function drawPlot(canvas, { times, lines, begin, end, labels, cursor = null, marks = [], shade = [] }) {
+// ends are labelled with `labels`. `cursor`: the time of a vertical line. `shade`: spans of time that are drawn grey.
+export function drawPlot(canvas, { times, lines, begin, end, labels, cursor = null, shade = [] }) {
   const box = canvas.getBoundingClientRect();
   if (box.width < 2) return;
   const ratio = window.devicePixelRatio;
@@ -40,7 +41,6 @@ export function drawPlot(canvas, { times, lines, begin, end, labels, cursor = nu
   context.globalAlpha = 0.15;
   for (const [from, to] of shade) context.fillRect(x(from), TOP, x(to) - x(from), height);
   context.globalAlpha = 1;
-  for (const mark of marks) context.strokeRect(x(mark), TOP, 0, height);
   context.lineWidth = 1.5;
   context.save();
   context.beginPath();
@@ -65,6 +65,15 @@ export function drawPlot(canvas, { times, lines, begin, end, labels, cursor = nu
   }
 }
 
+// The names of lines in their colours, for a legend.
+export function legendOf(lines) {
+  return lines.map(([name], i) => {
+    const mark = h("i", {});
+    mark.style.background = COLORS[i];
+    return h("span", {}, mark, shortOf(name));
+  });
+}
+
 // The time under a pointer on a plot, between begin and end.
 export function timeAt(canvas, event, begin, end) {
   const box = canvas.getBoundingClientRect();
@@ -78,4 +87,4 @@ export function kindOf(name) {
 }
 
 // The name of a value among those of its kind: shoulder_pan of position.shoulder_pan.
-export function shortOf(name) { return name.startsWith(`${kindOf(name)}.`) ? name.slice(kindOf(name).length + 1) : name; }
+function shortOf(name) { return name.startsWith(`${kindOf(name)}.`) ? name.slice(kindOf(name).length + 1) : name; }

@@ -1,6 +1,6 @@
 // The page without a running robot: header, navigation, and one view at a time.
 
-import { clearToasts, h, refresh, say, toast } from "./dom.js";
+import { clearToasts, h, refresh, say, switchTheme, toast } from "./dom.js";
 
 const $ = (id) => document.getElementById(id);
 
@@ -60,20 +60,6 @@ class Ui extends EventTarget {
   // The address of a run's page, with the address of this one, to which its end leads back.
   runAddress(url) { return `${url}#${new URLSearchParams({ home: location.origin })}`; }
 
-  // The jobs of a kind, newest first.
-  of(...kinds) { return [...this.jobs.values()].filter(({ kind }) => kinds.includes(kind)).reverse(); }
-
-  // A question in a dialog; resolves with whether it was confirmed.
-  confirm(title, text, confirm, danger = true) {
-    const dialog = $("dialog");
-    dialog.replaceChildren(h("h2", { id: "dialog-title" }, title), h("p", {}, text),
-      h("form", { method: "dialog", class: "row" },
-        h("button", { class: danger ? "danger" : "primary", value: "yes" }, confirm), h("button", { value: "no", autofocus: true }, "Cancel")));
-    dialog.returnValue = "no";
-    dialog.showModal();
-    return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
-  }
-
   follow() {
     const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/jobs`);
     socket.onopen = () => {
@@ -94,15 +80,15 @@ class Ui extends EventTarget {
       shown?.job?.(job);
     };
   }
-}
 
-// What the page shows is old from now on, and is hidden; a server that was started again has another address.
-Ui.prototype.lose = async function lose() {
-  this.connected = false;
-  showConnection();
-  const known = await fetch("/api/session").then(({ status }) => status !== 401, () => true);
-  if (!known) showConnection("this page belongs to a server that has ended: open the address that the new one shows");
-};
+  // What the page shows is old from now on, and is hidden; a server that was started again has another address.
+  async lose() {
+    this.connected = false;
+    showConnection();
+    const known = await fetch("/api/session").then(({ status }) => status !== 401, () => true);
+    if (!known) showConnection("this page belongs to a server that has ended: open the address that the new one shows");
+  }
+}
 
 async function ask(address, options) {
   let response;
@@ -171,12 +157,7 @@ function showRunning() {
     : h("a", { class: "chip good", href: "#jobs" }, job.title))));
 }
 
-$("theme").addEventListener("click", () => {
-  const dark = document.documentElement.dataset.theme
-    ? document.documentElement.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
-  document.documentElement.dataset.theme = dark ? "light" : "dark";
-  localStorage.setItem("theme", dark ? "light" : "dark");
-});
+$("theme").addEventListener("click", switchTheme);
 window.addEventListener("hashchange", () => { showView(); $("main").focus(); });
 window.addEventListener("focus", () => shown?.show?.(true, address()[1]));
 ui.session = await ui.get("session");

@@ -1,7 +1,7 @@
 // The 3D view: the main thread's side. Drawing happens in a worker, so that a slow graphics card delays neither the
 // deadman nor the stop.
 
-import { h } from "./dom.js";
+import { h, isDark } from "./dom.js";
 
 const STEP = 0.1;
 
@@ -115,9 +115,4 @@ export class View3D {
       event.preventDefault();
     });
   }
-}
-
-export function isDark() {
-  const { theme } = document.documentElement.dataset;
-  return theme ? theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
 }

@@ -7,7 +7,6 @@ from typing import Any
 import attrs
 
 from ibrobot_core.app import NoRequest
-from ibrobot_web.ui import episodes
 from ibrobot_web.ui.context import NamesPath, Route, Ui
 from ibrobot_web.ui.forms import run_command
 from ibrobot_web.ui.recordings import find_recordings
@@ -27,5 +26,4 @@ def info(ui: Ui, request: NamesPath) -> dict[str, Any]:
 ROUTES: dict[str, Route[Any]] = {
     "GET /list": Route(listing, NoRequest),
     "GET /info": Route(info, NamesPath),
-    **{f"GET /{name}": episodes.ROUTES[f"GET /{name}"] for name in ("open", "series", "picture", "scene", "objects")},
 }

@@ -9,7 +9,6 @@ import attrs
 
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import Case, Cases, Plots, ReportDescriptor, ReportSection, Table, Text, installed_plugins
-from ibrobot_web.ui import episodes
 from ibrobot_web.ui.context import File, NamesPath, Route, Ui
 from ibrobot_web.ui.recordings import find_recordings
 
@@ -103,5 +102,4 @@ ROUTES: dict[str, Route[Any]] = {
     "GET /list": Route(listing, NamesKind),
     "GET /show": Route(show, NamesReport),
     "GET /video": Route(video, NamesPath),
-    **{f"GET /{name}": episodes.ROUTES[f"GET /{name}"] for name in ("open", "series", "picture", "scene", "objects")},
 }

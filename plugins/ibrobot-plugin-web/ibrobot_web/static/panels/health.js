@@ -1,6 +1,6 @@
 // Rates, counters, temperatures and voltages: all groups of /diagnostics, and the panels of plugins.
 
-import { h, refresh } from "../dom.js";
+import { h, refresh, row, table } from "../dom.js";
 
 export class HealthPanel {
   id = "health";
@@ -21,19 +21,14 @@ export class HealthPanel {
     if (!this.shown) return;
     const recorded = episode ? [episode.rates_hz, episode.silent, episode.lost] : null;
     refresh(this.topics, recorded, () => (recorded ? [topics(episode)] : []));
-    refresh(this.panels, panels ?? [], () => (panels ?? []).map(({ title, columns, rows }) => h("table", {}, h("caption", {}, title),
-      h("thead", {}, h("tr", {}, columns.map((name) => h("th", { scope: "col" }, name)))),
-      h("tbody", {}, rows.map((row) => h("tr", {}, row.map((cell, i) => (i ? h("td", {}, cell) : h("th", { scope: "row" }, cell)))))))));
+    refresh(this.panels, panels, () => panels.map(({ title, columns, rows }) => table(columns, rows.map((cells) => row(cells)), title)));
     const groups = Object.entries(counts).filter(([, values]) => Object.keys(values).length);
-    refresh(this.groups, groups, () => groups.map(([group, values]) => h("table", {}, h("caption", {}, group),
-      h("tbody", {}, Object.entries(values).map(([key, value]) => h("tr", {}, h("th", { scope: "row" }, key),
-        h("td", {}, typeof value === "object" ? JSON.stringify(value) : String(value))))))));
+    refresh(this.groups, groups, () => groups.map(([group, values]) => table(null, Object.entries(values).map(
+      ([key, value]) => row([key, typeof value === "object" ? JSON.stringify(value) : String(value)])), group)));
   }
 }
 
 function topics({ rates_hz: rates, silent, lost }) {
-  return h("table", {}, h("caption", {}, "Recorded topics"),
-    h("thead", {}, h("tr", {}, ["Topic", "Rate", "Lost"].map((name) => h("th", { scope: "col" }, name)))),
-    h("tbody", {}, Object.entries(rates).map(([topic, rate]) => h("tr", { class: silent.includes(topic) ? "bad" : "" },
-      h("th", { scope: "row" }, topic), h("td", {}, `${rate.toFixed(1)} Hz`), h("td", {}, String(lost[topic] ?? 0))))));
+  return table(["Topic", "Rate", "Lost"], Object.entries(rates).map(([topic, rate]) => (
+    row([topic, `${rate.toFixed(1)} Hz`, lost[topic] ?? 0], { class: silent.includes(topic) ? "bad" : "" }))), "Recorded topics");
 }

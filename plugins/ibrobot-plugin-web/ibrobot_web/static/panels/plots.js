@@ -1,7 +1,7 @@
 // Plots of any numbers on any topic while this tab is shown, and of the run's counters, such as latencies, all the time.
 
 import { h, refresh } from "../dom.js";
-import { COLORS, drawPlot, kindOf, shortOf } from "../plot.js";
+import { COLORS, drawPlot, kindOf, legendOf } from "../plot.js";
 
 const SAMPLES = 2;
 const KEPT_S = 180;
@@ -33,8 +33,7 @@ export class PlotsPanel {
   show(shown) {
     this.shown = shown;
     this.page.stream.show(SAMPLES, shown);
-    if (!shown) return;
-    this.draw();
+    if (shown) this.draw();
   }
 
   samples({ stamp, topics }) {
@@ -81,10 +80,6 @@ export class PlotsPanel {
     const end = times.at(-1) ?? 0;
     const span = Math.max(10, end - (times[0] ?? 0));
     drawPlot(this.canvas, { times, lines, begin: end - span, end, labels: [`−${span.toFixed(0)} s`, "now"] });
-    refresh(this.legend, lines.map(([name]) => name), () => lines.map(([name], i) => {
-      const mark = h("i", {});
-      mark.style.background = COLORS[i];
-      return h("span", {}, mark, shortOf(name));
-    }));
+    refresh(this.legend, lines.map(([name]) => name), () => legendOf(lines));
   }
 }

@@ -1,6 +1,6 @@
 // The choice of a robot, its body and its mode, with what `ibrobot config check` says. Views share the choice.
 
-import { h, refresh } from "../dom.js";
+import { h, refresh, row, table } from "../dom.js";
 
 const SOURCES = { folder: "In the opened folders", ibrobot: "Shipped with ibrobot", plugin: "Shipped with plugins" };
 const KEY = "robot";
@@ -102,6 +102,6 @@ function reportOf(found) {
   const rows = [["Joints", found.joints.join(", ")], ["Cameras", found.cameras.join(", ") || "none"],
     ...Object.entries(found.devices)];
   return [h("p", { class: "good" }, "No problems found."),
-    h("table", {}, h("tbody", {}, rows.map(([name, value]) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, value))))),
+    table(null, rows.map((cells) => row(cells))),
     ...found.notes.map((note) => h("p", { class: "note" }, `Note: ${note}`))];
 }

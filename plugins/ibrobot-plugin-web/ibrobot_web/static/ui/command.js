@@ -1,27 +1,26 @@
 // View: a command that runs as a job: its form, and what it has done.
 
-import { h, refresh } from "../dom.js";
+import { h } from "../dom.js";
 import { Form } from "./form.js";
-import { JobCard } from "./job.js";
+import { JobList } from "./job.js";
 
 export class View {
   constructor(ui, { command, title }) {
     this.ui = ui;
     this.command = command;
     this.title = title;
-    this.cards = new Map();
+    this.jobs = new JobList(ui, "None yet.", command);
   }
 
   mount(element) {
     this.form = new Form(this.title, (values) => this.start(values));
-    this.list = h("div", { class: "columns" }, h("p", { class: "note" }, "None yet."));
-    element.append(h("h2", {}, this.title), this.form.element, h("h2", {}, "Jobs"), this.list);
+    element.append(h("h2", {}, this.title), this.form.element, h("h2", {}, "Jobs"), this.jobs.element);
   }
 
   // The address may fill in a field: FIELD=VALUE.
   async show(shown, rest) {
     if (!shown) return;
-    for (const job of this.ui.of(this.command)) this.job(job);
+    this.jobs.show();
     await this.load();
     const [, name, value] = /^(\w+)=(.*)$/.exec(rest) ?? [];
     if (name && rest !== this.filled) this.form.enter({ [name]: value }, true);
@@ -42,18 +41,13 @@ export class View {
     this.form.button.disabled = true;
     localStorage.setItem(this.key, JSON.stringify(values));
     const started = await this.ui.attempt(() => this.ui.post("jobs/start", { command: this.command, values }));
-    const show = () => this.cards.get(started.number)?.element.scrollIntoView({ block: "nearest" });
+    const show = () => this.jobs.cards.get(started.number)?.element.scrollIntoView({ block: "nearest" });
     if (started) setTimeout(show, 300); // once its card is there
     this.form.button.disabled = !this.ui.drives;
   }
 
   job(job) {
-    if (job.kind !== this.command) return;
-    if (!this.cards.has(job.number)) this.cards.set(job.number, new JobCard(this.ui));
-    const card = this.cards.get(job.number);
-    card.update(job);
-    const numbers = this.ui.of(this.command).map(({ number }) => number).filter((number) => this.cards.has(number));
-    refresh(this.list, numbers, () => numbers.map((number) => this.cards.get(number).element));
-    if (job.state !== "running" && card.ended !== job.state) { card.ended = job.state; this.load(); }
+    const card = this.jobs.update(job);
+    if (card && job.state !== "running" && card.ended !== job.state) { card.ended = job.state; this.load(); }
   }
 }

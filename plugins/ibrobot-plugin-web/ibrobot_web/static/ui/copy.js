@@ -1,6 +1,6 @@
 // A copy of the chosen robot YAML with one's own ports and cameras, chosen from what was found.
 
-import { h, toast } from "../dom.js";
+import { capital, h, toast } from "../dom.js";
 
 export class Copy {
   constructor(ui, chooser) {
@@ -51,7 +51,7 @@ function field({ name, default: usual, found }) {
   const note = found.length ? `found: ${found.join(", ")}` : "";
   return {
     name, input,
-    elements: [h("label", { for: id }, words.charAt(0).toUpperCase() + words.slice(1)),
+    elements: [h("label", { for: id }, capital(words)),
       h("div", {}, input, choices, note ? h("p", { class: "note" }, note) : null)],
   };
 }

@@ -1,6 +1,6 @@
 // View: datasets: counts, features, statistics, and their episodes, which are played back.
 
-import { h, refresh, say, toast } from "../dom.js";
+import { h, refresh, row, say, scroll, table, toast } from "../dom.js";
 import { size } from "./episodes.js";
 import { keyed, press } from "./keys.js";
 import { Player } from "./player.js";
@@ -13,7 +13,7 @@ export class View {
     this.choice.addEventListener("change", () => { location.hash = `datasets/${encodeURIComponent(this.choice.value)}`; });
     this.note = h("p", { class: "note", role: "status" });
     this.facts = h("section", { "aria-label": "Dataset" });
-    this.player = new Player(this.ui, "datasets");
+    this.player = new Player(this.ui);
     this.title = h("h3", {});
     this.problem = h("div", {});
     this.playing = h("section", { class: "card", hidden: true, "aria-label": "Episode" }, h("div", { class: "row" }, this.title,
@@ -60,16 +60,13 @@ export class View {
       ["Length", `${facts.seconds.toFixed(1)} s`], ["Size", size(facts.bytes)], ["Robot", facts.robot_type || "not given"],
       ["Tasks", facts.tasks.join("; ") || "none"], ["Unit of joints", facts.norm_mode || "not given"]];
     return [h("div", { class: "columns" },
-      h("div", { class: "card" }, h("h3", {}, "Contents"), h("table", {}, h("tbody", {}, counts.map(([name, value]) => (
-        h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, String(value)))))))),
-      h("div", { class: "card" }, h("h3", {}, "Episodes"), h("div", { class: "scroll tall", tabindex: "0", role: "region", "aria-label": "Episodes" },
-        h("table", {}, head(["Episode", "Length", "Frames", "Outcome", "Task", "Source"]), h("tbody", {}, facts.list.map((each) => h("tr", {},
-          h("th", { scope: "row" }, h("button", { onclick: () => this.play(each.number) }, `Play ${each.number}`)),
-          h("td", {}, `${each.seconds.toFixed(1)} s`), h("td", {}, String(each.frames)), h("td", {}, each.outcome),
-          h("td", { class: each.task.length > 30 ? "text" : "" }, each.task), h("td", {}, each.source)))))))),
-    h("div", { class: "card" }, h("h3", {}, "Features"), h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Features" },
-      h("table", {}, head(["Feature", "Type", "Shape", "Unit", "Value", "Minimum", "Mean", "Maximum", "Deviation"]),
-        h("tbody", {}, facts.features.flatMap((feature) => rows(feature))))))];
+      h("div", { class: "card" }, h("h3", {}, "Contents"), table(null, counts.map((cells) => row(cells)))),
+      h("div", { class: "card" }, h("h3", {}, "Episodes"), scroll("Episodes",
+        table(["Episode", "Length", "Frames", "Outcome", "Task", "Source"], facts.list.map((each) => row([
+          h("button", { onclick: () => this.play(each.number) }, `Play ${each.number}`), `${each.seconds.toFixed(1)} s`, each.frames,
+          each.outcome, h("td", { class: each.task.length > 30 ? "text" : "" }, each.task), each.source])))))),
+    h("div", { class: "card" }, h("h3", {}, "Features"), scroll("Features",
+      table(["Feature", "Type", "Shape", "Unit", "Value", "Minimum", "Mean", "Maximum", "Deviation"], facts.features.flatMap(rows))))];
   }
 
   async play(number) {
@@ -78,30 +75,18 @@ export class View {
     if (number === null) { this.player.close(); return; }
     say(this.title, `${this.path}, episode ${number}`);
     this.problem.replaceChildren();
-    this.player.element.hidden = false;
-    this.player.posed = undefined;
-    try {
-      await this.player.open(`${this.path}:${number}`);
-      this.player.toggle();
-    } catch (error) {
-      this.player.close();
-      this.player.element.hidden = true;
-      this.problem.replaceChildren(h("div", { class: "problem", role: "alert" }, error.message));
-    }
+    if (await this.player.open(`${this.path}:${number}`, this.problem)) this.player.toggle();
     this.playing.scrollIntoView({ block: "nearest" });
   }
 }
-
-function head(names) { return h("thead", {}, h("tr", {}, names.map((name) => h("th", { scope: "col" }, name)))); }
 
 // One row for each value of a feature; pictures have one for each colour.
 function rows({ key, dtype, shape, unit, names, stats, picture }) {
   const count = stats.mean?.length ?? 1;
   const colors = ["red", "green", "blue"];
-  return Array.from({ length: count }, (_, i) => h("tr", {}, i ? h("td", {}) : h("th", { scope: "row" }, key),
-    ...(i ? ["", "", ""] : [dtype, shape.join(" × "), unit]).map((text) => h("td", {}, text)),
-    h("td", {}, picture && count === 3 ? colors[i] : names[i] ?? (count > 1 ? String(i) : "")),
-    ...["min", "mean", "max", "std"].map((name) => h("td", {}, (stats[name]?.[i] ?? null) === null ? "" : rounded(stats[name][i])))));
+  return Array.from({ length: count }, (_, i) => row([...(i ? [h("td", {}), "", "", ""] : [key, dtype, shape.join(" × "), unit]),
+    picture && count === 3 ? colors[i] : names[i] ?? (count > 1 ? String(i) : ""),
+    ...["min", "mean", "max", "std"].map((name) => ((stats[name]?.[i] ?? null) === null ? "" : rounded(stats[name][i])))]));
 }
 
 // Four digits, of which at most four are decimals.

@@ -1,6 +1,6 @@
 // View: devices. The guides of plugins: ports, cameras, motors, calibration, step by step.
 
-import { h, refresh, say } from "../dom.js";
+import { h, problem, refresh, say, table } from "../dom.js";
 
 const POLL_MS = 150;
 
@@ -89,11 +89,11 @@ export class View {
     this.state.className = `state ${state}`;
     this.items.push(...items);
     this.steps.append(...items.map((item) => h("li", {}, this.item(item))));
-    if (error && !this.steps.querySelector(".problem")) this.steps.append(h("li", {}, h("div", { class: "problem", role: "alert" }, error)));
+    if (error && !this.steps.querySelector(".problem")) this.steps.append(h("li", {}, problem(error)));
     this.cancel.hidden = state !== "running";
     this.cancel.disabled = !this.ui.drives;
     refresh(this.ask, ask ? [ask.ask, ask.text] : null, () => (ask ? this.question(ask) : []));
-    if (ask?.rows) refresh(this.live, ask.rows, () => table(ask));
+    if (ask?.rows) refresh(this.live, ask.rows, () => tableOf(ask));
   }
 
   question({ ask, kind, text }) {
@@ -111,8 +111,8 @@ export class View {
       return h("figure", {}, h("img", { src: this.ui.address("devices/picture", { picture: item.picture, n: this.number }), alt: `Picture of ${item.title}` }),
         h("figcaption", {}, item.title));
     }
-    if (item.kind === "show") return h("div", { class: "scroll" }, table(item));
-    if (item.kind === "answered") return [h("p", { class: "note" }, `${item.text} — ${item.answer}`), item.rows ? h("div", { class: "scroll" }, table(item)) : null];
+    if (item.kind === "show") return h("div", { class: "scroll" }, tableOf(item));
+    if (item.kind === "answered") return [h("p", { class: "note" }, `${item.text} — ${item.answer}`), item.rows ? h("div", { class: "scroll" }, tableOf(item)) : null];
     return h("p", { class: item.warning ? "warned" : "" }, item.text);
   }
 }
@@ -142,8 +142,9 @@ function field(guide, { name, text, default: preset, choices, open }) {
   return { name, elements: [label, h("span", {}, select, input)], value: () => select.value || input.value };
 }
 
-function table({ columns, rows }) {
+// A table; the names of columns with numbers begin with `>`.
+function tableOf({ columns, rows }) {
   const number = columns.map((name) => name.startsWith(">"));
-  return h("table", {}, h("thead", {}, h("tr", {}, columns.map((name) => h("th", { scope: "col" }, name.replace(/^>/, ""))))),
-    h("tbody", {}, rows.map((row) => h("tr", {}, row.map((cell, i) => h("td", { class: number[i] ? "number" : "" }, cell))))));
+  return table(columns.map((name) => name.replace(/^>/, "")),
+    rows.map((cells) => h("tr", {}, cells.map((cell, i) => h("td", { class: number[i] ? "number" : "" }, cell)))));
 }

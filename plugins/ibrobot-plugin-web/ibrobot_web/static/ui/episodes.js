@@ -1,9 +1,9 @@
 // View: recorded episodes.
 
-import { h, refresh, say, toast } from "../dom.js";
+import { confirm, h, refresh, row, say, scroll, table, toast, when } from "../dom.js";
+import { RUNS } from "./job.js";
 import { keyed, press } from "./keys.js";
 import { Player } from "./player.js";
-
 
 export class View {
   constructor(ui) {
@@ -17,9 +17,9 @@ export class View {
     this.filter = h("input", { type: "text", id: "episode-filter", placeholder: "task, outcome, name" });
     this.filter.addEventListener("input", () => this.draw());
     this.bulk = h("div", { class: "row" });
-    this.table = h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Episodes" });
+    this.table = scroll("Episodes");
     this.trash = h("details", { class: "card", hidden: true });
-    this.player = new Player(this.ui, "episodes");
+    this.player = new Player(this.ui);
     this.title = h("h2", { tabindex: "-1" });
     this.about = h("div", {});
     this.controls = h("div", {});
@@ -52,7 +52,7 @@ export class View {
   }
 
   job(job) {
-    if (this.shown && job.state !== "running" && ["run", "record"].includes(job.kind)) this.load();
+    if (this.shown && job.state !== "running" && RUNS.includes(job.kind)) this.load();
   }
 
   async load() {
@@ -81,15 +81,15 @@ export class View {
     const rows = this.shownRows();
     const { drives } = this.ui;
     refresh(this.bulk, [[...this.chosen], drives, rows.length], () => this.bulkControls(rows));
-    refresh(this.table, [rows, [...this.chosen], this.path], () => (rows.length ? [h("table", {},
-      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, this.all(rows)),
-        ["Episode", "Task", "Length", "Began", "Size", "Outcome", "Problems"].map((name) => h("th", { scope: "col" }, name)))),
-      h("tbody", {}, rows.map((row) => this.row(row))))] : []));
+    refresh(this.table, [rows, [...this.chosen], this.path], () => (rows.length ? [table(
+      [this.box("Choose all", rows), "Episode", "Task", "Length", "Began", "Size", "Outcome", "Problems"],
+      rows.map((each) => this.row(each)))] : []));
   }
 
-  all(rows) {
-    const box = h("input", { type: "checkbox", "aria-label": "Choose all" });
-    box.checked = rows.length > 0 && rows.every(({ path }) => this.chosen.has(path));
+  // A box that chooses episodes.
+  box(label, rows) {
+    const box = h("input", { type: "checkbox", "aria-label": label });
+    box.checked = rows.every(({ path }) => this.chosen.has(path));
     box.addEventListener("change", () => {
       for (const { path } of rows) this.chosen[box.checked ? "add" : "delete"](path);
       this.draw();
@@ -97,22 +97,15 @@ export class View {
     return box;
   }
 
-  row(row) {
-    const box = h("input", { type: "checkbox", "aria-label": `Choose ${row.name} of ${row.group}` });
-    box.checked = this.chosen.has(row.path);
-    box.addEventListener("change", () => {
-      this.chosen[box.checked ? "add" : "delete"](row.path);
-      this.draw();
-    });
-    const place = row.group === "." ? row.name : `${row.group}/${row.name}`;
-    return h("tr", { class: row.path === this.path ? "current" : "" }, h("td", {}, box),
-      h("th", { scope: "row" }, h("a", { href: `#episodes/${encodeURIComponent(row.path)}` }, place)),
-      h("td", { class: row.task.length > 30 ? "text" : "" }, row.task || h("span", { class: "note" }, "none")),
-      h("td", {}, row.duration_s === null ? "" : `${row.duration_s.toFixed(1)} s`),
-      h("td", {}, began(row.began_s)),
-      h("td", {}, size(row.bytes)),
-      h("td", { class: { success: "good", failure: "bad" }[row.outcome] ?? "" }, row.outcome),
-      h("td", { class: row.problems.length ? "bad text" : "" }, row.problems.join("; ")));
+  row(each) {
+    const place = each.group === "." ? each.name : `${each.group}/${each.name}`;
+    return row([h("td", {}, this.box(`Choose ${each.name} of ${each.group}`, [each])),
+      h("th", { scope: "row" }, h("a", { href: `#episodes/${encodeURIComponent(each.path)}` }, place)),
+      h("td", { class: each.task.length > 30 ? "text" : "" }, each.task || h("span", { class: "note" }, "none")),
+      each.duration_s === null ? "" : `${each.duration_s.toFixed(1)} s`, began(each.began_s), size(each.bytes),
+      h("td", { class: { success: "good", failure: "bad" }[each.outcome] ?? "" }, each.outcome),
+      h("td", { class: each.problems.length ? "bad text" : "" }, each.problems.join("; "))],
+    { class: each.path === this.path ? "current" : "" });
   }
 
   bulkControls(rows) {
@@ -133,18 +126,8 @@ export class View {
     say(this.title, path);
     this.about.replaceChildren(h("p", { class: "note" }, "Opening …"));
     this.controls.replaceChildren();
-    this.player.posed = undefined;
-    this.player.element.hidden = false;
     this.player.setCut(null);
-    let facts;
-    try {
-      facts = await this.player.open(path);
-    } catch (error) {
-      this.player.close();
-      this.player.element.hidden = true;
-      this.about.replaceChildren(h("div", { class: "problem", role: "alert" }, error.message));
-      return;
-    }
+    const facts = await this.player.open(path, this.about);
     if (!facts || this.path !== path) return;
     const { metadata, topics } = facts;
     this.about.replaceChildren(
@@ -152,11 +135,9 @@ export class View {
         .filter(Boolean).join(" · ")),
       ...facts.problems.map((problem) => h("div", { class: "problem" }, problem)));
     this.drawControls(facts);
-    this.controls.append(h("details", {}, h("summary", {}, `${topics.length} topics`),
-      h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Topics" }, h("table", {}, h("thead", {}, h("tr", {},
-        ["Topic", "Type", "Messages", "Rate", "Lost"].map((name) => h("th", { scope: "col" }, name)))),
-      h("tbody", {}, topics.map((each) => h("tr", {}, h("th", { scope: "row" }, each.name), h("td", {}, each.type),
-        h("td", {}, String(each.count)), h("td", {}, each.rate_hz === null ? "" : `${each.rate_hz} Hz`), h("td", {}, String(each.lost || "")))))))));
+    this.controls.append(h("details", {}, h("summary", {}, `${topics.length} topics`), scroll("Topics",
+      table(["Topic", "Type", "Messages", "Rate", "Lost"], topics.map((each) => row(
+        [each.name, each.type, each.count, each.rate_hz === null ? "" : `${each.rate_hz} Hz`, each.lost || ""]))))));
   }
 
   drawControls(facts) {
@@ -199,9 +180,8 @@ export class View {
   }
 
   async trim(path, [begin_s, end_s]) {
-    const sure = await this.ui.confirm("Trim the episode?",
-      `Only ${begin_s.toFixed(2)} to ${end_s.toFixed(2)} s stay. The original goes to the trash, from which you can restore it.`, "Trim", false);
-    if (!sure) return;
+    const text = `Only ${begin_s.toFixed(2)} to ${end_s.toFixed(2)} s stay. The original goes to the trash, from which you can restore it.`;
+    if (!await confirm("Trim the episode?", text, "Trim", { danger: false })) return;
     if (await this.change(() => this.ui.post("episodes/trim", { path, begin_s, end_s }), "Trimmed. The trash below has the original.")) await this.open(path);
   }
 
@@ -219,12 +199,10 @@ export class View {
     for (const path of this.trashes) found.push(...await this.ui.attempt(() => this.ui.get("episodes/trash", { path })) ?? []);
     this.trash.hidden = !found.length;
     refresh(this.trash, [found, this.ui.drives], () => [h("summary", {}, `Trash: ${found.length}, ${size(found.reduce((sum, each) => sum + each.size_bytes, 0))}`),
-      h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Trash" }, h("table", {}, h("thead", {}, h("tr", {},
-        ["Episode", "What was done", "Size", ""].map((name) => h("th", { scope: "col" }, name || h("span", { class: "hidden-label" }, "Restore"))))),
-      h("tbody", {}, found.map((each) => h("tr", {}, h("th", { scope: "row" }, each.path), h("td", {}, each.what),
-        h("td", {}, size(each.size_bytes)), h("td", {}, h("button", {
+      scroll("Trash", table(["Episode", "What was done", "Size", h("span", { class: "hidden-label" }, "Restore")], found.map((each) => row(
+        [each.path, each.what, size(each.size_bytes), h("button", {
           disabled: !this.ui.drives, "aria-label": `Restore ${each.path}`, onclick: () => this.restore(each),
-        }, "Restore"))))))),
+        }, "Restore")])))),
       ...this.trashes.map((path) => h("button", { class: "danger", disabled: !this.ui.drives, onclick: () => this.empty(path) },
         `Empty the trash of ${path}`))]);
   }
@@ -235,7 +213,7 @@ export class View {
   }
 
   async empty(path) {
-    const sure = await this.ui.confirm("Empty the trash?", `What is in the trash of ${path} is deleted for good.`, "Delete for good");
+    const sure = await confirm("Empty the trash?", `What is in the trash of ${path} is deleted for good.`, "Delete for good");
     if (sure) await this.change(() => this.ui.post("episodes/empty", { path }), "The trash is empty.");
   }
 }
@@ -245,7 +223,7 @@ const count = (paths) => (paths.length === 1 ? paths[0] : `${paths.length} episo
 // Lockstep runs have a clock of their own, which begins in 1970.
 function began(seconds) {
   if (!seconds) return "";
-  return seconds < 1e9 ? "simulated time" : new Date(seconds * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" });
+  return seconds < 1e9 ? "simulated time" : when(seconds);
 }
 
 function round(seconds) { return Math.round(seconds * 1000) / 1000; }

@@ -1,6 +1,6 @@
 // The form of a command, from what its owner declares: labels, words, units, bounds and defaults are all from the server.
 
-import { h, refresh } from "../dom.js";
+import { capital, h, refresh } from "../dom.js";
 
 export class Form {
   // `title` is on the button; `submit` gets the values by name.
@@ -66,7 +66,7 @@ class Field {
     const id = `field-${field.name}`, help = h("small", { class: "help", id: `${id}-help` }, sentence(field));
     const described = { id, "aria-describedby": help.id };
     const choices = field.choices.length ? field.choices : known.map(({ value, text }) => [value, text]);
-    const closed = choices.length && !field.open && !(field.names === "robot");
+    const closed = choices.length && !field.open && field.names !== "robot";
     if (field.several && !choices.length && !field.names) {
       const input = h("input", { type: "text", placeholder: "several, with commas between them", ...described });
       this.elements = [h("label", { for: id }, field.label), h("div", {}, input, help)];
@@ -115,6 +115,5 @@ class Field {
 
 function sentence({ label, help, required }) {
   if (help.toLowerCase() === label.toLowerCase()) return "";
-  const text = help.charAt(0).toUpperCase() + help.slice(1);
-  return required ? `${text} (required)` : text;
+  return `${capital(help)}${required ? " (required)" : ""}`;
 }

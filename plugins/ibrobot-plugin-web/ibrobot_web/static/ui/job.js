@@ -1,19 +1,17 @@
 // A card that shows a job: state, progress, output, and the button that ends it.
 
-import { h, refresh, say } from "../dom.js";
+import { h, problem, refresh, say } from "../dom.js";
 import { drawPlot } from "../plot.js";
 import { Question } from "./question.js";
 
 // What a job has made -> the view that shows it.
 const MADE = { dataset: ["datasets", "Open the dataset"], policy: ["policies", "Use it in a robot"], episode: ["episodes", "See the episode"], episodes: ["episodes", "Judge the episodes"] };
-const RUNS = ["run", "record"];
+export const RUNS = ["run", "record"];
 const STATES = { running: "running", done: "done", failed: "failed", cancelled: "ended" };
 
 export class JobCard {
-  // `open`: whether the output is shown at once.
-  constructor(ui, { open = false } = {}) {
+  constructor(ui) {
     this.ui = ui;
-    this.shownLines = 0;
     this.state = h("span", { class: "state", role: "status" });
     this.title = h("h3", {});
     this.controls = h("div", { class: "row" });
@@ -26,7 +24,7 @@ export class JobCard {
     this.problems = h("div", {});
     this.made = h("div", { class: "row" });
     this.output = h("pre", { class: "output", tabindex: "0", "aria-label": "Output" });
-    this.details = h("details", { open }, h("summary", {}, "Output"), this.output);
+    this.details = h("details", {}, h("summary", {}, "Output"), this.output);
     this.element = h("div", { class: "card job" }, h("div", { class: "row" }, this.title, this.state), this.progress,
       this.facts, this.question.element, this.error, this.plot, this.problems, this.made, this.controls, this.details);
   }
@@ -46,7 +44,7 @@ export class JobCard {
     this.job = job;
     this.draw();
     const { problems = [], made = [] } = job.facts;
-    refresh(this.problems, problems, () => problems.map((problem) => h("div", { class: "problem" }, problem)));
+    refresh(this.problems, problems, () => problems.map((each) => h("div", { class: "problem" }, each)));
     refresh(this.made, [made, job.state], () => (job.state === "running" ? [] : made.flatMap((each) => this.next(each))));
     const text = job.lines.join("\n");
     this.details.hidden = !text;
@@ -93,9 +91,34 @@ export class JobCard {
 }
 
 // Why a job failed: its own error, or else its error lines, or its last lines.
-export function failure(job) {
-  if (job.facts.error) return [h("div", { class: "problem", role: "alert" }, job.facts.error)];
+function failure(job) {
+  if (job.facts.error) return [problem(job.facts.error)];
   const errors = job.lines.filter((line) => line.startsWith("error: "));
   const text = errors.length ? errors.map((line) => line.slice("error: ".length)) : job.lines.slice(-8);
-  return [h("div", { class: "problem", role: "alert" }, [`exit code ${job.exit_code}`, ...text].join("\n"))];
+  return [problem([`exit code ${job.exit_code}`, ...text].join("\n"))];
+}
+
+// The cards of the jobs of some kinds, or of all, newest first; `none` stands there before the first.
+export class JobList {
+  constructor(ui, none, ...kinds) {
+    Object.assign(this, { ui, kinds });
+    this.cards = new Map();
+    this.element = h("div", { class: "columns" }, h("p", { class: "note" }, none));
+  }
+
+  shows({ kind }) { return !this.kinds.length || this.kinds.includes(kind); }
+
+  // Shows all jobs of the kinds.
+  show() { for (const job of this.ui.jobs.values()) this.update(job); }
+
+  // Shows a job if it is of the kinds; returns its card then.
+  update(job) {
+    if (!this.shows(job)) return null;
+    if (!this.cards.has(job.number)) this.cards.set(job.number, new JobCard(this.ui));
+    const card = this.cards.get(job.number);
+    card.update(job);
+    const numbers = [...this.ui.jobs.keys()].filter((number) => this.cards.has(number)).reverse();
+    refresh(this.element, numbers, () => numbers.map((number) => this.cards.get(number).element));
+    return card;
+  }
 }

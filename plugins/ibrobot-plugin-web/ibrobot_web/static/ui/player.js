@@ -1,17 +1,15 @@
 // Plays an episode: 3D, camera pictures and plots on one time line. Pictures are asked for by time, the newest only.
 
-import { h, refresh, say } from "../dom.js";
-import { COLORS, drawPlot, kindOf, shortOf, timeAt } from "../plot.js";
+import { h, paint, problem, refresh, say } from "../dom.js";
+import { COLORS, drawPlot, kindOf, legendOf, timeAt } from "../plot.js";
 import { View3D } from "../view3d.js";
 
 const STEP_S = 0.05;
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
 
 export class Player {
-  // `routes`: the view whose requests answer, e.g. "episodes".
-  constructor(ui, routes) {
+  constructor(ui) {
     this.ui = ui;
-    this.routes = routes;
     this.at = 0;
     this.playing = false;
     this.cameras = [];
@@ -32,7 +30,7 @@ export class Player {
     this.clock = h("output", { class: "clock" });
     this.speed = h("select", { "aria-label": "Speed" },
       SPEEDS.map((speed) => h("option", { value: speed, selected: speed === 1 }, `${speed}×`)));
-    this.topic = h("select", { id: `${this.routes}-topic` });
+    this.topic = h("select", { id: `plot-${Math.random()}` });
     this.topic.addEventListener("change", () => this.plot());
     this.group = h("select", { "aria-label": "Values", hidden: true });
     this.group.addEventListener("change", () => this.draw());
@@ -46,26 +44,38 @@ export class Player {
     this.element = h("div", { class: "player" }, this.pictures, this.scene,
       h("div", { class: "row player-line" }, this.play, this.line, this.clock, this.speed),
       h("div", { class: "player-plot" }, h("div", { class: "row" },
-        h("label", { for: `${this.routes}-topic` }, "Plot"), this.topic, this.group), this.canvas, this.legend));
+        h("label", { for: this.topic.id }, "Plot"), this.topic, this.group), this.canvas, this.legend));
     new ResizeObserver(() => this.draw()).observe(this.canvas);
   }
 
-  // Opens an episode; throws its error. The 3D view is made once, when the element is on the page.
-  async open(path) {
+  // Opens an episode; returns what it contains, or null after showing in `problems` why it cannot be opened. The 3D view
+  // is made once, when the element is on the page.
+  async open(path, problems) {
     this.pause();
+    this.element.hidden = false;
+    this.posed = undefined;
     this.path = path;
     this.facts = null;
     this.series = null;
     this.enable();
     say(this.clock, "");
-    const facts = await this.ui.get(`${this.routes}/open`, { path });
+    let facts;
+    try {
+      facts = await this.ui.get("episodes/open", { path });
+    } catch (error) {
+      if (this.path !== path) return null;
+      this.close();
+      this.element.hidden = true;
+      problems.replaceChildren(problem(error.message));
+      return null;
+    }
     if (this.path !== path) return null; // another was opened meanwhile
     this.facts = facts;
     this.view ??= new View3D(this.scene, { scene: null });
     const robot = JSON.stringify(facts.metadata.robot ?? "") + JSON.stringify(facts.motion.joints);
     this.view.tell({ do: "clear" });
     this.view.tell({ do: "joints", names: facts.motion.joints });
-    if (this.robot !== robot) this.view.load(this.ui.address(`${this.routes}/scene`, { path })).then(() => this.pose(true));
+    if (this.robot !== robot) this.view.load(this.ui.address("episodes/scene", { path })).then(() => this.pose(true));
     this.robot = robot;
     this.line.max = String(this.length);
     this.enable();
@@ -86,7 +96,7 @@ export class Player {
 
   // The objects of a simulated scene, which take the server a moment.
   async loadObjects(path) {
-    const found = await this.ui.attempt(() => this.ui.get(`${this.routes}/objects`, { path }));
+    const found = await this.ui.attempt(() => this.ui.get("episodes/objects", { path }));
     if (this.path !== path || !found?.length) return;
     this.objects = found;
     this.place();
@@ -176,19 +186,13 @@ export class Player {
     camera.busy = true;
     const { path, at } = this;
     try {
-      const response = await fetch(this.ui.address(`${this.routes}/picture`, { path, topic: camera.topic, at_s: at }));
+      const response = await fetch(this.ui.address("episodes/picture", { path, topic: camera.topic, at_s: at }));
       const content = await response.blob();
       if (!response.ok) throw new Error(JSON.parse(await content.text()).error);
       camera.shown = at;
       say(camera.caption, content.size ? camera.name : `${camera.name}: no picture at this time`);
       if (content.size && this.path === path) {
-        const bitmap = await createImageBitmap(content);
-        if (camera.canvas.width !== bitmap.width || camera.canvas.height !== bitmap.height) {
-          camera.canvas.width = bitmap.width;
-          camera.canvas.height = bitmap.height;
-        }
-        camera.canvas.getContext("2d").drawImage(bitmap, 0, 0);
-        bitmap.close();
+        paint(camera.canvas, await createImageBitmap(content));
         this.frames += 1;
       }
     } catch (error) {
@@ -203,7 +207,7 @@ export class Player {
   async plot() {
     const topic = this.topic.value, { path } = this;
     if (!topic || !path) { this.series = null; this.draw(); return; }
-    const found = await this.ui.attempt(() => this.ui.get(`${this.routes}/series`, { path, topic }));
+    const found = await this.ui.attempt(() => this.ui.get("episodes/series", { path, topic }));
     if (this.path !== path || this.topic.value !== topic) return;
     this.series = found ?? null;
     const groups = [...new Set(Object.keys(found?.values ?? {}).map(kindOf))];
@@ -226,11 +230,7 @@ export class Player {
       times: this.series?.times ?? [], lines, begin: 0, end: this.length || 1, labels: ["0 s", `${this.length.toFixed(1)} s`],
       cursor: this.facts ? this.at : null, shade,
     });
-    refresh(this.legend, [this.topic.value, lines.map(([name]) => name)], () => lines.map(([name], i) => {
-      const mark = h("i", {});
-      mark.style.background = COLORS[i];
-      return h("span", {}, mark, shortOf(name));
-    }));
+    refresh(this.legend, [this.topic.value, lines.map(([name]) => name)], () => legendOf(lines));
   }
 }
 

@@ -1,6 +1,6 @@
 // View: trained policies, which are put into robot YAMLs.
 
-import { h, refresh, toast } from "../dom.js";
+import { h, problem, refresh, toast, when } from "../dom.js";
 import { remember } from "./chooser.js";
 
 export class View {
@@ -41,7 +41,7 @@ export class View {
     if (!found || !robots) return;
     robots.sort((one, other) => (other.source === "folder") - (one.source === "folder")); // own ones first
     fill(this.checkpoint, found.map(({ path }) => path),
-      found.map(({ path, changed_s: at }) => `${path} (${new Date(at * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`));
+      found.map(({ path, changed_s: at }) => `${path} (${when(at)})`));
     const first = !this.robot.value;
     fill(this.robot, robots.map(({ robot }) => robot), robots.map(({ robot }) => robot));
     const { robot } = JSON.parse(sessionStorage.getItem("robot") ?? "{}"); // the one of the last run
@@ -67,7 +67,7 @@ export class View {
     try {
       found = await this.ui.get("policies/preview", request);
     } catch (error) {
-      if (chosen()) this.change.replaceChildren(h("div", { class: "problem", role: "alert" }, error.message));
+      if (chosen()) this.change.replaceChildren(problem(error.message));
       return;
     }
     if (!chosen()) return; // another choice meanwhile
@@ -79,7 +79,7 @@ export class View {
       found.diff.length ? h("pre", { class: "diff", tabindex: "0", "aria-label": "Change" }, found.diff.map((line) => (
         h("span", { class: line.startsWith("+") ? "added" : line.startsWith("-") ? "removed" : "" }, `${line}\n`))))
         : h("p", { class: "note" }, "The robot has this policy already."),
-      ...found.problems.map((problem) => h("div", { class: "problem" }, problem)),
+      ...found.problems.map((each) => h("div", { class: "problem" }, each)),
       h("p", {}, `The mode ${found.mode} runs the policy.`), h("div", { class: "row" }, write));
   }
 

@@ -1,6 +1,6 @@
 // What a job asks its operator: buttons, each with its key, or a text; beside it what cameras see.
 
-import { h, refresh, say } from "../dom.js";
+import { capital, h, paint, refresh, say } from "../dom.js";
 
 const LIVE_MS = 200;
 const KEYS = { Enter: "enter", Escape: "esc", " ": "space" };
@@ -41,7 +41,7 @@ export class Question {
       pictures.length ? h("div", { class: "sights" }, pictures) : null,
       choices.length ? h("div", { class: "row choices-of" }, choices.map((choice) => h("button", {
         class: choice.urgent ? "stop" : "", disabled, onclick: () => this.answer(choice.key),
-      }, `${choice.text[0].toUpperCase()}${choice.text.slice(1)} `, h("kbd", {}, choice.key.length > 1 ? `${choice.key[0].toUpperCase()}${choice.key.slice(1)}` : choice.key))))
+      }, `${capital(choice.text)} `, h("kbd", {}, choice.key.length > 1 ? capital(choice.key) : choice.key))))
         : this.typed(disabled)].filter(Boolean);
   }
 
@@ -103,14 +103,7 @@ export class Question {
     try {
       const response = await fetch(this.ui.address("jobs/sight", query));
       if (!response.ok) throw new Error((await response.json()).error);
-      const bitmap = await createImageBitmap(await response.blob());
-      if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
-        canvas.width = bitmap.width;
-        canvas.height = bitmap.height;
-        this.reveal();
-      }
-      canvas.getContext("2d").drawImage(bitmap, 0, 0);
-      bitmap.close();
+      if (paint(canvas, await createImageBitmap(await response.blob()))) this.reveal();
       say(caption, title);
     } catch (error) {
       say(caption, `${title}: ${error.message}`);

@@ -1,16 +1,16 @@
 // View: record a number of episodes of one task.
 
-import { h, refresh, say } from "../dom.js";
+import { h, say } from "../dom.js";
 import { Chooser } from "./chooser.js";
 import { Form } from "./form.js";
-import { JobCard } from "./job.js";
+import { JobList } from "./job.js";
 
 const GIB = 1 << 30, MIB = 1 << 20;
 
 export class View {
   constructor(ui) {
     this.ui = ui;
-    this.cards = new Map();
+    this.sessions = new JobList(ui, "No session yet. In its page, you begin, judge and discard each episode.", "record");
     this.chooser = new Chooser(ui, (found) => this.found(found));
   }
 
@@ -21,11 +21,9 @@ export class View {
     this.form.element.prepend(this.chooser.fields);
     this.form.others.before(this.disk);
     this.form.element.addEventListener("change", () => this.place());
-    this.sessions = h("div", { class: "columns" },
-      h("p", { class: "note" }, "No session yet. In its page, you begin, judge and discard each episode."));
     element.append(h("h2", {}, "Record"), h("div", { class: "columns" },
       this.form.element, h("section", { class: "card", "aria-label": "Check" }, this.chooser.report)),
-    h("h2", {}, "Sessions"), this.sessions);
+    h("h2", {}, "Sessions"), this.sessions.element);
   }
 
   async load() {
@@ -50,7 +48,7 @@ export class View {
     if (!shown) return;
     this.chooser.load();
     this.load();
-    for (const job of this.ui.of("record")) this.job(job);
+    this.sessions.show();
   }
 
   found(found) {
@@ -79,11 +77,6 @@ export class View {
   }
 
   job(job) {
-    if (job.kind !== "record") return;
-    if (!this.cards.has(job.number)) this.cards.set(job.number, new JobCard(this.ui));
-    this.cards.get(job.number).update(job);
-    if (job.state !== "running") this.place();
-    const numbers = this.ui.of("record").map(({ number }) => number);
-    refresh(this.sessions, numbers, () => numbers.filter((n) => this.cards.has(n)).map((n) => this.cards.get(n).element));
+    if (this.sessions.update(job) && job.state !== "running") this.place();
   }
 }

@@ -1,6 +1,6 @@
 // View: reports of one kind on folders with results, e.g. evaluations, and the recordings that they name.
 
-import { h, refresh, say, toast } from "../dom.js";
+import { h, problem, refresh, row, say, scroll, table, toast, when } from "../dom.js";
 import { Player } from "./player.js";
 
 const SVG = "http://www.w3.org/2000/svg";
@@ -17,8 +17,8 @@ export class View {
 
   mount(element) {
     this.note = h("p", { class: "note", role: "status" });
-    this.list = h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": this.title });
-    this.player = new Player(this.ui, "reports");
+    this.list = scroll(this.title);
+    this.player = new Player(this.ui);
     this.playing = h("section", { class: "card", hidden: true, "aria-label": "Recording" },
       h("div", { class: "row" }, this.recording = h("h3", {}), h("button", { onclick: () => this.play("") }, "Close")),
       this.problem = h("div", {}), this.player.element);
@@ -46,30 +46,28 @@ export class View {
     const found = await this.ui.attempt(() => this.ui.get("reports/list", { kind: this.kind }));
     if (!found) return;
     say(this.note, found.length ? "" : "None in the opened folders.");
-    refresh(this.list, [found, this.path], () => (found.length ? [h("table", {},
-      h("thead", {}, h("tr", {}, ["Folder", "Result", "Changed"].map((name) => h("th", { scope: "col" }, name)))),
-      h("tbody", {}, found.map((each) => this.row(each))))] : []));
+    refresh(this.list, [found, this.path], () => (found.length
+      ? [table(["Folder", "Result", "Changed"], found.map((each) => this.row(each)))] : []));
   }
 
-  row({ path, lines, problem, changed_s: at }) {
-    return h("tr", { class: path === this.path ? "current" : "" },
-      h("th", { scope: "row" }, h("a", { href: `#${this.name}/${encodeURIComponent(path)}` }, path)),
-      h("td", { class: problem ? "bad text" : "text" }, problem || lines.map((line) => h("div", {}, line))),
-      h("td", {}, new Date(at * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })));
+  row({ path, lines, problem: why, changed_s: at }) {
+    return row([h("a", { href: `#${this.name}/${encodeURIComponent(path)}` }, path),
+      h("td", { class: why ? "bad text" : "text" }, why || lines.map((line) => h("div", {}, line))), when(at)],
+    { class: path === this.path ? "current" : "" });
   }
 
   async open(path) {
     if (path !== this.path) this.play("");
     this.path = path;
     this.detail.hidden = !path;
-    for (const row of this.list.querySelectorAll("tr")) row.classList.toggle("current", row.querySelector("a")?.textContent === path);
+    for (const each of this.list.querySelectorAll("tr")) each.classList.toggle("current", each.querySelector("a")?.textContent === path);
     if (!path) return;
     say(this.head, path);
     let sections;
     try {
       sections = await this.ui.get("reports/show", { kind: this.kind, path });
     } catch (error) {
-      if (this.path === path) refresh(this.body, error.message, () => [h("div", { class: "problem", role: "alert" }, error.message)]);
+      if (this.path === path) refresh(this.body, error.message, () => [problem(error.message)]);
       return;
     }
     if (this.path !== path) return; // another one was opened meanwhile
@@ -80,10 +78,8 @@ export class View {
   block(block, section) {
     switch (block.kind) {
       case "text": return block.role === "title" ? h("h4", {}, block.text) : h("p", { class: block.role }, block.text);
-      case "table": return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `${section}: table` }, h("table", {},
-        h("thead", {}, h("tr", {}, block.columns.map((name) => h("th", { scope: "col" }, name)))),
-        h("tbody", {}, block.rows.map((row) => h("tr", {}, row.map((cell, i) => (
-          i ? h("td", { class: cell.length > 40 ? "text" : "" }, cell) : h("th", { scope: "row" }, cell))))))));
+      case "table": return scroll(`${section}: table`, table(block.columns, block.rows.map(([first, ...cells]) => (
+        row([first, ...cells.map((cell) => h("td", { class: cell.length > 40 ? "text" : "" }, cell))])))));
       case "plots": return h("div", { class: block.pictures.length > 1 ? "plotted several" : "plotted" }, block.pictures.map(picture));
       case "cases": return h("div", { class: "columns cases" }, block.cases.map((each) => this.case(each)));
       default: return null;
@@ -104,22 +100,16 @@ export class View {
   // Plays a recording until it is closed, which leads back to where it was opened.
   async play(path, title = "", from = null) {
     this.playing.hidden = !path;
-    if (!path) this.player.close();
-    if (!path) this.from?.scrollIntoView({ block: "center" });
+    const opener = this.from;
     this.from = from;
-    if (!path) return;
+    if (!path) {
+      this.player.close();
+      opener?.scrollIntoView({ block: "center" });
+      return;
+    }
     say(this.recording, title);
     this.problem.replaceChildren();
-    this.player.element.hidden = false;
-    this.player.posed = undefined;
-    try {
-      await this.player.open(path);
-      this.player.toggle();
-    } catch (error) {
-      this.player.close();
-      this.player.element.hidden = true;
-      this.problem.replaceChildren(h("div", { class: "problem", role: "alert" }, error.message));
-    }
+    if (await this.player.open(path, this.problem)) this.player.toggle();
     this.playing.scrollIntoView({ block: "start" });
   }
 }

@@ -1,16 +1,14 @@
 // View: choose a robot, see its problems, launch it, and stop it.
 
-import { h, refresh } from "../dom.js";
+import { h } from "../dom.js";
 import { Chooser } from "./chooser.js";
 import { Copy } from "./copy.js";
-import { JobCard } from "./job.js";
-
-const KINDS = ["run", "record"];
+import { JobList, RUNS } from "./job.js";
 
 export class View {
   constructor(ui) {
     this.ui = ui;
-    this.cards = new Map();
+    this.runs = new JobList(ui, "No run yet. A run opens a page of its own, which shows and drives the robot.", ...RUNS);
     this.chooser = new Chooser(ui, () => this.enable());
     this.copy = new Copy(ui, this.chooser);
   }
@@ -18,21 +16,18 @@ export class View {
   mount(element) {
     this.launch = h("button", { class: "primary", disabled: true, onclick: () => this.start() }, "Launch");
     this.hint = h("p", { class: "note" });
-    this.runs = h("div", { class: "columns" });
     element.append(h("h2", {}, "Robots"),
       h("div", { class: "columns" },
         h("section", { class: "card", "aria-label": "Choice" }, this.chooser.fields,
           h("div", { class: "row" }, this.launch, h("a", { class: "button", href: "#record" }, "Record episodes")), this.hint, this.copy.element),
         h("section", { class: "card", "aria-label": "Check" }, this.chooser.report)),
-      h("h2", {}, "Runs"), this.runs);
-    this.none = h("p", { class: "note" }, "No run yet. A run opens a page of its own, which shows and drives the robot.");
-    this.runs.append(this.none);
+      h("h2", {}, "Runs"), this.runs.element);
   }
 
   show(shown) {
     if (!shown) return;
     this.chooser.load();
-    for (const job of this.ui.of(...KINDS)) this.job(job);
+    this.runs.show();
   }
 
   enable() {
@@ -49,11 +44,5 @@ export class View {
     this.enable();
   }
 
-  job(job) {
-    if (!KINDS.includes(job.kind)) return;
-    if (!this.cards.has(job.number)) this.cards.set(job.number, new JobCard(this.ui));
-    this.cards.get(job.number).update(job);
-    const numbers = this.ui.of(...KINDS).map(({ number }) => number);
-    refresh(this.runs, numbers, () => numbers.filter((n) => this.cards.has(n)).map((n) => this.cards.get(n).element));
-  }
+  job(job) { this.runs.update(job); }
 }
