@@ -30,8 +30,7 @@ from ibrobot_core.app import (
 )
 from ibrobot_eval.cameras import StartPictures, cameras_of, live_pictures
 from ibrobot_eval.comparison import Decision
-from ibrobot_eval.episodes import NO_INTERVENTION, SCRATCH, Result
-from ibrobot_eval.evaluation import Request
+from ibrobot_eval.episodes import SCRATCH, Result, interventions, recorded_in
 from ibrobot_eval.operators import QUIT, Operator, Quit
 from ibrobot_eval.options import EvalOptions
 from ibrobot_eval.policies import Policy
@@ -124,19 +123,23 @@ class Blinded:
     """Runs the blinded trials of an evaluation.
 
     Args:
-        request: the evaluation.
+        options: the evaluation.
+        policies: the policies.
         reset: command that resets the scene before each trial; empty if the operator resets it.
         operator: judges the trials.
     """
 
-    def __init__(self, request: Request, reset: Sequence[str], operator: Operator) -> None:
-        self._request = request
+    def __init__(
+        self, options: EvalOptions, policies: Sequence[Policy], reset: Sequence[str], operator: Operator
+    ) -> None:
+        self._options = options
+        self._out = options.out
         self._reset = reset
         self._operator = operator
-        self._policies = {each.label: each for each in request.policies}
-        self._blinding = Blinding.of(request.policies)
-        self._order = Order(request.out, list(self._policies))
-        self._robot = request.policies[0].load()
+        self._policies = {each.label: each for each in policies}
+        self._blinding = Blinding.of(policies)
+        self._order = Order(options.out, list(self._policies))
+        self._robot = policies[0].load()
 
     def run(self) -> bool:
         """Run trials until all are done or the comparison is decided. Returns False if the operator ends before that.
@@ -148,9 +151,9 @@ class Blinded:
         if self._enough():
             return True
         self._order.check_sealed()
-        with self._operator.present(), _blind_log(self._request.out, self._blinding):
+        with self._operator.present(), _blind_log(self._out, self._blinding):
             if not self._order.trials:
-                for line in power(self._request.episodes):
+                for line in power(self._options.episodes):
                     self._operator.say(line)
             try:
                 while not self._enough():
@@ -168,16 +171,16 @@ class Blinded:
             for label, trials in self._order.outcomes().items()
             for trial in trials
         ]
-        request = self._request
-        return Report.of(results, episodes, request.margin, until_decided=request.until_decided)
+        options = self._options
+        return Report.of(results, episodes, options.margin, until_decided=options.until_decided)
 
     def _enough(self) -> bool:
-        request = self._request
-        if self._order.blocks >= request.episodes:
+        options = self._options
+        if self._order.blocks >= options.episodes:
             return True
-        if not request.until_decided:
+        if not options.until_decided:
             return False
-        decision = Decision(list(self._policies), request.margin)
+        decision = Decision(list(self._policies), options.margin)
         decision.look(self._results(self._order.outcomes()))
         return decision.after is not None
 
@@ -193,22 +196,20 @@ class Blinded:
         block, place, label = self._order.next()
         number = len(self._order.trials) + 1
         operator = self._operator
-        starts = StartPictures(self._request.out / STARTS / f"start_{block + 1:04d}", cameras_of(self._robot))
+        starts = StartPictures(self._out / STARTS / f"start_{block + 1:04d}", cameras_of(self._robot))
         self._prepare(number, block, starts)
         try:
-            ran = self._run(self._policies[label], number, block, starts)
+            trial = self._run(number, block, place, self._policies[label], starts)
         except IbrobotError as error:
             failed = self._blinding(f"trial {number} did not run: {error_line(error)}")
             operator.ask(failed, (Choice(key="enter", text="try again"), QUIT))
             return
-        outcome = ran.outcome or _KEYS[operator.ask(f"trial {number} has ended", (*_JUDGE, QUIT))]
+        outcome = trial.outcome or _KEYS[operator.ask(f"trial {number} has ended", (*_JUDGE, QUIT))]
         reason = ""
         if outcome == VOID:
             while not reason:
                 reason = operator.ask(f"trial {number} is void; reason").strip()
-        self._order.add(
-            Trial(number, block, place, outcome, reason, ran.time_s, ran.interventions, ran.faults, self._order.seal)
-        )
+        self._order.add(attrs.evolve(trial, outcome=outcome, reason=reason))
         operator.say(f"trial {number}: {outcome}")
 
     def _prepare(self, number: int, block: int, starts: StartPictures) -> None:
@@ -218,7 +219,7 @@ class Blinded:
             operator.say("resetting the scene …")
             if failed := _failure_of(self._reset):
                 operator.say(self._blinding(f"the reset failed: {failed}"))
-        live = self._request.out / SCRATCH / "live"
+        live = self._out / SCRATCH / "live"
         simulated = self._robot.simulated
         with ExitStack() as stack:
             shows = operator.sees and not simulated
@@ -228,20 +229,17 @@ class Blinded:
             scene = "the simulation resets the scene" if simulated else f"set the scene to start {block + 1}"
             if any(each.wanted for each in sights) and not simulated:
                 scene += " as in the picture" if len(sights) == 1 else " as in the pictures"
-            text = f"trial {number} (start {block + 1} of {self._request.episodes}), {scene}"
+            text = f"trial {number} (start {block + 1} of {self._options.episodes}), {scene}"
             operator.ask(text, (Choice(key="enter", text="begin the trial"), QUIT), sights)
 
-    def _run(self, policy: Policy, number: int, block: int, starts: StartPictures) -> _Ran:
-        """Run a policy until the operator judges it or its time is up."""
-        config = policy.load()
-        assert config.recording is not None
-        scratch = self._request.out / SCRATCH / _name(number)
+    def _run(self, number: int, block: int, place: int, policy: Policy, starts: StartPictures) -> Trial:
+        """Run a policy until the operator judges it or its time is up; returns a trial without outcome if it is up."""
+        scratch = self._out / SCRATCH / _name(number)
         shutil.rmtree(scratch, ignore_errors=True)
-        recording = attrs.evolve(config.recording, root=str(scratch), dataset="one")
-        config = attrs.evolve(config, recording=recording, viewer=None)
+        config, recordings = recorded_in(scratch, policy.load())
         episodes = 1 if config.simulated else None
         duration_s = None if config.simulated else config.contract.max_duration_s
-        seed = self._request.seed + block
+        seed = self._options.seed + block
         session = Session(config, installed_plugins(), LaunchRequest(False, seed, duration_s, episodes))
         runtime = Runtime(session)
         # The first trial of a block defines the picture of its start.
@@ -266,30 +264,18 @@ class Blinded:
         if came:
             raise Quit
         runtime.raise_failure()
-        episode = self._request.out / SEALED / _name(number)
-        for bag in recording.folder.glob("episodes/*/"):
+        episode = self._out / SEALED / _name(number)
+        for bag in recordings.glob("*/"):
             shutil.rmtree(episode, ignore_errors=True)  # left by a trial that was not judged
             episode.parent.mkdir(parents=True, exist_ok=True)
             bag.rename(episode)
-        counts = session.counts()["safety"]
-        happened = {kind: count for kind, count in counts.items() if count and kind not in NO_INTERVENTION}
         faults = tuple(map(self._blinding, session.outcome.faults))
-        return _Ran(_KEYS[judged[0]] if judged else "", round(time_s, 3), happened, faults)
+        outcome, happened = _KEYS[judged[0]] if judged else "", interventions(session)
+        return Trial(number, block, place, outcome, "", round(time_s, 3), happened, faults, self._order.seal)
 
 
 def _name(number: int) -> str:
     return f"trial_{number:04d}"
-
-
-@attrs.frozen
-class _Ran:
-    """A finished trial."""
-
-    outcome: str
-    """The operator's judgement while it ran; empty if it ended by itself."""
-    time_s: float
-    interventions: dict[str, int]
-    faults: tuple[str, ...]
 
 
 def reset_of(options: EvalOptions) -> Sequence[str]:

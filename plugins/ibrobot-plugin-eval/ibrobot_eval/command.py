@@ -7,14 +7,16 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
+import attrs
 import click
 
 from ibrobot_core.app import Failed, declared, echo, emit, installed_plugins, run_options, wrong_input
 from ibrobot_eval import EVAL
 from ibrobot_eval.blinded import Blinded, reset_of
 from ibrobot_eval.episodes import Result
-from ibrobot_eval.evaluation import Evaluation, Request, Watch, opened
+from ibrobot_eval.evaluation import Evaluation, Watch, opened
 from ibrobot_eval.merge import WithMerge
 from ibrobot_eval.operators import AtPage, AtTerminal, Operator
 from ibrobot_eval.options import Begin, EvalOptions, Progress, Told
@@ -31,9 +33,7 @@ _KEPT = "interrupted; finished episodes are kept: {} to continue"
 @declared(EVAL)
 @run_options("overrides")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
-def evaluate(
-    options: EvalOptions, /, *, overrides: tuple[str, ...], as_json: bool, events: bool
-) -> None:  # fmt: skip
+def evaluate(options: EvalOptions, /, *, overrides: tuple[str, ...], as_json: bool, events: bool) -> None:
     """Count the successes of policies, and compare them.
 
     Each CONFIG is a robot YAML as for `ibrobot launch`, evaluated in each --mode with each --model. In simulation, all
@@ -48,19 +48,15 @@ def evaluate(
     """
     with wrong_input():
         policies = find_policies(options.config, options.mode, options.model, overrides, options.vary, sim=options.sim)
-        trials = _checked(options, policies)
+        options = attrs.evolve(options, trials=_checked(options, policies))
         installed_plugins().check_pool(options.on)
         reset = reset_of(options)
-        request = Request(
-            options.out, tuple(policies), len(options.seeds), options.seeds[0], options.until_decided, options.margin,
-            options.jobs, options.on, trials,
-        )  # fmt: skip
         try:
-            with opened(request) as evaluation:
-                if trials:
-                    report = _judged(request, reset, AtPage() if events else AtTerminal(), open_=options.open)
+            with opened(options, policies) as evaluation:
+                if options.trials:
+                    report = _judged(options, policies, reset, AtPage() if events else AtTerminal())
                 else:
-                    report = _evaluated(request, evaluation, options.videos, events=events, quiet=as_json)
+                    report = _evaluated(evaluation, events=events, quiet=as_json)
         except KeyboardInterrupt:
             if events:
                 emit(EVAL, Failed(_KEPT.format("start the same evaluation again")))
@@ -73,7 +69,7 @@ def evaluate(
         else:
             echo("not finished: run the same command again to continue")
     else:
-        _tell(request, report, events=events, as_json=as_json)
+        _tell(options.out, report, events=events, as_json=as_json)
 
 
 def _checked(options: EvalOptions, policies: Sequence[Policy]) -> bool:
@@ -102,19 +98,19 @@ def _checked(options: EvalOptions, policies: Sequence[Policy]) -> bool:
     return trials
 
 
-def _tell(request: Request, report: Report, *, events: bool, as_json: bool) -> None:
+def _tell(out: Path, report: Report, *, events: bool, as_json: bool) -> None:
     """Print the report."""
     if events:
-        emit(EVAL, ReportEvent(out=str(request.out), lines=tuple(report.lines())))
+        emit(EVAL, ReportEvent(out=str(out), lines=tuple(report.lines())))
     elif as_json:
         echo(json.dumps(report.facts()))
     else:
         for line in report.lines():
             echo(line)
-        echo(f"report: {request.out / 'report.html'}")
+        echo(f"report: {out / 'report.html'}")
 
 
-def _evaluated(request: Request, evaluation: Evaluation, videos: int, *, events: bool, quiet: bool) -> Report:
+def _evaluated(evaluation: Evaluation, *, events: bool, quiet: bool) -> Report:
     """Run the missing episodes, and write the report."""
     with (_events if events else _lines)(evaluation, quiet) as watch:
         results = evaluation.run(watch)
@@ -123,19 +119,22 @@ def _evaluated(request: Request, evaluation: Evaluation, videos: int, *, events:
         if not (events or quiet):
             echo(f"filming {failures} failures", err=True)
 
-    evaluation.film(results, videos, filming)
-    report = Report.of_simulation(request.policies, results, request.margin, until_decided=request.until_decided)
-    write_all(request.out, report)
+    options = evaluation.options
+    evaluation.film(results, options.videos, filming)
+    report = Report.of_simulation(evaluation.policies, results, options.margin, until_decided=options.until_decided)
+    write_all(options.out, report)
     return report
 
 
-def _judged(request: Request, reset: Sequence[str], operator: Operator, *, open_: bool) -> Report | None:
+def _judged(
+    options: EvalOptions, policies: Sequence[Policy], reset: Sequence[str], operator: Operator
+) -> Report | None:
     """Run blinded trials, and write the report. Returns None if the operator stops before the last trial."""
-    blinded = Blinded(request, reset, operator)
-    if not open_ and not blinded.run():
+    blinded = Blinded(options, policies, reset, operator)
+    if not options.open and not blinded.run():
         return None
     report = blinded.report()
-    write_all(request.out, report)
+    write_all(options.out, report)
     return report
 
 
@@ -143,14 +142,13 @@ def _judged(request: Request, reset: Sequence[str], operator: Operator, *, open_
 def _events(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
     """Yield a function that prints an event for each episode."""
     begin = time.monotonic()
-    request = evaluation.request
-    emit(EVAL, Begin(of=request.episodes * len(request.policies), done=evaluation.resumed))
+    total = len(evaluation.options.seeds) * len(evaluation.policies)
+    emit(EVAL, Begin(of=total, done=evaluation.resumed))
 
     def tell(done: int, total: int, policy: Policy, result: Result) -> None:
-        seconds = round(time.monotonic() - begin, 1)
         event = Progress(
             done=done, of=total, policy=policy.label, seed=result.seed, success=result.success, time_s=result.time_s,
-            seconds=seconds,
+            seconds=round(time.monotonic() - begin, 1),
         )  # fmt: skip
         emit(EVAL, event)
 

@@ -11,8 +11,8 @@ from uuid import uuid4
 import attrs
 
 from ibrobot_core.api import RecorderError, replace_file, seconds
-from ibrobot_core.app import ComponentFailed, LaunchRequest, Runtime, Session, installed_plugins
-from ibrobot_eval.policies import Policy, document_hash
+from ibrobot_core.app import ComponentFailed, LaunchRequest, RobotConfig, Runtime, Session, installed_plugins
+from ibrobot_eval.policies import Policy, as_texts, document_hash
 
 SCRATCH = ".unfinished"
 """Folder within the evaluation for episodes until they are complete."""
@@ -28,7 +28,7 @@ class Result:
     """Duration of the episode, in simulated time; of a success, the time to success [s]."""
     interventions: Mapping[str, int]
     """Kind of intervention of the safety layer -> number of interventions, for those that occurred."""
-    faults: tuple[str, ...]
+    faults: tuple[str, ...] = attrs.field(converter=as_texts)
     factors: Mapping[str, float]
     """Values drawn by the scene from the seed, e.g. the position of an object, and those of varied keys."""
     acting: Mapping[str, str]
@@ -37,8 +37,7 @@ class Result:
     @classmethod
     def read(cls, file: Path) -> Result:
         """Read the result in a file."""
-        fields = json.loads(file.read_text(encoding="utf-8"))
-        return cls(**fields | {"faults": tuple(fields["faults"])})
+        return cls(**json.loads(file.read_text(encoding="utf-8")))
 
 
 @attrs.frozen
@@ -48,23 +47,13 @@ class Place:
     result: Path
     episode: Path
     video: Path
-    unfinished: Path
-
-    def scratch(self) -> Path:
-        """A new folder for the unfinished episode, since another process may run it at the same time."""
-        return self.unfinished.with_name(f"{self.unfinished.name}-{uuid4().hex}")
 
     @classmethod
     def of(cls, out: Path, policy: Policy, seed: int) -> Place:
         """Return the place of an episode."""
-        name = f"seed_{seed:06d}"
-        folder = policy.folder
-        return cls(
-            out / "results" / folder / f"{name}.json",
-            out / "episodes" / folder / name,
-            out / "videos" / folder / f"{name}.mp4",
-            out / SCRATCH / f"{folder}-{name}",
-        )
+        folder, name = policy.folder, f"seed_{seed:06d}"
+        paths = (f"results/{folder}/{name}.json", f"episodes/{folder}/{name}", f"videos/{folder}/{name}.mp4")
+        return cls(*(out / each for each in paths))
 
 
 def run_episode(out: Path, policy: Policy, seed: int, document: str) -> Result:
@@ -80,31 +69,23 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str) -> Result:
         IbrobotError: e.g. if the policy fails, or the recording is incomplete.
     """
     place = Place.of(out, policy, seed)
-    registry = installed_plugins()
     if document_hash(policy.load()) != document:
         raise ComponentFailed(f"{policy.config}: changed during the evaluation")
-    config = policy.load(seed)
-    assert config.recording is not None
-    scratch = place.scratch()
-    # The recording does not contain its path, so that equal episodes have equal bytes.
-    recording = attrs.evolve(config.recording, root=str(scratch), dataset="one")
-    config = attrs.evolve(config, recording=recording, viewer=None)
-    request = LaunchRequest(lockstep=True, seed=seed, episodes=1)
-    runtime = Runtime(Session(config, registry, request))
+    scratch = out / SCRATCH / uuid4().hex  # another process may run the episode at the same time
+    config, recordings = recorded_in(scratch, policy.load(seed))
+    runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=seed, episodes=1)))
     session = runtime.session
     run_to_end(runtime)
     if session.state is None or session.state.success is None:
         raise ComponentFailed(f"{config.source}: the scene has no task, so success is not defined")
     time_s = seconds(session.clock.now_ns() - session.episodes.begun_ns)
-    bags = list(recording.folder.glob("episodes/*/"))
+    bags = list(recordings.glob("*/"))
     metadata = _checked(bags, "success" if session.outcome.successes else "failure", session.outcome.faults)
     varied = {key.rpartition(".")[2]: value for key, value in policy.varied(seed).items()}
-    counts = session.counts()
-    happened = {kind: count for kind, count in counts["safety"].items() if count and kind not in NO_INTERVENTION}
-    result = Result(
-        seed, session.outcome.successes == 1, round(time_s, 6), happened, tuple(session.outcome.faults),
-        json.loads(metadata.get("factors", "{}")) | varied, json.loads(metadata.get("policy", "{}")),
-    )  # fmt: skip
+    factors = json.loads(metadata.get("factors", "{}")) | varied
+    acting = json.loads(metadata.get("policy", "{}"))
+    success, faults = session.outcome.successes == 1, session.outcome.faults
+    result = Result(seed, success, round(time_s, 6), interventions(session), faults, factors, acting)
     place.episode.parent.mkdir(parents=True, exist_ok=True)
     try:
         bags[0].rename(place.episode)
@@ -117,8 +98,21 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str) -> Result:
     return result
 
 
-NO_INTERVENTION = ("missing", "estop")
-"""Counts of the safety layer that are not interventions: ticks without a request, and emergency stops."""
+def recorded_in(folder: Path, config: RobotConfig) -> tuple[RobotConfig, Path]:
+    """Have a robot record into a folder, without a viewer. Also returns the parent folder of its recordings.
+
+    A recording does not contain its path, so that equal episodes have equal bytes.
+    """
+    assert config.recording is not None
+    recording = attrs.evolve(config.recording, root=str(folder), dataset="one")
+    return attrs.evolve(config, recording=recording, viewer=None), recording.folder / "episodes"
+
+
+def interventions(session: Session) -> dict[str, int]:
+    """Kind of intervention of the safety layer -> number of interventions, for those that occurred."""
+    counts = session.counts()["safety"]
+    # The others count ticks without a request, and emergency stops.
+    return {kind: count for kind, count in counts.items() if count and kind not in ("missing", "estop")}
 
 
 def run_to_end(runtime: Runtime) -> None:

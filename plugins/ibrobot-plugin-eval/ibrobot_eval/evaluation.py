@@ -16,8 +16,8 @@ from ibrobot_core.app import ComponentFailed, Done, Job, installed_plugins, owne
 from ibrobot_eval.comparison import Decision
 from ibrobot_eval.episodes import SCRATCH, Place, Result, write
 from ibrobot_eval.film import can_film
-from ibrobot_eval.jobs import EpisodeJob, FilmJob, film_in_pool, run_in_pool
-from ibrobot_eval.options import SETTINGS
+from ibrobot_eval.jobs import EpisodeJob, film_in_pool, run_in_pool
+from ibrobot_eval.options import SETTINGS, EvalOptions
 from ibrobot_eval.policies import Identity, Policy, identify
 
 ASKED = "asked"
@@ -27,59 +27,34 @@ Watch = Callable[[int, int, Policy, Result], None]
 """Receives the number of finished episodes, the total, and the policy and result of the episode just finished."""
 
 
-@attrs.frozen
-class Request:
-    """An evaluation that a user asks for."""
-
-    out: Path
-    policies: tuple[Policy, ...]
-    episodes: int
-    """Number of episodes of each policy; the maximum with `until_decided`."""
-    seed: int
-    """Seed of the first episode; later ones add 1."""
-    until_decided: bool
-    margin: float
-    jobs: int | None
-    """Number of parallel episodes; None for as many as fit into the pool."""
-    on: str = ""
-    """The pool; see `Registry.pool`."""
-    trials: bool = False
-    """Whether an operator judges blinded trials; otherwise episodes run in simulation."""
-
-
 class Evaluation:
     """An evaluation in its folder, which is locked by the context of `opened`.
 
     Attributes:
-        request: the evaluation that the user asks for.
-        identities: label of a policy -> what its results depend on.
+        options: the evaluation that the user asks for.
+        policies: the policies.
         resumed: number of episodes that earlier calls have finished.
     """
 
-    def __init__(self, request: Request, identities: Mapping[str, Identity]) -> None:
-        self.request = request
-        self.identities = identities
+    def __init__(self, options: EvalOptions, policies: Sequence[Policy], identities: Mapping[str, Identity]) -> None:
+        self.options = options
+        self.policies = policies
+        self._identities = identities
         self._results: dict[tuple[str, int], Result] = {}
-        for policy in request.policies:
-            for seed in self._seeds:
-                file = Place.of(request.out, policy, seed).result
+        for policy in policies:
+            for seed in options.seeds:
+                file = Place.of(options.out, policy, seed).result
                 if file.exists():
                     self._results[policy.label, seed] = Result.read(file)
         self.resumed = len(self._results)
-        self._decision = Decision(
-            [each.label for each in request.policies] if request.until_decided else [], request.margin
-        )
-
-    @property
-    def _seeds(self) -> range:
-        return range(self.request.seed, self.request.seed + self.request.episodes)
+        self._decision = Decision([each.label for each in policies] if options.until_decided else [], options.margin)
 
     def results(self) -> dict[str, list[Result]]:
         """Label -> the results of the first seeds without a gap."""
         found: dict[str, list[Result]] = {}
-        for policy in self.request.policies:
+        for policy in self.policies:
             done = found.setdefault(policy.label, [])
-            for seed in self._seeds:
+            for seed in self.options.seeds:
                 if (result := self._results.get((policy.label, seed))) is None:
                     break
                 done.append(result)
@@ -91,19 +66,19 @@ class Evaluation:
         Raises:
             IbrobotError: if an episode fails; finished ones are kept.
         """
-        request = self.request
+        seeds = self.options.seeds
         todo = [
-            EpisodeJob(str(request.out), policy, seed, self.identities[policy.label].document)
-            for seed in self._seeds
-            for policy in request.policies
+            self._job(policy, seed)
+            for seed in seeds
+            for policy in self.policies
             if (policy.label, seed) not in self._results
         ]
-        total = len(self._seeds) * len(request.policies)
+        total = len(seeds) * len(self.policies)
         self._decision.look(self.results())
         if todo and self._decision.after is None:
             with self._running(run_in_pool, todo) as done:
                 for job, result in done:
-                    file = Place.of(request.out, job.policy, job.seed).result
+                    file = Place.of(job.out, job.policy, job.seed).result
                     if not file.exists():
                         raise DatasetError(
                             f"{file}: not found after a machine of the pool wrote it: --out must be in a folder that "
@@ -126,25 +101,28 @@ class Evaluation:
             begin: receives the number of failures to film, if there are any.
         """
         todo = []
-        for policy in self.request.policies:
+        for policy in self.policies:
             failed = [each.seed for each in results[policy.label] if not each.success][:most]
             if failed and can_film(policy):
-                todo += [FilmJob(str(self.request.out), policy, seed) for seed in failed]
-        todo = [job for job in todo if not Place.of(self.request.out, job.policy, job.seed).video.exists()]
+                todo += [self._job(policy, seed) for seed in failed]
+        todo = [job for job in todo if not Place.of(job.out, job.policy, job.seed).video.exists()]
         if todo:
             begin(len(todo))
             with self._running(film_in_pool, todo) as done:
                 for _ in done:
                     pass
 
+    def _job(self, policy: Policy, seed: int) -> EpisodeJob:
+        return EpisodeJob(self.options.out, policy, seed, self._identities[policy.label].document)
+
     @contextmanager
-    def _running[J: (EpisodeJob, FilmJob), R](
-        self, function: Callable[[J, Callable[[int], None]], R], orders: Sequence[J]
-    ) -> Iterator[Iterator[tuple[J, R]]]:
+    def _running[R](
+        self, function: Callable[[EpisodeJob, Callable[[int], None]], R], orders: Sequence[EpisodeJob]
+    ) -> Iterator[Iterator[tuple[EpisodeJob, R]]]:
         """Run jobs in the pool. Yields an iterator over each finished job and its result."""
         jobs = (Job(function, order) for order in orders)
         with (
-            closing(installed_plugins().pool(self.request.on, self.request.jobs)) as pool,
+            closing(installed_plugins().pool(self.options.on, self.options.jobs)) as pool,
             closing(pool.run(jobs)) as finished,
         ):
             yield map(_result, finished)
@@ -160,9 +138,9 @@ class Evaluation:
         found, decided = self.results(), self._decision.after
         if decided is None:
             return found
-        for policy in self.request.policies:
-            for seed in self._seeds[decided:]:
-                place = Place.of(self.request.out, policy, seed)
+        for policy in self.policies:
+            for seed in self.options.seeds[decided:]:
+                place = Place.of(self.options.out, policy, seed)
                 place.result.unlink(missing_ok=True)
                 shutil.rmtree(place.episode, ignore_errors=True)
         return {label: results[:decided] for label, results in found.items()}
@@ -180,58 +158,69 @@ def _result[R](done: Done[R]) -> tuple[Any, R]:
 
 
 @contextmanager
-def opened(request: Request) -> Iterator[Evaluation]:
+def opened(options: EvalOptions, policies: Sequence[Policy]) -> Iterator[Evaluation]:
     """Begin an evaluation in its folder, or continue that of an earlier call.
 
     Raises:
         InUse: if another process writes to the folder.
         DatasetError: if the folder contains anything else, was begun with other settings or files, or is read-only.
     """
-    out = request.out
+    out = options.out
     registry = installed_plugins()
-    identities = {policy.label: identify(policy, registry) for policy in request.policies}
+    identities = {policy.label: identify(policy, registry) for policy in policies}
     settings = {
         "format": _FORMAT,
-        "seed": request.seed,
-        "until_decided": request.until_decided,
-        "margin": request.margin,
-        "trials": request.trials,
-        "vary": list(request.policies[0].vary),
+        "seed": options.seeds[0],
+        "until_decided": options.until_decided,
+        "margin": options.margin,
+        "trials": options.trials,
+        "vary": list(options.vary),
         "policies": {
             each.label: {"mode": each.mode, "model": each.model, **attrs.asdict(identities[each.label])}
-            for each in request.policies
+            for each in policies
         },
         "versions": registry.versions(),
-        ASKED: [attrs.asdict(each) for each in request.policies],
+        ASKED: [attrs.asdict(each) for each in policies],
     }
     with owned(out, "is being evaluated", DatasetError):
         try:
-            _begin(request, settings)
+            _begin(options, settings)
         except OSError as error:
             raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
         try:
-            yield Evaluation(request, identities)
+            yield Evaluation(options, policies, identities)
         finally:
             shutil.rmtree(out / SCRATCH, ignore_errors=True)
 
 
-def _begin(request: Request, settings: Mapping[str, Any]) -> None:
+def _begin(options: EvalOptions, settings: Mapping[str, Any]) -> None:
     """Write the settings into a new folder, or compare them to the present ones."""
-    out, file = request.out, request.out / SETTINGS
+    out, file = options.out, options.out / SETTINGS
     if file.is_file():
-        try:
-            known = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise DatasetError(f"{file}: cannot be read: {error}") from None
+        known = read_settings(file)
         if differing := list(differences(known, {**settings, ASKED: known.get(ASKED)})):
             raise DatasetError(f"{out}: was begun with other settings: {'; '.join(differing)}; choose a new folder")
         done = max((len(list(each.glob("seed_*.json"))) for each in (out / "results").glob("*")), default=0)
-        if done > request.episodes and not request.until_decided:
+        if done > len(options.seeds) and not options.until_decided:
             raise DatasetError(f"{out}: already has {done} episodes of a policy; --episodes must not be smaller")
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out}: exists and is not an evaluation; choose a new folder")
     write(file, json.dumps(settings, indent=1) + "\n")
+
+
+def read_settings(file: Path) -> dict[str, Any]:
+    """Read the settings of an evaluation.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        DatasetError: if it is damaged.
+    """
+    try:
+        settings: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise DatasetError(f"{file}: cannot be read: {error}") from None
+    return settings
 
 
 def differences(known: Mapping[str, Any], now: Mapping[str, Any], where: str = "") -> Iterator[str]:

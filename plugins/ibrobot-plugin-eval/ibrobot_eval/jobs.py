@@ -1,4 +1,4 @@
-"""The jobs of an evaluation, for the processes of a pool: episodes to run, and episodes to film."""
+"""The jobs of an evaluation, for the processes of a pool: run an episode, or film it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ibrobot_eval.policies import Policy
 
 @attrs.frozen
 class EpisodeJob:
-    """An episode to run."""
+    """An episode to run, or to film."""
 
-    out: str
+    out: Path
     """The folder of the evaluation."""
     policy: Policy
     seed: int
@@ -25,26 +25,16 @@ class EpisodeJob:
     """Hash of the robot YAML with which the evaluation began."""
 
 
-@attrs.frozen
-class FilmJob:
-    """A finished episode to film."""
-
-    out: str
-    """The folder of the evaluation."""
-    policy: Policy
-    seed: int
-
-
 def run_in_pool(job: EpisodeJob, progress: Callable[[int], None]) -> Result:
     """Run an episode."""
     _quiet()
-    return run_episode(Path(job.out), job.policy, job.seed, job.document)
+    return run_episode(job.out, job.policy, job.seed, job.document)
 
 
-def film_in_pool(job: FilmJob, progress: Callable[[int], None]) -> None:
-    """Film an episode."""
+def film_in_pool(job: EpisodeJob, progress: Callable[[int], None]) -> None:
+    """Film a finished episode."""
     _quiet()
-    place = Place.of(Path(job.out), job.policy, job.seed)
+    place = Place.of(job.out, job.policy, job.seed)
     film(place.video, job.policy, Result.read(place.result))
 
 

@@ -14,7 +14,7 @@ import click
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import Ownership, echo, wrong_input
 from ibrobot_eval.episodes import Place, Result, write
-from ibrobot_eval.evaluation import ASKED, differences
+from ibrobot_eval.evaluation import ASKED, differences, read_settings
 from ibrobot_eval.options import SETTINGS
 from ibrobot_eval.page import write_all
 from ibrobot_eval.policies import Policy
@@ -38,18 +38,14 @@ class _Part:
         Raises:
             DatasetError: if the folder has no evaluation, or one that cannot be merged.
         """
-        file = folder / SETTINGS
         try:
-            settings = json.loads(file.read_text(encoding="utf-8"))
+            settings = read_settings(folder / SETTINGS)
         except FileNotFoundError:
             raise DatasetError(f"{folder}: is not an evaluation: it has no {SETTINGS}") from None
-        except ValueError as error:
-            raise DatasetError(f"{file}: cannot be read: {error}") from None
         asked = settings.pop(ASKED, None)
         if settings.get("trials") or settings.get("until_decided") or asked is None:
             raise DatasetError(f"{folder}: only simulated evaluations of a fixed number of episodes can be merged")
-        lists = ("overrides", "vary")
-        policies = tuple(Policy(**each | {name: tuple(each[name]) for name in lists}) for each in asked)
+        policies = tuple(Policy(**each) for each in asked)
         results = {
             policy.label: {
                 result.seed: result

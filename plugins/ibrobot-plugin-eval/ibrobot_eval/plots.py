@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Any
 
@@ -80,7 +80,8 @@ def _below(axis: Axis, top: float, bottom: float, label: str) -> list[str]:
     """Grid and labels of a horizontal axis."""
     parts = []
     for value in axis.ticks():
-        parts += [_line(axis(value), top, axis(value), bottom, "grid"), _text(axis(value), bottom + 15, f"{value:g}")]
+        x = axis(value)
+        parts += [_line(x, top, x, bottom, "grid"), _text(x, bottom + 15, f"{value:g}")]
     return [*parts, _text((axis.begin + axis.end) / 2, bottom + 29, label, class_="label")]
 
 
@@ -88,11 +89,14 @@ def _beside(axis: Axis, left: float, right: float) -> list[str]:
     """Grid and labels of a vertical axis."""
     parts = []
     for value in axis.ticks(5):
-        parts += [
-            _line(left, axis(value), right, axis(value), "grid"),
-            _text(left - 6, axis(value) + 4, f"{value:g}", "end"),
-        ]
+        y = axis(value)
+        parts += [_line(left, y, right, y, "grid"), _text(left - 6, y + 4, f"{value:g}", "end")]
     return parts
+
+
+def _margin(labels: Iterable[str]) -> int:
+    """Width for the labels of policies [px]."""
+    return 24 + 7 * max(map(len, labels))
 
 
 def rates(rows: Sequence[tuple[str, int, int]]) -> str:
@@ -101,7 +105,7 @@ def rates(rows: Sequence[tuple[str, int, int]]) -> str:
     Args:
         rows: label, number of successes and number of episodes of each policy.
     """
-    left = 24 + 7 * max(len(label) for label, _, _ in rows)
+    left = _margin(label for label, _, _ in rows)
     height = _TOP + 30 * len(rows) + _BOTTOM
     axis = Axis(0, 100, left, WIDTH - _RIGHT)
     parts = _below(axis, _TOP, height - _BOTTOM, "success rate [%], with 95 % interval")
@@ -144,7 +148,7 @@ def strips(rows: Sequence[tuple[str, Sequence[tuple[int, bool, float]]]]) -> str
     Args:
         rows: label of each policy, with seed, success and duration [s] of each episode.
     """
-    left = 24 + 7 * max(len(label) for label, _ in rows)
+    left = _margin(label for label, _ in rows)
     count = max(len(episodes) for _, episodes in rows)
     step = min(24.0, (WIDTH - left - _RIGHT) / count)
     parts = []
@@ -169,7 +173,7 @@ def times(rows: Sequence[tuple[str, Sequence[tuple[int, float]]]]) -> str:
     Args:
         rows: label of each policy, with seed and time [s] of each success.
     """
-    left = 24 + 7 * max(len(label) for label, _ in rows)
+    left = _margin(label for label, _ in rows)
     found = [time_s for _, successes in rows for _, time_s in successes]
     axis = Axis(0, 1.05 * max(found), left, WIDTH - _RIGHT)
     height = _TOP + 30 * len(rows) + _BOTTOM
@@ -178,9 +182,8 @@ def times(rows: Sequence[tuple[str, Sequence[tuple[int, float]]]]) -> str:
         y = _TOP + 30 * number + 15
         parts.append(_text(left - 10, y + 4, label, "end"))
         for seed, time_s in successes:
-            parts.append(
-                tag("circle", tag("title", f"seed {seed}: {time_s:.2f} s"), cx=axis(time_s), cy=y, r=4, class_="faint")
-            )
+            tip = tag("title", f"seed {seed}: {time_s:.2f} s")
+            parts.append(tag("circle", tip, cx=axis(time_s), cy=y, r=4, class_="faint"))
     return svg(WIDTH, height, parts, "Times to success")
 
 
@@ -199,10 +202,20 @@ def map_of(points: Sequence[tuple[float, float, bool, str]], names: tuple[str, s
         (across.high - across.low) / (width - _RIGHT - _LEFT), (up.high - up.low) / (height - _BOTTOM - _TOP - 16)
     )
     across, up = _widened(across, scale), _widened(up, scale)
-    parts = [*_below(across, _TOP + 16, height - _BOTTOM, names[0]), *_beside(up, _LEFT, width - _RIGHT)]
-    parts += [_text(_LEFT - 6, _TOP + 6, names[1], "start", "label"), _text(width - _RIGHT, _TOP + 6, title, "end")]
+    parts = _panel(across, up, names, title)
     parts += [mark(across(x), up(y), success, tip) for x, y, success, tip in points]
     return svg(width, height, parts, f"{title}: outcomes over {names[0]} and {names[1]}")
+
+
+def _panel(across: Axis, up: Axis, names: tuple[str, str], title: str) -> list[str]:
+    """Axes of a small plot with their names, and its title."""
+    names_y = _TOP + 6
+    return [
+        *_below(across, up.end, up.begin, names[0]),
+        *_beside(up, across.begin, across.end),
+        _text(across.begin - 6, names_y, names[1], "start", "label"),
+        _text(across.end, names_y, title, "end"),
+    ]
 
 
 def _widened(axis: Axis, scale: float) -> Axis:
@@ -222,26 +235,15 @@ def by_factor(points: Sequence[tuple[float, bool]], name: str, title: str) -> st
     ordered = sorted(points)
     across = axis_of([value for value, _ in ordered], _LEFT, width - _RIGHT)
     up = Axis(0, 100, height - _BOTTOM, _TOP + 16)
-    parts = [*_below(across, _TOP + 16, height - _BOTTOM, name), *_beside(up, _LEFT, width - _RIGHT)]
-    parts += [
-        _text(_LEFT - 6, _TOP + 6, "successes [%]", "start", "label"),
-        _text(width - _RIGHT, _TOP + 6, title, "end"),
-    ]
+    parts = _panel(across, up, (name, "successes [%]"), title)
     bins = min(_BINS, len(ordered))
     for number in range(bins):
         part = ordered[number * len(ordered) // bins : (number + 1) * len(ordered) // bins]
         successes, count = sum(success for _, success in part), len(part)
-        x = across((part[0][0] + part[-1][0]) / 2)
+        low, high, y = part[0][0], part[-1][0], up(100 * successes / count)
+        x = across((low + high) / 2)
         interval = wilson(successes, count)
         parts.append(_line(x, up(100 * interval.low), x, up(100 * interval.high), "range"))
-        parts.append(
-            _line(
-                across(part[0][0]),
-                up(100 * successes / count),
-                across(part[-1][0]),
-                up(100 * successes / count),
-                "estimate",
-            )
-        )
-        parts.append(mark(x, up(100 * successes / count), True, f"{successes} of {count}"))
+        parts.append(_line(across(low), y, across(high), y, "estimate"))
+        parts.append(mark(x, y, True, f"{successes} of {count}"))
     return svg(width, height, parts, f"{title}: success rate over {name}")

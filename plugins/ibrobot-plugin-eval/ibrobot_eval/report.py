@@ -84,8 +84,7 @@ class Report:
         results: dict[str, list[Result]] = {each["label"]: [] for each in facts["policies"]}
         episodes = []
         for each in facts["episodes"]:
-            fields = {field.name: each[field.name] for field in attrs.fields(Result)}
-            result = Result(**fields | {"faults": tuple(fields["faults"])})
+            result = Result(**{field.name: each[field.name] for field in attrs.fields(Result)})
             results[each["policy"]].append(result)
             episodes.append(Episode(each["policy"], result, each["recording"], each["video"], each["command"]))
         return cls.of(results, episodes, facts["margin"], until_decided=facts["until_decided"])
@@ -108,16 +107,7 @@ class Report:
             "lines": self.lines(),
             "policies": [attrs.asdict(each) for each in self.summaries],
             "comparisons": [{**attrs.asdict(each), "words": each.words} for each in self.comparisons],
-            "episodes": [
-                {
-                    "policy": each.policy,
-                    **attrs.asdict(each.result),
-                    "recording": each.recording,
-                    "video": each.video,
-                    "command": each.command,
-                }
-                for each in self.episodes
-            ],
+            "episodes": [_flat(each) for each in self.episodes],
         }
 
     def as_csv(self) -> str:
@@ -160,6 +150,12 @@ class Report:
                 f"{LEVEL} interval {percent(each.wilson)}{time}"
             )
         return [*lines, *(each.words for each in self.comparisons)]
+
+
+def _flat(episode: Episode) -> dict[str, Any]:
+    """An episode as a JSON object, with the fields of its result in place of the result."""
+    fields = attrs.asdict(episode)
+    return {"policy": fields.pop("policy"), **fields.pop("result"), **fields}
 
 
 SUMMARY_HEAD = (

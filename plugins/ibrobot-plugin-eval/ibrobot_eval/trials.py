@@ -20,6 +20,7 @@ import numpy as np
 
 from ibrobot_core.api import DatasetError
 from ibrobot_eval.episodes import write
+from ibrobot_eval.policies import as_texts
 
 ORDER = "order.sealed"
 OPENED = "order_opened.json"
@@ -45,15 +46,14 @@ class Trial:
     time_s: float
     """Time from its beginning to the operator's key, or to its end [s]."""
     interventions: dict[str, int]
-    faults: tuple[str, ...]
+    faults: tuple[str, ...] = attrs.field(converter=as_texts)
     seal: str
     """Hash of the sealed order under which it ran."""
 
     @classmethod
     def read(cls, file: Path) -> Trial:
         """Read a trial."""
-        fields = json.loads(file.read_text(encoding="utf-8"))
-        return cls(**fields | {"faults": tuple(fields["faults"])})
+        return cls(**json.loads(file.read_text(encoding="utf-8")))
 
 
 class Order:
