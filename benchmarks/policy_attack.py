@@ -36,13 +36,14 @@ STATE = "observation.state"
 KEY = "pa55word"
 SERVER = """
 import logging, sys
+from ibrobot_serve.client_model import ClientModel
 from ibrobot_serve.{module} import {name}
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 logging.disable(logging.CRITICAL)
 policy = FakePolicy(host_context())
 policy.load()
-server = {name}(policy, "net", "127.0.0.1", 0, "pa55word")
+server = {name}(ClientModel(policy, "net", "openpi"), "127.0.0.1", 0, "pa55word")
 print(server.port, flush=True)
 sys.stdin.read()
 server.close()

@@ -21,6 +21,7 @@ from contextlib import closing
 from typing import Any, override
 
 import numpy as np
+from ibrobot_serve.client_model import ClientModel
 from ibrobot_serve.gr00t_server import Gr00tServer
 from ibrobot_serve.openpi_server import OpenpiServer
 from ibrobot_testing import host_context
@@ -124,13 +125,13 @@ def main() -> int:
     ):
         if python is None:
             continue
-        with closing(server(Repeats(), "repeats", "127.0.0.1", 0, KEY)) as serving:
+        model = ClientModel(Repeats(), "repeats", name)
+        with closing(server(model, "127.0.0.1", 0, KEY)) as serving:
             arguments = (str(serving.port), str(given.requests), given.checkout)
             done = subprocess.run(
                 [python, "-c", code + COMMON, *arguments], stdout=subprocess.PIPE, text=True, check=True
             )
-            answered, refused = serving.counts
-        result = {"client": name, **json.loads(done.stdout), "answered": answered, "refused": refused}
+        result = {"client": name, **json.loads(done.stdout), "answered": model.answered, "refused": model.failed}
         print(json.dumps(result))
         failed |= bool(result["wrong"]) or not result["wrong_request"] or not result["wrong_key"]
     return int(failed)

@@ -1,4 +1,4 @@
-"""A model for clients of other projects: what they may ask, and its answers."""
+"""A model for clients of other projects: checks their requests, and computes the answers."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ class ClientModel:
     Args:
         policy: loaded; its owner closes it.
         name: name of the model.
-        project: whose clients ask, for messages.
+        protocol: the clients' protocol, for messages.
 
     Raises:
         PolicyError: for a policy that needs more than one request at a time.
     """
 
-    def __init__(self, policy: Policy, name: str, project: str) -> None:
+    def __init__(self, policy: Policy, name: str, protocol: str) -> None:
         if policy.spec.history or policy.spec.stateful:
             raise PolicyError(
-                f"model {name!r} uses earlier observations, for which {project}'s protocol has no place; serve it to "
-                "robots of ibrobot, without --protocol"
+                f"model {name!r} uses earlier observations, which do not fit into requests of {protocol}; serve it "
+                "to robots of ibrobot, without --protocol"
             )
         self.policy, self.name, self.spec = policy, name, policy.spec
         self.answered = self.failed = 0
@@ -40,7 +40,7 @@ class ClientModel:
 
     @contextmanager
     def contained(self) -> Iterator[None]:
-        """Count a request that fails.
+        """Count a request that fails, and let only `PolicyError` pass.
 
         Raises:
             PolicyError: for an error of any kind.
@@ -56,7 +56,7 @@ class ClientModel:
             raise PolicyError(f"{type(error).__name__}: {error}") from None
 
     def chunk(self, values: Mapping[str, Any], prompt: Any) -> tuple[NDArray[np.float32], float]:
-        """The actions for observations, shape (N, A), and the time that they took [ms].
+        """Compute the actions for observations, shape (N, A). Also returns the time that it took [ms].
 
         Args:
             values: the policy's observations: images (H, W, 3) uint8, vectors of numbers.
@@ -72,6 +72,17 @@ class ClientModel:
             actions = self.policy.postprocess(self.policy.infer(tensors)).astype(np.float32)
         self.answered += 1
         return actions, (time.perf_counter() - begun_s) * 1e3
+
+
+def as_dictionary(request: object) -> dict[str, Any]:
+    """A request after decoding.
+
+    Raises:
+        PolicyError: if it is no dictionary.
+    """
+    if not isinstance(request, dict):
+        raise PolicyError(f"a request must be a dictionary, got {type(request).__name__}")
+    return request
 
 
 def _frame(request: Mapping[str, Any], prompt: Any, policy: Policy) -> Frame:

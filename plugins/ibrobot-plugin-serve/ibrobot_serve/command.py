@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -220,12 +221,8 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
             f"{path} names no transport to robots: add "
             f"--set 'transport={{type: {example_type('transport')}}}' --listen ENDPOINT"
         )
-
-    def make_transport() -> Transport:
-        made: Transport = registry.find("transport", section.type).make(section.options, _context(config.robot))
-        return made
-
-    return options["name"] or model, build_policy(config, registry, model), make_transport
+    make = partial(registry.find("transport", section.type).make, section.options, _context(config.robot))
+    return options["name"] or model, build_policy(config, registry, model), make
 
 
 def _from_folder(
@@ -235,18 +232,9 @@ def _from_folder(
     policy, context = _policy_of_folder(folder, registry, options)
     transport = registry.default("transport")
     transports = registry.find("transport", transport)
-    settings = single_options(
-        transports.options,
-        [*_listening(registry, transport, options["listen"]), *options["transport_options"]],
-        "--listen, --transport",
-        "--transport",
-    )
-
-    def make_transport() -> Transport:
-        made: Transport = transports.make(settings, context)
-        return made
-
-    return options["name"] or folder.absolute().name, policy, make_transport
+    given = [*_listening(registry, transport, options["listen"]), *options["transport_options"]]
+    settings = single_options(transports.options, given, "--listen, --transport", "--transport")
+    return options["name"] or folder.absolute().name, policy, partial(transports.make, settings, context)
 
 
 def _policy_of_folder(folder: Path, registry: Registry, options: dict[str, Any]) -> tuple[Policy, Context]:
@@ -272,6 +260,7 @@ def _chosen(config: RobotConfig, path: Path, options: dict[str, Any]) -> str:
 
 def _serve_clients(what: str, registry: Registry, options: dict[str, Any]) -> None:
     """Answer clients of another project until a signal."""
+    from ibrobot_serve.client_model import ClientModel
     from ibrobot_serve.gr00t_server import Gr00tServer
     from ibrobot_serve.openpi_server import OpenpiServer
 
@@ -284,16 +273,17 @@ def _serve_clients(what: str, registry: Registry, options: dict[str, Any]) -> No
         else:
             path = find_config(what, registry)
             config = load_config(path, overrides=options["overrides"], sim=options["sim"], registry=registry)
-            model = _chosen(config, path, options)
-            name, policy = options["name"] or model, build_policy(config, registry, model)
+            chosen = _chosen(config, path, options)
+            name, policy = options["name"] or chosen, build_policy(config, registry, chosen)
     try:
         policy.load()
         stopping = threading.Event()
         on_signals(stopping.set)
         with wrong_input():
             try:
+                model = ClientModel(policy, name, protocol)
                 kind = OpenpiServer if protocol == "openpi" else Gr00tServer
-                server: OpenpiServer | Gr00tServer = kind(policy, name, host, port, key)
+                server: OpenpiServer | Gr00tServer = kind(model, host, port, key)
             except OSError as error:
                 raise click.UsageError(f"--listen: {host}:{port} cannot be used: {error.strerror}") from None
         try:
@@ -302,7 +292,7 @@ def _serve_clients(what: str, registry: Registry, options: dict[str, Any]) -> No
             stopping.wait()
         finally:
             server.close()
-        echo("{} answered, {} failed".format(*server.counts))
+        echo(f"{model.answered} answered, {model.failed} failed")
     finally:
         policy.close()
 

@@ -45,12 +45,12 @@ class Offer:
     server: str
     """Id of the server, new after each start."""
     fingerprint: str = attrs.field(validator=_text)
-    """Of its policy with the weights."""
+    """Fingerprint of its policy with the weights."""
     weights: str = attrs.field(validator=_text)
     """Hash of the weights; empty if the policy has none."""
     spec: Mapping[str, Any] = attrs.field(validator=instance_of(dict))
     robots: int = attrs.field(validator=_number)
-    """Number of robots that it served lately."""
+    """Number of robots that it served recently."""
     canary: float = attrs.field(validator=_number)
     """The share of all robots that may use it although its weights differ; 0: it is an ordinary server."""
     uptime_s: float = attrs.field(validator=_number)
@@ -59,10 +59,10 @@ class Offer:
 
     @classmethod
     def read(cls, server: str, payload: Payload) -> Offer:
-        """Of a server's answer.
+        """Parse a server's answer.
 
         Raises:
-            PolicyError: if it is something else.
+            PolicyError: if it is not an offer.
         """
         try:
             if len(payload) > _OFFER_SIZE:
@@ -109,7 +109,7 @@ def ranked(offers: Sequence[Offer], robot: str) -> list[Offer]:
 
 
 def _share(offers: Sequence[Offer], more: int = 0) -> int:
-    """An equal share of the robots, and of some more."""
+    """Robots per server, rounded up, if all of them and `more` new ones were spread evenly."""
     return -(-(sum(offer.robots for offer in offers) + more) // max(1, len(offers)))
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import zmq
 from ibrobot_policy_wire import MAX_MESSAGE, pack_npy, unpack_npy
 
-from ibrobot_core.api import Policy, PolicyError
-from ibrobot_serve.client_model import ClientModel
+from ibrobot_core.api import PolicyError
+from ibrobot_serve.client_model import ClientModel, as_dictionary
 
 TASK = "annotation.human.task_description"
 _GLANCE_MS = 100
@@ -33,20 +33,18 @@ class Gr00tServer:
     `video.top`. ZeroMQ takes the requests of all clients in turns, and refuses messages over 64 MiB unread.
 
     Args:
-        policy: loaded; its owner closes it.
-        name: name of the model.
+        model: the model.
         host: address to listen on.
         port: port; 0: any free one.
         key: what clients must send as `api_token`; None: nothing.
 
     Raises:
-        PolicyError: for a policy that needs more than one request at a time.
         OSError: if the address cannot be used.
     """
 
-    def __init__(self, policy: Policy, name: str, host: str, port: int, key: str | None = None) -> None:
-        self._model, self._key = ClientModel(policy, name, "GR00T"), key
-        self._places = {_place(observation): observation for observation in policy.spec.observations}
+    def __init__(self, model: ClientModel, host: str, port: int, key: str | None = None) -> None:
+        self._model, self._key = model, key
+        self._places = {_place(observation): observation for observation in model.spec.observations}
         """Modality and name -> observation."""
         self._context = zmq.Context()
         # A socket of kind REP stops answering everybody after bytes of another protocol (libzmq 4.3.5).
@@ -65,11 +63,6 @@ class Gr00tServer:
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="gr00t")
         self._thread.start()
-
-    @property
-    def counts(self) -> tuple[int, int]:
-        """Number of requests that were answered, and of those that failed."""
-        return self._model.answered, self._model.failed
 
     def close(self) -> None:
         """Stop answering. Safe to call twice."""
@@ -90,9 +83,7 @@ class Gr00tServer:
     def _answer(self, message: bytes) -> Any:
         try:
             with self._model.contained():
-                request = unpack_npy(message)
-                if not isinstance(request, dict):
-                    raise PolicyError(f"a request must be a dictionary, got {type(request).__name__}")
+                request = as_dictionary(unpack_npy(message))
                 if self._key is not None:
                     token = request.get("api_token")
                     if not isinstance(token, str) or not hmac.compare_digest(token.encode(), self._key.encode()):

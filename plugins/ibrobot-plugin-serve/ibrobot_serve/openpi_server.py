@@ -11,8 +11,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
-from ibrobot_core.api import Policy, PolicyError
-from ibrobot_serve.client_model import ClientModel
+from ibrobot_core.api import PolicyError
+from ibrobot_serve.client_model import ClientModel, as_dictionary
 
 _CLOSE_S = 0.5
 _PROMPT = "prompt"
@@ -26,22 +26,20 @@ class OpenpiServer:
     `server_timing`. Requests of all clients are computed one after the other.
 
     Args:
-        policy: loaded; its owner closes it.
-        name: name of the model, for the metadata.
+        model: the model.
         host: address to listen on.
         port: port; 0: any free one.
         key: what clients must send as `Authorization: Api-Key KEY`; None: nothing.
 
     Raises:
-        PolicyError: for a policy that needs more than one request at a time.
         OSError: if the address cannot be used.
     """
 
-    def __init__(self, policy: Policy, name: str, host: str, port: int, key: str | None = None) -> None:
-        self._model, self._key = ClientModel(policy, name, "openpi"), key
-        spec = policy.spec
+    def __init__(self, model: ClientModel, host: str, port: int, key: str | None = None) -> None:
+        self._model, self._key = model, key
+        policy, spec = model.policy, model.spec
         self._metadata = {
-            "model": name,
+            "model": model.name,
             "fingerprint": policy.fingerprint(),
             "weights": policy.weights(),
             "observations": {each: list(shape) for each, shape in spec.observations.items()},
@@ -58,11 +56,6 @@ class OpenpiServer:
         self.port: int = self._server.socket.getsockname()[1]
         self._thread = threading.Thread(target=self._server.serve_forever, name="openpi")
         self._thread.start()
-
-    @property
-    def counts(self) -> tuple[int, int]:
-        """Number of requests that were answered, and of those that failed."""
-        return self._model.answered, self._model.failed
 
     def close(self) -> None:
         """End all connections. Safe to call twice."""
@@ -96,9 +89,7 @@ class OpenpiServer:
             with self._model.contained():
                 if isinstance(message, str):
                     raise PolicyError("a request must be binary")
-                request = unpack(message)
-                if not isinstance(request, dict):
-                    raise PolicyError(f"a request must be a dictionary, got {type(request).__name__}")
+                request = as_dictionary(unpack(message))
                 prompt = request.pop(_PROMPT, "")
                 actions, took_ms = self._model.chunk(request, prompt)
         except PolicyError as error:

@@ -52,15 +52,6 @@ _PARALLEL = 8
 """Maximum number of concurrent requests to a server with a stateless model."""
 
 
-@attrs.frozen
-class _Session:
-    """The period in which a robot uses one server. Other sessions may have other weights."""
-
-    server: str
-    fingerprint: str
-    """Of the policy with the server's weights."""
-
-
 class _OtherServerError(PolicyError):
     """This server did not answer, but another may."""
 
@@ -68,7 +59,7 @@ class _OtherServerError(PolicyError):
 class RemoteEngine(Engine):
     """The model on a server; the robot's side has no weights.
 
-    A robot keeps its server until that one dies, fails, or stops taking robots; it may also change at the start of an
+    A robot keeps its server until it dies, fails, or stops accepting robots; it may also change at the start of an
     episode, if another server has more room. While no server is reachable, requests fail and the arm holds. Each
     request contains everything that a server needs. The transport reconnects by itself.
 
@@ -105,9 +96,9 @@ class RemoteEngine(Engine):
         self._episode = time.time_ns()
         """Begins at the present time, so that a restarted robot with the same name does not repeat a number."""
         self._choosing = threading.Lock()
-        self._session: _Session | None = None
+        self._session: Offer | None = None
+        """The server in use, as it described itself when it was chosen."""
         self._last_server = ""
-        """The session of the last request."""
         self._weights: str | None = None
         """Hash of the weights of the servers, except canaries; None before the first was chosen."""
         self._reconsider = False
@@ -182,7 +173,7 @@ class RemoteEngine(Engine):
         if end is not None:
             end()
 
-    def _ask(self, session: _Session, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
+    def _ask(self, session: Offer, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
         """The answer of one server.
 
         Raises:
@@ -226,7 +217,7 @@ class RemoteEngine(Engine):
         self.stats.model_ms = answer.latency_ms - self.stats.queue_ms
         return answer.tensors
 
-    def _leave(self, session: _Session, why: str) -> None:
+    def _leave(self, session: Offer, why: str) -> None:
         """Choose another server for the next request, if there is one."""
         with self._choosing:
             self._choice.avoid(session.server, time.monotonic())
@@ -234,7 +225,7 @@ class RemoteEngine(Engine):
                 self._session = None
                 self._log.warning("model %s: server %s failed: %s", self._model, session.server, why)
 
-    def _session_for(self, tried: Set[str]) -> _Session:
+    def _session_for(self, tried: Set[str]) -> Offer:
         """The present session, or a new one with a server that was not tried.
 
         Raises:
@@ -252,7 +243,7 @@ class RemoteEngine(Engine):
             groups = self._groups([offer for offer in self._offers(offered) if offer.server not in tried])
             return self._begin(self._choice.order(groups, time.monotonic())[0])
 
-    def _reconsidered(self, session: _Session, offered: frozenset[str]) -> _Session:
+    def _reconsidered(self, session: Offer, offered: frozenset[str]) -> Offer:
         """The session of a new episode."""
         try:
             offers = self._offers(offered)
@@ -265,26 +256,21 @@ class RemoteEngine(Engine):
             return session
         return self._begin(next(offer for offer in offers if offer.server == server))
 
-    def _begin(self, offer: Offer) -> _Session:
+    def _begin(self, offer: Offer) -> Offer:
         """Begin a session with a server. If its model is stateful, it must forget this robot's earlier episodes."""
         if self._last_server not in ("", offer.server):
             self._episode += 1
-            self._log.info(
-                "model %s: moves from server %s to %s, weights %s",
-                self._model,
-                self._last_server,
-                offer.server,
-                offer.weights,
-            )
+            move = (self._model, self._last_server, offer.server, offer.weights)
+            self._log.info("model %s: moves from server %s to %s, weights %s", *move)
         if offer.canary:
             self._log.warning("model %s: this robot tries the canary with weights %s", self._model, offer.weights)
         self._last_server, self.stats.weights = offer.server, offer.weights
         self.stats.server = f"{offer.server}: {offer.identity}"
-        self._session = _Session(offer.server, offer.fingerprint)
-        return self._session
+        self._session = offer
+        return offer
 
     def _offers(self, names: frozenset[str]) -> list[Offer]:
-        """What the servers of these names offer.
+        """Ask the servers of these names for their offers.
 
         Raises:
             TransportError: if there are none, or none answers.
@@ -328,10 +314,10 @@ class RemoteEngine(Engine):
         return groups
 
     def _of_one_weights(self, offers: list[Offer]) -> list[Offer]:
-        """The servers whose weights are this robot's.
+        """The servers with the weights that this robot uses.
 
         Raises:
-            PolicyError: if none has these, or the robot has none yet and the servers disagree.
+            PolicyError: if none has them, or the robot has none yet and the servers disagree.
         """
         known = {offer.weights for offer in offers}
         if self._weights in known or not known:

@@ -380,9 +380,8 @@ class InferenceService:
             self._batches[len(live)] += 1
         try:
             # Other threads encode the answers, while the model may overwrite its outputs in the next batch.
-            outputs = [
-                copied_tensors(each) for each in self._policy.infer_batch([ticket.message.tensors for ticket in live])
-            ]
+            requests = [ticket.message.tensors for ticket in live]
+            outputs = [copied_tensors(each) for each in self._policy.infer_batch(requests)]
             if len(outputs) != len(live):
                 raise PolicyError(f"{len(outputs)} outputs for a batch of {len(live)}")
         except Exception as error:  # noqa: BLE001 - contained: the request is refused

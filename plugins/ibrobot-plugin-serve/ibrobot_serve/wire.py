@@ -1,7 +1,7 @@
 """The wire format between a robot and its model: a fixed header, texts, a table of tensors, and their bytes.
 
-`docs/reference/wire.md` describes it byte by byte. Nothing that is received is evaluated, and every claim that a frame
-makes about itself is checked against its length and the limits before anything is made of it.
+`docs/reference/wire.md` describes it byte by byte. Nothing that is received is evaluated, and every size that
+a frame states is checked against its length and the limits before it is used.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import struct
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import override
 
 import attrs
 import numpy as np
@@ -31,8 +30,8 @@ _NUMBERS = struct.Struct("<4sHBBQqqQqd")
 _SIZES = struct.Struct("<QIHHH6s")
 _HEAD_SIZE = _NUMBERS.size + _SIZES.size
 _ENTRY = struct.Struct("<QQBBH")
-_OFFSET = struct.Struct("<Q")
-"""How an entry begins."""
+_OFFSET_SIZE = 8
+"""Bytes of the offset with which an entry begins."""
 _ZEROS = bytes(6)
 _DTYPES = tuple(
     np.dtype(code) for code in ("?", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")
@@ -55,7 +54,7 @@ def health_name(model: str) -> str:
 
 
 def offer_name(model: str, server: str = "") -> str:
-    """Name under which one of a model's servers takes robots; without `server`, what these names begin with."""
+    """Name of the service with which one of a model's servers accepts robots; without `server`, their prefix."""
     return f"{service_name(model)}/offer/{server}"
 
 
@@ -135,18 +134,6 @@ class WireMessage:
     """In an answer or a failure: minimum time between the robot's requests [ns]; 0: none."""
 
 
-class NoPictures(PictureCodec):
-    """Sends all tensors unchanged, and accepts no JPEG."""
-
-    @override
-    def encode(self, name: str, picture: NDArray[np.uint8]) -> bytes | None:
-        return None
-
-    @override
-    def decode(self, jpeg: memoryview, shape: tuple[int, int, int]) -> NDArray[np.uint8]:
-        raise WireError("JPEG, which this side does not support")
-
-
 @attrs.frozen(eq=False)
 class _Place:
     """Position of a tensor, or of its JPEG, in a frame."""
@@ -168,9 +155,9 @@ class _MessageLayout:
     text: str
     places: Sequence[_Place]
     head: bytes
-    """What lies between the numbers and the tensors."""
+    """The bytes between the numbers and the tensors."""
     size: int
-    """Of the whole frame."""
+    """Size of the whole frame [bytes]."""
 
 
 class _Layouts[K: Hashable]:
@@ -199,7 +186,7 @@ def _aligned(offset: int) -> int:
 
 
 def _jpegs(tensors: Tensors, codec: PictureCodec) -> Mapping[str, bytes]:
-    """Of those that the codec takes."""
+    """Encode the pictures that the codec accepts. Returns name -> JPEG."""
     jpegs = {}
     for name, array in tensors.items():
         if array.dtype == _BYTE and array.ndim == 3 and array.shape[2] in (1, 3):
@@ -348,9 +335,9 @@ class WireDecoder:
 
     def __init__(self, limits: WireLimits = WIRE_LIMITS, codec: PictureCodec | None = None) -> None:
         self._limits = limits
-        self._codec = codec or NoPictures()
+        self._codec = codec
         self._layouts: _Layouts[bytes] = _Layouts()
-        """By their heads."""
+        """By the bytes of `head`."""
 
     def decode(self, payload: Payload) -> WireMessage:
         """Decode a frame. Tensors are read-only views of `payload`, except for JPEG pictures. Thread-safe.
@@ -397,10 +384,10 @@ class WireDecoder:
                 f"{count} tensors, texts of {robot_size}, {fingerprint_size}, {text_size} bytes: over the limits"
             )
         end = table = _HEAD_SIZE + robot_size + fingerprint_size + text_size
-        if count and table + _OFFSET.size <= size:
+        if count and table + _OFFSET_SIZE <= size:
             # The table ends where the first tensor begins; reading it checks that.
             longest = count * (_ENTRY.size + 4 * limits.ndim + limits.name) + ALIGNMENT
-            end = min(_OFFSET.unpack_from(frame, table)[0], table + longest)
+            end = min(int.from_bytes(frame[table : table + _OFFSET_SIZE], "little"), table + longest)
         head = bytes(frame[_NUMBERS.size : end])
         layout = self._layouts.get(head)
         if layout is None:
@@ -413,6 +400,8 @@ class WireDecoder:
         return layout
 
     def _picture(self, frame: memoryview, place: _Place) -> NDArray[np.uint8]:
+        if self._codec is None:
+            raise WireError(f"picture {place.name!r}: JPEG, which this side does not support")
         height, width, channels = place.shape
         try:
             picture = self._codec.decode(frame[place.offset : place.offset + place.nbytes], (height, width, channels))

@@ -2,4 +2,6 @@
 
 from fake_runs import runs, site
 
-__all__ = ["runs", "site"]
+from .client_requests import broken, model
+
+__all__ = ["broken", "model", "runs", "site"]

@@ -7,33 +7,25 @@ import struct
 from collections.abc import Iterator
 from typing import Any
 
-import attrs
 import msgpack
 import numpy as np
 import pytest
 import zmq
 from ibrobot_policy_wire import pack_npy, unpack_npy
+from ibrobot_serve.client_model import ClientModel
 from ibrobot_serve.gr00t_server import TASK, Gr00tServer
 from ibrobot_testing import host_context
-from ibrobot_testing.fakes import FakePolicy
 
-from ibrobot_core.api import Frame, PolicyError
+from ibrobot_core.api import Frame
 
-STATE = "observation.state"
+from .client_requests import STATE, damaged
+
 ZEROS: dict[str, Any] = {"observation": {"state": {"state": np.zeros((1, 1, 6), np.float32)}}, "options": None}
 
 
 @pytest.fixture
-def policy() -> FakePolicy:
-    policy = FakePolicy(host_context())
-    policy.load()
-    policy.reset(3)
-    return policy
-
-
-@pytest.fixture
-def server(policy: FakePolicy) -> Iterator[Gr00tServer]:
-    server = Gr00tServer(policy, "net", "127.0.0.1", 0)
+def server(model: ClientModel) -> Iterator[Gr00tServer]:
+    server = Gr00tServer(model, "127.0.0.1", 0)
     yield server
     server.close()
 
@@ -68,8 +60,9 @@ def client(server: Gr00tServer) -> Iterator[Client]:
         yield client
 
 
-def test_chunks_are_those_of_the_policy(client: Client, policy: FakePolicy) -> None:
+def test_chunks_are_those_of_the_policy(client: Client, model: ClientModel) -> None:
     state = np.linspace(-0.5, 0.5, 6, dtype=np.float32)
+    policy = model.policy
     expected = policy.postprocess(policy.infer(policy.preprocess(Frame(0, {STATE: state}))))
     observation = {"state": {"state": state[None, None]}, "language": {TASK: [["pick up the cube"]]}}
     action, told = client.call("get_action", {"observation": observation, "options": None})
@@ -104,24 +97,16 @@ def test_the_other_endpoints_answer_as_the_clients_expect(client: Client) -> Non
     ],
 )
 def test_a_wrong_request_is_answered_by_an_error_and_the_next_one_by_a_chunk(
-    client: Client, server: Gr00tServer, data: Any, message: str
+    client: Client, model: ClientModel, data: Any, message: str
 ) -> None:
     assert message in client.call("get_action", data)["error"]
     assert client.call("get_action", ZEROS)[0]["action"].shape == (1, 10, 6)
-    assert server.counts == (1, 1)
+    assert (model.answered, model.failed) == (1, 1)
 
 
 def test_damaged_requests_harm_no_other(client: Client) -> None:
-    """1,000 requests with flipped or cut bytes."""
-    random, good = np.random.default_rng(0), pack_npy({"endpoint": "get_action", "data": ZEROS})
-    refused = 0
-    for _ in range(1000):
-        content = bytearray(good)
-        for place in random.integers(0, len(good), random.integers(1, 6)):
-            content[place] = random.integers(256)
-        answer = client.sent(bytes(content[: random.integers(1, len(good) + 1)]))
-        refused += isinstance(answer, dict) and "error" in answer
-    assert refused > 500
+    answers = map(client.sent, damaged(pack_npy({"endpoint": "get_action", "data": ZEROS})))
+    assert sum(isinstance(each, dict) and "error" in each for each in answers) > 500
     assert client.call("get_action", ZEROS)[0]["action"].shape == (1, 10, 6)
 
 
@@ -159,8 +144,8 @@ def test_other_protocols_harm_no_client(client: Client, server: Gr00tServer) -> 
         assert later.call("get_action", ZEROS)[0]["action"].shape == (1, 10, 6)
 
 
-def test_clients_need_the_key(policy: FakePolicy) -> None:
-    server = Gr00tServer(policy, "net", "127.0.0.1", 0, "pa55word")
+def test_clients_need_the_key(model: ClientModel) -> None:
+    server = Gr00tServer(model, "127.0.0.1", 0, "pa55word")
     try:
         with Client(server) as client:
             for wrong in ({}, {"api_token": "password"}, {"api_token": 3}):
@@ -170,22 +155,11 @@ def test_clients_need_the_key(policy: FakePolicy) -> None:
         server.close()
 
 
-def test_a_fault_of_the_policy_is_answered_by_an_error(
-    client: Client, policy: FakePolicy, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(tensors: Any) -> Any:
-        raise ZeroDivisionError("not today")
-
-    monkeypatch.setattr(policy, "infer", broken)
+@pytest.mark.usefixtures("broken")
+def test_a_fault_of_the_policy_is_answered_by_an_error(client: Client) -> None:
     assert client.call("get_action", ZEROS)["error"] == "ZeroDivisionError: not today"
 
 
-def test_a_policy_that_needs_earlier_observations_is_refused(policy: FakePolicy) -> None:
-    policy.spec = attrs.evolve(policy.spec, history=2)
-    with pytest.raises(PolicyError, match="uses earlier observations"):
-        Gr00tServer(policy, "net", "127.0.0.1", 0)
-
-
-def test_an_address_in_use_is_an_error(server: Gr00tServer, policy: FakePolicy) -> None:
+def test_an_address_in_use_is_an_error(server: Gr00tServer, model: ClientModel) -> None:
     with pytest.raises(OSError, match="in use"):
-        Gr00tServer(policy, "net", "127.0.0.1", server.port)
+        Gr00tServer(model, "127.0.0.1", server.port)

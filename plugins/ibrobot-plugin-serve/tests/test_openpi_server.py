@@ -11,29 +11,21 @@ import click
 import numpy as np
 import pytest
 from ibrobot_policy_wire import pack, unpack
+from ibrobot_serve.client_model import ClientModel
 from ibrobot_serve.command import _host_and_port
 from ibrobot_serve.openpi_server import OpenpiServer
 from ibrobot_testing import host_context
-from ibrobot_testing.fakes import FakePolicy
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from ibrobot_core.api import Frame, PolicyError
 
-STATE = "observation.state"
+from .client_requests import STATE, damaged
 
 
 @pytest.fixture
-def policy() -> FakePolicy:
-    policy = FakePolicy(host_context())
-    policy.load()
-    policy.reset(3)
-    return policy
-
-
-@pytest.fixture
-def server(policy: FakePolicy) -> Iterator[OpenpiServer]:
-    server = OpenpiServer(policy, "net", "127.0.0.1", 0)
+def server(model: ClientModel) -> Iterator[OpenpiServer]:
+    server = OpenpiServer(model, "127.0.0.1", 0)
     yield server
     server.close()
 
@@ -49,13 +41,14 @@ def asked(server: OpenpiServer, *messages: Any, key: str = "") -> list[Any]:
     return [unpack(each) if isinstance(each, bytes) else each for each in answers]
 
 
-def test_chunks_are_those_of_the_policy(server: OpenpiServer, policy: FakePolicy) -> None:
+def test_chunks_are_those_of_the_policy(server: OpenpiServer, model: ClientModel) -> None:
     state = np.linspace(-0.5, 0.5, 6, dtype=np.float32)
     metadata, answer = asked(server, {STATE: state, "prompt": "pick up the cube"})
     assert metadata["model"] == "net"
     assert metadata["horizon"] == 10
     assert metadata["observations"] == {STATE: [6]}
     assert metadata["actions"] == list(host_context().robot.joint_names)
+    policy = model.policy
     expected = policy.postprocess(policy.infer(policy.preprocess(Frame(0, {STATE: state}))))
     np.testing.assert_allclose(answer["actions"], expected, atol=1e-6)
     assert answer["server_timing"]["infer_ms"] > 0
@@ -75,40 +68,28 @@ def test_chunks_are_those_of_the_policy(server: OpenpiServer, policy: FakePolicy
     ],
 )
 def test_a_wrong_request_is_answered_by_a_text_and_the_next_one_by_a_chunk(
-    server: OpenpiServer, request_: Any, message: str
+    server: OpenpiServer, model: ClientModel, request_: Any, message: str
 ) -> None:
     _, refused, answer = asked(server, request_, {STATE: np.zeros(6)})
     assert message in refused
     assert answer["actions"].shape == (10, 6)
-    assert server.counts == (1, 1)
+    assert (model.answered, model.failed) == (1, 1)
 
 
 def test_damaged_requests_harm_no_other(server: OpenpiServer) -> None:
-    """1,000 requests with flipped or cut bytes."""
-    random, good = np.random.default_rng(0), pack({STATE: np.zeros(6, np.float32), "prompt": "pick"})
-    damaged = []
-    for _ in range(1000):
-        content = bytearray(good)
-        for place in random.integers(0, len(good), random.integers(1, 6)):
-            content[place] = random.integers(256)
-        damaged.append(bytes(content[: random.integers(1, len(good) + 1)]))
-    _, *answers, last = asked(server, *damaged, {STATE: np.zeros(6)})
+    requests = damaged(pack({STATE: np.zeros(6, np.float32), "prompt": "pick"}))
+    _, *answers, last = asked(server, *requests, {STATE: np.zeros(6)})
     assert sum(isinstance(each, str) for each in answers) > 500
     assert last["actions"].shape == (10, 6)
 
 
-def test_a_fault_of_the_policy_is_answered_by_a_text(
-    server: OpenpiServer, policy: FakePolicy, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(tensors: Any) -> Any:
-        raise ZeroDivisionError("not today")
-
-    monkeypatch.setattr(policy, "infer", broken)
+@pytest.mark.usefixtures("broken")
+def test_a_fault_of_the_policy_is_answered_by_a_text(server: OpenpiServer) -> None:
     assert asked(server, {STATE: np.zeros(6)})[1] == "ZeroDivisionError: not today"
 
 
-def test_clients_need_the_key(policy: FakePolicy) -> None:
-    server = OpenpiServer(policy, "net", "127.0.0.1", 0, "pa55word")
+def test_clients_need_the_key(model: ClientModel) -> None:
+    server = OpenpiServer(model, "127.0.0.1", 0, "pa55word")
     try:
         for wrong in ("", "password"):
             with pytest.raises(InvalidStatus, match="401"):
@@ -120,10 +101,10 @@ def test_clients_need_the_key(policy: FakePolicy) -> None:
         server.close()
 
 
-def test_a_policy_that_needs_earlier_observations_is_refused(policy: FakePolicy) -> None:
-    policy.spec = attrs.evolve(policy.spec, history=2)
-    with pytest.raises(PolicyError, match="uses earlier observations"):
-        OpenpiServer(policy, "net", "127.0.0.1", 0)
+def test_a_policy_that_needs_earlier_observations_is_refused(model: ClientModel) -> None:
+    model.policy.spec = attrs.evolve(model.policy.spec, history=2)
+    with pytest.raises(PolicyError, match="uses earlier observations, which do not fit into requests of openpi"):
+        ClientModel(model.policy, "net", "openpi")
 
 
 def test_the_address_is_checked() -> None:
