@@ -33,7 +33,7 @@ def contract_section(
     observations = [_observation(each, body, peripherals or {}) for each in node["observations"].each()]
     actions = [part for each in node["actions"].each() for part in _actions(each, body)]
     if body is not None and not actions:
-        actions = [so101.action_part(name, so101.added(body)) for name in so101.streams(body)]
+        actions = [so101.action_part(name, body.origin) for name in so101.streams(body)]
     values["observations"] = [each for each in observations if each is not None]
     values["actions"] = actions
     return {key: value for key, value in values.items() if value is not None and value != []}
@@ -78,8 +78,7 @@ def _observation(node: Node, body: so101.Body | None, peripherals: Mapping[str, 
     names = node["selector"]["names"]
     if names.value is not None and type_ not in _PICTURES:
         values["select"] = _select(names, type_, body)
-    values["align"] = _align(node["align"])
-    return {name: value for name, value in values.items() if value is not None}
+    return {**values, "align": _align(node["align"])}
 
 
 def _select(names: Node, type_: str, body: so101.Body | None) -> From | None:
@@ -119,14 +118,14 @@ def _align(node: Node) -> dict[str, Any] | None:
         tolerance.refuse("0 is no tolerance there")
         strategy = "hold"
     values = {
-        "strategy": From("hold", node["strategy"].origin, node["strategy"].line)
+        "strategy": node["strategy"].gives("hold")
         if strategy == "hold" and node["strategy"].value == "asof"
         else node["strategy"].text(),
         "stamp": node["stamp"].text(),
         "tol_ms": tolerance.number() if strategy == "asof" else None,
     }
     tolerance.refuse(f"{strategy} has no tolerance there either; contract.max_age bounds the age of a held value")
-    return {name: value for name, value in values.items() if value is not None} or None
+    return values if any(values.values()) else None
 
 
 def _actions(node: Node, body: so101.Body | None) -> list[dict[str, Any]]:
@@ -155,7 +154,7 @@ def _actions(node: Node, body: so101.Body | None) -> list[dict[str, Any]]:
         }
         if names.value is not None:
             names.changed(None, f"the joints of group {group}, in order")
-        return [{name: value for name, value in values.items() if value is not None}]
+        return [values]
     if match is not None:
         node.drop(f"there is no joint group {group!r} here")
         return []
@@ -164,10 +163,8 @@ def _actions(node: Node, body: so101.Body | None) -> list[dict[str, Any]]:
     for part in (publish["topic"], publish["type"], names):
         part.changed(None, note)
     comment = f"{publish['topic'].origin}; {note}"
-    return [
-        so101.action_part(name, comment, node.line) | ({"safety_behavior": safety} if safety is not None else {})
-        for name in so101.streams(body)
-    ]
+    added = {"safety_behavior": safety} if safety is not None else {}
+    return [so101.action_part(name, comment, node.line) | added for name in so101.streams(body)]
 
 
 def _foreign_action(key: From, publish: Node, names: Node, behaviour: Node) -> dict[str, Any]:
@@ -181,6 +178,5 @@ def _foreign_action(key: From, publish: Node, names: Node, behaviour: Node) -> d
         names.changed(given, "the names of the numbers")
     else:
         values["select"] = names.taken(select)
-    values["joints"] = From(joints, f"{names.origin}; the names of the numbers", names.line)
-    values |= {"executor": values["topic"], "foreign": From(True, "added: the commands of bags")}
-    return {name: value for name, value in values.items() if value is not None}
+    values["joints"] = names.gives(joints, "the names of the numbers")
+    return values | {"executor": values["topic"], "foreign": From(True, "added: the commands of bags")}

@@ -9,7 +9,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_import.source import From
+from ibrobot_import.source import From, Titled
 
 ADDED = "added"
 _PLAIN = re.compile(r"[A-Za-z_/][A-Za-z0-9_./+-]*")
@@ -41,7 +41,7 @@ class Draft:
         self.origins.append(origin)
 
     def block(self, value: Mapping[str, Any], indent: int = 0) -> None:
-        """Add a mapping in block style; `From` and lists of plain values in flow style."""
+        """Add a mapping in block style, without keys whose value is None; `From` and plain lists in flow style."""
         for name, each in value.items():
             self._entry(f"{' ' * indent}{scalar(name)}:", each, indent)
 
@@ -56,7 +56,7 @@ class Draft:
         elif isinstance(value, Mapping) and value:
             self.add(head, note, origin)
             self.block(value, indent + 2)
-        elif isinstance(value, list) and any(isinstance(each, Mapping | From | Titled) for each in value):
+        elif isinstance(value, list) and any(isinstance(each, Mapping | From) for each in value):
             self.add(head, note, origin)
             for each in value:
                 self._item(each, indent + 2)
@@ -72,15 +72,6 @@ class Draft:
             self.lines[start] = f"{' ' * indent}- {self.lines[start].lstrip()}"
         else:
             self.add(f"{' ' * indent}- {flow(value)}", ADDED)
-
-
-@attrs.frozen
-class Titled:
-    """A block with a comment beside its name."""
-
-    value: Mapping[str, Any] | list[Any]
-    comment: str
-    line: int = 0
 
 
 def printable(text: str) -> str:

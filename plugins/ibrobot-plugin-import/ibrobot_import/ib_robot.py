@@ -12,12 +12,10 @@ import attrs
 from ibrobot_core.app import installed_plugins
 from ibrobot_import import so101
 from ibrobot_import.contracts import contract_section
-from ibrobot_import.draft import Titled
-from ibrobot_import.source import From, Node, Source
+from ibrobot_import.source import From, Node, Source, Titled, plain_name
 
 _ARMS = ("so101_hardware/SO101SystemHardware", "lekiwi_hardware/LeKiwiSystemHardware")
 """Hardware plugins of ros2_control whose arm is an SO-101."""
-_NAMED = re.compile(r"[^A-Za-z0-9_-]")
 _CONTROLLER = re.compile(r"(\w+?)_(position|trajectory)_controller")
 _FORMATS = {"mjpeg2rgb": "MJPG", "mjpeg": "MJPG", "yuyv": "YUYV", "yuyv2rgb": "YUYV"}
 _AUTOMATIC = -1
@@ -156,9 +154,9 @@ def _sections(part: _Robot) -> dict[str, Any]:
         "models": models,
         "control_modes": modes,
         "default_control_mode": _default_mode(robot["default_control_mode"], modes),
-        "teleoperation": devices | {"web": From({"type": "web"}, "added, for the mode web")},
+        "teleoperation": devices | so101.WEB,
         "contract": contract,
-        "control": From({"rate_hz": 100, "stop": "hold"}, "so101 of ibrobot"),
+        "control": From(so101.CONTROL, "so101 of ibrobot"),
     }
 
 
@@ -261,7 +259,7 @@ def _peripherals(part: _Robot) -> dict[str, dict[str, Any]]:
         node["type"].taken(kind)
         values: dict[str, Any] = {
             "name": _renamed(node["name"], name),
-            "kind": From("camera", node["type"].origin, node["type"].line),
+            "kind": node["type"].gives("camera"),
             "type": node["driver"].taken(driver) if node["driver"].value is not None else From(driver, "added"),
         }
         values |= _usb(node) if driver == "opencv" else {"serial": node["serial_number"].text()}
@@ -271,7 +269,7 @@ def _peripherals(part: _Robot) -> dict[str, dict[str, Any]]:
         for key, reason in _CAMERA.items():
             node[key].refuse(reason)
         values["sim"] = so101.simulated(str(values["name"].value), part.body)
-        found[str(name.value)] = {key: value for key, value in values.items() if value is not None}
+        found[str(name.value)] = values
     return found
 
 
@@ -307,24 +305,23 @@ def _transform(node: Node, body: so101.Body) -> Titled | None:
     elif given.items() and (parent := given["parent_frame"].text()) is not None:
         link = so101.LINKS.get(parent.value, parent.value)
         axes = [[given[key].number() for key in keys] for keys in (("x", "y", "z"), ("roll", "pitch", "yaw"))]
-        origin = (given.origin, given.line)
         xyz, rpy = ([0.0 if each is None else float(each.value) for each in three] for three in axes)
         if link != parent.value:
             parent = given["parent_frame"].changed(link, "the link's name in the URDF")
         values = {
             "parent": parent,
-            "xyz": From(xyz, *origin),
-            "rpy": From(rpy, *origin),
+            "xyz": given.gives(xyz),
+            "rpy": given.gives(rpy),
             "frame": node["frame_id"].text(),
         }
-        return Titled({key: value for key, value in values.items() if value is not None}, *origin)
+        return given.titles(values)
     node["frame_id"].refuse("names the frame of a transform, which this camera does not have")
     return None
 
 
 def _renamed(node: Node, name: From) -> From:
     """A name with the characters that ibrobot allows."""
-    plain = _NAMED.sub("_", str(name.value))
+    plain = plain_name(str(name.value))
     return name if plain == name.value else node.changed(plain, "letters, digits, _ and - only")
 
 
@@ -346,8 +343,7 @@ def _models(node: Node) -> dict[str, Any]:
         else:
             values["device"] = each["device"].text()
         each["normalization"].refuse("the checkpoint's own processors normalise")
-        present = {key: value for key, value in values.items() if value is not None}
-        models[_NAMED.sub("_", name)] = Titled(present, each.origin, each.line)
+        models[plain_name(name)] = each.titles(values)
     return models
 
 
@@ -370,7 +366,7 @@ def _control_modes(part: _Robot) -> dict[str, Any]:
         for reasons, place in ((_MODE, node), (_EXECUTOR, node["executor"]), (_INFERENCE, node["inference"])):
             for key, reason in reasons.items():
                 place[key].refuse(reason)
-        modes[_NAMED.sub("_", name)] = Titled(values, titled, node.line)
+        modes[plain_name(name)] = Titled(values, titled, node.line)
     return modes
 
 
@@ -390,7 +386,7 @@ def _source(part: _Robot, name: str, node: Node, executors: list[str]) -> dict[s
     device = part.node["teleoperation"]["active_device"]
     if device.value is None or name != "teleop":
         return {}
-    known = _NAMED.sub("_", str(device.value))
+    known = plain_name(str(device.value))
     if known in part.devices:
         return {"teleop": device.taken(known)}
     device.refuse("this device is not imported, so that the mode holds the robot")
@@ -478,7 +474,5 @@ def _teleoperation(part: _Robot) -> dict[str, Any]:
             values |= {"scale": device["phone_config"]["linear_scale"].number()}
         for key, reason in _DEVICE[kind].items():
             device[key].refuse(reason)
-        part.devices[_NAMED.sub("_", str(name.value))] = Titled(
-            {key: value for key, value in values.items() if value is not None}, device.origin, device.line
-        )
+        part.devices[plain_name(str(name.value))] = device.titles(values)
     return part.devices

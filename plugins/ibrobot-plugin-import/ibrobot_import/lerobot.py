@@ -10,15 +10,13 @@ from typing import Any
 
 from ibrobot_core.api import load_calibration
 from ibrobot_import import so101
-from ibrobot_import.draft import Titled
-from ibrobot_import.source import Fate, From, Node, Source
+from ibrobot_import.source import Fate, From, Node, Source, Titled, plain_name
 
 _SINGLE = ("so100_follower", "so101_follower", "so_follower")
 _DOUBLE = ("bi_so100_follower", "bi_so101_follower", "bi_so_follower")
 _LEADERS = ("so100_leader", "so101_leader", "so_leader")
 _BI_LEADERS = ("bi_so100_leader", "bi_so101_leader", "bi_so_leader")
 _DEVICES = {"keyboard": "keyboard", "gamepad": "gamepad", "phone": "webxr"}
-_NAMED = re.compile(r"[^A-Za-z0-9_-]")
 _CAMERA = {
     "color_mode": "datasets have RGB",
     "warmup_s": "a camera is ready when its first image came",
@@ -56,8 +54,7 @@ def convert_calibration(source: Source) -> dict[str, Any]:
     path = Path(source.document.file).absolute()
     load_calibration(path, tuple(so101.SERVOS.values()))
     source.mark((), Fate.TAKEN, "hardware.calibration reads it as it is")
-    body = so101.SINGLE
-    return _sections(source.root["-"], body, [None], [From(str(path), "this file, which stays as it is")], {}, {})
+    return _sections(so101.SINGLE, [None], [From(str(path), "this file, which stays as it is")], {}, {})
 
 
 def convert(source: Source) -> dict[str, Any]:
@@ -75,7 +72,7 @@ def convert(source: Source) -> dict[str, Any]:
     cameras = _cameras([robot, *arms])
     devices = _devices(root["teleop"], body) if record else {}
     sections = _sections(
-        robot, body, [_port(arm, robot, side) for arm, side in zip(arms, body.prefixes, strict=True)],
+        body, [_port(arm, robot, side) for arm, side in zip(arms, body.prefixes, strict=True)],
         [_calibration(arm, robot, "robots", kind, side) for arm, side in zip(arms, body.prefixes, strict=True)],
         cameras, devices,
     )  # fmt: skip
@@ -87,7 +84,7 @@ def convert(source: Source) -> dict[str, Any]:
         if stop.flag() is not None:
             word = "relax" if stop.flag() else "hold"
             sections["control"] = {
-                "rate_hz": From(100, so101.added(body)),
+                "rate_hz": body.own(100),
                 "stop": stop.changed(word, "relax takes the torque off at the end, hold keeps it"),
             }
     if record:
@@ -96,42 +93,26 @@ def convert(source: Source) -> dict[str, Any]:
 
 
 def _sections(
-    robot: Node,
     body: so101.Body,
     ports: list[From | None],
     calibrations: list[From | None],
     cameras: Mapping[str, Any],
     devices: Mapping[str, Any],
 ) -> dict[str, Any]:
-    streams = list(so101.streams(body))
-    modes: dict[str, Any] = {}
+    modes = {}
     if devices:
         names = list(devices)
         given: Any = names[0] if len(names) == 1 else dict(zip(body.groups, names, strict=True))
-        modes["teleop"] = Titled(
-            {"executors": From(streams, "added"), "teleop": From(given, "added")}, "added: the device of `teleop`"
-        )
+        modes["teleop"] = so101.added_mode(list(so101.streams(body)), "the device of `teleop`", given)
     observations = [so101.state_observation(body)]
     observations += [
         so101.picture_observation(From(f"observation.images.{name}", part["name"].comment, part["name"].line), name)
         for name, part in cameras.items()
     ]
-    return {
-        "robot": so101.robot_section(body, From(body.config, so101.added(body)), None),
-        "hardware": so101.hardware_section(body, ports, calibrations),
-        "simulation": so101.simulation_section(),
-        "peripherals": list(cameras.values()),
-        "executors": so101.executor_sections(so101.streams(body)),
-        "control_modes": modes | so101.added_modes(streams, list(modes)),
-        "default_control_mode": From("teleop" if modes else "hold", "added"),
-        "teleoperation": {**devices, "web": From({"type": "web"}, "added, for the mode web")},
-        "contract": {
-            "rate_hz": From(30, "LeRobot's default"),
-            "observations": observations,
-            "actions": [so101.action_part(name, so101.added(body)) for name in streams],
-        },
-        "control": From({"rate_hz": 100, "stop": "hold"}, so101.added(body)),
-    }
+    robot = so101.robot_section(body, body.own(body.config), None)
+    hardware = so101.hardware_section(body, ports, calibrations)
+    rate = From(30, "LeRobot's default")
+    return so101.sections(body, robot, hardware, list(cameras.values()), modes, devices, rate, observations)
 
 
 def _arms(robot: Node, body: so101.Body) -> list[Node]:
@@ -173,12 +154,12 @@ def _cameras(nodes: list[Node]) -> dict[str, Any]:
             if kind not in ("opencv", "intelrealsense"):
                 camera.refuse(f"there is no plugin here for a camera of type {kind}")
                 continue
-            plain = _NAMED.sub("_", name)
+            plain = plain_name(name)
             prefix = node.key[-1].removesuffix("arm_config") if node.key and isinstance(node.key[-1], str) else ""
             plain = f"{prefix}{plain}" if prefix in so101.DOUBLE.prefixes else plain
             values: dict[str, Any] = {
-                "name": From(plain, camera.origin, camera.line),
-                "kind": From("camera", camera.origin, camera.line),
+                "name": camera.gives(plain),
+                "kind": camera.gives("camera"),
             }
             if kind == "opencv":
                 device = camera["index_or_path"]
@@ -200,7 +181,7 @@ def _cameras(nodes: list[Node]) -> dict[str, Any]:
                 if key not in values:
                     camera[key].refuse(reason)
             values["sim"] = so101.simulated(plain, so101.DOUBLE if prefix in so101.DOUBLE.prefixes else so101.SINGLE)
-            found[plain] = {key: value for key, value in values.items() if value is not None}
+            found[plain] = values
     return found
 
 
@@ -217,7 +198,7 @@ def _devices(teleop: Node, body: so101.Body) -> dict[str, Any]:
     if kind.value in _DEVICES and len(body.prefixes) == 1:
         name = kind.changed(_DEVICES[str(kind.value)], "the type here")
         teleop.refuse(f"`ibrobot config schema` has the options of {name.value}")
-        return {str(kind.value): Titled({"type": name}, teleop.origin, teleop.line)}
+        return {str(kind.value): teleop.titles({"type": name})}
     teleop.refuse(f"there is no plugin here for a device of type {kind.value} with this robot")
     return {}
 
@@ -233,16 +214,15 @@ def _leader(node: Node, whole: Node, kind: Node, prefix: str) -> Titled:
         "prefix": From(prefix, "added") if prefix else None,
     }
     node["use_degrees"].refuse("joints are in radians")
-    return Titled({key: value for key, value in values.items() if value is not None}, node.origin, node.line)
+    return node.titles(values)
 
 
 def _record(root: Node, sections: dict[str, Any]) -> None:
     dataset = root["dataset"]
     contract = sections["contract"]
-    contract["rate_hz"] = dataset["fps"].number() or contract["rate_hz"]
-    sections["contract"] = {
-        "rate_hz": contract.pop("rate_hz"), "max_duration_s": dataset["episode_time_s"].number(), **contract,
-    }  # fmt: skip
+    default = contract.pop("rate_hz")
+    times = {"rate_hz": dataset["fps"].number() or default, "max_duration_s": dataset["episode_time_s"].number()}
+    sections["contract"] = times | contract
     for place, reasons in ((dataset, _DATASET), (root, _RECORD)):
         for key, reason in reasons.items():
             place[key].refuse(reason)
@@ -250,13 +230,11 @@ def _record(root: Node, sections: dict[str, Any]) -> None:
     policy = root["policy"]
     path = policy["path"] if policy["path"].value is not None else policy["pretrained_path"]
     if path.value is not None and (where := path.text()) is not None:
-        sections["models"] = {"policy": {"type": From("lerobot", "added"), "path": where}}
-        sections["models"]["policy"]["norm_mode"] = _norm_mode(root["robot"])
+        model = {"type": From("lerobot", "added"), "path": where, "norm_mode": _norm_mode(root["robot"])}
+        sections["models"] = {"policy": model}
         executors = list(so101.streams(so101.SINGLE if root["robot"]["type"].value in _SINGLE else so101.DOUBLE))
-        sections["control_modes"]["model_inference"] = Titled(
-            {"executors": From(executors, "added"), "inference": {"model": From("policy", path.origin, path.line)}},
-            path.origin,
-            path.line,
+        sections["control_modes"]["model_inference"] = path.titles(
+            {"executors": From(executors, "added"), "inference": {"model": path.gives("policy")}}
         )
     policy.refuse("the checkpoint has its own options")
 

@@ -9,12 +9,10 @@ from typing import Any
 from ibrobot_core.api import MESSAGE_TYPES
 from ibrobot_import import so101
 from ibrobot_import.contracts import JOINT_STATE, QOS
-from ibrobot_import.draft import Titled
-from ibrobot_import.source import Fate, From, Node, Source
+from ibrobot_import.source import Fate, From, Node, Source, plain_name
 
 _ARMS = re.compile(r"so_?10[01](_follower)?|so_follower")
 IMAGES = "observation.images."
-_NAMED = re.compile(r"[^A-Za-z0-9_-]")
 _SIGNALS = {"task": "std_msgs/msg/String", "next.reward": "", "next.done": ""}
 _ARRAY = re.compile(r"std_msgs/msg/\w+MultiArray")
 _SCALAR = re.compile(r"std_msgs/msg/\w+")
@@ -64,7 +62,7 @@ def _robot(root: Node, joints: Mapping[str, str]) -> dict[str, Any]:
     observations: list[dict[str, Any]] = []
     for key, node in root["observations"].items():
         if key.startswith(IMAGES):
-            name = _NAMED.sub("_", key.removeprefix(IMAGES))
+            name = plain_name(key.removeprefix(IMAGES))
             peripherals.append(_camera(node, name, len(peripherals)))
             observations.append(_picture(node, key, name))
         elif key == "observation.state":
@@ -77,39 +75,20 @@ def _robot(root: Node, joints: Mapping[str, str]) -> dict[str, Any]:
         channel["type"].changed(None, "commands go to the executors")
         select.changed(None, "the joints of the executors")
         _rest(node, f"{key} is the action of an SO-101")
-    streams = so101.streams(body)
-    rate = root["fps"].number()
-    teleop = so101.shipped(body.config)["teleoperation"]["leader"]
-    modes = {
-        "teleop": Titled(
-            {"executors": From(list(streams), "added"), "teleop": From("leader", "added")}, "added: the leader arm"
-        )
-    }
+    modes = {"teleop": so101.added_mode(list(so101.streams(body)), "the leader arm", "leader")}
+    devices = {"leader": body.own(so101.shipped(body.config)["teleoperation"]["leader"])}
     kind = root["robot_type"].text()
-    return {
-        "robot": so101.robot_section(body, kind or From(body.config, "added"), kind),
-        "hardware": so101.hardware_section(body, [None], [None]),
-        "simulation": so101.simulation_section(),
-        "peripherals": peripherals,
-        "executors": so101.executor_sections(streams),
-        "control_modes": modes | so101.added_modes(list(streams), list(modes)),
-        "default_control_mode": From("teleop", "added"),
-        "teleoperation": {"leader": From(teleop, so101.added(body)), "web": From({"type": "web"}, "added")},
-        "contract": {
-            "rate_hz": rate,
-            "observations": observations,
-            "actions": [so101.action_part(name, so101.added(body)) for name in streams],
-        },
-        "control": From({"rate_hz": 100, "stop": "hold"}, so101.added(body)),
-    }
+    robot = so101.robot_section(body, kind or From(body.config, "added"), kind)
+    hardware = so101.hardware_section(body, [None], [None])
+    return so101.sections(body, robot, hardware, peripherals, modes, devices, root["fps"].number(), observations)
 
 
 def _camera(node: Node, name: str, number: int) -> dict[str, Any]:
     node["channel"]["topic"].changed(None, f"the camera {name} publishes on /camera/{name}/image_raw")
     node["channel"]["type"].changed(None, "the camera chooses between raw and JPEG")
     return {
-        "name": From(name, f"{node.origin}", node.line),
-        "kind": From("camera", node.origin, node.line),
+        "name": node.gives(name),
+        "kind": node.gives("camera"),
         "type": From("opencv", "added"),
         "device": From(2 * number, "GUESS: `ibrobot camera list` prints the cameras"),
         "width": From(640, "GUESS"),
@@ -120,14 +99,13 @@ def _camera(node: Node, name: str, number: int) -> dict[str, Any]:
 
 
 def _picture(node: Node, key: str, name: str) -> dict[str, Any]:
-    return _present(
-        {
-            "key": From(key, node.origin, node.line),
-            "peripheral": From(name, node.origin, node.line),
-            "image": _image(node),
-            "align": _align(node),
-        }
-    ) | _rest(node)
+    values = {
+        "key": node.gives(key),
+        "peripheral": node.gives(name),
+        "image": _image(node),
+        "align": _align(node),
+    }
+    return values | _rest(node)
 
 
 def _state(node: Node, key: str, joints: Mapping[str, str]) -> dict[str, Any]:
@@ -137,14 +115,13 @@ def _state(node: Node, key: str, joints: Mapping[str, str]) -> dict[str, Any]:
     note = "names of the SO-101's joints" + (f"; GUESS, as the only one left: {', '.join(guess)}" if guess else "")
     node["channel"]["topic"].changed("/joint_states", "the topic of the robot's state")
     node["channel"]["type"].taken(JOINT_STATE)
-    return _present(
-        {
-            "key": From(key, node.origin, node.line),
-            "topic": From("/joint_states", f"{node['channel']['topic'].origin}; the robot's state", node.line),
-            "select": node["select"].changed(select, note) if select != given else node["select"].taken(select),
-            "align": _align(node),
-        }
-    ) | _rest(node)
+    values = {
+        "key": node.gives(key),
+        "topic": From("/joint_states", f"{node['channel']['topic'].origin}; the robot's state", node.line),
+        "select": node["select"].changed(select, note) if select != given else node["select"].taken(select),
+        "align": _align(node),
+    }
+    return values | _rest(node)
 
 
 def _contract_alone(root: Node) -> dict[str, Any]:
@@ -177,7 +154,7 @@ def _observation(key: str, node: Node) -> dict[str, Any] | None:
         return None
     type_ = channel["type"].value
     values = {
-        "key": From(key, node.origin, node.line),
+        "key": node.gives(key),
         "topic": channel["topic"].text(),
         "type": channel["type"].text(),
         "foreign": None if type_ in MESSAGE_TYPES else From(True, "added: only bags have this type"),
@@ -185,7 +162,7 @@ def _observation(key: str, node: Node) -> dict[str, Any] | None:
         "image": _image(node) if key.startswith(IMAGES) else None,
         "align": _align(node),
     }
-    return _present(values) | _rest(node)
+    return values | _rest(node)
 
 
 def _action(key: str, node: Node) -> dict[str, Any] | None:
@@ -196,7 +173,7 @@ def _action(key: str, node: Node) -> dict[str, Any] | None:
     select = _select(node, str(channel["type"].value))
     names = [each.partition(".")[2] or each for each in node["select"].texts()] or [key]
     values = {
-        "key": From(key, node.origin, node.line),
+        "key": node.gives(key),
         "topic": channel["topic"].text(),
         "type": channel["type"].text(),
         "select": select,
@@ -207,7 +184,7 @@ def _action(key: str, node: Node) -> dict[str, Any] | None:
     strategy = node["align"]["strategy"]
     if strategy.value == "hold":
         strategy.taken("hold", "the default")
-    return _present(values) | _rest(node, "the command in effect at the tick")
+    return values | _rest(node, "the command in effect at the tick")
 
 
 def _select(node: Node, type_: str) -> From | None:
@@ -243,7 +220,7 @@ def _align(node: Node) -> dict[str, Any] | None:
     if stamp.value not in (None, "header", "receive"):
         stamp.wrong(f"expected header or receive, got {stamp.value!r}")
     tolerance.refuse("only asof has a tolerance")
-    return _present(values) or None
+    return values if any(values.values()) else None
 
 
 def _signals(root: Node) -> list[dict[str, Any]]:
@@ -256,14 +233,14 @@ def _signals(root: Node) -> list[dict[str, Any]]:
             channel = node["channel"]
             align = node["align"]["strategy"]
             values = {
-                "key": From(key, node.origin, node.line),
+                "key": node.gives(key),
                 "topic": channel["topic"].text(),
                 "type": channel["type"].text(),
                 "select": _select(node, str(channel["type"].value)),
                 "align": align.text() if align.value == "hold" else None,
             }
             node["align"]["timeline"].refuse("signals are aligned by their time of receipt")
-            found.append(_present(values) | _rest(node))
+            found.append(values | _rest(node))
     return found
 
 
@@ -280,7 +257,3 @@ def _rest(node: Node, note: str = "") -> dict[str, Any]:
     node["kind"].refuse("policies normalise by the statistics of the dataset")
     node["align"].refuse(note or "has no counterpart for this entry")
     return {}
-
-
-def _present(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if value is not None}

@@ -9,8 +9,7 @@ from typing import Any
 import attrs
 
 from ibrobot_core.app import find_config, installed_plugins, parse_yaml
-from ibrobot_import.draft import Titled
-from ibrobot_import.source import From, Node
+from ibrobot_import.source import From, Node, Titled
 
 ARM, GRIPPER = "arm", "gripper"
 SERVOS = {
@@ -27,7 +26,11 @@ LINKS = {
     "wrist": "wrist_link", "gripper": "gripper_link", "jaw": "moving_jaw_so101_v1_link",
 }  # fmt: skip
 """Other names of its links."""
-ADDED_MODES = ("hold", "web")
+
+WEB = {"web": From({"type": "web"}, "added, for the mode web")}
+"""The device of the mode `web`."""
+CONTROL = {"rate_hz": 100, "stop": "hold"}
+"""The section `control`."""
 
 
 @attrs.frozen
@@ -38,6 +41,15 @@ class Body:
     """The config that ibrobot ships."""
     prefixes: tuple[str, ...]
     """What the joints' names begin with, for each arm."""
+
+    @property
+    def origin(self) -> str:
+        """The comment of a value of ibrobot's own config."""
+        return f"{self.config} of ibrobot"
+
+    def own(self, value: Any) -> From:
+        """A value of ibrobot's own config."""
+        return From(value, self.origin)
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -85,48 +97,38 @@ def robot_section(
         robot_type: LeRobot's name of the robot type.
         limits: joint -> lower and upper limit [rad] and where they stand; the narrower ones hold.
         poses: name -> joint positions [rad], beside those of ibrobot's own.
-        groups: name -> joints, for those in the file.
+        groups: name -> joints, for groups of `body` that are in the file.
     """
     own = shipped(body.config)["robot"]
     joints: list[From] = []
     for each in own["joints"]:
         lower, upper, node = (limits or {}).get(each["name"], (each["lower"], each["upper"], None))
         narrowed = {**each, "lower": max(lower, each["lower"]), "upper": min(upper, each["upper"])}
-        comment = f"{added(body)}"
-        if node is not None:
-            comment = f"{node.origin}; the narrower of it and {body.config} of ibrobot"
-            if narrowed["lower"] >= narrowed["upper"]:
-                node.wrong(f"leaves {each['name']} no range within {each['lower']} to {each['upper']} rad")
-        joints.append(From(narrowed, comment, node.line if node is not None else 0))
-    description = {key: _comment(value, body) for key, value in own["description"].items() if key != "poses"}
+        if node is None:
+            joints.append(body.own(narrowed))
+            continue
+        if narrowed["lower"] >= narrowed["upper"]:
+            node.wrong(f"leaves {each['name']} no range within {each['lower']} to {each['upper']} rad")
+        joints.append(node.gives(narrowed, f"the narrower of it and {body.origin}"))
+    poses = {name: body.own(pose) for name, pose in own["description"]["poses"].items()} | dict(poses or {})
     return {
         "name": name,
-        "robot_type": robot_type or From(own["robot_type"], added(body)),
+        "robot_type": robot_type or body.own(own["robot_type"]),
         "joints": joints,
-        "groups": {
-            **{each: (groups or {}).get(each) or From(names, added(body)) for each, names in body.groups.items()},
-            **{each: From(names, added(body)) for each, names in body.grippers.items()},
-        },
-        "description": {
-            **description,
-            "poses": {**{each: From(pose, added(body)) for each, pose in own["description"]["poses"].items()}}
-            | dict(poses or {}),
-        },
+        "groups": {name: body.own(group) for name, group in (body.groups | body.grippers).items()} | dict(groups or {}),
+        "description": {name: body.own(value) for name, value in own["description"].items()} | {"poses": poses},
     }
 
 
 def hardware_section(body: Body, ports: Sequence[From | None], calibrations: Sequence[From | None]) -> dict[str, Any]:
     """The section `hardware`, with a port and a calibration for each arm."""
     own = shipped(body.config)["hardware"]
-    parts = [own] if len(body.prefixes) == 1 else list(own.values())
-    names = [""] if len(body.prefixes) == 1 else list(own)
-    found = []
-    for part, port, calibration in zip(parts, ports, calibrations, strict=True):
-        values = {key: From(value, added(body)) for key, value in part.items()}
-        values |= {"port": port} if port is not None else {}
-        values |= {"calibration": calibration} if calibration is not None else {}
-        found.append(values)
-    return found[0] if names == [""] else dict(zip(names, found, strict=True))
+    parts = {"": own} if len(body.prefixes) == 1 else own
+    found = {}
+    for (name, part), port, calibration in zip(parts.items(), ports, calibrations, strict=True):
+        given = {"port": port, "calibration": calibration}
+        found[name] = {key: given.get(key) or body.own(value) for key, value in part.items()}
+    return found.get("", found)
 
 
 def executor_sections(names: Mapping[str, tuple[str, str, str, int]]) -> dict[str, Any]:
@@ -141,27 +143,65 @@ def executor_sections(names: Mapping[str, tuple[str, str, str, int]]) -> dict[st
 
 def streams(body: Body) -> dict[str, tuple[str, str, str, int]]:
     """An executor of setpoints for each group, as for `executor_sections`."""
-    return {f"{group}_position": ("position", group, added(body), 0) for group in body.groups}
+    return {f"{group}_position": ("position", group, body.origin, 0) for group in body.groups}
 
 
 def added_modes(executors: Sequence[str], taken: Sequence[str]) -> dict[str, Any]:
     """Modes that every robot can run, also in simulation, without devices."""
-    modes: dict[str, Any] = {
-        "hold": Titled({"executors": From(list(executors), "added")}, "added: holds its pose, needs no device"),
-        "web": Titled(
-            {"executors": From(list(executors), "added"), "teleop": From("web", "added")},
-            "added: driven from the page of `ibrobot launch --web`",
-        ),
+    modes = {
+        "hold": added_mode(executors, "holds its pose, needs no device"),
+        "web": added_mode(executors, "driven from the page of `ibrobot launch --web`", "web"),
     }
     return {name: mode for name, mode in modes.items() if name not in taken}
 
 
-def simulation_section(type_: From | None = None, scene: From | None = None, mode: str = "hold") -> dict[str, Any]:
+def added_mode(executors: Sequence[str], remark: str, teleop: Any = None) -> Titled:
+    """A mode that the file does not have, with its device or, for each group, the devices."""
+    device = From(teleop, "added") if teleop is not None else None
+    return Titled({"executors": From(list(executors), "added"), "teleop": device}, f"added: {remark}")
+
+
+def sections(
+    body: Body, robot: Mapping[str, Any], hardware: Mapping[str, Any], cameras: Sequence[Any], modes: Mapping[str, Any],
+    devices: Mapping[str, Any], rate: From | None, observations: Sequence[Any],
+) -> dict[str, Any]:  # fmt: skip
+    """The sections of the new file, with all that a file lacks which has no executors and modes.
+
+    Args:
+        body: the arms.
+        robot: the section `robot`.
+        hardware: the section `hardware`.
+        cameras: the peripherals.
+        modes: the modes of the file's devices; the first one is the default.
+        devices: the section `teleoperation`.
+        rate: rate of the contract [Hz].
+        observations: observations of the contract.
+    """
+    executors = streams(body)
+    return {
+        "robot": robot,
+        "hardware": hardware,
+        "simulation": simulation_section(),
+        "peripherals": list(cameras),
+        "executors": executor_sections(executors),
+        "control_modes": {**modes, **added_modes(list(executors), list(modes))},
+        "default_control_mode": From(next(iter(modes), "hold"), "added"),
+        "teleoperation": {**devices, **WEB},
+        "contract": {
+            "rate_hz": rate,
+            "observations": observations,
+            "actions": [action_part(name, body.origin) for name in executors],
+        },
+        "control": body.own(CONTROL),
+    }
+
+
+def simulation_section(type_: From | None = None, scene: From | None = None) -> dict[str, Any]:
     """The section `simulation`."""
     return {
         "type": type_ or From("mujoco", "added"),
         "scene": scene or From("empty", "added"),
-        "default_control_mode": From(mode, "added: a mode that needs no device"),
+        "default_control_mode": From("hold", "added: a mode that needs no device"),
     }
 
 
@@ -182,10 +222,10 @@ def simulated(name: str, body: Body) -> From | None:
 def state_observation(body: Body) -> dict[str, Any]:
     """The observation of all joints, as LeRobot's datasets have it."""
     return {
-        "key": From("observation.state", added(body)),
-        "topic": From("/joint_states", added(body)),
-        "select": From([f"position.{name}" for name in body.joints], added(body)),
-        "align": From({"strategy": "hold", "stamp": "header"}, added(body)),
+        "key": body.own("observation.state"),
+        "topic": body.own("/joint_states"),
+        "select": body.own([f"position.{name}" for name in body.joints]),
+        "align": body.own({"strategy": "hold", "stamp": "header"}),
     }
 
 
@@ -206,12 +246,3 @@ def action_part(executor: str, comment: str = "added", line: int = 0) -> dict[st
         "topic": From(f"/{executor}_controller/commands", comment, line),
         "safety_behavior": From("hold", "added"),
     }
-
-
-def added(body: Body) -> str:
-    """The comment of a value of ibrobot's own config."""
-    return f"{body.config} of ibrobot"
-
-
-def _comment(value: Any, body: Body) -> From:
-    return From(value, added(body))

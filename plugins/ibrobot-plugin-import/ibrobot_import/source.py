@@ -46,6 +46,11 @@ class From:
     line: int = 0
 
 
+@attrs.frozen
+class Titled(From):
+    """A mapping or list in block style, with its comment beside its name."""
+
+
 @attrs.define
 class Source:
     """The file to import. Every value gets a verdict, so that none is dropped in silence."""
@@ -162,22 +167,30 @@ class Node:
             return []
         return values
 
+    def gives(self, value: Any, note: str = "") -> From:
+        """A value of the new file that comes from here, without a verdict."""
+        return From(value, f"{self.origin}; {note}" if note else self.origin, self.line)
+
+    def titles(self, values: Mapping[str, Any]) -> Titled:
+        """A block of the new file that comes from here."""
+        return Titled(values, self.origin, self.line)
+
     def changed(self, value: Any, note: str) -> From:
         """Take it as another value."""
         self.source.mark(self.key, Fate.CHANGED, note)
-        return From(value, f"{self.origin}; {note}", self.line)
+        return self.gives(value, note)
 
     def taken(self, value: Any, note: str = "") -> From:
-        """Take it as it is, in other words."""
+        """Take it as it is, perhaps in other words."""
         self.source.mark(self.key, Fate.TAKEN, note)
-        return From(value, f"{self.origin}; {note}" if note else self.origin, self.line)
+        return self.gives(value, note)
 
     def refuse(self, reason: str) -> None:
-        """It, or all below it without a verdict, has no counterpart."""
+        """Note that it, or all below it without a verdict, has no counterpart."""
         self.source.mark(self.key, Fate.REFUSED, reason, keeps=True)
 
     def drop(self, reason: str) -> None:
-        """It, and all below it, has no counterpart, whatever was taken of it before."""
+        """Note that it and all below it have no counterpart, whatever was taken of it before."""
         self.source.mark(self.key, Fate.REFUSED, reason)
 
     def fault(self, expected: str) -> None:
@@ -203,6 +216,11 @@ class Node:
             expanded = _VARIABLE.sub(lambda m: f"${{{m[1]}{':' + m[2] if m[2] else ''}}}", value)
             return self.changed(expanded, note or "variables are written ${NAME}")
         return self.changed(value, note) if note else self.taken(value)
+
+
+def plain_name(name: str) -> str:
+    """A name with the characters that ibrobot allows."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name)
 
 
 def _is_plain_list(value: Any) -> bool:
