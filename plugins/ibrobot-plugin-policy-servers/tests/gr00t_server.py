@@ -11,7 +11,8 @@ import numpy as np
 import zmq
 from ibrobot_policy_wire import pack_npy, unpack_npy
 
-HORIZON = 5
+from .served_requests import HORIZON
+
 ARM_SIZE = 5
 DESCRIPTION = {
     "action": {

@@ -18,13 +18,24 @@ from ibrobot_policy_wire import pack_npy, unpack_npy
 from ibrobot_testing import PolicySuite, check_descriptor, host_context
 from ibrobot_testing.contexts import ARM, GRIPPER
 
-from ibrobot_core.api import Context, Frame, Policy, PolicyError
+from ibrobot_core.api import Context, Policy, PolicyError
 
-from .gr00t_server import HORIZON, Gr00tServer, ramp
+from .gr00t_server import Gr00tServer, ramp
+from .served_requests import (
+    CAMERA,
+    HORIZON,
+    IMAGE,
+    SIZE,
+    STATE,
+    Damage,
+    chunk,
+    error_when_closed,
+    expected,
+    frame,
+    in_time,
+    refused,
+)
 
-STATE, CAMERA = "observation.state", "observation.images.top"
-IMAGE = (8, 10, 3)
-SIZE = 6
 OPTIONS = Gr00tOptions(
     observations=(
         ObservationMap(STATE, ("state", "joints"), (SIZE,), joints=ARM + GRIPPER),
@@ -41,30 +52,6 @@ OPTIONS = Gr00tOptions(
 
 def make(options: Gr00tOptions) -> ServedPolicy:
     return ServedPolicy(options, host_context(), Gr00tConnection(options))
-
-
-def frame(level: int = 40) -> Frame:
-    state = np.linspace(-0.5, 0.5, SIZE, dtype=np.float32)
-    return Frame(7, {STATE: state, CAMERA: np.full(IMAGE, level, np.uint8)}, prompt="pick up the cube")
-
-
-def chunk(policy: Policy, seen: Frame) -> np.ndarray[Any, Any]:
-    return policy.postprocess(policy.infer(policy.preprocess(seen)))
-
-
-def in_time(policy: Policy, seen: Frame) -> np.ndarray[Any, Any]:
-    """A chunk, whatever the load of the machine: requests without an answer in time are repeated."""
-    while True:
-        try:
-            return chunk(policy, seen)
-        except PolicyError as error:
-            if "no answer within" not in str(error):
-                raise
-
-
-def expected(level: int) -> np.ndarray[Any, Any]:
-    state = np.linspace(-0.5, 0.5, SIZE, dtype=np.float32)
-    return state + np.arange(HORIZON)[:, None] * 0.01 + level * 1e-3
 
 
 @pytest.fixture
@@ -146,10 +133,10 @@ def test_the_token_is_sent_and_a_wrong_one_is_an_error(server: Gr00tServer, opti
     allowed = make(attrs.evolve(options, api_token="pa55word"))
     allowed.load()
     allowed.close()
-    refused = make(options)
+    other = make(options)
     with pytest.raises(PolicyError, match="the server's error: Unauthorized"):
-        refused.load()
-    refused.close()
+        other.load()
+    other.close()
 
 
 @pytest.mark.parametrize(
@@ -167,10 +154,10 @@ def test_a_wrong_answer_is_an_error_before_anything_moves_and_later(
     server: Gr00tServer, options: Gr00tOptions, answer: Any, message: str
 ) -> None:
     server.answer = lambda data: answer
-    refused = make(options)
+    wrong = make(options)
     with pytest.raises(PolicyError, match=message):
-        refused.load()
-    refused.close()
+        wrong.load()
+    wrong.close()
     server.answer = ramp
     policy = make(options)
     policy.load()
@@ -234,52 +221,23 @@ def test_no_server_is_an_error() -> None:
 def test_close_ends_a_request(options: Gr00tOptions, server: Gr00tServer) -> None:
     policy = make(attrs.evolve(options, timeout=60.0))
     policy.load()
-    asked, errors = threading.Event(), []
-
-    def never(data: dict[str, Any]) -> None:
-        asked.set()
-
-    def ask() -> None:
-        try:
-            chunk(policy, frame())
-        except PolicyError as error:
-            errors.append(str(error))
-
-    server.answer = never
-    thread = threading.Thread(target=ask)
-    thread.start()
-    asked.wait()
-    policy.close()
-    thread.join()
-    assert errors == [f"{server.address}: was closed"]
+    assert error_when_closed(policy, server) == f"{server.address}: was closed"
 
 
 def test_damaged_answers_are_errors_and_the_next_answer_is_right(policy: ServedPolicy, server: Gr00tServer) -> None:
     """1,000 answers with flipped, cut or repeated bytes: each is refused or has the shape, finite, of an answer."""
-    random, refused = np.random.default_rng(0), 0
+    damage = Damage()
     zeros = {"state": {"joints": np.zeros((1, 1, SIZE), np.float32)}, "video": {"front": np.zeros((1, 1, *IMAGE))}}
     good = pack_npy(ramp({"observation": zeros}))
 
-    def damaged(data: dict[str, Any]) -> Any:
-        if data["observation"]["video"]["front"].max() == 200:
-            return ramp(data)
-        content = bytearray(good)
-        for place in random.integers(0, len(good), random.integers(1, 6)):
-            content[place] = random.integers(256)
-        cut = random.integers(0, len(good) + 1) if random.random() < 0.3 else len(good)
-        return bytes(content[:cut])
+    def answer(data: dict[str, Any]) -> Any:
+        return ramp(data) if data["observation"]["video"]["front"].max() == 200 else damage(good)
 
-    server.answer = damaged
-    for i in range(1000):
-        try:
-            actions = chunk(policy, frame(1))
-            assert actions.shape == (HORIZON, SIZE)
-            assert np.isfinite(actions).all()
-        except PolicyError:
-            refused += 1
-        if i % 100 == 0:
-            np.testing.assert_allclose(chunk(policy, frame(200)), expected(200), atol=1e-6)
-    assert refused > 300
+    server.answer, count = answer, 0
+    for _ in range(10):
+        count += refused(policy, 100)
+        np.testing.assert_allclose(chunk(policy, frame(200)), expected(200), atol=1e-6)
+    assert count > 300
 
 
 def test_arrays_survive() -> None:

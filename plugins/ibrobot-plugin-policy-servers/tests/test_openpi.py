@@ -17,12 +17,25 @@ from ibrobot_policy_servers.served import ServedPolicy
 from ibrobot_policy_wire import pack
 from ibrobot_testing import PolicySuite, check_descriptor, host_context
 from ibrobot_testing.contexts import ARM, GRIPPER
-from openpi_server import HORIZON, SIZE, OpenpiServer, ramp
+from openpi_server import OpenpiServer, ramp
 
-from ibrobot_core.api import Context, Frame, Policy, PolicyError
+from ibrobot_core.api import Context, Policy, PolicyError
 
-STATE, CAMERA = "observation.state", "observation.images.top"
-IMAGE = (8, 10, 3)
+from .served_requests import (
+    CAMERA,
+    HORIZON,
+    IMAGE,
+    SIZE,
+    STATE,
+    Damage,
+    chunk,
+    error_when_closed,
+    expected,
+    frame,
+    in_time,
+    refused,
+)
+
 JOINTS = ARM + GRIPPER
 OPTIONS = OpenpiOptions(
     observations=(
@@ -40,30 +53,6 @@ OPTIONS = OpenpiOptions(
 def make(options: OpenpiOptions) -> ServedPolicy:
     ctx = host_context()
     return ServedPolicy(options, ctx, OpenpiConnection(options, ctx.log))
-
-
-def frame(level: int = 40, prompt: str = "pick up the cube") -> Frame:
-    state = np.linspace(-0.5, 0.5, SIZE, dtype=np.float32)
-    return Frame(7, {STATE: state, CAMERA: np.full(IMAGE, level, np.uint8)}, prompt=prompt)
-
-
-def chunk(policy: Policy, seen: Frame) -> np.ndarray[Any, Any]:
-    return policy.postprocess(policy.infer(policy.preprocess(seen)))
-
-
-def in_time(policy: Policy, seen: Frame) -> np.ndarray[Any, Any]:
-    """A chunk, whatever the load of the machine: requests without an answer in time are repeated."""
-    while True:
-        try:
-            return chunk(policy, seen)
-        except PolicyError as error:
-            if "no answer within" not in str(error):
-                raise
-
-
-def expected(level: int) -> np.ndarray[Any, Any]:
-    state = np.linspace(-0.5, 0.5, SIZE, dtype=np.float32)
-    return state + np.arange(HORIZON)[:, None] * 0.01 + level * 1e-3
 
 
 @pytest.fixture
@@ -177,10 +166,10 @@ def test_a_wrong_answer_is_an_error_before_anything_moves_and_later(
     server: OpenpiServer, options: OpenpiOptions, answer: Any, message: str
 ) -> None:
     server.answer = lambda request: answer
-    refused = make(options)
+    wrong = make(options)
     with pytest.raises(PolicyError, match=message):
-        refused.load()
-    refused.close()
+        wrong.load()
+    wrong.close()
     server.answer = ramp
     policy = make(options)
     policy.load()
@@ -282,24 +271,7 @@ def test_another_model_after_a_restart_is_refused(
 def test_close_ends_a_request(options: OpenpiOptions, server: OpenpiServer) -> None:
     policy = make(attrs.evolve(options, timeout=60.0))
     policy.load()
-    asked, errors = threading.Event(), []
-
-    def never(request: dict[str, Any]) -> None:
-        asked.set()
-
-    def ask() -> None:
-        try:
-            chunk(policy, frame())
-        except PolicyError as error:
-            errors.append(error)
-
-    server.answer = never
-    thread = threading.Thread(target=ask)
-    thread.start()
-    asked.wait()
-    policy.close()
-    thread.join()
-    assert len(errors) == 1
+    assert error_when_closed(policy, server)
 
 
 def test_the_key_is_sent_and_not_shown(
@@ -332,26 +304,14 @@ def test_a_prompt_is_needed(policy: ServedPolicy) -> None:
 
 def test_damaged_answers_are_errors_and_the_next_answer_is_right(policy: ServedPolicy, server: OpenpiServer) -> None:
     """1,000 answers with flipped, cut or repeated bytes: each is refused or has the shape, finite, of an answer."""
-    random, refused = np.random.default_rng(0), 0
+    damage = Damage()
     good = pack(ramp({"observation/state": np.zeros(SIZE, np.float32), "observation/image": np.zeros(IMAGE, np.uint8)}))
 
-    def damaged(request: dict[str, Any]) -> bytes | dict[str, Any]:
-        if request["observation/image"].max() == 200:
-            return ramp(request)
-        content = bytearray(good)
-        for place in random.integers(0, len(good), random.integers(1, 6)):
-            content[place] = random.integers(256)
-        cut = random.integers(0, len(good) + 1) if random.random() < 0.3 else len(good)
-        return bytes(content[:cut])
+    def answer(request: dict[str, Any]) -> bytes | dict[str, Any]:
+        return ramp(request) if request["observation/image"].max() == 200 else damage(good)
 
-    server.answer = damaged
-    for i in range(1000):
-        try:
-            actions = chunk(policy, frame(1))
-            assert actions.shape == (HORIZON, SIZE)
-            assert np.isfinite(actions).all()
-        except PolicyError:
-            refused += 1
-        if i % 100 == 0:
-            np.testing.assert_allclose(chunk(policy, frame(200)), expected(200), atol=1e-6)
-    assert refused > 300
+    server.answer, count = answer, 0
+    for _ in range(10):
+        count += refused(policy, 100)
+        np.testing.assert_allclose(chunk(policy, frame(200)), expected(200), atol=1e-6)
+    assert count > 300

@@ -20,10 +20,10 @@ from ibrobot_testing.contexts import ARM, GRIPPER
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
-from ibrobot_core.api import Context, Frame, Policy, PolicyError
+from ibrobot_core.api import Context, Policy, PolicyError
 
-STATE, CAMERA = "observation.state", "observation.images.top"
-IMAGE, SIZE = (8, 10, 3), 6
+from .served_requests import CAMERA, IMAGE, POSITIONS, SIZE, STATE, Damage, chunk, refused
+
 OPTIONS = VlaEvalOptions(
     observations=(
         ObservationMap(STATE, ("states",), (SIZE,)),
@@ -92,15 +92,6 @@ def policy(server: Server) -> Iterator[ServedPolicy]:
     policy.close()
 
 
-def frame() -> Frame:
-    state = np.linspace(-0.5, 0.5, SIZE, dtype=np.float32)
-    return Frame(7, {STATE: state, CAMERA: np.full(IMAGE, 3, np.uint8)}, prompt="pick up the cube")
-
-
-def chunk(policy: Policy) -> np.ndarray[Any, Any]:
-    return policy.postprocess(policy.infer(policy.preprocess(frame())))
-
-
 class TestVlaEval(PolicySuite):
     @pytest.fixture(autouse=True)
     def server(self, no_leaks: None) -> Iterator[None]:
@@ -120,7 +111,7 @@ def test_descriptor_is_right() -> None:
 
 def test_messages_are_those_of_version_1(policy: ServedPolicy, server: Server) -> None:
     policy.reset(4)
-    np.testing.assert_allclose(chunk(policy), [np.linspace(-0.5, 0.5, SIZE)], atol=1e-6)
+    np.testing.assert_allclose(chunk(policy), [POSITIONS], atol=1e-6)
     kinds = [each["type"] for each in server.messages]
     assert kinds == ["hello", "episode_start", "observation", "episode_end", "episode_start", "observation"]
     assert [each["seq"] for each in server.messages] == list(range(1, 7))
@@ -175,24 +166,8 @@ def test_another_protocol_is_an_error(server: Server, hello: Any, message: str) 
 
 def test_damaged_answers_are_errors_and_the_next_answer_is_right(policy: ServedPolicy, server: Server) -> None:
     """1,000 answers with flipped or cut bytes: each is refused or has the shape, finite, of an answer."""
-    random, refused, is_damaged = np.random.default_rng(0), 0, True
-
-    def damaged(answer: dict[str, Any]) -> Any:
-        if answer["type"] != "action" or not is_damaged:
-            return answer
-        content = bytearray(pack_named(answer))
-        for place in random.integers(0, len(content), random.integers(1, 6)):
-            content[place] = random.integers(256)
-        return bytes(content[: random.integers(0, len(content) + 1) if random.random() < 0.3 else len(content)])
-
-    server.changed = damaged
-    for _ in range(1000):
-        try:
-            actions = chunk(policy)
-            assert actions.shape == (1, SIZE)
-            assert np.isfinite(actions).all()
-        except PolicyError:
-            refused += 1
-    is_damaged = False
-    np.testing.assert_allclose(chunk(policy), [np.linspace(-0.5, 0.5, SIZE)], atol=1e-6)
-    assert refused > 300
+    damage = Damage()
+    server.changed = lambda answer: damage(pack_named(answer)) if answer["type"] == "action" else answer
+    assert refused(policy, 1000, horizon=1) > 300
+    server.changed = lambda answer: answer
+    np.testing.assert_allclose(chunk(policy), [POSITIONS], atol=1e-6)
