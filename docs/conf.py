@@ -43,6 +43,7 @@ html_theme = "furo"
 html_title = "ibrobot"
 html_static_path = ["_static"]
 html_css_files = ["wide.css"]
+html_split_index = True  # one page for each letter: whole, the index is 29,000 pixels tall
 
 default_role = "code"  # `--sim` in a docstring is code, not a title with a dash
 autodoc_member_order = "bysource"

@@ -27,10 +27,8 @@ pytestmark = pytest.mark.integration
 PATIENCE_S = 120.0
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the robot YAML `picks`, whose modes are one good policy twice, and one that cannot grasp."""
-    folder = tmp_path_factory.mktemp("eval")
+def write_picks(folder: Path) -> Path:
+    """Write the robot YAML `picks`, whose modes are one good policy twice, and one that cannot grasp."""
     text = find_config("so101_pick_cube", installed_plugins()).read_text(encoding="utf-8")
     text = text.replace("max_duration_s: 20", "max_duration_s: 6")
     text = text.replace("\nmodels:\n", "\nmodels:\n  broken: {type: scripted_pick, gripper_closed: 0.6}\n")
@@ -44,9 +42,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with the robot YAML `picks`, of each test's own: one that runs again begins anew."""
+    (tmp_path / "eval").mkdir()
+    return write_picks(tmp_path / "eval")
+
+
 @pytest.fixture(scope="module")
-def whole(folder: Path) -> Path:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An evaluation of two policies with three episodes each, in one process."""
+    folder = write_picks(tmp_path_factory.mktemp("whole"))
     done = evaluate(folder, "--out", "whole", "--jobs", 1)
     assert done.returncode == 0, done.stderr
     assert "scripted  3 of 3 succeeded" in done.stdout

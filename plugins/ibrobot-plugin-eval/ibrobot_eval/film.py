@@ -72,7 +72,11 @@ def film(file: Path, policy: Policy, result: Result) -> None:
 
 
 def encode(pictures: list[bytes], rate_hz: float) -> bytes:
-    """Encode JPEG pictures as a video (MP4, H.264). Equal pictures give equal bytes."""
+    """Encode JPEG pictures as a video (MP4, H.264). Equal pictures give equal bytes.
+
+    Pictures keep their pixel format and full range: libswscale's conversion, on several threads, differs now and then
+    by 1 in a last row.
+    """
     import av
 
     buffer = io.BytesIO()
@@ -84,10 +88,10 @@ def encode(pictures: list[bytes], rate_hz: float) -> bytes:
                 if stream is None:
                     options = {"crf": "28", "preset": "veryfast", "threads": "1"}
                     stream = container.add_stream("libx264", rate=round(rate_hz), options=options)
-                    stream.width, stream.height, stream.pix_fmt = frame.width, frame.height, "yuv420p"
-                made = frame.reformat(format="rgb24").reformat(format="yuv420p")  # of the full range, as JPEG has it
-                made.pts = None
-                container.mux(stream.encode(made))
+                    stream.width, stream.height, stream.pix_fmt = frame.width, frame.height, frame.format.name
+                    stream.codec_context.colorspace = frame.colorspace
+                frame.pts = None
+                container.mux(stream.encode(frame))
         if stream is not None:
             container.mux(stream.encode(None))
     return buffer.getvalue()

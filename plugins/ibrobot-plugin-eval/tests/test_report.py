@@ -171,7 +171,9 @@ def test_video_of_pictures_can_be_decoded_and_is_repeatable():
     video = encode(pictures, 10.0)
     assert video == encode(pictures, 10.0)
     with av.open(io.BytesIO(video), "r") as container:
-        shades = [frame.to_ndarray(format="rgb24").mean() for frame in container.decode(video=0)]
+        frames = list(container.decode(video=0))
+    assert {frame.format.name for frame in frames} == {"yuvj420p"}, "of the full range, as JPEG pictures"
+    shades = [frame.to_ndarray(format="rgb24").mean() for frame in frames]
     assert (len(shades), shades) == (10, sorted(shades))
     assert shades[0] < 20
     assert shades[-1] > 200
