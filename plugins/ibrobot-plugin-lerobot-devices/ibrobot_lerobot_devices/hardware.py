@@ -103,11 +103,7 @@ class LeRobotHardware(Hardware):
             self._newest = self._reading(answer)
             return self._newest
         if self._link.blocked_s > self._options.blocked:
-            try:
-                why: object = self._link.blockage("get_observation")
-            except DeviceProblem as problem:
-                why = problem
-            raise self._fail(why)
+            raise self._fail(self._link.blockage("get_observation"))
         newest = self._newest
         if newest is None:
             now_ns, size = self._ctx.clock.now_ns(), len(self.joints)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ibrobot_core.api import did_you_mean
-from ibrobot_lerobot_devices.registry import third_parties
+from ibrobot_lerobot_devices.registry import KEEPS_TORQUE, third_parties
 
 Kind = Literal["robot", "teleoperator", "camera"]
 KINDS: tuple[Kind, ...] = ("robot", "teleoperator", "camera")
@@ -24,8 +24,6 @@ _PACKAGES: Mapping[str, tuple[str, str]] = {
     "teleoperator": ("lerobot.teleoperators", "TeleoperatorConfig"),
     "camera": ("lerobot.cameras", "CameraConfig"),
 }
-KEEPS_TORQUE = "disable_torque_on_disconnect"
-"""The key of LeRobot's configs that decides about the torque after the end; here `control.stop` does."""
 
 
 class DeviceError(Exception):

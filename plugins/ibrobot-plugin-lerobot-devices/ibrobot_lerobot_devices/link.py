@@ -148,12 +148,15 @@ class DeviceLink:
         return 0.0 if self._asked_s is None else time.monotonic() - self._asked_s
 
     def blockage(self, call: str) -> str:
-        """What is known of the present call of LeRobot's, e.g. `get_observation`, which does not return.
-
-        Raises:
-            DeviceProblem: if the process has died.
-        """
+        """What is known of the present call of LeRobot's, e.g. `get_observation`, which does not return."""
         text = f"LeRobot's {self.type}.{call} does not return for {self.blocked_s:.2f} s"
+        try:
+            return f"{text}{self._traffic()}"
+        except DeviceProblem as problem:  # the process has died
+            return str(problem)
+
+    def _traffic(self) -> str:
+        """What has come from the device's ports during the present call."""
         self._running().channel.send({"do": TRAFFIC})
         deadline_s = time.monotonic() + _TRAFFIC_S
         while (left_s := deadline_s - time.monotonic()) > 0:
@@ -162,13 +165,13 @@ class DeviceLink:
                 continue
             if message["received"]:
                 return (
-                    f"{text}: {message['received']} bytes have come from its port, but no valid answer of all motors; "
+                    f": {message['received']} bytes have come from its port, but no valid answer of all motors; "
                     "check the cables, and that no other program uses the port"
                 )
             if message["reads"]:
-                return f"{text}: nothing comes from its port; check the motors' power and cable"
-            return text
-        return f"{text}, and its process does not respond"
+                return ": nothing comes from its port; check the motors' power and cable"
+            return ""
+        return ", and its process does not respond"
 
     def act(self, action: Mapping[str, float]) -> None:
         """Send an action; LeRobot gets the newest one when its present call has returned.

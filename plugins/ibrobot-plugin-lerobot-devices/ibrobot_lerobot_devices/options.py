@@ -24,34 +24,25 @@ def _unit_names(instance: object, attribute: attrs.Attribute[Any], value: Mappin
             raise ValueError(f"{name}: {unit!r} is not one of: {', '.join(UNITS)}")
 
 
-def _joint_options() -> dict[str, Any]:
-    return {
-        "joints": option(factory=dict, help="LeRobot's name of a joint -> joint of the robot, where they differ"),
-        "units": option(
-            factory=dict,
-            validator=_unit_names,
-            help=f"LeRobot's name of a joint, or '*' for all others -> its unit, where LeRobot does not say it: "
-            f"{', '.join(UNITS)}",
-        ),
-        "zero_at": option(
-            "pose",
-            choices=("pose", "range"),
-            help="position of 0 rad of joints with a calibration: the middle of the encoder, which is the pose set by "
-            "hand at calibration, or the middle of the calibrated range",
-        ),
-        "anchored": option(
-            GRIPPER, help="joints whose calibrated closed end is at their lower limit, as with feetech_so101"
-        ),
-        "inverted": option((), help="joints whose direction is reversed"),
-    }
-
-
 def _is_topic(instance: object, attribute: attrs.Attribute[Any], value: str) -> None:
     if not value.startswith("/") or value.endswith("/") or " " in value:
         raise ValueError(f"{value!r} is not a topic: a topic begins with /, e.g. {attribute.default}")
 
 
-_JOINTS = _joint_options()
+_JOINTS = option(factory=dict, help="LeRobot's name of a joint -> joint of the robot, where they differ")
+_UNITS = option(
+    factory=dict,
+    validator=_unit_names,
+    help=f"LeRobot's name of a joint, or '*' for all others -> its unit, where LeRobot does not say it: "
+    f"{', '.join(UNITS)}",
+)
+_ZERO_AT = option(
+    "pose",
+    choices=("pose", "range"),
+    help="position of 0 rad of joints with a calibration: the middle of the encoder, which is the pose set by hand at "
+    "calibration, or the middle of the calibrated range",
+)
+_INVERTED = option((), help="joints whose direction is reversed")
 _START = option(40.0, unit="s", gt=0, help="how long LeRobot may take to start and to connect")
 _LOST = option(3, ge=0, help="consecutive readings that LeRobot may fail to give")
 
@@ -63,11 +54,13 @@ class RobotOptions:
 
     robot: str = option(validator=not_empty, help="LeRobot's type of the robot, e.g. koch_follower")
     config: Mapping[str, Any] = option(factory=dict, help=_CONFIG)
-    joints: Mapping[str, str] = _JOINTS["joints"]
-    units: Mapping[str, str] = _JOINTS["units"]
-    zero_at: str = _JOINTS["zero_at"]
-    anchored: tuple[str, ...] = _JOINTS["anchored"]
-    inverted: tuple[str, ...] = _JOINTS["inverted"]
+    joints: Mapping[str, str] = _JOINTS
+    units: Mapping[str, str] = _UNITS
+    zero_at: str = _ZERO_AT
+    anchored: tuple[str, ...] = option(
+        GRIPPER, help="joints whose calibrated closed end is at their lower limit, as with feetech_so101"
+    )
+    inverted: tuple[str, ...] = _INVERTED
     lost_readings: int = _LOST
     blocked: float = option(
         0.08,
@@ -90,10 +83,10 @@ class TeleopOptions:
 
     teleop: str = option(validator=not_empty, help="LeRobot's type of the teleoperator, e.g. koch_leader")
     config: Mapping[str, Any] = option(factory=dict, help=_CONFIG)
-    joints: Mapping[str, str] = _JOINTS["joints"]
-    units: Mapping[str, str] = _JOINTS["units"]
-    zero_at: str = _JOINTS["zero_at"]
-    inverted: tuple[str, ...] = _JOINTS["inverted"]
+    joints: Mapping[str, str] = _JOINTS
+    units: Mapping[str, str] = _UNITS
+    zero_at: str = _ZERO_AT
+    inverted: tuple[str, ...] = _INVERTED
     scaled: tuple[str, ...] = option(
         GRIPPER,
         help="joints whose values from 0 to 100, or from -100 to 100, map to the robot's limits; others map by angle",

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 _PREFIXES = ("lerobot_robot_", "lerobot_teleoperator_", "lerobot_camera_")
 """LeRobot imports the distributions whose names begin with one of these."""
 _TIMEOUT_S = 90.0
-_KEEPS_TORQUE = "disable_torque_on_disconnect"
+KEEPS_TORQUE = "disable_torque_on_disconnect"
+"""The key of LeRobot's configs that decides about the torque after the end; here `control.stop` does."""
 _PYTHON: Mapping[str, tuple[type, ...]] = {
     "int": (int,),
     "float": (int, float),
@@ -114,7 +115,7 @@ def _check(
             yield OptionFault(
                 (*at, key), f"LeRobot's {type_} has no {key!r}{did_you_mean(key, list(fields), 'it has')}"
             )
-        elif key == _KEEPS_TORQUE:
+        elif key == KEEPS_TORQUE:
             yield OptionFault(
                 (*at, key), "is control.stop here: relax switches the torque off at the end, hold does not"
             )
