@@ -61,6 +61,7 @@ from ibrobot_core.interfaces import (
     nan_vector as nan_vector,
     Viewer as Viewer,
 )
+from ibrobot_core.interfaces.teleop import Approach as Approach
 from ibrobot_core.deadman import Deadman as Deadman
 from ibrobot_core.keys import HeldKeys as HeldKeys, KeyEvent as KeyEvent
 
@@ -101,14 +102,16 @@ from ibrobot_core.interfaces import (
     Recorder as Recorder,
     EpisodeStart as EpisodeStart,
     EpisodeEnd as EpisodeEnd,
+    DatasetWriter as DatasetWriter,
+    DatasetSummary as DatasetSummary,
+    Feature as Feature,
+)
+from ibrobot_core.interfaces.reader import (
     EpisodeReader as EpisodeReader,
     EpisodeAddress as EpisodeAddress,
     EpisodeSummary as EpisodeSummary,
     TopicSummary as TopicSummary,
     Recorded as Recorded,
-    DatasetWriter as DatasetWriter,
-    DatasetSummary as DatasetSummary,
-    Feature as Feature,
 )
 from ibrobot_core.files import replace_file as replace_file, sync as sync
 

@@ -92,7 +92,7 @@ from ibrobot_core.control.spline import Spline as Spline
 
 # Planning
 from ibrobot_core.descriptors import PlannerDescriptor as PlannerDescriptor
-from ibrobot_core.interfaces import (
+from ibrobot_core.interfaces.planner import (
     Planner as Planner,
     PlanRequest as PlanRequest,
     PlanResult as PlanResult,
@@ -128,7 +128,7 @@ from ibrobot_core.interfaces.policy import copied_tensors as copied_tensors
 
 # Episodes and datasets
 from ibrobot_core.ownership import Ownership as Ownership, owned as owned
-from ibrobot_core.interfaces import find_episode as find_episode
+from ibrobot_core.interfaces.reader import find_episode as find_episode
 from ibrobot_core.contract.metadata import robot_metadata as robot_metadata
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, FrameSampler as FrameSampler
 from ibrobot_core.selection import Selection as Selection, Leaf as Leaf, value_at as value_at

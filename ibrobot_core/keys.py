@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import queue
 from collections import defaultdict
-from collections.abc import Iterable
 from typing import Literal
 
 import attrs
@@ -52,10 +52,11 @@ class HeldKeys:
         self.touched: set[str] = set()
         self.exact = False
 
-    def take(self, typed: Iterable[str], now_ns: int) -> None:
-        """Take in the keys typed since the last call; call it at every tick [ns]."""
+    def take(self, typed: queue.SimpleQueue[str] | None, now_ns: int) -> None:
+        """Empty the queue of typed keys, None without a terminal; call it at every tick [ns]."""
         self.events, self.touched = [], set()
-        for event in typed:
+        while typed is not None and not typed.empty():
+            event = typed.get_nowait()
             kind, _, key = event.rpartition(":") if event.startswith((REPEAT, RELEASE)) else ("", "", event)
             self.exact |= bool(kind)
             if kind == "release":

@@ -194,6 +194,14 @@ def said(person: int, wanted: bytes) -> None:
         text += os.read(person, 100)
 
 
+def received(subscriber: queue.SimpleQueue[str], number: int) -> queue.SimpleQueue[str]:
+    """A queue with the next keys, which may still be on their way."""
+    keys: queue.SimpleQueue[str] = queue.SimpleQueue()
+    for _ in range(number):
+        keys.put(subscriber.get(timeout=TIMEOUT_S))
+    return keys
+
+
 def test_a_terminal_that_can_reports_repeats_and_releases_until_the_end(terminal, caplog):
     caplog.set_level("INFO", "ibrobot.keys")
     person, program = terminal
@@ -204,10 +212,10 @@ def test_a_terminal_that_can_reports_repeats_and_releases_until_the_end(terminal
         said(person, b"\x1b[>27u")
         held = HeldKeys(0.2)
         os.write(person, b"\x1b[32;1:1;32u\x1b[32;1:2;32u")
-        held.take([subscriber.get(timeout=TIMEOUT_S) for _ in range(2)], 0)
+        held.take(received(subscriber, 2), 0)
         assert held.held("space")
         os.write(person, b"\x1b[32;1:3u")
-        held.take([subscriber.get(timeout=TIMEOUT_S)], 1)
+        held.take(received(subscriber, 1), 1)
         assert held.events == [("release", "space")]
         with keys.suspended():
             said(person, b"\x1b[<u")

@@ -18,29 +18,10 @@ from ibrobot_core.interfaces.hardware import (
     Torque,
     nan_vector,
 )
-from ibrobot_core.interfaces.planner import (
-    AnyGoal,
-    Goal,
-    JointGoal,
-    LinearGoal,
-    NamedGoal,
-    OrientationPolicy,
-    Planner,
-    PlanRequest,
-    PlanResult,
-    PoseGoal,
-    PositionGoal,
-)
+from ibrobot_core.interfaces.planner import Planner
 from ibrobot_core.interfaces.policy import Frame, PictureCodec, Policy, PolicySpec, Tensors
-from ibrobot_core.interfaces.pool import Done, Job, Pool
-from ibrobot_core.interfaces.reader import (
-    EpisodeAddress,
-    EpisodeReader,
-    EpisodeSummary,
-    Recorded,
-    TopicSummary,
-    find_episode,
-)
+from ibrobot_core.interfaces.pool import Pool
+from ibrobot_core.interfaces.reader import EpisodeAddress, EpisodeReader
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.interfaces.scene import Scene
 from ibrobot_core.interfaces.sensor import Sensor

@@ -130,7 +130,7 @@ class Corrections(SourceWorker):
         self._devices.activate(self.session.measured())
         self._taken = self._waiting = self._engaged = False
         self._set(POLICY)
-        self._held.take(self._typed(), self.session.clock.now_ns())
+        self._held.take(self._keys, self.session.clock.now_ns())
         self._held.forget()
         self._policy.begin(seed)
         self.session.bus.serve(INTERVENE, lambda request: self.intervene(request.take))
@@ -162,7 +162,7 @@ class Corrections(SourceWorker):
         if self._states.get(timeout_s) is None:
             return
         with self.lock:
-            self._held.take(self._typed(), self.session.clock.now_ns())
+            self._held.take(self._keys, self.session.clock.now_ns())
             if self.active:
                 self._tick(int(self._is_key_pressed()))
 
@@ -305,10 +305,3 @@ class Corrections(SourceWorker):
 
     def _publish(self) -> None:
         self.session.bus.publish(COMMANDER, String(self._commander), latched=True)
-
-    def _typed(self) -> list[str]:
-        """The keys typed since the last call."""
-        typed: list[str] = []
-        while self._keys is not None and not self._keys.empty():
-            typed.append(self._keys.get_nowait())
-        return typed

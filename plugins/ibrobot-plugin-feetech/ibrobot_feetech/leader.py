@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
+    Approach,
     Context,
     HardwareError,
     HeldKeys,
@@ -31,7 +32,7 @@ from ibrobot_feetech.ticks import TICKS_PER_RADIAN, TICKS_PER_TURN
 from ibrobot_feetech.usb import check_adapter
 
 _LONGEST_STEP_S = 0.1
-"""Longest time step of the approach, e.g. after a pause of the host [s]."""
+"""Longest time step of its motors' goal, e.g. after a pause of the host [s]."""
 _FASTEST_HAND = 13_000
 """Upper bound on the speed of a joint moved by hand [ticks/s]: three turns per second."""
 _SLACK = 64
@@ -82,12 +83,7 @@ class LeaderTeleop(Teleop):
         """When they were read [ns]."""
         self._lost = np.zeros(len(pairs), dtype=np.int32)
         """Number of reads since then."""
-        self._setpoint: Vector | None = None
-        """The last setpoint [rad]; None while paused."""
-        self._set_ns = 0
-        """When it was computed [ns]."""
-        self._following = False
-        """Whether the approach is finished."""
+        self._approach = Approach(options.follow_tolerance)
         self._toggled = False
         self._held = HeldKeys(options.release)
         self._resting: NDArray[np.int32] | None = None
@@ -158,7 +154,7 @@ class LeaderTeleop(Teleop):
                 self._let_go()
             except HardwareError as error:
                 self._ctx.log.error("%s: %s", self._ctx.name, error)
-        self._held.take(self._typed(), measured.stamp_ns)
+        self._held.take(self._keys, measured.stamp_ns)
         self._held.forget()
         self._release()
 
@@ -167,18 +163,18 @@ class LeaderTeleop(Teleop):
         if self._reader is None:
             raise TeleopError(f"{self._ctx.name}: the leader is not connected: call connect before read")
         now_ns = measured.stamp_ns
-        self._held.take(self._typed(), now_ns)
+        self._held.take(self._keys, now_ns)
         self._receive(self._reader, now_ns)
         # A press counts with the oldest of the servos' positions.
         self.deadman.report(self._engaged(), int(self._ticks_ns.min()))
         if not self.deadman.allows(now_ns):
-            self._setpoint = None
+            self._approach.setpoint = None
             if not self.deadman.armed:
                 self._release()
             return TeleopCommand(None)
-        self._setpoint = self._next(measured)
-        positions = dict(zip(self._joints, self._setpoint.tolist(), strict=True))
-        return TeleopCommand(positions, approaching=not self._following)
+        setpoint = self._approach.next(measured.position[list(self._columns)], self._pose(), self._ramp, now_ns)
+        positions = dict(zip(self._joints, setpoint.tolist(), strict=True))
+        return TeleopCommand(positions, approaching=not self._approach.following)
 
     @override
     def disconnect(self) -> None:
@@ -201,8 +197,8 @@ class LeaderTeleop(Teleop):
             "hold": f"hold {key} to follow the leader arm{'' if self._held.exact else ' (known by its repeats)'}",
         }
         pause = {"none": "", "toggle": f": {key} pauses", "hold": f": release {key} to pause"}
-        deadman = self._options.deadman
-        return f"PAUSED: {start[deadman]}" if self._setpoint is None else f"following the leader arm{pause[deadman]}"
+        deadman, paused = self._options.deadman, self._approach.setpoint is None
+        return f"PAUSED: {start[deadman]}" if paused else f"following the leader arm{pause[deadman]}"
 
     def _check_names(self, option: str, names: Sequence[str], known: Sequence[str]) -> None:
         for name in names:
@@ -292,32 +288,10 @@ class LeaderTeleop(Teleop):
         self._goal = None
         relax(self._bus, self._arm.servos)
 
-    def _next(self, measured: JointReading) -> Vector:
-        """The setpoint [rad], which moves from the measured positions to the leader's and then follows."""
-        now_ns, pose = measured.stamp_ns, self._pose()
-        before = self._setpoint
-        elapsed_s, self._set_ns = min(seconds(now_ns - self._set_ns), _LONGEST_STEP_S), now_ns
-        if before is None:
-            self._following = False
-            return measured.position[list(self._columns)]
-        way = pose - before
-        if self._following or np.abs(way).max() <= self._options.follow_tolerance:
-            self._following = True
-            return pose
-        # All joints arrive together; the one with the longest distance sets the pace.
-        share = float(np.min(self._ramp * elapsed_s / np.maximum(np.abs(way), 1e-9)))
-        return before + way * min(1.0, share)
-
     def _release(self) -> None:
         """Return to the paused state, so that following begins with an approach."""
-        self._setpoint = self._resting = None
+        self._approach.setpoint = self._resting = None
         self._toggled = self._taken_up = False
-
-    def _typed(self) -> list[str]:
-        typed: list[str] = []
-        while self._keys is not None and not self._keys.empty():
-            typed.append(self._keys.get_nowait())
-        return typed
 
     def _engaged(self) -> bool:
         """Whether the deadman is pressed."""

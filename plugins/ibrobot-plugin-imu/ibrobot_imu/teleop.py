@@ -78,7 +78,7 @@ class ImuTeleop(Teleop):
 
     @override
     def activate(self, measured: JointReading) -> None:
-        self._held.take(self._typed(), measured.stamp_ns)
+        self._held.take(self._keys, measured.stamp_ns)
         self._held.forget()
         self._zero = self._moved_ns = None
         self._received_ns = measured.stamp_ns
@@ -90,7 +90,7 @@ class ImuTeleop(Teleop):
         if port is None:
             raise TeleopError(f"{self._ctx.name}: the sensor is not connected: call connect before read")
         now_ns, options = measured.stamp_ns, self._options
-        self._held.take(self._typed(), now_ns)
+        self._held.take(self._keys, now_ns)
         try:
             self._receive(port, now_ns)
             held = self._held.held(options.deadman_key) if self._key_deadman else self._pressed(port)
@@ -128,12 +128,6 @@ class ImuTeleop(Teleop):
         state = "moves" if self._zero is not None else "no message yet" if self._orientation is None else "waits"
         moves = ", ".join(f"{tilt} {axis}" for axis, tilt in options.axes.items())
         return f"{options.model} {state}: hold {button} and tilt ({moves})"
-
-    def _typed(self) -> list[str]:
-        typed: list[str] = []
-        while self._keys is not None and not self._keys.empty():
-            typed.append(self._keys.get_nowait())
-        return typed
 
     def _pressed(self, port: serial.Serial) -> bool:
         """Whether the button at the port's line is pressed.

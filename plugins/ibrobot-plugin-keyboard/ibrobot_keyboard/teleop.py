@@ -74,7 +74,7 @@ class KeyboardTeleop(Teleop):
         self._held.clear()
         self._moved_ns = None
         self._arm.stop_tool()
-        self._pressed.take(self._typed(), measured.stamp_ns)
+        self._pressed.take(self._keys, measured.stamp_ns)
         self._pressed.forget()
 
     @override
@@ -86,7 +86,7 @@ class KeyboardTeleop(Teleop):
         if not self._moves():
             # The motion begins now, so after a pause of the host the robot does not jump.
             self._moved_ns = None
-        self._pressed.take(self._typed(), now_ns)
+        self._pressed.take(self._keys, now_ns)
         for event, key in self._pressed.events:
             if (action := self._keymap.action(self._mode, key)) is not None:
                 self._take(event, action, now_ns)
@@ -114,13 +114,6 @@ class KeyboardTeleop(Teleop):
     @override
     def help(self) -> str:
         return self._keymap.help()
-
-    def _typed(self) -> list[str]:
-        """The keys typed since the last call."""
-        typed: list[str] = []
-        while self._keys is not None and not self._keys.empty():
-            typed.append(self._keys.get_nowait())
-        return typed
 
     def _take(self, event: KeyEvent, action: str, now_ns: int) -> None:
         if action in _SETTINGS:

@@ -8,15 +8,13 @@ from typing import Any, override
 
 import numpy as np
 
-from ibrobot_core.api import Context, HeldKeys, JointReading, Teleop, TeleopCommand, TeleopError, Vector, seconds
+from ibrobot_core.api import Approach, Context, HeldKeys, JointReading, Teleop, TeleopCommand, TeleopError, Vector
 from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem, age_ns
 from ibrobot_lerobot_devices.options import TeleopOptions
 from ibrobot_lerobot_devices.units import POSITION, UnitProblem, bases, columns, map_joints
 
 _WAIT_S = 0.002
 """How long a tick waits for a new reading [s]; a leader on a servo bus answers within that."""
-_LONGEST_STEP_S = 0.1
-"""Longest time step of the approach, e.g. after a pause of the host [s]."""
 _TAKEN_UP = 0.06
 """A joint that turned by more was moved by hand [rad]."""
 
@@ -36,10 +34,8 @@ class LeRobotTeleop(Teleop):
         self._lost = 0
         self._pose: Vector | None = None
         """The device's pose [rad]; None until it is read."""
-        self._setpoint: Vector | None = None
-        """The last setpoint [rad]; None while paused."""
-        self._set_ns = 0
-        self._following = self._toggled = self._taken_up = False
+        self._approach = Approach(options.follow_tolerance)
+        self._toggled = self._taken_up = False
         self._resting: Vector | None = None
         """The device's pose at the start of the mode [rad]; None until it is read."""
 
@@ -62,7 +58,7 @@ class LeRobotTeleop(Teleop):
 
     @override
     def activate(self, measured: JointReading) -> None:
-        self._held.take(self._typed(), measured.stamp_ns)
+        self._held.take(self._keys, measured.stamp_ns)
         self._held.forget()
         self._release()
 
@@ -73,23 +69,21 @@ class LeRobotTeleop(Teleop):
             answer = self._link.read(_WAIT_S)
         except DeviceProblem as problem:
             raise self._error(problem) from None
-        self._held.take(self._typed(), now_ns)
+        self._held.take(self._keys, now_ns)
         engaged = None if answer is None else self._receive(answer)
         if engaged is not None:
             self.deadman.report(engaged, self._ctx.clock.now_ns() - age_ns(answer or {}))
         elif self._link.blocked_s > self._options.blocked:
             self._pose = None
-            try:
-                raise self._error(self._link.blockage("get_action"))
-            except DeviceProblem as problem:
-                raise self._error(problem) from None
+            raise self._error(self._link.blockage("get_action"))
         if not self.deadman.allows(now_ns) or self._pose is None:
-            self._setpoint = None
+            self._approach.setpoint = None
             if not self.deadman.armed:
                 self._release()
             return TeleopCommand(None)
-        self._setpoint = self._next(measured, self._pose)
-        return TeleopCommand(dict(zip(self._joints, self._setpoint.tolist(), strict=True)))
+        setpoint = self._approach.next(measured.position[self._columns], self._pose, self._ramp, now_ns)
+        positions = dict(zip(self._joints, setpoint.tolist(), strict=True))
+        return TeleopCommand(positions, approaching=not self._approach.following)
 
     @override
     def disconnect(self) -> None:
@@ -105,7 +99,8 @@ class LeRobotTeleop(Teleop):
             "hold": f"hold {key} to follow the device{'' if self._held.exact else ' (known by its repeats)'}",
         }
         pause = {"none": "", "toggle": f": {key} pauses", "hold": f": release {key} to pause"}
-        return f"PAUSED: {start[deadman]}" if self._setpoint is None else f"following the device{pause[deadman]}"
+        paused = self._approach.setpoint is None
+        return f"PAUSED: {start[deadman]}" if paused else f"following the device{pause[deadman]}"
 
     def _map(self, found: Mapping[str, Any]) -> None:
         """Map the device's joints to the robot's.
@@ -142,31 +137,10 @@ class LeRobotTeleop(Teleop):
         self._pose = np.clip(self._factor * np.array(values) + self._offset, self._lower, self._upper)
         return self._engaged(self._pose)
 
-    def _next(self, measured: JointReading, pose: Vector) -> Vector:
-        """The setpoint [rad], which moves from the measured positions to the device's and then follows."""
-        now_ns, before = measured.stamp_ns, self._setpoint
-        elapsed_s, self._set_ns = min(seconds(now_ns - self._set_ns), _LONGEST_STEP_S), now_ns
-        if before is None:
-            self._following = False
-            return measured.position[self._columns]
-        way = pose - before
-        if self._following or np.abs(way).max() <= self._options.follow_tolerance:
-            self._following = True
-            return pose
-        # All joints arrive together; the one with the longest distance sets the pace.
-        share = float(np.min(self._ramp * elapsed_s / np.maximum(np.abs(way), 1e-9)))
-        return before + way * min(1.0, share)
-
     def _release(self) -> None:
         """Return to the paused state, so that following begins with an approach."""
-        self._setpoint = self._resting = None
+        self._approach.setpoint = self._resting = None
         self._toggled = self._taken_up = False
-
-    def _typed(self) -> list[str]:
-        typed: list[str] = []
-        while self._keys is not None and not self._keys.empty():
-            typed.append(self._keys.get_nowait())
-        return typed
 
     def _engaged(self, pose: Vector) -> bool:
         """Whether the deadman is pressed."""
