@@ -12,8 +12,6 @@ from ibrobot_feetech.options import (
     EmulatedSignalOptions,
     FollowerOptions,
     LeaderOptions,
-    anchored_joints,
-    calibration_of,
     check_follower,
     check_leader,
     leader_keys,
@@ -98,7 +96,7 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     yield HardwareDescriptor(
         type="feetech_so101", options=FollowerOptions, make=_follower, torque_off="ibrobot feetech torque off",
         summary="SO-101 arm: STS3215 servos on one bus", check_options=check_follower, devices=serial_port,
-        calibration=calibration_of, anchored=anchored_joints,
+        calibration=lambda options: options.calibration, anchored=lambda options: options.anchored,
     )  # fmt: skip
 
 
@@ -119,8 +117,8 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """The SO-101 leader arm."""
     yield TeleopDescriptor(
         type="so101_leader", options=LeaderOptions, make=_leader, summary="SO-101 leader arm, moved by hand",
-        check_options=check_leader, devices=serial_port, calibration=calibration_of, keys=leader_keys,
-        label="follow the leader arm", needs_terminal=lambda options: options.deadman != "none",
+        check_options=check_leader, devices=serial_port, calibration=lambda options: options.calibration,
+        keys=leader_keys, label="follow the leader arm", needs_terminal=lambda options: options.deadman != "none",
     )  # fmt: skip
 
 

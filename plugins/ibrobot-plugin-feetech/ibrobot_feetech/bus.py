@@ -166,21 +166,6 @@ class FeetechBus:
             raise EpromLocked(self.place(servo, name), f"EPROM is locked, {value} was not written")
         self._retried(lambda: self._write_once(servo, target, value, request, faulty=faulty))
 
-    def reg_write(self, servo: int, name: str, value: int) -> None:
-        """Prepare a register's value; `action` sets it.
-
-        Raises:
-            FeetechError: if the servo did not acknowledge it. It is sent only once, since it cannot be read back.
-        """
-        target = writable(name)
-        request = protocol.reg_write(servo, target.address, target.encode(value))
-        self._acknowledged(servo, target, request, faulty=False)
-
-    def action(self) -> None:
-        """Set the values that `reg_write` prepared, on all servos at once; no servo answers."""
-        self.counters["requests"] += 1
-        self.port.write(protocol.action())
-
     def sync_read(self, name: str, servos: Sequence[int], *, faulty: bool = False) -> dict[int, int]:
         """Read a register of several servos in one request; `faulty` also accepts servos that report errors.
 

@@ -18,9 +18,7 @@ ZERO_AT: Mapping[str, str] = {
 """The choices for the position of 0 rad, with their meaning."""
 
 
-def save_calibration(
-    calibration: Calibration, name: str | Path, *, overwrite: bool = False, by_id: bool = False
-) -> Path:
+def save_calibration(calibration: Calibration, name: str | Path, *, overwrite: bool = False) -> Path:
     """Save a calibration as LeRobot's JSON, and `NAME.meta.json` with arm, date, adapter, position of 0 rad, and hash.
 
     There are two files because LeRobot's loader refuses unknown keys.
@@ -29,7 +27,6 @@ def save_calibration(
         calibration: the calibration to save.
         name: a name or a path, see `calibration_path`.
         overwrite: whether it may replace a file.
-        by_id: write IB-Robot's layout, servo id -> values.
 
     Raises:
         CalibrationError: if the file exists already, or cannot be written.
@@ -47,10 +44,8 @@ def save_calibration(
     }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        numbers = calibration.numbers()
-        by_key = {str(joint["id"]): joint for joint in numbers.values()} if by_id else numbers
         # The companion comes first: without it, the file would be read as LeRobot's, with another 0 rad.
-        _write_all({companion_path(path): meta, path: by_key})
+        _write_all({companion_path(path): meta, path: calibration.numbers()})
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from None
     return path

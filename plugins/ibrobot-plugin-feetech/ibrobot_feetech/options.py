@@ -180,16 +180,6 @@ def _unknown(option: str, names: Sequence[str], known: Sequence[str], what: str)
             yield OptionFault((option, i), f"unknown {what} {name!r}{did_you_mean(name, known, 'known')}")
 
 
-def calibration_of(options: FollowerOptions | LeaderOptions) -> str:
-    """The calibration of the arm."""
-    return options.calibration
-
-
-def anchored_joints(options: FollowerOptions) -> tuple[str, ...]:
-    """The joints whose closed end is at their lower limit."""
-    return options.anchored
-
-
 def serial_port(options: FollowerOptions | LeaderOptions) -> Mapping[str, str]:
     """The resolved path of the port."""
     return {"port": os.path.realpath(options.port)}

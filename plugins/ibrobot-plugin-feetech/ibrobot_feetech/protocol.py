@@ -23,6 +23,7 @@ class Instruction(IntEnum):
     READ = 0x02
     WRITE = 0x03
     REG_WRITE = 0x04
+    """A write that waits for `ACTION`; the emulator knows both."""
     ACTION = 0x05
     SYNC_READ = 0x82
     SYNC_WRITE = 0x83
@@ -77,16 +78,6 @@ def read(servo: int, address: int, size: int) -> bytes:
 def write(servo: int, address: int, content: bytes) -> bytes:
     """Set bytes from `address`."""
     return pack(Packet(servo, Instruction.WRITE, bytes((address,)) + content))
-
-
-def reg_write(servo: int, address: int, content: bytes) -> bytes:
-    """Set bytes from `address` when `action` is received."""
-    return pack(Packet(servo, Instruction.REG_WRITE, bytes((address,)) + content))
-
-
-def action(servo: int = BROADCAST) -> bytes:
-    """Execute the writes that `reg_write` prepared."""
-    return pack(Packet(servo, Instruction.ACTION))
 
 
 def sync_read(servos: Iterable[int], address: int, size: int) -> bytes:

@@ -115,7 +115,6 @@ def fuzz(mutations: int, seed: int) -> Counter[str]:
         partial(bus.read, 6, "present_voltage"),
         partial(bus.read_faulty, 3, "status"),
         partial(bus.write, 4, "goal_position", POSITION),
-        partial(bus.reg_write, 4, "goal_position", POSITION),
         partial(bus.sync_read, "present_position", SERVOS),
         partial(bus.scan, SERVOS),
         partial(writer.write, [POSITION] * 6),

@@ -64,7 +64,6 @@ class TestRequests:
     def test_what_can_only_be_read_is_not_written(self, bus: FeetechBus) -> None:
         for write in (
             lambda: bus.write(2, "present_load", 1),
-            lambda: bus.reg_write(2, "present_load", 1),
             lambda: bus.sync_write("present_load", {2: 1}),
             lambda: SyncWriter(bus, SERVOS, "present_load"),
         ):
@@ -75,13 +74,6 @@ class TestRequests:
         goals = {servo: 2000 + servo for servo in SERVOS}
         bus.sync_write("goal_position", goals)
         assert bus.sync_read("goal_position", SERVOS) == goals
-
-    def test_prepared_writes_wait_for_the_action(self, bus: FeetechBus) -> None:
-        for servo in (1, 4):
-            bus.reg_write(servo, "goal_position", 2100)
-        assert bus.sync_read("goal_position", (1, 4)) != {1: 2100, 4: 2100}
-        bus.action()
-        assert bus.sync_read("goal_position", (1, 4)) == {1: 2100, 4: 2100}
 
     def test_a_value_that_does_not_fit_is_refused_before_it_is_sent(self, bus: FeetechBus) -> None:
         with pytest.raises(ValueError, match="acceleration must be 0 to 255, not 256"):

@@ -33,7 +33,9 @@ def calibrations(draw: st.DrawFn) -> Calibration:
 @given(calibrations(), st.booleans())
 def test_what_is_saved_is_loaded(tmp_path_factory: pytest.TempPathFactory, made: Calibration, by_id: bool) -> None:
     path = tmp_path_factory.mktemp("c") / "arm.json"
-    save_calibration(made, path, by_id=by_id)
+    save_calibration(made, path)
+    if by_id:  # as IB-Robot's files are
+        path.write_text(json.dumps({str(joint["id"]): joint for joint in made.numbers().values()}))
     loaded = load_calibration(path, list(made.joints))
     assert loaded.joints == made.joints
     assert (loaded.robot, loaded.date, loaded.path) == (made.robot, made.date, path)

@@ -18,8 +18,6 @@ packets = st.builds(Packet, st.integers(0, 0xFE), st.integers(0, 0xFF), st.binar
         (protocol.ping(1), "ff ff 01 02 01 fb"),
         (protocol.read(1, 56, 2), "ff ff 01 04 02 38 02 be"),
         (protocol.write(1, 5, b"\x01"), "ff ff 01 04 03 05 01 f1"),
-        (protocol.reg_write(1, 42, b"\x00\x08"), "ff ff 01 05 04 2a 00 08 c3"),
-        (protocol.action(), "ff ff fe 02 05 fa"),
         (protocol.sync_read((1, 2), 56, 8), "ff ff fe 06 82 38 08 01 02 36"),
         (protocol.sync_write(42, {1: b"\x00\x08", 2: b"\x01\x08"}), "ff ff fe 0a 83 2a 02 01 00 08 02 01 08 34"),
     ],
