@@ -61,7 +61,7 @@ def test_paths_are_free_and_get_shorter(seed):
             assert space().free(a, b)
     # Around both corners: (-0.5, 1) to (-0.3, 1), (0.3, -1) to (0.5, -1).
     shortest = 2.0616 + 0.2 + 2.0881 + 0.2 + 2.0616
-    assert shortest - 0.01 < length(short) < 1.6 * shortest
+    assert shortest - 0.01 < length(np.array(short)) < 1.6 * shortest
     assert PACE.time(np.array(short)) < 0.9 * PACE.time(np.array(path))
 
 

@@ -33,6 +33,7 @@ from ibrobot_core.app import (
 )
 from ibrobot_planning.execution.plans import GoalPlans, arm_joints
 from ibrobot_planning.goals.text import Target, target
+from ibrobot_planning.planners.search import length
 from ibrobot_planning.planners.timing import motion_of
 from ibrobot_planning.world.objects import world_of
 
@@ -191,10 +192,8 @@ def _planned(
         "goal_joints": dict(zip(joints, sampled.positions[-1].tolist(), strict=True)),
         "position_error_m": result.position_error,
         "orientation_error_rad": result.orientation_error,
-        "length_rad": float(np.linalg.norm(np.diff(sampled.positions, axis=0), axis=1).sum()),
-        "tool_path_m": None
-        if sampled.tool is None
-        else float(np.linalg.norm(np.diff(sampled.tool, axis=0), axis=1).sum()),
+        "length_rad": length(sampled.positions),
+        "tool_path_m": None if sampled.tool is None else length(sampled.tool),
         "duration_s": float(sampled.times[-1]),
         "clearance": clearance,
         "peak_velocity": {

@@ -1,4 +1,4 @@
-"""Results of the goals of a run."""
+"""Results of the goals and tasks of a run."""
 
 from __future__ import annotations
 
@@ -35,52 +35,60 @@ class MoveResult:
     """Index of the chosen goal, of several."""
 
 
-class Results:
-    """Numbers and results of the goals of a run, whatever its mode. Methods may be called from several threads."""
+class Results[T]:
+    """Numbers and results of the goals or tasks of a run. Methods may be called from several threads.
+
+    Args:
+        what: what the results are of, for errors: `goal` or `task`.
+        service: the service that answers with their numbers.
+    """
 
     KEPT = 100
     """Number of results kept."""
 
-    def __init__(self) -> None:
+    def __init__(self, what: str, service: str) -> None:
+        self._what, self._service = what, service
         self._lock = threading.Lock()
         self._newest = 0
-        self._moving: set[int] = set()
-        self._ended: dict[int, MoveResult] = {}
+        self._present: set[int] = set()
+        self._ended: dict[int, T] = {}
 
     def number(self) -> int:
-        """A number for a new goal."""
+        """A number for a new one."""
         with self._lock:
             self._newest += 1
-            self._moving.add(self._newest)
+            self._present.add(self._newest)
             return self._newest
 
-    def end(self, number: int, result: MoveResult) -> None:
-        """Keep the result of a goal."""
+    def end(self, number: int, result: T) -> None:
+        """Keep a result."""
         with self._lock:
-            self._moving.discard(number)
+            self._present.discard(number)
             self._ended[number] = result
             while len(self._ended) > self.KEPT:
                 del self._ended[next(iter(self._ended))]
 
-    def of(self, number: int) -> MoveResult | None:
-        """The result of a goal; None before it has ended.
+    def of(self, number: int) -> T | None:
+        """The result of a number; None before its goal or task has ended.
 
         Raises:
-            PlanningError: for an unknown goal, or one whose result is no longer kept.
+            PlanningError: for an unknown number, or a result that is no longer kept.
         """
         with self._lock:
-            if number in self._moving:
+            if number in self._present:
                 return None
             if number in self._ended:
                 return self._ended[number]
             if 0 < number <= self._newest:
-                raise PlanningError(f"the result of goal {number} is no longer kept, only the last {self.KEPT} are")
-            raise PlanningError(f"no goal {number}; /planning/go_to answers with the number of a goal")
+                raise PlanningError(
+                    f"the result of {self._what} {number} is no longer kept, only the last {self.KEPT} are"
+                )
+            raise PlanningError(f"no {self._what} {number}; {self._service} answers with the number of a {self._what}")
 
 
-_RESULTS: WeakKeyDictionary[RunView, Results] = WeakKeyDictionary()
+_RESULTS: WeakKeyDictionary[RunView, Results[MoveResult]] = WeakKeyDictionary()
 
 
-def results_of(session: RunView) -> Results:
-    """The results of a run. Its modes share them, so that a number stays valid when the mode changes."""
-    return _RESULTS.setdefault(session, Results())
+def results_of(session: RunView) -> Results[MoveResult]:
+    """The results of the goals of a run. Its modes share them, so that a number stays valid when the mode changes."""
+    return _RESULTS.setdefault(session, Results("goal", "/planning/go_to"))

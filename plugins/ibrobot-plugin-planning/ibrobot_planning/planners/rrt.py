@@ -31,7 +31,7 @@ from ibrobot_planning.goals.tool import Candidate, Tool
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.search import Pace, Space, connect, shortened
-from ibrobot_planning.planners.timing import Motion, motion_of, timed, trajectory_of
+from ibrobot_planning.planners.timing import Motion, motion_of, resting, timed, trajectory_of
 from ibrobot_planning.world.arm import Arm, Pair
 from ibrobot_planning.world.checked_arm import checked_arm
 from ibrobot_planning.world.collision import Collisions, Contact
@@ -207,7 +207,7 @@ class _Plan:
     ) -> PlanResult:
         candidates = self._free_goals(self._candidates(tool, goal), goal)
         if np.abs(candidates[0].joints[self._order] - self.start).max() < _ROUNDING and len(way_out) == 1:
-            return self._result(Motion(*_still(self.start, self.options.step)), candidates[0], number)
+            return self._result(resting(self.start, self.options.step), candidates[0], number)
         goals = [candidate.joints[self._order] for candidate in candidates]
         for path in self._paths(way_out[-1], goals, deadline):
             motion = self._checked([*way_out[:-1], *path])
@@ -452,11 +452,6 @@ def _outwards(checks: Collisions, configurations: Vector) -> int | None:
             return None
         before = {pair: max(distance, before[pair]) for pair, distance in now.items()}
     return None
-
-
-def _still(q: Vector, step: float) -> tuple[Vector, Vector, Vector, Vector]:
-    rest = np.zeros((2, len(q)))
-    return np.array([0.0, step]), np.array([q, q]), rest, rest
 
 
 def _sentence(contacts: Sequence[Contact], most: int = 3) -> str:

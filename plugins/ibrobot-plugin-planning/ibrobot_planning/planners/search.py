@@ -283,9 +283,9 @@ def _extended_in_part(
     return tree.add(line[free - 1] if free < len(line) else end, parent)
 
 
-def length(path: Sequence[Vector]) -> float:
-    """Length of a polyline [rad]."""
-    return float(np.linalg.norm(np.diff(np.asarray(path), axis=0), axis=1).sum())
+def length(path: Vector) -> float:
+    """Length of a polyline, shape (N, J), in the unit of its points."""
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
 def shortened(space: Space, path: Sequence[Vector], rng: Random, pace: Pace) -> list[Vector]:

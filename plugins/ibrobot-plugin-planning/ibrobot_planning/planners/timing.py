@@ -134,6 +134,12 @@ def evaluated(coefficients: Vector, u: Vector, h: Vector) -> tuple[Vector, Vecto
     )
 
 
+def resting(q: Vector, duration: float) -> Motion:
+    """Rest at `q` [rad], shape (J,), for a duration [s]."""
+    rest = np.zeros((2, len(q)))
+    return Motion(np.array([0.0, duration]), np.array([q, q]), rest, rest)
+
+
 def motion_of(trajectory: JointTrajectory) -> Motion | None:
     """A trajectory as a motion; None if it lacks velocities or accelerations."""
     points = trajectory.points
@@ -188,8 +194,7 @@ def timed(
     """
     path, blends = _without_repeats(np.asarray(path, dtype=float), blends)
     if len(path) == 1:
-        rest = np.zeros((2, path.shape[1]))
-        return Motion(np.array([0.0, step]), np.repeat(path, 2, axis=0), rest, rest)
+        return resting(path[0], step)
     samples = max(round(window / _SAMPLE_S), 4)
     step = min(step, samples * _SAMPLE_S / 2)
     max_velocity, max_acceleration = (1 - _EASED) * max_velocity, (1 - _EASED) * max_acceleration

@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import attrs
+import numpy as np
 
 from ibrobot_core.api import IbrobotError, PlanningError, Vector
-from ibrobot_core.app import ControlMode, Registry, RobotConfig, check_models
+from ibrobot_core.app import (
+    AnyGoal,
+    ControlMode,
+    Goal,
+    LinearGoal,
+    PoseGoal,
+    PositionGoal,
+    Registry,
+    RobotConfig,
+    check_models,
+)
 from ibrobot_planning.execution.plans import tool_planners
 from ibrobot_planning.goals.grammar import GoalOptions
 from ibrobot_planning.goals.joints import named_pose, pose_names
@@ -21,9 +34,11 @@ from ibrobot_planning.tasks.format import (
     Step,
     WaitStep,
 )
-from ibrobot_planning.tasks.reach import Reach
 from ibrobot_planning.tasks.reading import TaskFile
 from ibrobot_planning.world.objects import World
+
+if TYPE_CHECKING:
+    from ibrobot_planning.goals.tool import Tool
 
 type Key = tuple[str | int, ...]
 
@@ -71,7 +86,6 @@ def check_task(file: TaskFile, situation: Situation) -> CheckedTask:
 class _Checks:
     def __init__(self, file: TaskFile, situation: Situation) -> None:
         self._file, self._document, self._situation = file, file.document, situation
-        self._within_reach = Reach(situation.config.robot, situation.start)
         self._tool_planners = tool_planners(situation.registry)
         self._moved = set(situation.elsewhere)
         """Objects that have left the poses that the world has for them."""
@@ -242,10 +256,42 @@ class _Checks:
             world = self._situation.world or World()
             goal = step.target(self._situation.config.robot, self._arm, world).tool
             if goal is not None:
-                self._within_reach.check(goal)
+                self._within_reach(goal)
         except IbrobotError as error:
             code = f"{error.code.name}: " if isinstance(error, PlanningError) else ""
             self._out_of_reach.append((key, f"{code}{error}"))
+
+    def _within_reach(self, goal: Goal) -> None:
+        """Check that all waypoints of a goal, or one of its alternatives, can be reached.
+
+        Raises:
+            PlanningError: if not.
+            KinematicsError: without a model of the robot.
+        """
+        if isinstance(goal, LinearGoal):
+            for waypoint in goal.waypoints:
+                self._within_reach(waypoint)
+        elif isinstance(goal, AnyGoal):
+            errors = []
+            for each in goal.goals:
+                try:
+                    self._within_reach(each)
+                except PlanningError as error:
+                    errors.append(error)
+            if len(errors) == len(goal.goals):
+                raise errors[0]
+        elif isinstance(goal, PositionGoal | PoseGoal):
+            model, start = self._tool.model, self._situation.start
+            self._tool.candidates(goal, np.clip(0.0, model.lower, model.upper) if start is None else start)
+
+    @cached_property
+    def _tool(self) -> Tool:
+        """Inverse kinematics, from the robot's model, which only goals of the tool need."""
+        from ibrobot_kinematics import robot_model
+
+        from ibrobot_planning.goals.tool import Tool
+
+        return Tool(robot_model(self._situation.config.robot))
 
     def _gripper(self, key: Key, step: GripperStep) -> None:
         config = self._situation.config

@@ -70,7 +70,8 @@ class Performance:
     Args:
         session: the run.
         checked: the task.
-        begins: called with each step before it begins.
+        number: its number.
+        begins: called with this and each step before it begins.
 
     Attributes:
         begun_ns: when it began [ns].
@@ -78,9 +79,11 @@ class Performance:
         results: results of the steps that have ended.
     """
 
-    def __init__(self, session: RunView, checked: CheckedTask, begins: Callable[[Step], None]) -> None:
+    def __init__(
+        self, session: RunView, checked: CheckedTask, number: int, begins: Callable[[Performance, Step], None]
+    ) -> None:
         self._session = session
-        self.checked = checked
+        self.checked, self.number = checked, number
         self._begins = begins
         self.begun_ns = session.clock.now_ns()
         self.cancelled = ""
@@ -108,7 +111,7 @@ class Performance:
         session, steps = self._session, self.checked.file.task.steps
         for number, step in enumerate(steps, 1):
             session.log.info("step %d/%d: %s", number, len(steps), step.name or _text(step))
-            self._begins(step)
+            self._begins(self, step)
             begun_ns = session.clock.now_ns()
             outcome: StepOutcome = "SUCCEEDED"
             message, code, facts = "", "", {}

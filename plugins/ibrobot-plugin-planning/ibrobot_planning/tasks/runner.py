@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import queue
 import threading
@@ -15,6 +14,7 @@ import attrs
 from ibrobot_core.api import PlanningError, String, documented, option, seconds
 from ibrobot_core.app import CONTROL, NoRequest, RequestLimits, RunView, Service, SessionWorker
 from ibrobot_planning.execution.requests import Numbered
+from ibrobot_planning.execution.results import Results
 from ibrobot_planning.tasks.checks import CheckedTask, Situation, check_task
 from ibrobot_planning.tasks.format import Step
 from ibrobot_planning.tasks.performing import Performance
@@ -44,8 +44,6 @@ CANCEL = Service(
 STATUS = "/task/status"
 """std_msgs/msg/String, latched: JSON with `task`, `step`, `steps`, `kind`, `name` and `state`."""
 _POLL_S = 0.01
-_KEPT = 100
-"""Number of results kept for `RESULT`."""
 _STOP_S = 3.0
 """Longest wait for the robot to slow down at the end of a run [s]."""
 
@@ -54,23 +52,14 @@ def _read(request: RunTask) -> TaskFile:
     return read_task(request.task, "the request", expands=False)
 
 
-@attrs.frozen(eq=False)
-class _Running:
-    """The task in progress, with its number."""
-
-    number: int
-    task: Performance
-
-
 class TaskRunner(SessionWorker):
     """Performs tasks: `/task/run`, `/task/check`, `/task/result` and `/task/cancel`."""
 
     def __init__(self, session: RunView) -> None:
         world = (SECTION,) if SECTION in session.config.plugin_sections else ()
         super().__init__(session, "tasks", f"performs tasks: {RUN.name}", (CONTROL, *world))
-        self._numbers = itertools.count(1)
-        self._running: _Running | None = None
-        self._results: dict[int, TaskResult | None] = {}
+        self._running: Performance | None = None
+        self._results: Results[TaskResult] = Results("task", RUN.name)
         self._lock = threading.Lock()
         self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
@@ -103,26 +92,22 @@ class TaskRunner(SessionWorker):
         with self._lock:
             if self._running is not None:
                 raise PlanningError(f"task {self._running.number} is running; {CANCEL.name} ends it")
-            number = next(self._numbers)
-            performance = Performance(self.session, checked, lambda step: self._show(number, performance, step))
-            self._running, self._results[number] = _Running(number, performance), None
-            while len(self._results) > _KEPT:
-                self._results.pop(next(iter(self._results)))
+            self._running = running = Performance(self.session, checked, self._results.number(), self._show)
         self._wake.put(None)
-        return number
+        return running.number
 
     def cancel(self, why: str) -> None:
         """End the present task, if there is one: the robot slows down and holds."""
         running = self._running
-        if running is not None and not running.task.cancelled:
-            running.task.cancelled = why
+        if running is not None and not running.cancelled:
+            running.cancelled = why
 
     def line(self) -> str:
         """The step of the present task, in one line; empty without a task."""
         running = self._running
         if running is None:
             return ""
-        task, number = running.task.checked.file.task, len(running.task.results)
+        task, number = running.checked.file.task, len(running.results)
         if number >= len(task.steps):
             return ""
         step = task.steps[number]
@@ -142,8 +127,8 @@ class TaskRunner(SessionWorker):
             self.pause(min(timeout_s, _POLL_S))
         self._advance(self._running)
 
-    def _advance(self, running: _Running) -> None:
-        if running.task.advance():
+    def _advance(self, running: Performance) -> None:
+        if running.advance():
             self._finish(running)
 
     def _checked(self, file: TaskFile) -> CheckedTask:
@@ -163,14 +148,12 @@ class TaskRunner(SessionWorker):
         """The result of a task; None until it has ended.
 
         Raises:
-            PlanningError: for an unknown number.
+            PlanningError: for an unknown number, or a result that is no longer kept.
         """
-        if number not in self._results:
-            raise PlanningError(f"no task {number}; {RUN.name} answers with the number of a task")
-        return self._results[number]
+        return self._results.of(number)
 
-    def _finish(self, running: _Running) -> None:
-        session, performance, name = self.session, running.task, running.task.checked.file.task.name
+    def _finish(self, performance: Performance) -> None:
+        session, name = self.session, performance.checked.file.task.name
         failed = next((each for each in performance.results if each.outcome in ("FAILED", "CANCELLED")), None)
         outcome: Any = "SUCCEEDED" if failed is None else failed.outcome
         message = "" if failed is None else f"step {failed.number} ({failed.name or failed.kind}): {failed.why}"
@@ -182,8 +165,9 @@ class TaskRunner(SessionWorker):
             session.log.error("task %s %s: %s", name, outcome.lower(), message)
             session.outcome.goals_failed += 1
         with self._lock:
-            self._running, self._results[running.number] = None, result
-        self._show(running.number, performance, None, outcome.lower())
+            self._running = None
+            self._results.end(performance.number, result)
+        self._show(performance, None, outcome.lower())
 
     def _end_early(self) -> None:
         """At the end of the run: let the robot slow down, and end the task."""
@@ -195,18 +179,24 @@ class TaskRunner(SessionWorker):
         while self._running is running:
             # In lockstep, time has stopped: a motion cannot end.
             if self.session.request.lockstep or waits > _STOP_S:
-                running.task.end()
+                running.end()
                 self._finish(running)
                 return
             self._advance(running)
             waits += _POLL_S
             threading.Event().wait(_POLL_S)
 
-    def _show(self, number: int, performance: Performance, step: Step | None, state: str = "executing") -> None:
+    def _show(self, performance: Performance, step: Step | None, state: str = "executing") -> None:
         """Publish the status of the task."""
         task = performance.checked.file.task
         position = len(performance.results) + (step is not None)
-        status = {"task": task.name, "number": number, "step": position, "steps": len(task.steps), "state": state}
+        status = {
+            "task": task.name,
+            "number": performance.number,
+            "step": position,
+            "steps": len(task.steps),
+            "state": state,
+        }
         if step is not None:
             status |= {"kind": step.kind, "name": step.name}
         self.session.bus.publish(STATUS, String(json.dumps(status)), latched=True)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
@@ -24,9 +24,13 @@ _KEYS = {
     "mesh": ("file",),
 }
 """Shape -> the keys that it needs."""
-
-
 _LONGEST_NAME = 100
+
+
+def _near(instance: object, attribute: attrs.Attribute[Any], value: Sequence[float] | None) -> None:
+    # Written so that NaN fails it.
+    if not all(abs(number) <= FURTHEST for number in value or ()):
+        raise ValueError(f"{attribute.name} is {value}, must be numbers from -{FURTHEST:g} to {FURTHEST:g}")
 
 
 @documented
@@ -37,14 +41,18 @@ class ObjectOptions:
     shape: Literal["box", "sphere", "cylinder", "capsule", "plane", "mesh"] = option(
         help="box about its centre, sphere, cylinder or capsule along z, everything below z = 0, or triangles of a file"
     )
-    size: tuple[float, float, float] | None = option(None, unit="m", help="lengths of a box along x, y and z")
+    size: tuple[float, float, float] | None = option(
+        None, unit="m", validator=_near, help="lengths of a box along x, y and z"
+    )
     radius: float | None = option(None, unit="m", gt=0, help="of a sphere, cylinder or capsule")
     height: float | None = option(None, unit="m", gt=0, help="of a cylinder, or of the cylinder of a capsule")
     file: Path | None = option(None, help="mesh: STL, OBJ or PLY")
     scale: float = option(1.0, gt=0, help="factor of the mesh's numbers, e.g. 0.001 for millimetres")
     convex: bool = option(False, help="take the mesh's convex hull: solid, and faster to check")
-    position: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="m", help="in the base frame")
-    rpy: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="rad", help="turns about the base's x, y and z axis")
+    position: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="m", validator=_near, help="in the base frame")
+    rpy: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), unit="rad", validator=_near, help="turns about the base's x, y and z axis"
+    )
     link: str | None = option(None, help="link of the MJCF that carries it; its position and turns are in that frame")
     may_touch: tuple[str, ...] = option((), help="links and objects that it may touch")
 
@@ -57,9 +65,6 @@ class ObjectOptions:
             if key not in needed and value is not None:
                 takes = f"it takes {' and '.join(needed)}" if needed else "it takes no size"
                 raise ValueError(f"a {self.shape} has no {key}; {takes}")
-        for key, numbers in (("position", self.position), ("rpy", self.rpy), ("size", self.size or ())):
-            if any(abs(number) > FURTHEST for number in numbers):
-                raise ValueError(f"{key} is {list(numbers)}, must be numbers from -{FURTHEST:g} to {FURTHEST:g}")
         if self.size is not None and min(self.size) <= 0:
             raise ValueError(f"size is {list(self.size)}, must be three lengths above 0")
 
@@ -160,7 +165,7 @@ class Moved:
 
     name: str = option(help="the object's name")
     position: tuple[float, float, float] = option(
-        unit="m", help="in the object's frame: of the base, or of the link that carries it"
+        unit="m", validator=_near, help="in the object's frame: of the base, or of the link that carries it"
     )
     rpy: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="rad", help="turns about its x, y and z axis")
 

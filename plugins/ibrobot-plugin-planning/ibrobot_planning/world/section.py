@@ -67,8 +67,6 @@ _SIMPLE: Mapping[Literal["box", "sphere", "cylinder", "capsule", "plane"], type[
     "box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Capsule, "plane": Plane,
 }  # fmt: skip
 """The shapes of a simulated scene."""
-_FARTHEST_M = 1000.0
-"""Positions beyond this are errors."""
 _STILL = 1e-4
 """Smaller changes of an object's position [m] and axes do not count as motion."""
 
@@ -143,7 +141,7 @@ class WorldKeeper(Component):
             SHAPES: lambda _: simple_objects(self._snapshot()),
             ADD: self._add,
             REMOVE: self._changing(lambda world, it: world.remove(it.name)),
-            MOVE: self._changing(self._move),
+            MOVE: self._changing(lambda world, it: world.move(it.name, pose_at(it.position, it.rpy))),
             ATTACH: self._changing(self._attach),
             DETACH: self._changing(self._detach),
             TOUCH: self._changing(self._touch),
@@ -237,7 +235,6 @@ class WorldKeeper(Component):
         return handler
 
     def _add(self, it: Added) -> list[str]:
-        _check_position(it.object.position)
         try:
             thing = it.object.made()  # outside the lock: reading a mesh is slow, and motions are checked meanwhile
         except ValueError as error:
@@ -277,10 +274,6 @@ class WorldKeeper(Component):
                 f"{text!r} has {path.stat().st_size} bytes; a request names meshes of up to {LARGEST_MESH}"
             )
         return path
-
-    def _move(self, world: World, it: Moved) -> World:
-        _check_position(it.position)
-        return world.move(it.name, pose_at(it.position, it.rpy))
 
     def _attach(self, world: World, it: Attached) -> World:
         hand = self._hand() if it.link is None else ()
@@ -333,9 +326,3 @@ class WorldKeeper(Component):
             if self._clearance is None or self._clearance[0] != world:
                 self._clearance = world, Clearance(self._robot(), world)
             return self._clearance[1](q)
-
-
-def _check_position(position: Sequence[float]) -> None:
-    # Written so that NaN fails it.
-    if not all(abs(each) <= _FARTHEST_M for each in position):
-        raise PlanningError(f"position is {list(position)} m; each number must be within {_FARTHEST_M:g} m of 0")
