@@ -42,7 +42,7 @@ class RosNode(Component):
 
     def __init__(self, options: RosOptions, session: RunAccess) -> None:
         super().__init__("ros", f"node /{options.name} in a process of its own", (CONTROL,))
-        if session.request.lockstep and (options.subscribe):
+        if session.request.lockstep and options.subscribe:
             raise NotSupported("ros.subscribe: a lockstep run cannot receive topics of ROS")
         self._options = options
         self._session = session
@@ -86,9 +86,7 @@ class RosNode(Component):
     def start(self) -> None:
         session = self._session
         self._ending.clear()
-        self._node = NodeProcess(
-            self._options, self._options.name, niceness=_NICE, given_up=session.finished.is_set
-        )  # fmt: skip
+        self._node = self._new_node(session.finished)
         self._trouble = ""
         session.log.info("ros: node /%s: %s", self._options.name, self._node.hello)
         self.topics.open()
@@ -115,7 +113,8 @@ class RosNode(Component):
         for head, payload in wire.wait(0.0):
             self._take(wire, head, payload)
         if not wire.flush(_STOP_S):
-            raise ComponentFailed(f"the ROS node is gone: {self._cause()}")
+            assert self._node is not None
+            raise ComponentFailed(f"the ROS node is gone: {self._node.cause()}")
 
     @override
     def stop(self) -> None:
@@ -142,6 +141,9 @@ class RosNode(Component):
         node, self._node = self._node, None
         if node is not None:
             node.end()
+
+    def _new_node(self, given_up: threading.Event) -> NodeProcess:
+        return NodeProcess(self._options, self._options.name, niceness=_NICE, given_up=given_up.is_set)
 
     def _declare(self, wire: Wire) -> None:
         """Tell a new node what the run has."""
@@ -181,7 +183,8 @@ class RosNode(Component):
                 if self._restarts and time.monotonic() - self._begun_s > _LONGEST_WAIT_S:
                     wait_s = _FIRST_WAIT_S
             else:
-                self._lose(self._cause() if self._node is not None else "", wait_s)
+                if self._node is not None:
+                    self._lose(self._node.cause(), wait_s)
                 if not self._ending.wait(wait_s):
                     wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
                     self._restart()
@@ -207,19 +210,15 @@ class RosNode(Component):
 
     def _lose(self, cause: str, wait_s: float) -> None:
         """Report the death of the node."""
-        if not cause:
-            return
         self._node = self._wire = None
-        self._trouble = f"the ROS node died ({cause.splitlines()[-1] if cause else ''})"
+        self._trouble = f"the ROS node died ({cause.splitlines()[-1]})"
         self._session.log.error("ros: %s; starting it again in %g s", self._trouble, wait_s)
         self._actions.abandon(self._trouble)
 
     def _restart(self) -> None:
         self._restarts += 1
         try:
-            self._node = NodeProcess(
-                self._options, self._options.name, niceness=_NICE, given_up=self._ending.is_set
-            )  # fmt: skip
+            self._node = self._new_node(self._ending)
         except Exception as error:  # noqa: BLE001 - reported, and tried again
             self._trouble = f"the ROS node does not start: {error_line(error)}"
             self._session.log.error("ros: %s", self._trouble)
@@ -228,10 +227,6 @@ class RosNode(Component):
         self._trouble = ""
         self._session.log.warning("ros: the node was started again")
         self._declare(self._node.wire)
-
-    def _cause(self) -> str:
-        assert self._node is not None
-        return self._node.cause()
 
     def _take(self, wire: Wire, head: dict[str, Any], payload: bytes) -> None:
         self._heard_s = time.monotonic()

@@ -21,11 +21,7 @@ class Services:
 
     def __init__(self, options: RosOptions, session: RunView) -> None:
         self._session = session
-        self._found = Offers(
-            session,
-            options.offers,
-            lambda name: ros_name(name, options.namespace),
-        )
+        self._found = Offers(session, options.offers, lambda name: ros_name(name, options.namespace))
         self._offers: dict[str, Offer] = {}
         self._offered: set[str] = set()
         self._calls: ThreadPoolExecutor | None = None

@@ -51,7 +51,7 @@ def make_class(type_name: str, types: Typestore) -> type[Any]:
     """A frozen class for a type that core does not have, named and shaped as core would."""
     fields: dict[str, Any] = {}
     for name, desc in types.fielddefs[type_name][1]:
-        array = desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) and _dtype(desc[1][0]) is not None
+        array = desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) and dtype_of(desc[1][0]) is not None
         fields[_core_name(name, desc)] = attrs.field(eq=attrs.cmp_using(eq=np.array_equal) if array else True)
     body = {"ros_type": type_name}
     return attrs.make_class(type_name.rpartition("/")[2], fields, bases=(Message,), class_body=body, frozen=True)
@@ -85,7 +85,7 @@ def _encode_field(name: str, desc: Any, types: Typestore) -> Convert:
         # A transform's parts are the message's own.
         return part if inner == _TRANSFORM else lambda message: part(get(message))
     item, size = inner
-    dtype = _dtype(item)
+    dtype = dtype_of(item)
     if dtype is not None:
         return _encode_array(get, dtype, size if kind == Nodetype.ARRAY else 0)
     if item[0] == Nodetype.BASE:
@@ -136,7 +136,7 @@ def _decode_field(name: str, desc: Any, types: Typestore, class_of: Callable[[st
         return _chain(get, _decode_part(inner, types, class_of))
     item = inner[0]
     if item[0] == Nodetype.BASE:
-        return get if _dtype(item) is not None else lambda ros: tuple(get(ros))
+        return get if dtype_of(item) is not None else lambda ros: tuple(get(ros))
     convert = _decode_part(item[1], types, class_of)
     return lambda ros: tuple(map(convert, get(ros)))
 
@@ -157,7 +157,7 @@ def _core_name(name: str, desc: Any) -> str:
     return f"{name}_ns" if named[0] == Nodetype.NAME and named[1] in _TIMES else normalize_fieldname(name)
 
 
-def _dtype(item: Any) -> np.dtype[Any] | None:
+def dtype_of(item: Any) -> np.dtype[Any] | None:
     """The NumPy type of an array's items; None where they are strings or messages."""
     kind, base = item
     if kind != Nodetype.BASE or base[0] == "string":

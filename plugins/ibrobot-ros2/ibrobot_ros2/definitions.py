@@ -81,7 +81,7 @@ def definition(type_name: str) -> str:
     Raises:
         CodecError: for a type that is not known.
     """
-    return _known(type_name, standard_types()).generate_msgdef(type_name, ros_version=2)[0]
+    return known(type_name, standard_types()).generate_msgdef(type_name, ros_version=2)[0]
 
 
 def type_hash(type_name: str, types: Typestore | None = None) -> str:
@@ -92,12 +92,17 @@ def type_hash(type_name: str, types: Typestore | None = None) -> str:
     """
     types = standard_types() if types is None else types
     try:
-        return _known(type_name, types).hash_rihs01(type_name)
+        return known(type_name, types).hash_rihs01(type_name)
     except KeyError as error:
         raise CodecError(f"{type_name}: needs {error}, which is not defined") from None
 
 
-def _known(type_name: str, types: Typestore) -> Typestore:
+def known(type_name: str, types: Typestore) -> Typestore:
+    """The types, if a type is among them.
+
+    Raises:
+        CodecError: if it is not.
+    """
     if type_name not in types.fielddefs:
         raise CodecError(f"{type_name}: this message type is not defined")
     return types

@@ -21,7 +21,8 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import TypesysError, get_types_from_msg
 from rosbags.typesys.store import Typestore
 
-from ibrobot_ros2.definitions import CodecError, define, standard_types, type_hash
+from ibrobot_ros2.convert import dtype_of
+from ibrobot_ros2.definitions import CodecError, define, known, standard_types, type_hash
 
 FOLDER = files(__package__) / "interfaces"
 """The texts of services, actions and messages that ROS 2 nodes often have: PACKAGE/KIND/NAME.KIND."""
@@ -94,9 +95,7 @@ def to_cdr(type_name: str, value: Mapping[str, Any]) -> bytes:
     Raises:
         CodecError: for a type that nobody defined, and data that does not fit, with the field.
     """
-    store = standard_types()
-    if type_name not in store.fielddefs:
-        raise CodecError(f"{type_name}: this message type is not defined")
+    store = known(type_name, standard_types())
     made = _to_ros(store, type_name, value, "")
     try:
         return bytes(store.serialize_cdr(made, type_name, little_endian=True))
@@ -110,9 +109,7 @@ def from_cdr(type_name: str, data: bytes) -> dict[str, Any]:
     Raises:
         CodecError: for a type that nobody defined, or data that is not such a message.
     """
-    store = standard_types()
-    if type_name not in store.fielddefs:
-        raise CodecError(f"{type_name}: this message type is not defined")
+    store = known(type_name, standard_types())
     if data[:2] not in (_LITTLE_ENDIAN, b"\x00\x00"):
         raise CodecError(f"{type_name}: not plain CDR: begins with {data[:4].hex(' ') or 'nothing'}")
     try:
@@ -149,8 +146,7 @@ def _text(name: str, kind: str, count: int) -> list[str]:
     package, found, base = ([*name.split("/"), "", ""])[:3]
     file = FOLDER / package / kind / f"{base}.{kind}"
     if found != kind or not base.isidentifier() or not package.isidentifier() or not file.is_file():
-        known = ", ".join(sorted(interfaces(kind)))
-        raise CodecError(f"{name!r} is not defined here; defined are {known}")
+        raise CodecError(f"{name!r} is not defined here; defined are {', '.join(sorted(interfaces(kind)))}")
     messages = FOLDER / package / "msg"
     for each in messages.iterdir() if messages.is_dir() else ():
         _define(f"{package}/msg/{each.name.removesuffix('.msg')}", each.read_text(encoding="utf-8"))
@@ -220,10 +216,8 @@ def _field(store: Typestore, desc: Any, value: Any, where: str) -> Any:
     if fixed and len(value) != fixed:
         raise CodecError(f"{where}: needs {fixed} values, got {len(value)}")
     made = [_field(store, item, each, f"{where}[{i}]") for i, each in enumerate(value)]
-    if item[0] == Nodetype.BASE and item[1][0] != "string":
-        dtype = {"byte": "uint8", "char": "uint8", "octet": "uint8"}.get(item[1][0], item[1][0])
-        return np.array(made, dtype=dtype)
-    return made
+    dtype = dtype_of(item)
+    return made if dtype is None else np.array(made, dtype)
 
 
 def _number(kind: str, value: Any, where: str) -> Any:
