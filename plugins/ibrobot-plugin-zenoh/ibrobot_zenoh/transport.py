@@ -149,12 +149,23 @@ class ZenohTransport(TopicTransport):
                 with rejected:
                     rejected.reply_err("it is overloaded, or about to end", encoding=_FAILED)
 
+        end = self._declare_server(
+            name, key, take,
+            lambda: self._connection.declare(lambda session: session.liveliness().declare_token(token)),
+        )  # fmt: skip
+        return self._keep(self._keep(end, server), urgent)
+
+    def _declare_server(
+        self, name: str, key: zenoh.KeyExpr | str, take: Callable[[zenoh.Query], None],
+        announce: Callable[[], Callable[[], None]],
+    ) -> Callable[[], None]:  # fmt: skip
+        """Take the queries of a key, and announce the server, which may exist once; returns a function that ends it."""
         with self._lock:
             if name in self._served:
                 raise TransportError(f"{name} already has a server in this process")
             end_queries = self._connection.declare(lambda session: session.declare_queryable(key, take, complete=True))
             self._served.add(name)
-        end_token = self._connection.declare(lambda session: session.liveliness().declare_token(token))
+        end_token = announce()
 
         def end() -> None:
             end_token()
@@ -162,7 +173,7 @@ class ZenohTransport(TopicTransport):
             with self._lock:
                 self._served.discard(name)
 
-        return self._keep(self._keep(end, server), urgent)
+        return end
 
     @override
     def request(self, name: str, payload: Payload, timeout_s: float) -> Payload:
@@ -225,22 +236,8 @@ class ZenohTransport(TopicTransport):
         self, name: str, kind: ServiceType, handler: RosHandler, *, urgent: bool = False
     ) -> Callable[[], None]:
         server = RosServer(name, kind, handler, self._log, URGENT_WAITING if urgent else REQUESTS_WAITING)
-        with self._lock:
-            if name in self._served:
-                raise TransportError(f"{name} already has a server in this process")
-            key = service_key(self._options.domain, name, kind, hashed=self._options.type_hashes)
-            end_queries = self._connection.declare(
-                lambda session: session.declare_queryable(key, server.take, complete=True)
-            )
-            self._served.add(name)
-        end_token = self._topics.announce_server(name, kind)
-
-        def end() -> None:
-            end_token()
-            end_queries()
-            with self._lock:
-                self._served.discard(name)
-
+        key = service_key(self._options.domain, name, kind, hashed=self._options.type_hashes)
+        end = self._declare_server(name, key, server.take, lambda: self._topics.announce_server(name, kind))
         return self._keep(end, server.workers)
 
     @override
