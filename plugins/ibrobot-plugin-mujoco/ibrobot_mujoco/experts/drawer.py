@@ -47,10 +47,7 @@ class DrawerTask(Task):
             line.append(at)
         above = handle + distance * pull + options.hover_height * UP
         up = hand.reach(above, tool, at, opened, HOVER_TURN_RAD)
-        way.to("hover", hover, clear=True, expects=is_at(0, handle))
-        way.to("descend", grasp, expects=is_at(0, handle))
-        way.to("close", hand.grip(grasp, closed))
-        way.rest("close", SETTLE_S)
+        way.grasp(hand, hover, grasp, closed, is_at(0, handle))
         for joints in line:
             way.to("pull", joints)
         way.to("open", hand.grip(at, opened))

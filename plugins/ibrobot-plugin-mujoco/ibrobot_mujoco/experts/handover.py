@@ -60,10 +60,7 @@ class HandoverTask(Task):
         present = left.reach(_MEETING + _GRIP_M * LEFT, tool, left.grip(hover, closed), closed, GRASP_TURN_RAD)
         beside = _MEETING - _GRIP_M * LEFT + _CLEAR_M * UP
         ready = right.reach(beside, down(right.inward(beside)), present, opened, HOVER_TURN_RAD)
-        way.to("hover", hover, clear=True, expects=is_at(0, bar))
-        way.to("descend", grasp, expects=is_at(0, bar))
-        way.to("close", left.grip(grasp, closed))
-        way.rest("close", SETTLE_S)
+        way.grasp(left, hover, grasp, closed, is_at(0, bar))
         way.to("lift", left.grip(hover, closed), clear=True)
         way.to("present", present, clear=True, expects=is_held(0, left, _HELD_M))
         way.to("meet", ready, clear=True, expects=is_held(0, left, _HELD_M))

@@ -44,10 +44,7 @@ class PickTask(Task):
         grasp = hand.reach(place, tool, hover, opened, GRASP_TURN_RAD)
         over = spot + options.release_height * UP
         release = hand.reach(over, down(hand.inward(spot)), hover, closed, HOVER_TURN_RAD)
-        way.to("hover", hover, clear=True, expects=is_at(first, place))
-        way.to("descend", grasp, expects=is_at(first, place))
-        way.to("close", hand.grip(grasp, closed))
-        way.rest("close", SETTLE_S)
+        way.grasp(hand, hover, grasp, closed, is_at(first, place))
         way.to("lift", hand.grip(hover, closed), clear=True)
         way.to("carry", release, clear=True, expects=is_held(first, hand))
         way.to("open", hand.grip(release, opened), clear=True)

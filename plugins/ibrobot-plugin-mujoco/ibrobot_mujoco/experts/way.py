@@ -88,6 +88,13 @@ class Way:
         """Stay in place."""
         self._add(name, self.at, duration_s, clear, expects)
 
+    def grasp(self, hand: Hand, hover: Vector, grasp: Vector, closed: float, expects: Expectation) -> None:
+        """Come down from `hover` to `grasp`, both [rad], shape (J,), and close the hand to `closed` [rad]."""
+        self.to("hover", hover, clear=True, expects=expects)
+        self.to("descend", grasp, expects=expects)
+        self.to("close", hand.grip(grasp, closed))
+        self.rest("close", SETTLE_S)
+
     def _add(self, name: str, end: Vector, duration_s: float, clear: bool, expects: Expectation) -> None:
         self.segments.append(Segment(name, self.at, end, duration_s, clear, expects))
         self.at = end

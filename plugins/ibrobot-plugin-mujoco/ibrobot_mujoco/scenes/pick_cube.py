@@ -11,7 +11,7 @@ import numpy as np
 from ibrobot_core.api import Robot, Vector
 from ibrobot_mujoco.scenes.options import PickCubeOptions
 from ibrobot_mujoco.scenes.solids import BLUE, add_bin, add_cube, bin_centre, hue, is_in_bin
-from ibrobot_mujoco.scenes.table import TableScene, polar
+from ibrobot_mujoco.scenes.table import TableScene
 from ibrobot_mujoco.spans import ends
 from ibrobot_mujoco.world import World
 
@@ -42,14 +42,7 @@ class PickCube(TableScene):
 
     @override
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
-        given, size = self._given, look["cube_size"]
-        x, y, _, yaw = self.place(
-            world,
-            CUBE,
-            lambda: polar(rng, given.cube_distance, given.cube_bearing, given.cube_yaw, size),
-            f"cube_distance {list(given.cube_distance)} and cube_bearing {list(given.cube_bearing)}",
-        )
-        return x, y, yaw
+        return self.place_cube(world, CUBE, rng, look["cube_size"])
 
     @override
     def observe(self, world: World, out: Vector) -> None:

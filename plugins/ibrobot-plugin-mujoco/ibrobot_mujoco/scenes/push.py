@@ -12,7 +12,7 @@ import numpy as np
 from ibrobot_core.api import Robot, Vector
 from ibrobot_mujoco.scenes.options import PushOptions
 from ibrobot_mujoco.scenes.solids import add_cube, hue
-from ibrobot_mujoco.scenes.table import TableScene, polar
+from ibrobot_mujoco.scenes.table import TableScene
 from ibrobot_mujoco.spans import ends
 from ibrobot_mujoco.world import World
 
@@ -52,16 +52,10 @@ class Push(TableScene):
 
     @override
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
-        given, size = self._given, look["block_size"]
+        given = self._given
         distance, bearing = rng.uniform(*given.goal_distance), rng.uniform(*given.goal_bearing)
         goal = distance * math.cos(bearing), distance * math.sin(bearing)
-        x, y, _, yaw = self.place(
-            world,
-            BLOCK,
-            lambda: polar(rng, given.block_distance, given.block_bearing, given.block_yaw, size),
-            f"block_distance {list(given.block_distance)} and block_bearing {list(given.block_bearing)}",
-        )
-        return x, y, yaw, *goal
+        return *self.place_cube(world, BLOCK, rng, look["block_size"], "block"), *goal
 
     @override
     def show(self, world: World, factors: Vector) -> None:

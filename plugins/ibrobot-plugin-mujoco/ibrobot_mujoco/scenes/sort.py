@@ -11,7 +11,7 @@ import numpy as np
 from ibrobot_core.api import Robot, Vector
 from ibrobot_mujoco.scenes.options import SortOptions
 from ibrobot_mujoco.scenes.solids import BLUE, RED, add_bin, add_cube, bin_centre, is_in_bin
-from ibrobot_mujoco.scenes.table import TableScene, polar
+from ibrobot_mujoco.scenes.table import TableScene
 from ibrobot_mujoco.spans import ends
 from ibrobot_mujoco.world import World
 
@@ -45,15 +45,9 @@ class Sort(TableScene):
 
     @override
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
-        given, size, factors = self._given, look["cube_size"], []
-        for cube, number in zip(self.moving, rng.integers(2, size=given.cubes), strict=True):
-            x, y, _, yaw = self.place(
-                world,
-                cube,
-                lambda: polar(rng, given.cube_distance, given.cube_bearing, given.cube_yaw, size),
-                f"cube_distance {list(given.cube_distance)} and cube_bearing {list(given.cube_bearing)}",
-            )
-            factors += [x, y, yaw, float(number)]
+        factors: list[float] = []
+        for cube, number in zip(self.moving, rng.integers(2, size=self._given.cubes), strict=True):
+            factors += [*self.place_cube(world, cube, rng, look["cube_size"]), float(number)]
         return factors
 
     @override

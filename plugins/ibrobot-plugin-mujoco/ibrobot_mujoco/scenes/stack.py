@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import ClassVar, override
 
 import mujoco
@@ -12,7 +11,7 @@ import numpy as np
 from ibrobot_core.api import Robot
 from ibrobot_mujoco.scenes.options import StackOptions
 from ibrobot_mujoco.scenes.solids import add_cube, hue
-from ibrobot_mujoco.scenes.table import TableScene, polar
+from ibrobot_mujoco.scenes.table import TableScene
 from ibrobot_mujoco.spans import ends
 from ibrobot_mujoco.world import World
 
@@ -44,17 +43,8 @@ class Stack(TableScene):
 
     @override
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
-        given = self._given
-        factors: list[float] = []
-        for body, size in ((BASE, look["base_size"]), (CUBE, look["cube_size"])):
-            place = self.place(
-                world,
-                body,
-                partial(polar, rng, given.cube_distance, given.cube_bearing, given.cube_yaw, size),
-                f"cube_distance {list(given.cube_distance)} and cube_bearing {list(given.cube_bearing)}",
-            )
-            factors = [*place[[0, 1, 3]].tolist(), *factors]
-        return factors
+        base = self.place_cube(world, BASE, rng, look["base_size"])
+        return *self.place_cube(world, CUBE, rng, look["cube_size"]), *base
 
     @override
     def success(self, world: World) -> bool:

@@ -183,6 +183,22 @@ class TableScene(Scene[mujoco.MjSpec, World]):
             f"{options} must leave one"
         )
 
+    def place_cube(
+        self, world: World, body: str, rng: np.random.Generator, size: float, of: str = "cube"
+    ) -> tuple[float, float, float]:
+        """Place a cube of edge `size` [m] by the options `OF_distance`, `OF_bearing` and `OF_yaw`.
+
+        Returns:
+            x, y [m] and yaw [rad].
+
+        Raises:
+            HardwareError: if the options leave no place.
+        """
+        distance, bearing, yaw = (getattr(self._options, f"{of}_{name}") for name in ("distance", "bearing", "yaw"))
+        options = f"{of}_distance {list(distance)} and {of}_bearing {list(bearing)}"
+        x, y, _, turn = self.place(world, body, partial(_polar, rng, distance, bearing, yaw, size), options).tolist()
+        return x, y, turn
+
     @staticmethod
     def is_clear(world: World, bodies: Collection[int], apart: float) -> bool:
         """Whether everything but the table is at least `apart` [m] away from some bodies, by their ids."""
@@ -197,7 +213,7 @@ class TableScene(Scene[mujoco.MjSpec, World]):
         )
 
 
-def polar(
+def _polar(
     rng: np.random.Generator, distance: Span, bearing: Span, yaw: Span, size: float
 ) -> tuple[float, float, float, float]:
     """Draw a place on the table for a cube of edge `size` [m]."""
