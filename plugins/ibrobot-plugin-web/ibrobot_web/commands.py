@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import attrs
+
 from ibrobot_core.api import IbrobotError, PlanningError, seconds
 from ibrobot_core.app import RESET, SET_MODE, TOGGLE_SMOOTHING, RunView, error_text, raise_thread_priority
 from ibrobot_core.app import Reset as ResetRun
@@ -22,6 +24,7 @@ from ibrobot_web.messages import (
     GoTo,
     Intervene,
     Jog,
+    Motion,
     Preview,
     RedoEpisode,
     Release,
@@ -56,6 +59,7 @@ _ALWAYS = Finish | Reset | Preview
 _STOPPED = "an emergency stop came after this command was sent, so it is not carried out; reset, then send it again"
 _PREVIEW_ROWS = 40
 _NS_PER_MS = 1_000_000
+_MOTION = tuple(attrs.fields_dict(Motion))
 _log = logging.getLogger("ibrobot.web")
 
 
@@ -181,8 +185,7 @@ def _jog(session: RunView, sent: Sent[Jog]) -> None:
     if now_ms - jog.at > _LATE_MS:
         raise IbrobotError(f"the connection is too slow to jog: {(now_ms - jog.at) / 1e3:.1f} s")
     made_ns, began_ns = _run_times(session, jog.at, jog.press)
-    motion = (jog.joints, jog.targets, jog.linear, jog.turn, jog.pose, jog.device)
-    session.bus.call(JOG, JogRequest(made_ns, began_ns, *motion))
+    session.bus.call(JOG, JogRequest(made_ns, began_ns, **{name: getattr(jog, name) for name in _MOTION}))
 
 
 def _release(session: RunView, sent: Sent[Release]) -> None:

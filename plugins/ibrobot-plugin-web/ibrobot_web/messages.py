@@ -40,7 +40,7 @@ def clock_ns() -> int:
     return time.clock_gettime_ns(_CLOCK)
 
 
-def within_one(instance: object, attribute: object, values: Mapping[str, float] | tuple[float, ...]) -> None:
+def _within_one(instance: object, attribute: object, values: Mapping[str, float] | tuple[float, ...]) -> None:
     """Check speeds, which are fractions; a validator of attrs.
 
     Raises:
@@ -51,8 +51,26 @@ def within_one(instance: object, attribute: object, values: Mapping[str, float] 
         raise ValueError("a speed must lie between -1 and 1")
 
 
+@attrs.frozen(kw_only=True)
+class Motion:
+    """A motion while the deadman is held."""
+
+    joints: Mapping[str, float] = option(
+        factory=dict, validator=_within_one, help="joint -> fraction of its speed, -1 to 1"
+    )
+    targets: Mapping[str, float] = option(factory=dict, unit="rad", help="joint -> position that it approaches")
+    linear: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), validator=_within_one, help="fraction of the tool's speed along the axes of the base"
+    )
+    turn: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0), validator=_within_one, help="fraction of the tool's speed of turning about its own axes"
+    )
+    pose: str = option("", help="named pose that all joints of the device approach")
+    device: str = option("", help="the device that moves; empty: the only one of the mode")
+
+
 @attrs.frozen
-class Jog:
+class Jog(Motion):
     """Moves the robot while the page's deadman is held: at most until the next one, and for a fraction of a second.
 
     Times are those of `clock_ms`. The page stamps with the earliest that its message can have by it, so that a message
@@ -61,18 +79,6 @@ class Jog:
 
     at: int = option(ge=0, lt=_LARGEST, unit="ms", help="when the page made this message")
     press: int = option(ge=0, lt=_LARGEST, unit="ms", help="when the present press of the deadman began")
-    joints: Mapping[str, float] = option(
-        factory=dict, validator=within_one, help="joint -> fraction of its speed, -1 to 1"
-    )
-    targets: Mapping[str, float] = option(factory=dict, unit="rad", help="joint -> position that it approaches")
-    linear: tuple[float, float, float] = option(
-        (0.0, 0.0, 0.0), validator=within_one, help="fraction of the tool's speed along the axes of the base"
-    )
-    turn: tuple[float, float, float] = option(
-        (0.0, 0.0, 0.0), validator=within_one, help="fraction of the tool's speed of turning about its own axes"
-    )
-    pose: str = option("", help="named pose that all joints approach")
-    device: str = option("", help="the device that moves; empty: the only one of the mode")
 
 
 @attrs.frozen

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ibrobot_core.api import Float64MultiArray, HardwareDescriptor, IbrobotError, Pose, SceneObject, Vector
-from ibrobot_core.app import RunView, Subscription
+from ibrobot_core.app import Registry, RobotConfig, RunView, Subscription
 from ibrobot_web.run_services import SHAPES
 
 _POSE_SIZE = 7
@@ -23,7 +23,11 @@ class SceneObjects:
 
     def __init__(self, session: RunView) -> None:
         self._session = session
-        self._things = [each for each in _simulated(session) if each.shape != "plane"]
+        try:
+            self._things = simulated_objects(session.config, session.registry) if session.config.simulated else []
+        except IbrobotError as error:
+            _log.warning("the page shows no objects of the scene: %s", error)
+            self._things = []
         topics = {each.topic for each in self._things if each.topic}
         self._topics: dict[str, Subscription] = {topic: session.bus.subscribe(topic, 1) for topic in topics}
         self._newest: dict[str, Vector] = {}
@@ -79,18 +83,18 @@ def _pose(pose: Pose) -> tuple[list[float], list[float]]:
     return [at.x, at.y, at.z], [turn.w, turn.x, turn.y, turn.z]
 
 
-def _simulated(session: RunView) -> Sequence[SceneObject]:
-    """The objects of the simulated scene; none on hardware."""
-    config = session.config
-    if not config.simulated or config.simulation is None:
-        return ()
-    descriptor = session.registry.find("hardware", config.simulation.type)
+def simulated_objects(config: RobotConfig, registry: Registry) -> list[SceneObject]:
+    """The objects of a robot's simulation, without the ground; none if it has no simulation.
+
+    Raises:
+        IbrobotError: if the scene cannot be read.
+    """
+    if config.simulation is None:
+        return []
+    descriptor = registry.find("hardware", config.simulation.type)
     assert isinstance(descriptor, HardwareDescriptor)
-    try:
-        return descriptor.scene(config.simulation.options, config.robot)
-    except IbrobotError as error:
-        _log.warning("the page shows no objects of the scene: %s", error)
-        return ()
+    scene = descriptor.scene(config.simulation.options, config.robot)
+    return [each for each in scene if each.shape != "plane"]
 
 
 def mounts(peripherals: Mapping[str, Any]) -> list[dict[str, Any]]:

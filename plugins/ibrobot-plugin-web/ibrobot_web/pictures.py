@@ -12,6 +12,8 @@ from ibrobot_ros2.jpeg import to_jpeg
 from ibrobot_core.api import CompressedImage, Header, Image, Message, pixels
 from ibrobot_web.link import JPEG, PICTURE_HEAD, PNG, RGB
 
+PICTURES = (Image.ros_type, CompressedImage.ros_type)
+"""Types of messages with pictures."""
 _QUALITY = 80
 _DEPTH_M = 4.0
 """Distance shown as black in pictures of depth [m]."""

@@ -16,21 +16,18 @@ import numpy as np
 
 from ibrobot_core.api import (
     NS_PER_S,
-    CompressedImage,
     Contract,
     EpisodeReader,
     EpisodeSummary,
     Float64MultiArray,
-    HardwareDescriptor,
     IbrobotError,
-    Image,
     JointState,
     Recorded,
     resolve_path,
 )
 from ibrobot_core.app import from_document, installed_plugins
-from ibrobot_web.objects import place_of
-from ibrobot_web.pictures import Picture, to_picture
+from ibrobot_web.objects import place_of, simulated_objects
+from ibrobot_web.pictures import PICTURES, Picture, to_picture
 from ibrobot_web.status import numbers_of
 
 STATES_HZ = 30.0
@@ -40,7 +37,6 @@ _POINTS = 1000
 """Most points of a plot."""
 _AHEAD_NS, _BACK_NS = 2 * NS_PER_S, NS_PER_S
 """How far ahead a picture is reached by reading on, and how far before its time reading begins otherwise [ns]."""
-_PICTURES = (Image.ros_type, CompressedImage.ros_type)
 _LONG = 300
 """Longer values of the metadata are not shown [characters]."""
 
@@ -109,7 +105,7 @@ class Playback:
         """What the episode contains, and the robot's motion, as JSON; times from the first message [s]."""
         summary = self.summary
         length_s = (summary.end_ns - summary.start_ns) / NS_PER_S
-        cameras = [topic for topic, each in summary.topics.items() if each.type in _PICTURES and each.count]
+        cameras = [topic for topic, each in summary.topics.items() if each.type in PICTURES and each.count]
         shown = {key: value for key, value in summary.metadata.items() if len(value) <= _LONG}
         return {
             "duration_s": length_s, "outcome": summary.outcome, "finished": summary.finished, "metadata": shown,
@@ -188,12 +184,7 @@ class Playback:
         try:
             self.description(find)
             document = json.loads(self.summary.metadata["config"])
-            config = from_document(document, source=self._path, sim=True)
-            simulation = config.simulation
-            descriptor = installed_plugins().find("hardware", simulation.type) if simulation is not None else None
-            if not isinstance(descriptor, HardwareDescriptor) or simulation is None:
-                return []
-            things = [each for each in descriptor.scene(simulation.options, config.robot) if each.shape != "plane"]
+            things = simulated_objects(from_document(document, source=self._path, sim=True), installed_plugins())
         except (IbrobotError, KeyError, ValueError):  # the episode says too little, or its plugins are missing
             return []
         moving = {each.topic for each in things if each.topic} & {

@@ -53,12 +53,12 @@ def make_scene(description: Mapping[str, Any]) -> dict[str, Any]:
         `bodies` (parents first), `meshes` (base64 of float32 vertices and uint32 faces), `tips` by the prefix of their
         arm, `cameras`, and `problem`: why there are no shapes.
     """
+    model, problem = None, "the robot has no model: set robot.description.mjcf or robot.description.urdf"
     try:
         model = _compiled(description)
     except ValueError as error:
-        return {"bodies": [], "meshes": [], "tips": {}, "problem": " ".join(str(error).split())}
+        problem = " ".join(str(error).split())
     if model is None:
-        problem = "the robot has no model: set robot.description.mjcf or robot.description.urdf"
         return {"bodies": [], "meshes": [], "tips": {}, "problem": problem}
     known = [i for i in range(model.ngeom) if int(model.geom_type[i]) in _SHAPES]
     shown = [i for i in known if model.geom_group[i] < _SHOWN_GROUPS] or known
@@ -130,11 +130,11 @@ def _compiled(description: Mapping[str, Any]) -> Any:
         return None
     arms = description.get("arms") or {}
     if not arms:
-        return mujoco.MjSpec.from_file(str(Path(path))).compile()
+        return mujoco.MjSpec.from_file(path).compile()
     spec = mujoco.MjSpec()
     for prefix, (x, y, z, yaw) in arms.items():
         frame = spec.worldbody.add_frame(pos=[x, y, z], quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
-        spec.attach(mujoco.MjSpec.from_file(str(Path(path))), prefix=prefix, frame=frame)
+        spec.attach(mujoco.MjSpec.from_file(path), prefix=prefix, frame=frame)
     return spec.compile()
 
 

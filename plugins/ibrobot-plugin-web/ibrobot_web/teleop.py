@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
 from functools import partial
 from types import NoneType
 from typing import override
@@ -26,7 +25,7 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_core.app import Bus, Service
-from ibrobot_web.messages import within_one
+from ibrobot_web.messages import Motion
 from ibrobot_web.options import WebTeleopOptions
 
 _SAME_PRESS_NS = 500_000
@@ -37,21 +36,11 @@ _LONGEST_STEP_S = 0.1
 
 @documented
 @attrs.frozen
-class Jog:
+class Jog(Motion):
     """A request to `/web_teleop/jog`: the motion while a page's deadman is held, as fractions of the top speeds."""
 
     made_ns: int = option(unit="ns", help="when the page made it, by the run's clock")
     began_ns: int = option(unit="ns", help="when the present press of the deadman began")
-    joints: Mapping[str, float] = option(factory=dict, validator=within_one, help="joint -> speed, -1 to 1")
-    targets: Mapping[str, float] = option(factory=dict, unit="rad", help="joint -> position that it approaches")
-    linear: tuple[float, float, float] = option(
-        (0.0, 0.0, 0.0), validator=within_one, help="velocity of the tool in the base frame, each -1 to 1"
-    )
-    turn: tuple[float, float, float] = option(
-        (0.0, 0.0, 0.0), validator=within_one, help="angular velocity about the tool's own axes, each -1 to 1"
-    )
-    pose: str = option("", help="named pose that all joints of the device approach")
-    device: str = option("", help="the device that moves; empty: the only one of the mode")
 
 
 @documented

@@ -7,19 +7,21 @@ import select
 import socket
 import threading
 import time
-import webbrowser
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, override
 
-from ibrobot_core.api import CompressedImage, Context, ContractError, IbrobotError, Image, Viewer
+import attrs
+
+from ibrobot_core.api import Context, ContractError, IbrobotError, Viewer
 from ibrobot_core.app import Child, ComponentFailed, RunView, Subscription, error_text, raise_thread_priority
 from ibrobot_web.commands import Commands
-from ibrobot_web.desktop import has_desktop
+from ibrobot_web.desktop import open_browser
 from ibrobot_web.link import FIRST_PICTURE, PLAN, SAMPLES, STATE, STATUS, FrameSender
 from ibrobot_web.messages import Pages, Release, Sent, StopRun, from_server
 from ibrobot_web.objects import SceneObjects, mounts
 from ibrobot_web.options import WebOptions
-from ibrobot_web.pictures import to_payload
+from ibrobot_web.pictures import PICTURES, to_payload
 from ibrobot_web.status import LogLines, episode_json, numbers_of, plan_json, state_json, status_json
 
 _MODULE = "ibrobot_web.server.process"
@@ -30,7 +32,6 @@ _SILENT_S = 5.0
 """Time without a sign of life of the server after which the run ends [s]."""
 _STATUS_S, _SAMPLES_S, _TOPICS_S = 0.25, 0.1, 1.0
 """Periods of the status, of samples of topics, and of looking for new topics with pictures."""
-_PICTURES = (Image.ros_type, CompressedImage.ros_type)
 _CAMERAS = 32
 """Most topics with pictures."""
 _SAMPLED = 40
@@ -91,8 +92,8 @@ class WebViewer(Viewer):
         self._commands = Commands(session, self.finish, self._child.channel.send, self._fail)
         self._thread = threading.Thread(target=self._receive, args=(self._child,), name="web commands", daemon=True)
         self._thread.start()
-        if self._options.browser and has_desktop():
-            threading.Thread(target=webbrowser.open, args=(self.url,), name="browser", daemon=True).start()
+        if self._options.browser:
+            open_browser(self.url)
 
     @override
     def update(self) -> bool:
@@ -153,22 +154,12 @@ class WebViewer(Viewer):
 
     def _order(self, session: RunView) -> dict[str, Any]:
         """The order of the server's process."""
-        options, robot = self._options, session.config.robot
-        paths = {"mjcf": robot.description.mjcf, "urdf": robot.description.urdf}
-        return {
-            "address": options.host,
-            "port": options.port,
-            "names": options.names,
-            "password": options.password,
-            "certificate": str(options.certificate) if options.certificate is not None else None,
-            "key": str(options.key) if options.key is not None else None,
-            "description": {
-                "tip": robot.description.tip,
-                "arms": {prefix: list(place) for prefix, place in robot.description.arms.items()},
-                "mounts": mounts(session.config.peripherals),
-                **{name: str(path) if path is not None else None for name, path in paths.items()},
-            },
-        }
+        options, robot = attrs.asdict(self._options), session.config.robot.description
+        described = {"tip": robot.tip, "arms": dict(robot.arms), "mjcf": robot.mjcf, "urdf": robot.urdf}
+        order = {"options": options, "description": {**described, "mounts": mounts(session.config.peripherals)}}
+        for facts in order.values():
+            facts |= {name: str(value) for name, value in facts.items() if isinstance(value, Path)}
+        return order
 
     @staticmethod
     def _await_ready(child: Child) -> tuple[str, str]:
@@ -253,7 +244,7 @@ class WebViewer(Viewer):
             self._due[-1] = now_s + _TOPICS_S
             bus = self._session.bus
             for topic, (kind, _) in bus.topics().items():
-                if kind in _PICTURES and topic not in self._pictures and len(self._pictures) < _CAMERAS:
+                if kind in PICTURES and topic not in self._pictures and len(self._pictures) < _CAMERAS:
                     self._pictures[topic] = bus.subscribe(topic, 1)
         for i, subscription in enumerate(self._pictures.values()):
             arrived = subscription.drain()
@@ -292,7 +283,7 @@ class WebViewer(Viewer):
         """The newest numbers of every topic that has any."""
         bus = self._session.bus
         for topic, (kind, _) in bus.topics().items():
-            if kind not in _PICTURES and topic not in _PRIVATE_TOPICS | set(self._samples):
+            if kind not in PICTURES and topic not in _PRIVATE_TOPICS | set(self._samples):
                 if len(self._samples) >= _SAMPLED:
                     break
                 self._samples[topic] = bus.subscribe(topic, 1)

@@ -211,7 +211,7 @@ def test_a_message_of_the_deadman_counts_while_it_is_young(rig: Callable[..., Ri
     taken: list[Any] = []
     found = rig({"/web_teleop/jog": taken.append})
     now_ns, at = found.session.clock.now_ns(), messages.clock_ms() - age_ms
-    found.send(messages.Jog(at, at, {"gripper": 0.5}))
+    found.send(messages.Jog(at, at, joints={"gripper": 0.5}))
     (answer,) = found.answers(1)
     if why:
         assert why in answer["error"]

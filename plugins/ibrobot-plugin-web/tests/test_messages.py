@@ -125,7 +125,7 @@ def test_a_stop_is_a_number_and_nothing_else(text: str) -> None:
 
 
 COMMANDS = (
-    messages.Jog(7, 5, {"a": 0.5}, linear=(0.0, 1.0, 0.0)), Release(), Release(3), messages.Reset(),
+    messages.Jog(7, 5, joints={"a": 0.5}, linear=(0.0, 1.0, 0.0)), Release(), Release(3), messages.Reset(),
     messages.SetMode("web"), messages.BeginEpisode("pick"), messages.EndEpisode("failure"), messages.DiscardEpisode(),
     messages.RedoEpisode(),
     messages.SetSmoothing(True), messages.Intervene(False), messages.Preview(messages.Target(xyz=(0.1, 0.2, 0.3))),

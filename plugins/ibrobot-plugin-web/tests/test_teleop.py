@@ -215,7 +215,7 @@ def test_requests_that_fit_no_robot_are_refused() -> None:
     rig = Rig()
     assert rig.ctx.bus is not None
     for request, why in (
-        (Jog(1, 1, {"shoulder": 1.0}), "no joint 'shoulder'; the joints are: shoulder_pan"),
+        (Jog(1, 1, joints={"shoulder": 1.0}), "no joint 'shoulder'; the joints are: shoulder_pan"),
         (Jog(1, 1, pose="hom"), "no pose 'hom'; the poses are: home, rest"),
         (Jog(1, 1, linear=(1.0, 1.0, 1.0)), "moving the tool needs robot.description.mjcf"),
     ):
@@ -249,7 +249,7 @@ def test_the_devices_of_a_mode_share_the_services() -> None:
     def press(device: str, joint: str) -> list[str]:
         context.clock.sleep_until(context.clock.now_ns() + ns(0.001))
         now_ns = context.clock.now_ns()
-        bus.call(JOG, Jog(now_ns, now_ns, {joint: 1.0}, device=device))
+        bus.call(JOG, Jog(now_ns, now_ns, joints={joint: 1.0}, device=device))
         zeros = np.zeros(3)
         reading = JointReading(now_ns, zeros, zeros, zeros)
         return [name for name, each in devices.items() if each.read(reading).positions is not None]

@@ -13,6 +13,7 @@ from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import read_form
 from ibrobot_web.ui.job_runner import Jobs
+from ibrobot_web.ui.recordings import Episodes
 from ibrobot_web.ui.server import routes_of
 from ui_server import UiServer, run_ui
 
@@ -262,7 +263,7 @@ def test_an_episode_is_converted_and_its_dataset_shown_and_played(tmp_path: Path
             await server.get("episodes/open", path="datasets/pick:7")
         with pytest.raises(RuntimeError, match="outside the opened folders"):
             await server.get("datasets/info", path="..")
-        server.ui.view_state["recordings"].forget()
+        server.ui.keep(Episodes).close()
         await server.post("jobs/start", command="convert", values={**values, "missing": "hold"})
         job, _ = await server.job(lambda job: job["number"] == 2 and job["state"] in ("done", "failed"))
         assert job["state"] == "failed"

@@ -14,9 +14,10 @@ import pytest
 import yaml
 from click.testing import CliRunner
 from ibrobot_web.playback import Playback
+from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import choices_of
 from ibrobot_web.ui.job_runner import IBROBOT
-from ibrobot_web.ui.recordings import episodes_of, find_recordings
+from ibrobot_web.ui.recordings import Episodes, find_recordings
 from ui_server import UiServer, run_ui
 
 from ibrobot_core.api import IbrobotError
@@ -97,14 +98,14 @@ def test_a_model_outside_the_opened_folders_is_not_read(episode: Path, tmp_path:
     async def test(server: UiServer) -> None:
         scene = await server.get("episodes/scene", path=str(episode))
         assert [body["name"] for body in scene["bodies"]] == ["world", "arm"]
-        found = episodes_of(server.ui).opened(episode)
+        found = server.ui.keep(Episodes).opened(episode)
         for mjcf, problem in other.items():
             config = json.dumps({"robot": {"description": {"mjcf": mjcf}}})
             found.summary = attrs.evolve(found.summary, metadata={"config": config})
             scene = await server.get("episodes/scene", path=str(episode))
             assert scene["bodies"] == []
             assert problem in scene["problem"]
-        episodes_of(server.ui).forget()
+        server.ui.keep(Episodes).close()
 
     run_ui([tmp_path], test)
 
@@ -144,7 +145,7 @@ def test_episodes_are_judged_trimmed_deleted_and_restored(
         assert (deleted["what"], original["what"]) == ("deleted", "trimmed; this is the original")
         await server.post("episodes/restore", path="pick/episodes", id=original["id"])
         assert (await row())["duration_s"] == 1.0
-        episodes_of(server.ui).forget()
+        server.ui.keep(Episodes).close()
 
     run_ui([tmp_path], test)
 
@@ -207,4 +208,4 @@ def test_what_is_outside_or_malformed_is_refused(episode: Path, tmp_path: Path) 
 def test_hidden_folders_and_links_are_not_looked_into(episode: Path, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(episode.parent)
     episode.parent.rename(tmp_path / ".hidden")
-    assert find_recordings([tmp_path]).episodes == ()
+    assert find_recordings(Folders([tmp_path])).episodes == ()

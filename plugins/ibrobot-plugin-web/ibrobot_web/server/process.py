@@ -1,6 +1,7 @@
 """The process of the page's server: `python -m ibrobot_web.server.process CHANNEL STREAM`, started by the viewer.
 
-Its order has the options of the viewer; it answers `{"url": …, "watch_url": …}`. Later messages:
+Its order has the `options` of the viewer and the `description` of the robot. It answers `{"url": …, "watch_url": …}`.
+Later messages:
 
 - to the run: what `ibrobot_web.messages.to_run` makes;
 - to the server: `{"reply": N, "ok": … | "error": …}`.
@@ -26,7 +27,7 @@ import attrs
 from ibrobot_http.server import HttpServer
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Channel, Failure, open_parent
+from ibrobot_core.app import Channel, Failure, open_parent, read_options
 from ibrobot_web.link import ALIVE_S, FIRST_PICTURE, STATUS, receive_frame
 from ibrobot_web.messages import Alive, FromServer, Pages, Release, RunCommand, Sent, StopRun, to_run
 from ibrobot_web.options import WebOptions
@@ -126,18 +127,6 @@ class RunLink:
         self._channel.send(to_run(message))
 
 
-def _options(order: Mapping[str, Any]) -> WebOptions:
-    certificate, key = (Path(order[name]) if order[name] is not None else None for name in ("certificate", "key"))
-    return WebOptions(
-        host=order["address"],
-        port=order["port"],
-        names=tuple(order["names"]),
-        password=order["password"],
-        certificate=certificate,
-        key=key,
-    )
-
-
 async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any]) -> None:
     """Serve until the run closes the channel.
 
@@ -146,7 +135,8 @@ async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any
     """
     loop = asyncio.get_running_loop()
     link = RunLink(channel, order)
-    guard = page_guard(_options(order), of="viewer: ", any_port="--set viewer.port=0")
+    options = read_options(WebOptions, order["options"], Path, {})
+    guard = page_guard(options, of="viewer: ", any_port="--set viewer.port=0")
     async with HttpServer(guard, make_app(guard, link.broadcast, link.drive, link.scene)):
         loop.add_reader(channel.fileno(), link.receive)
         relaying = asyncio.create_task(link.relay(stream))

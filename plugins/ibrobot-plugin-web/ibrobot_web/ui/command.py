@@ -7,15 +7,13 @@ import contextlib
 import logging
 import signal
 import sys
-import threading
-import webbrowser
 from pathlib import Path
 
 import click
 from ibrobot_http.server import HttpServer
 
 from ibrobot_core.app import LogFormatter, echo, end_signals
-from ibrobot_web.desktop import has_desktop
+from ibrobot_web.desktop import open_browser
 from ibrobot_web.options import WebOptions
 from ibrobot_web.server.page_guard import page_guard
 from ibrobot_web.ui.context import Ui
@@ -75,8 +73,8 @@ async def _serve(options: WebOptions, context: Ui, *, browser: bool) -> None:
         address = guard.link("drive")
         echo(f"page: {address}  (to watch only: {guard.link('watch')})")
         sys.stdout.flush()
-        if browser and has_desktop():
-            threading.Thread(target=webbrowser.open, args=(address,), name="browser", daemon=True).start()
+        if browser:
+            open_browser(address)
         await _ended()
 
 

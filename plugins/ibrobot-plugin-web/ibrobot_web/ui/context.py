@@ -1,11 +1,12 @@
-"""What the functions behind the requests of views work with."""
+"""Requests of views: how they are read, and what their answers are made from."""
 
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import attrs
 
@@ -13,6 +14,13 @@ from ibrobot_core.api import option
 from ibrobot_core.app import RequestError, RequestLimits, Service
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
+
+
+class Closes(Protocol):
+    """What ends with the server."""
+
+    def close(self) -> None:
+        """End it."""
 
 
 @attrs.frozen(eq=False)
@@ -23,24 +31,20 @@ class Ui:
     jobs: Jobs
     run_options: tuple[str, ...] = ()
     """Options of runs that the page launches, so that their pages are reachable from where this page is."""
-    view_state: dict[str, Any] = attrs.field(factory=dict)
-    """What views keep between requests, by the view's name; use locks, since requests run in threads."""
-    closers: list[Callable[[], None]] = attrs.field(factory=list)
-    """Called when the server ends."""
+    _kept: dict[type[Any], Any] = attrs.field(factory=dict, init=False)
+    _lock: threading.Lock = attrs.field(factory=threading.Lock, init=False)
+
+    def keep[T: Closes](self, kind: type[T]) -> T:
+        """The one object of a class that requests share until the server ends, made at the first call."""
+        with self._lock:
+            found: T = self._kept[kind] if kind in self._kept else self._kept.setdefault(kind, kind())
+        return found
 
     def close(self) -> None:
         """End what views and jobs have started."""
-        for close in self.closers:
-            close()
+        for each in self._kept.values():
+            each.close()
         self.jobs.close()
-
-
-@attrs.frozen
-class Blob:
-    """An answer that is not JSON, e.g. a picture."""
-
-    content: bytes
-    content_type: str
 
 
 @attrs.frozen
@@ -63,8 +67,8 @@ class Route[Q]:
     """
 
     answer: Callable[[Ui, Q], Any]
-    """Returns what JSON can express, a `Blob` or a `File`. It runs in a thread, may block, and raises IbrobotError for
-    what the page is to show."""
+    """Returns what JSON can express, a `Picture` or a `File`. It runs in a thread, may block, and raises IbrobotError
+    with what the page shows."""
     request: type[Q]
     """Class of the request, with its fields as `option`."""
 

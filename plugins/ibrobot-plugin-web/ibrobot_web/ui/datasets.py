@@ -14,7 +14,7 @@ from ibrobot_web.ui.recordings import find_recordings
 
 def listing(ui: Ui, request: NoRequest) -> list[str]:
     """The datasets in the opened folders."""
-    return [ui.folders.name(path) for path in find_recordings(ui.folders.paths).datasets]
+    return [ui.folders.name(path) for path in find_recordings(ui.folders).datasets]
 
 
 def info(ui: Ui, request: NamesPath) -> dict[str, Any]:

@@ -20,14 +20,14 @@ from ibrobot_core.app import (
     installed_plugins,
     official_plugins,
 )
-from ibrobot_web.ui.context import Blob, Route, Ui
+from ibrobot_web.pictures import Picture
+from ibrobot_web.ui.context import Route, Ui
 
 _MODULE = "ibrobot_web.ui.guide_process"
 _POLL_S = 0.1
 _END_S = 5.0
 """Time that a guide gets to end by itself after it was cancelled [s]."""
 _LARGEST_ANSWER = 500
-_making = threading.Lock()
 
 
 @attrs.define(eq=False)
@@ -154,17 +154,6 @@ def _table(message: Mapping[str, Any]) -> dict[str, Any]:
     return {name: message[name] for name in ("columns", "rows") if name in message}
 
 
-def devices_of(ui: Ui) -> Devices:
-    """The guides of a page's server."""
-    with _making:
-        if "devices" not in ui.view_state:
-            ui.view_state["devices"] = Devices()
-            ui.closers.append(ui.view_state["devices"].close)
-        devices = ui.view_state["devices"]
-    assert isinstance(devices, Devices)
-    return devices
-
-
 @attrs.frozen
 class StartGuide:
     """Which guide to start."""
@@ -224,7 +213,7 @@ def start(ui: Ui, request: StartGuide) -> dict[str, int]:
     if guide is None:
         raise IbrobotError(f"no guide {request.name!r}")
     answers = {each.name: _answer(each, request.answers) for each in guide.questions()}
-    return {"number": devices_of(ui).start(guide, answers)}
+    return {"number": ui.keep(Devices).start(guide, answers)}
 
 
 def _answer(question: Question, given: Mapping[str, Any]) -> str | bool:
@@ -241,7 +230,7 @@ def _answer(question: Question, given: Mapping[str, Any]) -> str | bool:
 
 def state(ui: Ui, request: AskState) -> dict[str, Any]:
     """What the guide shows, from item number `after` on, and what it asks."""
-    devices = devices_of(ui)
+    devices = ui.keep(Devices)
     with devices.lock:
         work = devices.work
         if work is None:
@@ -252,24 +241,24 @@ def state(ui: Ui, request: AskState) -> dict[str, Any]:
         }  # fmt: skip
 
 
-def picture(ui: Ui, request: NamesPicture) -> Blob:
+def picture(ui: Ui, request: NamesPicture) -> Picture:
     """A picture that the guide has shown."""
-    devices, index = devices_of(ui), request.picture
+    devices, index = ui.keep(Devices), request.picture
     with devices.lock:
         if devices.work is None or index >= len(devices.work.pictures):
             raise IbrobotError("no such picture")
         content = devices.work.pictures[index]
-    return Blob(content, "image/png" if content.startswith(b"\x89PNG") else "image/jpeg")
+    return Picture(content, "image/png" if content.startswith(b"\x89PNG") else "image/jpeg")
 
 
 def answer(ui: Ui, request: GiveAnswer) -> None:
     """Answer what the guide asks."""
-    devices_of(ui).answer(request.number, request.ask, request.ok)
+    ui.keep(Devices).answer(request.number, request.ask, request.ok)
 
 
 def cancel(ui: Ui, request: NamesGuide) -> None:
     """End the guide."""
-    devices_of(ui).cancel(request.number)
+    ui.keep(Devices).cancel(request.number)
 
 
 ROUTES: dict[str, Route[Any]] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,10 @@ import attrs
 
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import NoRequest
-from ibrobot_web.ui.context import Blob, NamesPath, NamesPaths, Route, Ui
+from ibrobot_web.pictures import Picture
+from ibrobot_web.ui.context import NamesPath, NamesPaths, Route, Ui
 from ibrobot_web.ui.forms import choices_of, run_command
-from ibrobot_web.ui.recordings import episodes_of, existing, find_recordings, playback
+from ibrobot_web.ui.recordings import Episodes, existing, find_recordings, playback
 
 _LONGEST_S = 1e6
 
@@ -55,8 +57,8 @@ class Restore(NamesPath):
 
 def listing(ui: Ui, request: NoRequest) -> dict[str, Any]:
     """All episodes in the opened folders."""
-    found = find_recordings(ui.folders.paths)
-    rows = [episodes_of(ui).row(ui, path) for path in found.episodes]
+    found = find_recordings(ui.folders)
+    rows = [ui.keep(Episodes).row(ui, path) for path in found.episodes]
     trashes = [ui.folders.name(path) for path in found.trashes]
     outcomes = choices_of("episodes mark", "outcome")
     return {"episodes": rows, "complete": found.complete, "trashes": trashes, "outcomes": outcomes}
@@ -80,26 +82,24 @@ def series(ui: Ui, request: NamesTopic) -> dict[str, Any]:
     return playback(ui, request.path).series(request.topic)
 
 
-def picture(ui: Ui, request: NamesPicture) -> Blob:
+def picture(ui: Ui, request: NamesPicture) -> Picture:
     """A camera's picture at a time; empty if there is none."""
-    found = playback(ui, request.path).picture(request.topic, request.at_s)
-    return Blob(found.content, found.content_type) if found is not None else Blob(b"", "image/jpeg")
+    return playback(ui, request.path).picture(request.topic, request.at_s) or Picture(b"", "image/jpeg")
 
 
 def scene(ui: Ui, request: NamesPath) -> dict[str, Any]:
     """The robot's shapes."""
-    from ibrobot_web.scene import make_scene
-
     try:
-        description = playback(ui, request.path).description(ui.folders.find)
+        return _scene(json.dumps(playback(ui, request.path).description(ui.folders.find), sort_keys=True))
     except IbrobotError as error:
         return {"bodies": [], "meshes": [], "tips": {}, "problem": str(error)}
-    key = json.dumps(description, sort_keys=True)
-    scenes: dict[str, Any] = ui.view_state.setdefault("scenes", {})
-    if key not in scenes:
-        scenes[key] = make_scene(description)
-    found: dict[str, Any] = scenes[key]
-    return found
+
+
+@functools.cache
+def _scene(description: str) -> dict[str, Any]:
+    from ibrobot_web.scene import make_scene
+
+    return make_scene(json.loads(description))
 
 
 def objects(ui: Ui, request: NamesPath) -> list[dict[str, Any]]:
@@ -114,7 +114,7 @@ def mark(ui: Ui, request: Mark) -> None:
 
 def trim(ui: Ui, request: Trim) -> None:
     """Replace an episode by a part of it."""
-    episodes_of(ui).forget()
+    ui.keep(Episodes).close()
     begin_s, end_s = request.begin_s, request.end_s
     run_command(ui, "episodes trim", episode=request.path, in_place=True, begin_s=begin_s, end_s=end_s)
 
@@ -122,13 +122,13 @@ def trim(ui: Ui, request: Trim) -> None:
 def delete(ui: Ui, request: NamesPaths) -> None:
     """Move episodes to the trash."""
     paths = existing(ui, request.paths)
-    episodes_of(ui).forget()
+    ui.keep(Episodes).close()
     run_command(ui, "episodes delete", episodes=paths, to_trash=True)
 
 
 def restore(ui: Ui, request: Restore) -> None:
     """Put an original back."""
-    episodes_of(ui).forget()
+    ui.keep(Episodes).close()
     run_command(ui, "episodes trash", path=request.path, restore=request.id)
 
 
@@ -139,7 +139,7 @@ def empty(ui: Ui, request: NamesPath) -> None:
 
 def repair(ui: Ui, request: NamesPath) -> None:
     """Repair an unfinished episode."""
-    episodes_of(ui).forget()
+    ui.keep(Episodes).close()
     run_command(ui, "episodes repair", path=request.path)
 
 

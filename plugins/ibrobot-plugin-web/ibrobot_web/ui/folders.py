@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from ibrobot_core.api import IbrobotError
 
 _LONGEST, _LONGEST_NAME = 4000, 255
 """Longest path [characters], and longest name in it [bytes]."""
+
+_PACKAGES = ("node_modules", "site-packages", "__pycache__")
+"""Folders of installed packages."""
 
 
 class Folders:
@@ -25,6 +28,19 @@ class Folders:
     def first(self) -> Path:
         """The folder in which jobs run."""
         return self.paths[0]
+
+    def walk(self, depth: int, skipped: Collection[str] = ()) -> Iterator[tuple[Path, list[str], list[str]]]:
+        """Walk the folders down to a depth, as `Path.walk` does, in the order of their names.
+
+        It enters no links, hidden folders, folders of packages, and none with a `skipped` name. A caller that empties a
+        list of subfolders enters none of these.
+        """
+        for opened in self.paths:
+            for parent, folders, names in opened.walk():
+                yield parent, folders, names
+                entered = folders if len(parent.relative_to(opened).parts) < depth else ()
+                out = {*_PACKAGES, *skipped}
+                folders[:] = sorted(each for each in entered if not each.startswith(".") and each not in out)
 
     def find(self, text: str) -> Path:
         """The path that a request names, with links resolved; it need not exist.

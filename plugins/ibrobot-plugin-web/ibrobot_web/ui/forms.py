@@ -175,7 +175,7 @@ def _shown(command: Command) -> dict[str, attrs.Attribute[Any]]:
 
 def _known(ui: Ui) -> dict[str, list[dict[str, str]]]:
     """What the opened folders have, by what paths name: the value of each, and its words."""
-    found = find_recordings(ui.folders.paths)
+    found = find_recordings(ui.folders)
     counts: dict[str, int] = {}
     for path in found.episodes:
         name = ui.folders.name(_dataset_of(ui, path))

@@ -148,19 +148,19 @@ class Jobs:
         with self._lock:
             return list(self._jobs.values())
 
-    def get(self, number: Any) -> Job:
+    def get(self, number: int) -> Job:
         """The job with a number.
 
         Raises:
             IbrobotError: if there is none.
         """
         with self._lock:
-            job = self._jobs.get(number) if isinstance(number, int) else None
+            job = self._jobs.get(number)
         if job is None:
             raise IbrobotError(f"no job {number}")
         return job
 
-    def cancel(self, number: Any) -> None:
+    def cancel(self, number: int) -> None:
         """End a job as Ctrl-C does; the second time at once.
 
         Raises:

@@ -10,15 +10,14 @@ import attrs
 
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import Answer, Ask, Command, Failed, WireError, decode_event, installed_plugins
-from ibrobot_web.ui.context import Blob, Route, Ui
+from ibrobot_web.pictures import Picture
+from ibrobot_web.ui.context import Route, Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import arguments, form_of, in_page_words, job_commands, read_form, title_of
 from ibrobot_web.ui.job_runner import Reader
 
 _POINTS = 400
 """Points of a curve that are kept."""
-
-
 _LONGEST_ANSWER = 500
 
 
@@ -147,14 +146,14 @@ def answer(ui: Ui, request: GiveAnswer) -> None:
     ui.jobs.answer(request.number, Answer(ask=request.ask, answer=request.answer))
 
 
-def sight(ui: Ui, request: NamesSight) -> Blob:
+def sight(ui: Ui, request: NamesSight) -> Picture:
     """A picture beside the question of a job."""
     asked = ui.jobs.get(request.number).facts.get("ask")
     if asked is None or asked["ask"] != request.ask or request.sight >= len(asked["sights"]):
         raise IbrobotError("no such picture: the question was answered")
     name = asked["sights"][request.sight][request.which]
     try:
-        return Blob(ui.folders.find(name).read_bytes(), "image/jpeg")
+        return Picture(ui.folders.find(name).read_bytes(), "image/jpeg")
     except OSError as error:
         raise IbrobotError(f"{name}: cannot be read: {error.strerror}") from None
 

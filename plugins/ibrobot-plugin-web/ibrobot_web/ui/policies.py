@@ -9,7 +9,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.api import IbrobotError, option, replace_file
 from ibrobot_core.app import ConfigError, NoRequest, find_config, from_document, installed_plugins, parse_yaml
 from ibrobot_web.model_edit import ModelEdit, with_model
 from ibrobot_web.ui.context import Route, Ui
@@ -62,10 +62,8 @@ def apply(ui: Ui, request: AgreedChange) -> dict[str, str]:
         raise IbrobotError(f"{source.name} has changed since; look at the change again")
     if target != source and target.exists():
         raise IbrobotError(f"{ui.folders.name(target)} exists already; choose it as the robot, or another name")
-    staged = target.with_name(f".{target.name}.new")
     try:
-        staged.write_text(edit.text, encoding="utf-8")
-        staged.replace(target)
+        replace_file(target, edit.text)
     except OSError as error:
         raise IbrobotError(f"{ui.folders.name(target)}: cannot be written: {error.strerror}") from error
     return {"robot": ui.folders.name(target), "mode": edit.mode}

@@ -44,7 +44,7 @@ def form(ui: Ui, request: NoRequest) -> dict[str, Any]:
 
 def place(ui: Ui, request: NamesDataset) -> dict[str, Any]:
     """Where episodes go, how many the dataset has, how large they are, and the disk's free space."""
-    folder = _folder(ui, _ROOT, request.dataset)
+    folder = _folder(ui, request.dataset)
     episodes = [path for path in (folder / "episodes").glob("episode_*") if path.is_dir()]
     sizes = [sum(each.stat().st_size for each in path.rglob("*") if each.is_file()) for path in episodes]
     existing = folder
@@ -62,33 +62,27 @@ def start(ui: Ui, request: RecordSession) -> dict[str, int]:
     """Begin a session: `ibrobot record`, which ends by itself after the last episode."""
     command = installed_plugins().command(_COMMAND)
     values = dict(request.values)
-    folder = _folder(ui, _ROOT, str(values.pop("dataset", None) or "default"))
+    folder = _folder(ui, str(values.pop("dataset", None) or "default"))
     root = ui.folders.find(_ROOT)
     options = read_form(ui, command, values)
-    words = [
-        _COMMAND,
-        "--events",
-        *run_arguments(ui, request),
-        f"--root={root}",
-        f"--dataset={folder.relative_to(root)}",
-    ]
+    place = (f"--root={root}", f"--dataset={folder.relative_to(root)}")
     read_event = event_reader(ui.folders, command)
     job = ui.jobs.start(
         _COMMAND,
         f"Record {folder.name}",
-        [*words, *arguments(options)],
+        [_COMMAND, "--events", *run_arguments(ui, request), *place, *arguments(options)],
         read=lambda line: found if (found := read_event(line)) is not None else read_address(line),
         done_codes=RUN_DONE,
     )
     return {"number": job.number}
 
 
-def _folder(ui: Ui, root: str, dataset: str) -> Path:
+def _folder(ui: Ui, dataset: str) -> Path:
     """The dataset's folder."""
     dataset = dataset.strip()
     if _DATASET.fullmatch(dataset) is None:
         raise IbrobotError(f"dataset {dataset!r}: use letters, digits, spaces, dots, - and _, e.g. pick_cube")
-    return ui.folders.find(str(Path(root) / dataset))
+    return ui.folders.find(str(Path(_ROOT) / dataset))
 
 
 ROUTES: dict[str, Route[Any]] = {

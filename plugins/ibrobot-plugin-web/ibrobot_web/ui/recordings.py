@@ -1,10 +1,11 @@
-"""Episodes and datasets in the opened folders, and the commands of `ibrobot` that change them."""
+"""Episodes, datasets, reports and policies in the opened folders."""
 
 from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from ibrobot_core.api import NS_PER_S, IbrobotError, PolicyDescriptor
 from ibrobot_core.app import installed_plugins
 from ibrobot_web.playback import Playback, problems_of
 from ibrobot_web.ui.context import Ui
+from ibrobot_web.ui.folders import Folders
 
 _DEPTH = 6
 """Levels of folders below an opened one in which recordings are looked for."""
@@ -23,7 +25,6 @@ _MOST_POLICIES = 200
 """Policies that are listed."""
 _OPEN = 4
 """Episodes that stay open."""
-_SKIPPED = frozenset({"node_modules", "__pycache__", "site-packages"})
 
 
 @attrs.frozen
@@ -40,8 +41,8 @@ class Found:
     """Kind of report -> the folders of that kind."""
 
 
-def find_recordings(folders: Sequence[Path]) -> Found:
-    """The episodes, datasets and reports in folders. Hidden folders and links are left out."""
+def find_recordings(opened: Folders) -> Found:
+    """The episodes, datasets and reports in the opened folders."""
     registry = installed_plugins()
     readers = registry.readers
     reports: dict[str, dict[Path, None]] = {each.name: {} for each in registry.reports}
@@ -49,9 +50,7 @@ def find_recordings(folders: Sequence[Path]) -> Found:
     datasets: list[Path] = []
     trashes: list[Path] = []
     left = _MOST_FOLDERS
-
-    def look(folder: Path, depth: int) -> None:
-        nonlocal left
+    for folder, folders, _ in opened.walk(_DEPTH):
         left -= 1
         for each in registry.reports:
             if each.reads(folder):
@@ -60,15 +59,10 @@ def find_recordings(folders: Sequence[Path]) -> Found:
             episodes.append(folder)
         elif any(reader.reads(folder) for reader in readers if reader.numbered):
             datasets.append(folder)
-        elif depth and left > 0:
-            for child in _folders_in(folder):
-                if child.name == ".trash":
-                    trashes.append(folder)
-                elif not child.name.startswith(".") and child.name not in _SKIPPED:
-                    look(child, depth - 1)
-
-    for folder in folders:
-        look(folder, _DEPTH)
+        elif left > 0:
+            trashes += [folder] * (".trash" in folders)
+            continue
+        folders.clear()
     once = [tuple(dict.fromkeys(each)) for each in (episodes, datasets, trashes)]
     return Found(once[0], once[1], once[2], left > 0, {kind: tuple(found) for kind, found in reports.items()})
 
@@ -86,23 +80,11 @@ def policy_type(path: Path) -> str | None:
 def find_policies(ui: Ui) -> list[tuple[Path, str]]:
     """The folders with a trained policy in the opened folders, and the type of each; the newest first."""
     found = []
-    for folder in ui.folders.paths:
-        for parent, folders, _ in folder.walk():
-            depth = len(parent.relative_to(folder).parts)
-            folders[:] = [each for each in folders if not each.startswith(".")] if depth < _POLICY_DEPTH else []
-            if (type_ := policy_type(parent)) is not None:
-                found.append((parent, type_))
-                folders.clear()
+    for parent, folders, _ in ui.folders.walk(_POLICY_DEPTH):
+        if (type_ := policy_type(parent)) is not None:
+            found.append((parent, type_))
+            folders.clear()
     return sorted(found, key=lambda each: each[0].stat().st_mtime_ns, reverse=True)[:_MOST_POLICIES]
-
-
-def _folders_in(folder: Path) -> Iterator[Path]:
-    try:
-        with os.scandir(folder) as entries:
-            found = sorted(entry.path for entry in entries if entry.is_dir(follow_symlinks=False))
-    except OSError:
-        return
-    yield from map(Path, found)
 
 
 class Episodes:
@@ -139,22 +121,12 @@ class Episodes:
                 self._open.pop(next(iter(self._open))).close()
         return found
 
-    def forget(self) -> None:
-        """Close all episodes, e.g. before one is changed."""
+    def close(self) -> None:
+        """Close all episodes, at the end and before one is changed."""
         with self._lock:
             opened, self._open = list(self._open.values()), {}
         for each in opened:
             each.close()
-
-
-_creating = threading.Lock()
-
-
-def episodes_of(ui: Ui) -> Episodes:
-    """The episodes that the views share."""
-    with _creating:
-        found: Episodes = ui.view_state.setdefault("recordings", Episodes())
-    return found
 
 
 def playback(ui: Ui, path: str) -> Playback:
@@ -163,7 +135,7 @@ def playback(ui: Ui, path: str) -> Playback:
     Raises:
         IbrobotError: if it is outside the opened folders, or cannot be read.
     """
-    return episodes_of(ui).opened(ui.folders.find(path))
+    return ui.keep(Episodes).opened(ui.folders.find(path))
 
 
 def existing(ui: Ui, named: Sequence[str]) -> list[str]:
@@ -196,11 +168,8 @@ def _row(ui: Ui, path: Path) -> dict[str, Any]:
         "bytes": sum(file.stat().st_size for file in path.rglob("*") if file.is_file()),
     }  # fmt: skip
     try:
-        reader = installed_plugins().open_episode(path)
-        try:
+        with closing(installed_plugins().open_episode(path)) as reader:
             summary = reader.summary()
-        finally:
-            reader.close()
     except IbrobotError as error:
         return {**row, "problems": [str(error)]}
     known = summary.metadata

@@ -39,7 +39,7 @@ def _kind(name: str) -> ReportDescriptor:
 def listing(ui: Ui, request: NamesKind) -> list[dict[str, Any]]:
     """The folders of a kind in the opened folders, the newest first."""
     descriptor = _kind(request.kind)
-    found = find_recordings(ui.folders.paths).reports.get(descriptor.name, ())
+    found = find_recordings(ui.folders).reports.get(descriptor.name, ())
     rows = []
     for folder in found:
         try:

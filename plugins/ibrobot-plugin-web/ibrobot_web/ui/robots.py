@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import threading
 from collections.abc import Iterable, Iterator, Mapping
@@ -36,7 +37,7 @@ _MOST = 200
 """Robot YAMLs that are listed."""
 _HEAD = 1 << 16
 """Bytes of a file in which `robot:` is found."""
-_SKIPPED = frozenset({"node_modules", "site-packages", "episodes", "datasets", "outputs", "__pycache__"})
+_SKIPPED = ("episodes", "datasets", "outputs")
 _PAGE = re.compile(r"viewer: (?P<url>https?://\S+)(?:\s+\(to watch only: (?P<watch_url>\S+)\))?")
 RUN_DONE = (0, 3)
 """Exit codes of runs that ended as they should; 3: not all episodes or goals succeeded."""
@@ -86,19 +87,9 @@ def robot_names(ui: Ui) -> list[str]:
 
 def _yamls(ui: Ui) -> Iterator[Path]:
     """The robot YAMLs of the opened folders."""
-    seen = 0
-    for folder in ui.folders.paths:
-        for parent, folders, names in folder.walk():
-            depth = len(parent.relative_to(folder).parts)
-            kept = [name for name in folders if not name.startswith(".") and name not in _SKIPPED]
-            folders[:] = sorted(kept) if depth < _DEPTH else []
-            for name in sorted(names):
-                path = parent / name
-                if path.suffix in (".yaml", ".yml") and ui.folders.has(path) and _ROBOT.search(_head(path)):
-                    yield path
-                    seen += 1
-                    if seen == _MOST:
-                        return
+    files = (parent / name for parent, _, names in ui.folders.walk(_DEPTH, _SKIPPED) for name in sorted(names))
+    yamls = (path for path in files if path.suffix in (".yaml", ".yml") and ui.folders.has(path))
+    return itertools.islice((path for path in yamls if _ROBOT.search(_head(path))), _MOST)
 
 
 def _head(path: Path) -> str:

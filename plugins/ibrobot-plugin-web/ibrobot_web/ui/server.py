@@ -18,8 +18,9 @@ from ibrobot_http.guard import Guard
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import ConfigError, error_text, installed_plugins
+from ibrobot_web.pictures import Picture
 from ibrobot_web.server.app import STATIC
-from ibrobot_web.ui.context import Blob, File, Route, Ui
+from ibrobot_web.ui.context import File, Route, Ui
 from ibrobot_web.ui.forms import job_commands, takes, title_of
 
 VIEWS = {
@@ -52,7 +53,7 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
 
     Args:
         guard: has the roles of sessions.
-        ui: what views work with.
+        ui: the folders, jobs and state that requests share.
     """
     app = web.Application(middlewares=[_errors], client_max_size=LARGEST_REQUEST)
     app[_UI] = ui
@@ -106,7 +107,7 @@ async def _answer(route: Route[Any], guard: Guard, request: web.Request) -> web.
             raise IbrobotError("this link is for watching only")
         facts = route.read(await _body(request))
     answer = await asyncio.to_thread(route.answer, request.app[_UI], facts)
-    if isinstance(answer, Blob):
+    if isinstance(answer, Picture):
         return web.Response(body=answer.content, content_type=answer.content_type)
     if isinstance(answer, File):
         return web.FileResponse(answer.path, headers={"Content-Type": answer.content_type})
