@@ -55,20 +55,14 @@ class OpenCvCamera(Sensor):
         self._ctx = ctx
         self._frame_id = options.frame_id or f"{ctx.name}_optical_frame"
         self._source: _Live | _File | None = None
+        self._info: Callable[[Header], CameraInfo] | None = None
         self._last_ns = 0
-
-    def _load_info(self) -> Callable[[Header], CameraInfo] | None:
-        if self._options.info is None:
-            return None
-        try:
-            return load_info(self._options.info)
-        except SensorError as error:
-            raise SensorError(f"camera {self._ctx.name}: {error}") from None
 
     @override
     def open(self) -> None:
         try:
             device = find_device(self._options.device)
+            self._info = load_info(self._options.info) if self._options.info is not None else None
         except SensorError as error:
             raise SensorError(f"camera {self._ctx.name}: {error}") from None
         if device.kind != "file" and isinstance(self._ctx.clock, SteppedClock):
@@ -76,7 +70,6 @@ class OpenCvCamera(Sensor):
                 f"camera {self._ctx.name}: {device}: a live source cannot run in lockstep; a video file can"
             )
         make = _File if device.kind == "file" else _Live
-        self._info = self._load_info()
         source = make(lambda: Capture(device, self._options, self._ctx.name), self._options, self._ctx)
         source.open()
         self._source = source

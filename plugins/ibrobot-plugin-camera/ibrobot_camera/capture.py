@@ -219,9 +219,9 @@ class Capture:
         return found
 
     def _offered(self) -> str:
-        if self._device.kind != "v4l2":
-            return ""
-        return _listed(modes(self._device.target))
+        offered = modes(self._device.target) if self._device.kind == "v4l2" else ()
+        lines = ("{} {} at {}".format(*mode.row) for mode in offered[:12])
+        return f"; it offers: {'; '.join(lines)}" if offered else ""
 
     def _taken_ns(self, now_ns: int) -> int:
         # OpenCV's V4L2 backend returns the buffer's stamp, which drivers take from the monotonic clock.
@@ -257,10 +257,3 @@ def _stream_options() -> Iterator[None]:
         finally:
             if before is None:
                 del os.environ[name]
-
-
-def _listed(offered: tuple[Mode, ...]) -> str:
-    if not offered:
-        return ""
-    lines = (f"{m.fourcc} {m.width}x{m.height} at {', '.join(f'{r:g}' for r in m.rates_hz)}" for m in offered[:12])
-    return f"; it offers: {'; '.join(lines)}"

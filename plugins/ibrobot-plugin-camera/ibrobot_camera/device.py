@@ -61,11 +61,11 @@ def find_device(device: int | str) -> Device:
 
 def video_device(options: OpenCvOptions) -> Mapping[str, str]:
     """The resolved path of a V4L2 device; streams and files can be opened more than once."""
-    text = str(options.device)
-    if text.isdigit():
-        return {"device": f"/dev/video{text}"}
-    path = text if text.startswith("/dev/") else str(BY_ID / text)
-    return {"device": os.path.realpath(path)} if text.startswith("/dev/") or Path(path).exists() else {}
+    try:
+        device = find_device(options.device)
+    except SensorError:
+        return {}
+    return {"device": os.path.realpath(device.target)} if device.kind == "v4l2" else {}
 
 
 def require_device(options: OpenCvOptions) -> None:

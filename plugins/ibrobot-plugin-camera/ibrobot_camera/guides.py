@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import cv2
-
 from ibrobot_camera import v4l2
-from ibrobot_camera.commands.sources import decoded, opened, pixels
+from ibrobot_camera.commands.sources import browser_jpeg, opened
 from ibrobot_core.api import SensorError
 from ibrobot_core.app import Guide, Question
 
 _WAIT_S = 5.0
-_QUALITY = 80
-
-
 _ALL = "all"
 
 
@@ -36,11 +31,7 @@ def show_cameras(answers: Mapping[str, str | bool], guide: Guide) -> None:
         if camera.problem:
             guide.say(f"{camera.problem}: sudo usermod -aG video $USER, then log in again", warning=True)
             continue
-        rows = [
-            (mode.fourcc, f"{mode.width}x{mode.height}", ", ".join(f"{r:g}" for r in mode.rates_hz))
-            for mode in camera.modes
-        ]
-        guide.show(("format", "size", "rates [Hz]"), rows)
+        guide.show(v4l2.COLUMNS, [mode.row for mode in camera.modes])
         try:
             guide.picture(camera.path, _picture(camera.path))
         except SensorError as error:
@@ -53,5 +44,4 @@ def _picture(device: str) -> bytes:
         image = cameras["camera"].read(_WAIT_S)
     if image is None:
         raise SensorError(f"{device}: no image within {_WAIT_S:g} s; does a run use it?")
-    _, jpeg = cv2.imencode(".jpg", pixels(decoded(image)), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    return jpeg.tobytes()
+    return browser_jpeg(image)

@@ -21,6 +21,8 @@ _QUERYCAP, _ENUM_FMT, _ENUM_FRAMESIZES, _ENUM_FRAMEINTERVALS = 0x80685600, 0xC04
 _CAPTURE = 1
 """V4L2_BUF_TYPE_VIDEO_CAPTURE, and V4L2_CAP_VIDEO_CAPTURE."""
 _DISCRETE = 1
+COLUMNS = ("format", "size", "rates [Hz]")
+"""What the columns of `Mode.row` are called."""
 
 
 @attrs.frozen
@@ -36,6 +38,11 @@ class Mode:
     def size(self) -> tuple[int, int]:
         """Width and height [px]."""
         return self.width, self.height
+
+    @property
+    def row(self) -> tuple[str, str, str]:
+        """As texts."""
+        return self.fourcc, f"{self.width}x{self.height}", ", ".join(f"{rate:g}" for rate in self.rates_hz)
 
 
 @attrs.frozen

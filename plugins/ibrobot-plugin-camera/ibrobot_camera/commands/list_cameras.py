@@ -39,8 +39,8 @@ def list_cameras(as_json: bool) -> None:
 
 def _table(camera: v4l2.Camera) -> Table:
     table = Table(box=None, padding=(0, 2))
-    for heading in ("format", "size", "rates [Hz]"):
+    for heading in v4l2.COLUMNS:
         table.add_column(heading)
     for mode in camera.modes:
-        table.add_row(mode.fourcc, f"{mode.width}x{mode.height}", ", ".join(f"{rate:g}" for rate in mode.rates_hz))
+        table.add_row(*mode.row)
     return table

@@ -10,16 +10,14 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 import click
-import cv2
 
-from ibrobot_core.api import CompressedImage, Image
+from ibrobot_core.api import SensorError
 from ibrobot_core.app import echo, on_signals
 
 if TYPE_CHECKING:
     from ibrobot_camera.camera import OpenCvCamera
 
 _BOUNDARY = "picture"
-_QUALITY = 80
 
 
 class Newest:
@@ -42,7 +40,7 @@ class Newest:
             return (self._number, self._jpeg) if self._number > number else (number, b"")
 
     def _run(self) -> None:
-        from ibrobot_core.api import SensorError
+        from ibrobot_camera.commands.sources import browser_jpeg
 
         while not self._ended.is_set():
             try:
@@ -53,21 +51,10 @@ class Newest:
                 return
             if image is None:
                 continue
-            jpeg = image.data.tobytes() if isinstance(image, CompressedImage) else _to_jpeg(image)
+            jpeg = browser_jpeg(image)
             with self._changed:
                 self._jpeg, self._number = jpeg, self._number + 1
                 self._changed.notify_all()
-
-
-def _to_jpeg(image: Image) -> bytes:
-    """An image for a browser, as JPEG; depth is shown in colours, up to 4 m."""
-    from ibrobot_camera.commands.sources import pixels
-
-    found = pixels(image)
-    if image.encoding == "16UC1":
-        found = cv2.applyColorMap(cv2.convertScaleAbs(found, alpha=255 / 4000), cv2.COLORMAP_TURBO)  # type: ignore[assignment]
-    _, jpeg = cv2.imencode(".jpg", found, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    return jpeg.tobytes()
 
 
 @click.command()

@@ -8,14 +8,15 @@ from contextlib import ExitStack, contextmanager
 
 import cv2
 import numpy as np
-from ibrobot_ros2.jpeg import from_jpeg
-from numpy.typing import NDArray
+from ibrobot_ros2.jpeg import from_jpeg, to_jpeg
 
-from ibrobot_camera.camera import OpenCvCamera
+from ibrobot_camera.camera import OpenCvCamera, to_image
+from ibrobot_camera.capture import Pixels
 from ibrobot_camera.options import OpenCvOptions
 from ibrobot_core.api import CompressedImage, Context, Image, RealClock, Robot, SensorError
 from ibrobot_core.app import find_config, installed_plugins, load_config, wrong_input
 
+_QUALITY = 80
 _TO_BGR = {"bgr8": None, "rgb8": cv2.COLOR_RGB2BGR, "mono8": cv2.COLOR_GRAY2BGR}
 
 
@@ -56,7 +57,15 @@ def decoded(message: Image | CompressedImage) -> Image:
     return from_jpeg(message) if isinstance(message, CompressedImage) else message
 
 
-def pixels(image: Image) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def browser_jpeg(image: Image | CompressedImage) -> bytes:
+    """A camera's message as browsers show it; depth is shown in colours, up to 4 m."""
+    if isinstance(image, Image) and image.encoding == "16UC1":
+        coloured = cv2.applyColorMap(cv2.convertScaleAbs(pixels(image), alpha=255 / 4000), cv2.COLORMAP_TURBO)
+        image = to_image(np.asarray(coloured, dtype=np.uint8), image.header)
+    return (to_jpeg(image, _QUALITY) if isinstance(image, Image) else image).data.tobytes()
+
+
+def pixels(image: Image) -> Pixels:
     """An image in OpenCV's layout: (H, W, 3) BGR, or (H, W) for depth."""
     if image.encoding == "16UC1":
         return image.data.view(np.uint16).reshape(image.height, image.width)
