@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 
 import attrs
@@ -23,20 +22,8 @@ MOUSE_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 """-1 to 1: forward, left, up, and rotations about these axes (right-hand rule)."""
 MOUSE_BUTTONS = ("left", "right", *(f"button{n}" for n in range(3, 49)))
 
-_RAW_AXIS = re.compile(r"axis\d{1,2}|hat\d_[xy]")
-_RAW_BUTTON = re.compile(r"button\d{1,2}")
 _PULLED = 0.5
 """Deflection beyond which an axis counts as a pressed button."""
-
-
-def is_raw_axis(name: str) -> bool:
-    """Whether a pad that SDL has no mapping for may have this axis."""
-    return _RAW_AXIS.fullmatch(name) is not None
-
-
-def is_raw_button(name: str) -> bool:
-    """Whether a pad that SDL has no mapping for may have this button."""
-    return _RAW_BUTTON.fullmatch(name) is not None
 
 
 @attrs.frozen

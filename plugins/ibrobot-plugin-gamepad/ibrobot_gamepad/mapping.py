@@ -11,17 +11,36 @@ from ibrobot_core.api import OperatorEvent, OptionFault, Robot, TeleopError, did
 from ibrobot_gamepad.controls import Controls
 from ibrobot_gamepad.options import NONE, GamepadOptions, SpaceMouseOptions
 
-_PAD_JOINTS = ("left_x", "left_y", "right_y", "dpad_y", "right_x", "dpad_x")
-_PAD_TOOL = {"x": "left_y", "y": "-left_x", "z": "right_y", "roll": "right_x", "pitch": "-dpad_y", "yaw": "dpad_x"}
-_PAD_BUTTONS = {
-    "deadman": "left_shoulder", "toggle": "right_shoulder", "gripper_open": "left_trigger",
-    "gripper_close": "right_trigger", "estop": "east", "start": "start", "success": "south", "failure": "right_stick",
-    "discard": "back", "intervention": "left_stick",
-}  # fmt: skip
-_PAD_POSES = {"home": "west", "rest": "north"}
-_MOUSE_JOINTS = ("yaw", "x", "z", "pitch", "roll", "y")
-_MOUSE_TOOL = {"x": "x", "y": "y", "z": "z", "roll": "roll", "pitch": "pitch", "yaw": "-yaw"}
-_MOUSE_BUTTONS = {"deadman": "left", "gripper": "right"}
+GRIPPER = ("gripper_open", "gripper_close", "gripper")
+"""Functions that move the gripper."""
+
+
+@attrs.frozen
+class _Defaults:
+    """The assignment where the YAML has none."""
+
+    joints: tuple[str, ...]
+    tool: Mapping[str, str]
+    buttons: Mapping[str, str]
+    poses: Mapping[str, str]
+
+
+_PAD = _Defaults(
+    ("left_x", "left_y", "right_y", "dpad_y", "right_x", "dpad_x"),
+    {"x": "left_y", "y": "-left_x", "z": "right_y", "roll": "right_x", "pitch": "-dpad_y", "yaw": "dpad_x"},
+    {
+        "deadman": "left_shoulder", "toggle": "right_shoulder", "gripper_open": "left_trigger",
+        "gripper_close": "right_trigger", "estop": "east", "start": "start", "success": "south",
+        "failure": "right_stick", "discard": "back", "intervention": "left_stick",
+    },
+    {"home": "west", "rest": "north"},
+)  # fmt: skip
+_MOUSE = _Defaults(
+    ("yaw", "x", "z", "pitch", "roll", "y"),
+    {"x": "x", "y": "y", "z": "z", "roll": "roll", "pitch": "pitch", "yaw": "-yaw"},
+    {"deadman": "left", "gripper": "right"},
+    {},
+)
 
 
 @attrs.frozen
@@ -73,7 +92,7 @@ EVENTS: tuple[OperatorEvent, ...] = get_args(OperatorEvent)
 
 def events(options: GamepadOptions | SpaceMouseOptions) -> tuple[OperatorEvent, ...]:
     """The events that have a button."""
-    buttons = _chosen(_PAD_BUTTONS if isinstance(options, GamepadOptions) else _MOUSE_BUTTONS, options.buttons)
+    buttons = _chosen(_defaults(options).buttons, options.buttons)
     return tuple(event for event in EVENTS if event in buttons)
 
 
@@ -85,22 +104,9 @@ def control_map(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> Co
     """
     for fault in check_mapping(options, robot):
         raise TeleopError(f"{'.'.join(str(part) for part in fault.option)}: {fault.message}")
-    gripper, arm = _parts(options, robot)
-    is_pad = isinstance(options, GamepadOptions)
-    joints = _chosen(dict(zip(arm, _PAD_JOINTS if is_pad else _MOUSE_JOINTS, strict=False)), options.joints)
-    tool = _chosen(_PAD_TOOL if is_pad else _MOUSE_TOOL, options.tool) if options.cartesian else {}
-    buttons = _chosen(_PAD_BUTTONS if is_pad else _MOUSE_BUTTONS, options.buttons)
-    if not gripper:
-        buttons = {name: control for name, control in buttons.items() if name not in _GRIPPER}
-    if not options.cartesian:
-        buttons.pop("toggle", None)
-    poses = {name: control for name, control in _PAD_POSES.items() if name in robot.description.poses}
-    return ControlMap(
-        {name: Axis.named(control) for name, control in joints.items()},
-        {name: Axis.named(control) for name, control in tool.items()},
-        buttons,
-        _chosen(poses if is_pad else {}, options.poses),
-    )
+    chosen = _assigned(options, robot)
+    joints, tool = ({name: Axis.named(at) for name, at in chosen[each].items()} for each in ("joints", "tool"))
+    return ControlMap(joints, tool, chosen["buttons"], chosen["poses"])
 
 
 def check_mapping(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> Iterator[OptionFault]:
@@ -125,17 +131,32 @@ def check_mapping(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> 
     ]
     yield from unknown
     for function in options.buttons:
-        if function in _GRIPPER and not gripper:
+        if function in GRIPPER and not gripper:
             yield OptionFault(("buttons", function), f"the robot has no group {options.gripper!r}")
-    default = _PAD_JOINTS if isinstance(options, GamepadOptions) else _MOUSE_JOINTS
-    for joint in arm[len(default) :]:
+    for joint in arm[len(_defaults(options).joints) :]:
         if joint not in options.joints:
             yield OptionFault(("joints",), f"no axis is left for {joint}: give it one, or `{joint}: {NONE}`")
     if not unknown:
         yield from _doubles(options, robot)
 
 
-_GRIPPER = ("gripper_open", "gripper_close", "gripper")
+def _defaults(options: GamepadOptions | SpaceMouseOptions) -> _Defaults:
+    return _PAD if isinstance(options, GamepadOptions) else _MOUSE
+
+
+def _assigned(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> dict[str, dict[str, str]]:
+    """Option -> function -> control, of the functions that the robot has."""
+    gripper, arm = _parts(options, robot)
+    defaults = _defaults(options)
+    poses = {name: control for name, control in defaults.poses.items() if name in robot.description.poses}
+    absent = {*(() if gripper else GRIPPER), *(() if options.cartesian else ("toggle",))}
+    buttons = _chosen(defaults.buttons, options.buttons).items()
+    return {
+        "joints": _chosen(dict(zip(arm, defaults.joints, strict=False)), options.joints),
+        "tool": _chosen(defaults.tool, options.tool) if options.cartesian else {},
+        "buttons": {name: control for name, control in buttons if name not in absent},
+        "poses": _chosen(poses, options.poses),
+    }
 
 
 def _parts(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> tuple[Sequence[str], Sequence[str]]:
@@ -150,23 +171,15 @@ def _chosen(defaults: Mapping[str, str], own: Mapping[str, str]) -> dict[str, st
 
 def _doubles(options: GamepadOptions | SpaceMouseOptions, robot: Robot) -> Iterator[OptionFault]:
     """A fault for each control to which the file assigns a second function."""
-    is_pad = isinstance(options, GamepadOptions)
-    _, arm = _parts(options, robot)
-    known_poses = {name: at for name, at in (_PAD_POSES if is_pad else {}).items() if name in robot.description.poses}
-    buttons = _chosen(_PAD_BUTTONS if is_pad else _MOUSE_BUTTONS, options.buttons)
-    poses = _chosen(known_poses, options.poses)
-    joints = _chosen(dict(zip(arm, _PAD_JOINTS if is_pad else _MOUSE_JOINTS, strict=False)), options.joints)
-    tool = _chosen(_PAD_TOOL if is_pad else _MOUSE_TOOL, options.tool) if options.cartesian else {}
-    always = [("buttons", name, control) for name, control in buttons.items()]
-    always += [("poses", name, control) for name, control in poses.items()]
-    own = {"buttons": options.buttons, "poses": options.poses, "joints": options.joints, "tool": options.tool}
+    chosen = _assigned(options, robot)
     faults: dict[OptionFault, None] = {}
-    for section, axes in (("joints", joints), ("tool", tool)):
+    for mode in ("joints", "tool"):
         taken: dict[str, tuple[str, str]] = {}
-        for option, name, control in (*always, *((section, name, control) for name, control in axes.items())):
-            plain = control.removeprefix("-")
-            first, other = taken.setdefault(plain, (option, name))
-            if (first, other) != (option, name):
-                message = f"{plain!r} is both {other} and {name}: assign it to one of them"
-                faults[OptionFault((option if name in own[option] else first,), message)] = None
+        for option in ("buttons", "poses", mode):
+            for name, control in chosen[option].items():
+                plain = control.removeprefix("-")
+                first, other = taken.setdefault(plain, (option, name))
+                if (first, other) != (option, name):
+                    message = f"{plain!r} is both {other} and {name}: assign it to one of them"
+                    faults[OptionFault((option if name in getattr(options, option) else first,), message)] = None
     yield from faults

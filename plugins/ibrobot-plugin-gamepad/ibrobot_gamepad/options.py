@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import attrs
 
 from ibrobot_core.api import did_you_mean, documented, option
-from ibrobot_gamepad.controls import (
-    MOUSE_AXES,
-    MOUSE_BUTTONS,
-    PAD_AXES,
-    PAD_BUTTONS,
-    is_raw_axis,
-    is_raw_button,
-)
+from ibrobot_gamepad.controls import MOUSE_AXES, MOUSE_BUTTONS, PAD_AXES, PAD_BUTTONS
 
 NONE = "none"
 """In a mapping: this function has no control."""
@@ -43,78 +36,70 @@ class Layout:
 
     axes: tuple[str, ...]
     buttons: tuple[str, ...]
-    raw: bool
-    """Whether controls may have numbers in place of names."""
+    numbered_axes: str = "(?!)"
+    """Pattern of the numbers that axes may have in place of names; by default they have none."""
+    numbered_buttons: str = "(?!)"
 
     def check_axis(self, name: str) -> str | None:
         """The error in the name of an axis, which may begin with `-`; None if it is valid."""
         plain = name.removeprefix("-")
-        if plain in (NONE, *self.axes) or (self.raw and is_raw_axis(plain)):
+        if plain in (NONE, *self.axes) or re.fullmatch(self.numbered_axes, plain):
             return None
         return f"unknown axis {name!r}{did_you_mean(plain, self.axes, 'the axes are')}"
 
     def check_button(self, name: str) -> str | None:
         """The error in the name of a button; None if it is valid. An axis works as a button, too."""
-        if name in (NONE, *self.axes, *self.buttons) or (self.raw and (is_raw_button(name) or is_raw_axis(name))):
-            return None
         known = (*self.buttons, *self.axes)
+        if name in (NONE, *known) or re.fullmatch(f"{self.numbered_buttons}|{self.numbered_axes}", name):
+            return None
         return f"unknown button {name!r}{did_you_mean(name, known, 'the buttons are')}"
 
 
-PAD = Layout(PAD_AXES, PAD_BUTTONS, raw=True)
-MOUSE = Layout(MOUSE_AXES, MOUSE_BUTTONS, raw=False)
+PAD = Layout(PAD_AXES, PAD_BUTTONS, r"axis\d{1,2}|hat\d_[xy]", r"button\d{1,2}")
+MOUSE = Layout(MOUSE_AXES, MOUSE_BUTTONS)
+
+
+def _controls(
+    fault: Callable[[str], str | None], help: str, names: tuple[str, ...] = (), kind: str = "", are: str = ""
+) -> Any:
+    """An option that maps names to controls.
+
+    Args:
+        fault: returns the error in the name of a control; None if it is valid.
+        help: what it maps.
+        names: the known names; empty: `check_mapping` checks them.
+        kind: of the names, for errors.
+        are: begins the list of known names in errors.
+    """
+
+    def check(instance: Any, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
+        for name, control in value.items():
+            if names and name not in names:
+                raise ValueError(f"unknown {kind} {name!r}{did_you_mean(name, names, are)}")
+            if (why := fault(control)) is not None:
+                raise ValueError(f"{name}: {why}")
+        if names is FUNCTIONS and value.get("deadman") == NONE:
+            raise ValueError("deadman: must have a button: the robot moves only while it is held")
+
+    return option(factory=dict, help=help, validator=check)
 
 
 def _joints(layout: Layout) -> Any:
-    def check(instance: Any, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
-        for joint, control in value.items():
-            _refuse(joint, layout.check_axis(control))
-
-    return option(factory=dict, help="joint -> axis (`-` reverses it, `none`), where not the default", validator=check)
+    return _controls(layout.check_axis, "joint -> axis (`-` reverses it, `none`), where not the default")
 
 
 def _tool(layout: Layout) -> Any:
-    def check(instance: Any, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
-        for axis, control in value.items():
-            if axis not in TOOL_AXES:
-                raise ValueError(f"unknown axis of the tool {axis!r}{did_you_mean(axis, TOOL_AXES, 'they are')}")
-            _refuse(axis, layout.check_axis(control))
-
-    return option(
-        factory=dict,
-        help=f"{', '.join(TOOL_AXES)} -> axis (`-` reverses it, `none`), where not the default",
-        validator=check,
-    )
+    help = f"{', '.join(TOOL_AXES)} -> axis (`-` reverses it, `none`), where not the default"
+    return _controls(layout.check_axis, help, TOOL_AXES, "axis of the tool", "they are")
 
 
 def _buttons(layout: Layout) -> Any:
-    def check(instance: Any, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
-        for function, control in value.items():
-            if function not in FUNCTIONS:
-                known = did_you_mean(function, FUNCTIONS, "the functions are")
-                raise ValueError(f"unknown function {function!r}{known}")
-            _refuse(function, layout.check_button(control))
-        if value.get("deadman") == NONE:
-            raise ValueError("deadman: must have a button: the robot moves only while it is held")
-
-    return option(
-        factory=dict,
-        help=f"function -> button or `none`, where not the default; functions: {', '.join(FUNCTIONS)}",
-        validator=check,
-    )
+    help = f"function -> button or `none`, where not the default; functions: {', '.join(FUNCTIONS)}"
+    return _controls(layout.check_button, help, FUNCTIONS, "function", "the functions are")
 
 
 def _poses(layout: Layout) -> Any:
-    def check(instance: Any, attribute: attrs.Attribute[Any], value: Mapping[str, str]) -> None:
-        for pose, control in value.items():
-            _refuse(pose, layout.check_button(control))
-
-    return option(factory=dict, help="pose -> button that drives there while held, or `none`", validator=check)
-
-
-def _refuse(key: str, fault: str | None) -> None:
-    if fault is not None:
-        raise ValueError(f"{key}: {fault}")
+    return _controls(layout.check_button, "pose -> button that drives there while held, or `none`")
 
 
 @documented

@@ -21,7 +21,7 @@ from ibrobot_core.api import (
 from ibrobot_gamepad.controls import Controls
 from ibrobot_gamepad.devices import Device, DeviceGone
 from ibrobot_gamepad.finder import Finder, open_first
-from ibrobot_gamepad.mapping import EVENTS, control_map
+from ibrobot_gamepad.mapping import EVENTS, GRIPPER, control_map
 from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
 from ibrobot_gamepad.reports import Kind
 
@@ -31,7 +31,6 @@ _REST_NS = ns(2.0)
 """Time for which the deadman of a device that reports only changes may be held at rest [ns]."""
 _LONGEST_STEP_S = 0.1
 """Maximum motion of one command [s]: after a pause of the host the robot does not jump."""
-_GRIPPER = ("gripper_open", "gripper_close", "gripper")
 _POSE = "pose "
 """Prefix of the function of a button that drives to a pose."""
 
@@ -220,7 +219,7 @@ class JogTeleop(Teleop):
 
     def _functions(self, controls: Controls) -> frozenset[str]:
         """Functions whose buttons are pressed; those of the gripper only after their controls have moved."""
-        for function in _GRIPPER:
+        for function in GRIPPER:
             if (control := self._buttons.get(function)) is not None:
                 value = controls.value(control)
                 if abs(value - self._rest.setdefault(control, value)) > self._options.dead_zone:
@@ -257,7 +256,7 @@ class JogTeleop(Teleop):
 
     def _gripper(self, controls: Controls) -> float:
         """Speed of the gripper as a fraction of its maximum; negative for closing."""
-        opens, closes, turns = (self._moved(controls, function) for function in _GRIPPER)
+        opens, closes, turns = (self._moved(controls, function) for function in GRIPPER)
         return opens - closes + (turns if self._opens else -turns)
 
     def _moved(self, controls: Controls, function: str) -> float:
