@@ -51,7 +51,7 @@ autocomplete="current-password" autofocus required><button class="primary">Sign 
 <p role="alert">{message}</p></form>"""
 _CLOSED = """<h1>This page needs its link</h1>
 <p>Open the whole address that the terminal of the robot shows, with its token.</p>"""
-_NO_SESSION = "no session: open the link that the terminal shows\n"
+_NO_SESSION = "no session: open the link that the terminal shows"
 _log = logging.getLogger("ibrobot.http")
 
 
@@ -143,7 +143,7 @@ class Guard:
         sockets = f"{'wss' if self._secure else 'ws'}://{host}" if host in self._hosts else ""
         forms = "'none'" if self._password is None else "'self'"
         response.headers["Content-Security-Policy"] = _CSP.format(sockets=sockets, forms=forms)
-        response.headers["Server"] = "ibrobot"  # versions are no client's business
+        response.headers["Server"] = "ibrobot"  # instead of aiohttp's and Python's versions
 
     def _foreign(self, request: web.Request) -> str | None:
         """Why a request is not of this server's own pages; None if it may be."""
@@ -202,7 +202,7 @@ class Guard:
 
     def _unknown(self, request: web.Request) -> web.StreamResponse:
         if request.method != "GET" or request.path != "/":
-            return self._refuse(401, _NO_SESSION.rstrip())
+            return self._refuse(401, _NO_SESSION)
         return self._closed() if self._password is None else _page("sign in", _LOGIN.format(message=""), 401)
 
     def _closed(self) -> web.StreamResponse:

@@ -35,7 +35,7 @@ class Controls:
     buttons: frozenset[str]
     """The pressed ones."""
     complete: bool = True
-    """Whether the device has told the state of its buttons since it was connected."""
+    """Whether the device has reported the state of its buttons since it was connected."""
 
     def value(self, control: str) -> float:
         """Deflection of an axis; 1 for a pressed button; 0 for a control that the device lacks."""

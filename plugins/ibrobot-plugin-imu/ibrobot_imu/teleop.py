@@ -27,7 +27,7 @@ class ImuTeleop(Teleop):
     """Moves the tool at a velocity given by the tilt since the deadman was pressed. Time is that of the measurements.
 
     Each press makes the present orientation the zero, so that neither drift nor the mounting matters. Without valid
-    messages the robot holds, and the deadman must be pressed again. Of a key, a press begins with its first repeat.
+    messages the robot holds, and the deadman must be pressed again. A key counts as pressed from its first repeat.
     """
 
     def __init__(self, options: ImuOptions, ctx: Context) -> None:
@@ -55,8 +55,7 @@ class ImuTeleop(Teleop):
         if options.deadman == "key" and self._ctx.keys is None:
             raise TeleopError(
                 f"{name}: deadman: key needs a terminal: start ibrobot in one, without --headless and without "
-                "redirecting its input, or wire "
-                "a button to the port and set deadman: cts"
+                "redirecting its input, or wire a button to the port and set deadman: cts"
             )
         self._arm.load_model("another type of device")
         try:
@@ -100,7 +99,7 @@ class ImuTeleop(Teleop):
         if now_ns - self._received_ns > ns(options.timeout):
             self.deadman.disarm(now_ns)
         elif orientation is not None:
-            # A line of the port says nothing without the messages that come by the same port.
+            # A line of the port counts only while messages arrive on the same port.
             self.deadman.report(held, self._received_ns)
         if orientation is None or not self.deadman.allows(now_ns):
             self._zero = None

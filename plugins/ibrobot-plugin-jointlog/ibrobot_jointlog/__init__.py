@@ -38,13 +38,13 @@ def _npz(options: Any, ctx: Context) -> DatasetWriter:
 
 @hookimpl
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
-    """What reads joint logs."""
+    """The reader of joint logs."""
     yield ReaderDescriptor("joint_log", "joint logs: CSV", _reads, _read)
 
 
 @hookimpl
 def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
-    """What writes a joint log."""
+    """The recorder of joint logs."""
     yield RecorderDescriptor(
         type="joint_log", make=_joint_log, summary="joint positions of an episode as CSV, for replay"
     )

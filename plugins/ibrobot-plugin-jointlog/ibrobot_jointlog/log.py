@@ -17,6 +17,10 @@ from numpy.typing import NDArray
 from ibrobot_core.api import RecorderError
 
 TIME, SUM = "time_s", "crc32"
+TOPIC = "/joint_states"
+"""The recorded topic."""
+LOG, METADATA = "joints.csv", "metadata.json"
+"""Files of a recorded episode."""
 
 
 @attrs.frozen(eq=False)

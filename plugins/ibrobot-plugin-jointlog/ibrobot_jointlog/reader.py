@@ -21,10 +21,7 @@ from ibrobot_core.api import (
     TopicSummary,
     ns,
 )
-from ibrobot_jointlog.log import TIME, read_log
-
-LOG, METADATA = "joints.csv", "metadata.json"
-TOPIC = "/joint_states"
+from ibrobot_jointlog.log import LOG, METADATA, TIME, TOPIC, read_log
 
 
 def is_joint_log(path: Path) -> bool:

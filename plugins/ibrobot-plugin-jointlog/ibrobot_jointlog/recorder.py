@@ -22,10 +22,9 @@ from ibrobot_core.api import (
     RecorderError,
     replace_file,
 )
-from ibrobot_jointlog.log import header, row
+from ibrobot_jointlog.log import LOG, METADATA, TOPIC, header, row
 
-TOPIC = "/joint_states"
-FLUSH_NS = NS_PER_S
+_FLUSH_NS = NS_PER_S
 """Maximum age of unwritten rows, by their stamps [ns]."""
 
 
@@ -56,7 +55,7 @@ class _Episode:
         except OSError as error:
             os.ftruncate(self.descriptor, self.size)
             self.samples, self.checksum = self.samples - count, self.written_checksum  # these rows are lost
-            raise RecorderError(f"{self.start.directory / 'joints.csv'}: {error}") from error
+            raise RecorderError(f"{self.start.directory / LOG}: {error}") from error
         self.size += len(block)
         self.written_checksum = self.checksum
 
@@ -77,7 +76,7 @@ class JointLogRecorder(Recorder):
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
         try:
             episode.directory.mkdir()
-            opened = _Episode(episode, os.open(episode.directory / "joints.csv", flags, 0o644))
+            opened = _Episode(episode, os.open(episode.directory / LOG, flags, 0o644))
         except OSError as error:
             raise RecorderError(f"cannot record into {episode.directory}: {error}") from error
         try:
@@ -109,7 +108,7 @@ class JointLogRecorder(Recorder):
         episode.checksum = checksum
         episode.newest_ns = stamp_ns
         episode.samples += 1
-        if stamp_ns - episode.oldest_ns >= FLUSH_NS:
+        if stamp_ns - episode.oldest_ns >= _FLUSH_NS:
             episode.flush()
 
     @override
@@ -163,7 +162,8 @@ class JointLogRecorder(Recorder):
             "repeated": episode.repeated,
             **closing,
         }
+        path = start.directory / METADATA
         try:
-            replace_file(start.directory / "metadata.json", json.dumps(facts, indent=2, ensure_ascii=False))
+            replace_file(path, json.dumps(facts, indent=2, ensure_ascii=False))
         except OSError as error:
-            raise RecorderError(f"{start.directory / 'metadata.json'}: {error}") from error
+            raise RecorderError(f"{path}: {error}") from error

@@ -72,7 +72,7 @@ class Commands:
         session: the run.
         finish: ends the run.
         reply: sends the reply to a command.
-        on_failure: called if one of the threads ends by an error: it is deaf from then on.
+        on_failure: called with the error that ended a thread, whose commands are no longer heard.
     """
 
     def __init__(

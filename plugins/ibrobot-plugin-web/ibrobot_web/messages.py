@@ -1,8 +1,8 @@
 """Messages of pages, and what travels between the page's server and the run.
 
-A page sends JSON objects. The server makes an object of a class of this module of each, or refuses it, and only such
-objects go on to the run. Their envelopes are written by the server: nothing that a page sends can pass for one. The run
-reads them as strictly as the server reads the page's.
+A page sends JSON objects. The server reads each as an object of a class of this module, or refuses it, and passes only
+such objects on to the run, in envelopes of its own that no page can forge. The run checks them as strictly as the
+server does.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Jog(Motion):
 
 @attrs.frozen
 class Release:
-    """Releases the deadman: presses that began before it count no more."""
+    """Releases the deadman: presses that began earlier no longer count."""
 
     at: int | None = option(None, ge=0, lt=_LARGEST, unit="ms", help="when; by default now")
 
@@ -251,7 +251,7 @@ def from_page(text: str) -> Sent[PageCommand]:
     """The command in a message of a page.
 
     Raises:
-        MalformedMessage: if it is none, with its number if that is known.
+        MalformedMessage: if it is not valid, with its number if that is known.
     """
     message = _object(text)
     number = _whole(message, "id")
@@ -269,7 +269,7 @@ def stop_from_page(text: str) -> int:
     """The number of an emergency stop in a message of a page, which is nothing else, so that it needs no time.
 
     Raises:
-        MalformedMessage: if it is none.
+        MalformedMessage: if it is not valid.
     """
     if not (text.isascii() and text.isdecimal() and len(text) <= 15):
         raise MalformedMessage("expected a whole number")
@@ -294,8 +294,8 @@ def from_server(message: Mapping[str, Any]) -> FromServer:
     """A message of the server, in the run.
 
     Raises:
-        ValueError: if it is none.
-        RequestError: for a command that is none.
+        ValueError: if it is not valid.
+        RequestError: for an unknown command, or one whose facts do not fit.
     """
     match dict(message):
         case {"command": str() as name, "facts": dict() as facts, "number": _, "stops": _, **more} if not more:
@@ -310,11 +310,11 @@ def from_server(message: Mapping[str, Any]) -> FromServer:
             return Pages(count, None if wanted is None else frozenset(channels))
         case {"alive": True, **more} if not more:
             return Alive()
-    raise ValueError(f"no message of the page's server: {', '.join(map(str, message))[:80]}")
+    raise ValueError(f"invalid message of the page's server: {', '.join(map(str, message))[:80]}")
 
 
 class MalformedMessage(IbrobotError):
-    """A page has sent what is no command.
+    """A page has sent an invalid command.
 
     Attributes:
         number: the page's number of it, if that is known.

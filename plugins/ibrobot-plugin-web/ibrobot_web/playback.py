@@ -36,14 +36,14 @@ _MOST_STATES = 20_000
 _POINTS = 1000
 """Most points of a plot."""
 _AHEAD_NS, _BACK_NS = 2 * NS_PER_S, NS_PER_S
-"""How far ahead a picture is reached by reading on, and how far before its time reading begins otherwise [ns]."""
+"""A picture up to this far ahead is reached by reading on; otherwise reading begins this long before its time [ns]."""
 _LONG = 300
 """Longer values of the metadata are not shown [characters]."""
 
 
 @attrs.define(eq=False)
 class _Stream:
-    """The pictures of a topic, read on as far as they were asked for."""
+    """The pictures of a topic, read up to the newest one that was requested."""
 
     reader: EpisodeReader
     items: Iterator[Recorded] = iter(())

@@ -48,7 +48,7 @@ class Jog(Motion):
 class Released:
     """A request to `/web_teleop/release`."""
 
-    at_ns: int | None = option(None, unit="ns", help="when; presses that began earlier count no more. By default now")
+    at_ns: int | None = option(None, unit="ns", help="when; presses that began earlier no longer count. By default now")
 
 
 JOG = Service("/web_teleop/jog", Jog, NoneType, "Move the robot until the next call, or for the timeout.")
@@ -76,8 +76,8 @@ def _take(devices: dict[str, WebTeleop], request: Jog | Released) -> None:
 class WebTeleop(Teleop):
     """Moves as the newest `Jog` says, for at most `timeout` after the page made it.
 
-    A page that is closed, hidden, stopped or out of reach sends nothing in time, and its press counts no more: the next
-    one must begin later.
+    A page that is closed, hidden, stopped or out of reach sends nothing in time, which ends its press: the next one
+    must begin later.
     """
 
     def __init__(self, options: WebTeleopOptions, ctx: Context) -> None:
@@ -89,7 +89,7 @@ class WebTeleop(Teleop):
         self._lock = threading.Lock()
         self._request: Jog | None = None
         self._released_ns = -1
-        """The end of the last press [ns]: one that began earlier counts no more."""
+        """The end of the last press [ns]: presses that began earlier do not count."""
         self._moved_ns: int | None = None
         """When the last setpoint was computed [ns]; None while the deadman is released."""
         self._setpoint: Vector | None = None

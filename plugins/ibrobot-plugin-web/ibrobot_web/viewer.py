@@ -201,7 +201,7 @@ class WebViewer(Viewer):
             try:
                 message = from_server(each)
             except (ValueError, IbrobotError) as error:
-                self._ctx.log.warning("the page's server sent what is no message, which was dropped: %s", error)
+                self._ctx.log.warning("dropped a message: %s", error)
                 continue
             match message:
                 case Pages():

@@ -15,7 +15,7 @@ from ibrobot_web.server.drive import Drive
 
 STATIC = Path(__file__).parents[1] / "static"
 _HEARTBEAT_S = 5.0
-"""Time between pings that find pages which are gone without a word [s]."""
+"""Period of pings, which detect pages that vanished without closing their connection [s]."""
 
 
 def make_app(

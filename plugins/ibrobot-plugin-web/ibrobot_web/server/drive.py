@@ -1,7 +1,7 @@
 """Commands of pages: one operator at a time, limits, and replies; and the emergency stop, which has its own way.
 
-Commands have a WebSocket of their own, so that they never wait behind pictures. The emergency stop has another one,
-on which nothing else is sent.
+Commands have a WebSocket of their own, so that they never wait behind pictures. The emergency stop has another one for
+itself.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Answer = Callable[[Mapping[str, Any]], None]
 
 
 class CommandRefused(Exception):
-    """A command that is refused, with the reason for the operator."""
+    """A refused command; the text is the reason for the operator."""
 
 
 @attrs.define(eq=False)

@@ -118,7 +118,7 @@ class RunLink:
         self._send(Pages(len(self.broadcast.pages), self.broadcast.wanted))
 
     async def live(self) -> None:
-        """Tell the run again and again that the server is alive."""
+        """Report to the run periodically that the server is alive."""
         while True:
             self._send(Alive())
             await asyncio.sleep(ALIVE_S)

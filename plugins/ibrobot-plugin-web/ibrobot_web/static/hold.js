@@ -26,7 +26,7 @@ export class Deadman {
   get held() { return this.request !== null; }
 
   // `request` is a function that returns the present motion: {joints, targets, linear, turn, pose}. A press that began
-  // `since` and was released before the call, as by leaving the page, counts no more.
+  // `since` and was released before the call, as by leaving the page, does not count.
   hold(request, since = performance.now()) {
     if (since < this.released || !this.drive.facts.operating || document.hidden) return;
     this.press = this.drive.clock.now();

@@ -81,7 +81,7 @@ class Ui extends EventTarget {
     };
   }
 
-  // What the page shows is old from now on, and is hidden; a server that was started again has another address.
+  // Hides what the page shows, which is out of date from now on. A server that was restarted has another address.
   async lose() {
     this.connected = false;
     showConnection();

@@ -31,7 +31,7 @@ _ENDED = 50
 _END_S = 20.0
 """Time that jobs get to end by themselves when the page's server ends [s]."""
 _POLL_S = 0.5
-"""Time between two looks at whether a silent job has ended [s]."""
+"""Period of checking whether a silent job has ended [s]."""
 _CHUNK = 65536
 _LONGEST = 4000
 """Longest line [characters]; the rest of a longer one is left out."""

@@ -36,7 +36,7 @@ class Found:
     trashes: tuple[Path, ...]
     """Folders that have a trash."""
     complete: bool
-    """False if there are too many folders to look into."""
+    """False if there are too many folders to search."""
     reports: Mapping[str, Sequence[Path]]
     """Kind of report -> the folders of that kind."""
 
@@ -152,7 +152,7 @@ def existing(ui: Ui, named: Sequence[str]) -> list[str]:
 
 
 def _state_of(path: Path) -> Any:
-    """What changes with an episode's files."""
+    """Names, sizes and times of an episode's files, which show whether it has changed."""
     if not path.is_dir():
         return None
     with os.scandir(path) as entries:

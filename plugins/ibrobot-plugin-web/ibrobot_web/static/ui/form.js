@@ -45,7 +45,7 @@ export class Form {
     const lacking = fields.filter(({ names, required, open }) => required && !open && known[names]?.length === 0);
     this.button.disabled = !drives || Boolean(missing) || lacking.length > 0;
     refresh(this.note, [summary, missing, lacking], () => [missing ? h("span", { class: "problem" }, missing)
-      : lacking.length ? `The opened folders have nothing to choose for: ${lacking.map(({ label }) => label).join(", ")}.` : summary]);
+      : lacking.length ? `The opened folders contain nothing for: ${lacking.map(({ label }) => label).join(", ")}.` : summary]);
     refresh(this.first, [fields, known], () => {
       const entered = this.values;
       this.fields = fields.map((field) => new Field(field, known[field.names] ?? []));

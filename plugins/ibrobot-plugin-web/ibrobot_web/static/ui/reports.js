@@ -119,7 +119,7 @@ async function copy(text) {
     await navigator.clipboard.writeText(text);
     toast("The command is copied.");
   } catch {
-    toast("The browser did not permit to copy; select the command instead.", "error");
+    toast("The browser does not allow copying; select the command instead.", "error");
   }
 }
 
