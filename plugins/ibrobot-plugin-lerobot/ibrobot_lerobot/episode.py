@@ -162,7 +162,6 @@ class EpisodeWriter:
         for key in self._tracks:
             assert form.encoder is not None
             info["features"][key]["info"] = describe_video(self._video(key), form.fps, form.encoder)
-        info |= {"total_episodes": 1, "total_frames": n, "total_tasks": len(self._tasks), "splits": {"train": "0:1"}}
         row: dict[str, Any] = {
             "episode_index": 0, "tasks": list(self._tasks), "length": n, "data/chunk_index": 0, "data/file_index": 0,
             "dataset_from_index": 0, "dataset_to_index": n,
@@ -170,17 +169,31 @@ class EpisodeWriter:
         for key in self._tracks:
             place = {"chunk_index": 0, "file_index": 0, "from_timestamp": 0.0, "to_timestamp": n / form.fps}
             row |= {f"videos/{key}/{name}": value for name, value in place.items()}
-        row |= {f"stats/{key}/{name}": value.tolist() for key, each in stats.items() for name, value in each.items()}
-        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        row |= stats_columns(stats) | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
         path = self._root / layout.chunk_file(layout.EPISODES, 0, "parquet")
         path.parent.mkdir(parents=True)
         pq.write_table(table_of([row]), path)
-        pq.write_table(layout.task_table(list(self._tasks)), self._root / layout.TASKS)
-        layout.write_json(self._root / layout.STATS, plain(stats))
-        if pictures:
-            layout.write_json(self._root / layout.PIXELS, {key: each.state() for key, each in pictures.items()})
-        layout.write_json(self._root / layout.OWN, self._metadata)
-        layout.write_json(self._root / layout.INFO, info)
+        write_meta(self._root, info, 1, n, list(self._tasks), stats, pictures, self._metadata)
+
+
+def write_meta(
+    root: Path, info: Mapping[str, Any], episodes: int, frames: int, tasks: list[str], stats: Mapping[str, Stats],
+    pictures: Mapping[str, PictureStats], metadata: Mapping[str, Any],
+) -> None:  # fmt: skip
+    """Write what `meta` has besides the rows of the episodes; `info.json`, which marks a dataset, comes last."""
+    totals = {"total_episodes": episodes, "total_frames": frames, "total_tasks": len(tasks)}
+    values = {key: {name: value.tolist() for name, value in each.items()} for key, each in stats.items()}
+    pq.write_table(layout.task_table(tasks), root / layout.TASKS)
+    layout.write_json(root / layout.STATS, values)
+    if pictures:
+        layout.write_json(root / layout.PIXELS, {key: each.state() for key, each in pictures.items()})
+    layout.write_json(root / layout.OWN, metadata)
+    layout.write_json(root / layout.INFO, {**info, **totals, "splits": {"train": f"0:{episodes}"}})
+
+
+def stats_columns(stats: Mapping[str, Stats]) -> dict[str, Any]:
+    """The statistics of an episode in its row."""
+    return {f"stats/{key}/{name}": value.tolist() for key, each in stats.items() for name, value in each.items()}
 
 
 def counter_stats(frames: int, fps: int, begin: int, episode: int, task_numbers: NDArray[Any]) -> dict[str, Stats]:
@@ -194,8 +207,3 @@ def counter_stats(frames: int, fps: int, begin: int, episode: int, task_numbers:
         "task_index": task_numbers,
     }
     return {key: vector_stats(values[:, None]) for key, values in values_of.items()}
-
-
-def plain(stats: Mapping[str, Stats]) -> dict[str, Any]:
-    """Statistics as JSON values."""
-    return {key: {name: value.tolist() for name, value in each.items()} for key, each in stats.items()}

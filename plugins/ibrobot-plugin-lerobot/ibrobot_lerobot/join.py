@@ -32,9 +32,7 @@ def join_datasets(parts: Sequence[Path], out: Path) -> int:
 
 
 def _opened(part: Path) -> OnDisk:
-    there = layout.open_dataset(part)
-    if there is None:
-        raise DatasetError(f"{part}: is not a LeRobot dataset: it has no {layout.INFO}")
+    there = layout.existing_dataset(part)
     if "episodes" not in there.metadata or "contract" not in there.metadata:
         raise DatasetError(f"{part}: was not made by ibrobot convert; lerobot-edit-dataset merges other datasets")
     return there

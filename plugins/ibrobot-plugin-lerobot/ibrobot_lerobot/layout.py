@@ -45,6 +45,12 @@ def chunk_file(folder: str, number: int, suffix: str) -> str:
     return f"{folder}/chunk-{chunk:03d}/file-{file:03d}.{suffix}"
 
 
+def file_number(row: Mapping[str, Any], what: str) -> int:
+    """Number of the file, counted from 0, that an episode's row names for `what`, e.g. `data`."""
+    number: int = row[f"{what}/chunk_index"] * FILES_PER_CHUNK + row[f"{what}/file_index"]
+    return number
+
+
 @attrs.frozen
 class Column:
     """A feature and how it is stored."""
@@ -218,6 +224,18 @@ def open_dataset(root: Path) -> OnDisk | None:
     if version != _VERSION:
         raise DatasetError(f"{root}: has version {version!r}, must be {_VERSION!r}; LeRobot can convert older versions")
     return OnDisk(root, info, stats, tasks, metadata, pixels)
+
+
+def existing_dataset(root: Path) -> OnDisk:
+    """The dataset at `root`.
+
+    Raises:
+        DatasetError: if there is none, it cannot be read, or has another version.
+    """
+    dataset = open_dataset(root)
+    if dataset is None:
+        raise DatasetError(f"{root}: is not a LeRobot dataset: it has no {INFO}")
+    return dataset
 
 
 def _read_tasks(path: Path) -> list[str]:

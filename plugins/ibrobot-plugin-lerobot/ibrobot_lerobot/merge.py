@@ -17,7 +17,7 @@ from ibrobot_core.api import DatasetError, sync
 from ibrobot_core.app import Ownership, owned
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.arrow import table_of, to_array, to_numpy
-from ibrobot_lerobot.episode import counter_stats, plain
+from ibrobot_lerobot.episode import counter_stats, stats_columns, write_meta
 from ibrobot_lerobot.layout import OnDisk
 from ibrobot_lerobot.stats import PictureStats, Stats, picture_stats, vector_stats
 from ibrobot_lerobot.video import VideoFile, join_videos
@@ -162,9 +162,7 @@ class _Merge:
             self._count_pictures(self._old)
         try:
             for path in parts:
-                part = layout.open_dataset(path)
-                if part is None:
-                    raise DatasetError(f"{path}: there is no dataset")
+                part = layout.existing_dataset(path)
                 self._check(part)
                 self._count_pictures(part)
                 self._append(part)
@@ -177,7 +175,8 @@ class _Merge:
             for table in (self._table, self._rows_table):
                 if table is not None:
                     table.close()
-        self._write_meta(metadata)
+        episodes, frames, tasks = self._episode, self._frame, list(self._tasks)
+        write_meta(self._target, self._info, episodes, frames, tasks, self._stats(), self._pictures, metadata)
 
     def _check(self, part: OnDisk) -> None:
         """Check that a part is compatible; an empty dataset adopts the first part's description."""
@@ -196,7 +195,7 @@ class _Merge:
         videos = {key: self._append_videos(part, key, rows) for key in part.videos}
         for row in rows:
             n = row["length"]
-            place = data[_number(row, "data")]
+            place = data[layout.file_number(row, "data")]
             stats = _row_stats(row)
             task_numbers = tasks[[part.tasks.index(task) for task in row["tasks"]]]
             stats |= counter_stats(n, self._info["fps"], self._frame, self._episode, np.resize(task_numbers, n))
@@ -209,12 +208,11 @@ class _Merge:
                 "dataset_to_index": self._frame + n,
             }
             for key, places in videos.items():
-                file, begin_s = places[_number(row, f"videos/{key}")]
+                file, begin_s = places[layout.file_number(row, f"videos/{key}")]
                 moved |= _indices(f"videos/{key}", file)
                 for name in ("from_timestamp", "to_timestamp"):
                     moved[f"videos/{key}/{name}"] = row[f"videos/{key}/{name}"] + begin_s
-            moved |= {f"stats/{key}/{name}": v.tolist() for key, each in stats.items() for name, v in each.items()}
-            self._rows.append(moved | _indices("meta/episodes", self._rows_number))
+            self._rows.append(moved | stats_columns(stats) | _indices("meta/episodes", self._rows_number))
             self._episode += 1
             self._frame += n
 
@@ -267,7 +265,7 @@ class _Merge:
         limit = self._info["video_files_size_in_mb"] * _MIB
         frames: dict[int, int] = {}
         for row in rows:
-            number = _number(row, f"videos/{key}")
+            number = layout.file_number(row, f"videos/{key}")
             frames[number] = frames.get(number, 0) + row["length"]
         placed = []
         place = self._videos.setdefault(key, _Place(_next(self._old, f"{layout.VIDEOS}/{key}", "mp4")))
@@ -299,21 +297,6 @@ class _Merge:
         self._rows_table.write_table(table)
         self._rows = []
 
-    def _write_meta(self, metadata: Mapping[str, Any]) -> None:
-        info = self._info | {
-            "total_episodes": self._episode,
-            "total_frames": self._frame,
-            "total_tasks": len(self._tasks),
-            "splits": {"train": f"0:{self._episode}"},
-        }
-        pq.write_table(layout.task_table(list(self._tasks)), self._target / layout.TASKS)
-        layout.write_json(self._target / layout.STATS, plain(self._stats()))
-        if self._pictures:
-            pixels = {key: each.state() for key, each in self._pictures.items()}
-            layout.write_json(self._target / layout.PIXELS, pixels)
-        layout.write_json(self._target / layout.OWN, metadata)
-        layout.write_json(self._target / layout.INFO, info)
-
 
 def _next(old: OnDisk | None, folder: str, suffix: str) -> int:
     """The number of the first new file; existing files are never changed."""
@@ -322,12 +305,6 @@ def _next(old: OnDisk | None, folder: str, suffix: str) -> int:
         return 0
     chunk, file = files[-1].parent.name.removeprefix("chunk-"), files[-1].stem.removeprefix("file-")
     return int(chunk) * layout.FILES_PER_CHUNK + int(file) + 1
-
-
-def _number(row: Mapping[str, Any], what: str) -> int:
-    """The file number in an episode's row."""
-    number: int = row[f"{what}/chunk_index"] * layout.FILES_PER_CHUNK + row[f"{what}/file_index"]
-    return number
 
 
 def _indices(what: str, number: int) -> dict[str, int]:

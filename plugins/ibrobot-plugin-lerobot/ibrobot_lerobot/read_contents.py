@@ -22,9 +22,7 @@ def dataset_contents(root: Path) -> Contents:
     Raises:
         DatasetError: if there is no dataset, or it cannot be read.
     """
-    dataset = layout.open_dataset(root)
-    if dataset is None:
-        raise DatasetError(f"{root}: is not a LeRobot dataset: it has no {layout.INFO}")
+    dataset = layout.existing_dataset(root)
     info, own = dataset.info, dataset.metadata
     norm_mode = str((own.get("conversion") or {}).get("norm_mode", ""))
     try:

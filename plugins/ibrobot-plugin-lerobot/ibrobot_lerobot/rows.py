@@ -69,8 +69,7 @@ class EpisodeRows:
             raise DatasetError(f"{self._dataset.root}: episode {self._number} has {rows} rows, must have {self.length}")
 
     def _file(self, what: str, folder: str, suffix: str) -> Path:
-        number = self._row[f"{what}/chunk_index"] * layout.FILES_PER_CHUNK + self._row[f"{what}/file_index"]
-        return self._dataset.root / layout.chunk_file(folder, number, suffix)
+        return self._dataset.root / layout.chunk_file(folder, layout.file_number(self._row, what), suffix)
 
     def _table(self, features: dict[str, Feature]) -> Iterator[dict[str, NDArray[Any]]]:
         path = self._file("data", layout.DATA, "parquet")
