@@ -44,7 +44,6 @@ from ibrobot_core.units import NS_PER_S as NS_PER_S, ns as ns, seconds as second
 from ibrobot_core.interfaces import (
     Context as Context,
     Hardware as Hardware,
-    SimulatedHardware as SimulatedHardware,
     JointReading as JointReading,
     Torque as Torque,
     Holding as Holding,
@@ -53,13 +52,16 @@ from ibrobot_core.interfaces import (
     Signal as Signal,
     EpisodeSetup as EpisodeSetup,
     Scene as Scene,
-    SceneObject as SceneObject,
     Sensor as Sensor,
     Teleop as Teleop,
     TeleopCommand as TeleopCommand,
     OperatorEvent as OperatorEvent,
-    nan_vector as nan_vector,
     Viewer as Viewer,
+)
+from ibrobot_core.interfaces.hardware import (
+    SimulatedHardware as SimulatedHardware,
+    SceneObject as SceneObject,
+    nan_vector as nan_vector,
 )
 from ibrobot_core.interfaces.teleop import Approach as Approach
 from ibrobot_core.deadman import Deadman as Deadman

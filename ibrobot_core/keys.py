@@ -78,6 +78,16 @@ class HeldKeys:
         """Whether a key is held."""
         return self._keys[key].state == "held"
 
+    def toggled(self, key: str, on: bool) -> bool:
+        """Whether what a key switches on and off is on after the last `take`, and was `on` before it.
+
+        A new press switches it on. Whatever comes while it is on switches it off, and switches nothing on later.
+        """
+        if on and key in self.touched:
+            self.forget()
+            return False
+        return on or key in self.presses
+
     def forget(self) -> None:
         """Let no press count that began before."""
         for each in self._keys.values():

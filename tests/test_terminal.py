@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.keys import HeldKeys
 from ibrobot_core.terminal import KeyReader, decode
+from ibrobot_core.units import ns
 
 TIMEOUT_S = 30
 
@@ -200,6 +201,18 @@ def received(subscriber: queue.SimpleQueue[str], number: int) -> queue.SimpleQue
     for _ in range(number):
         keys.put(subscriber.get(timeout=TIMEOUT_S))
     return keys
+
+
+def test_whatever_comes_switches_a_toggle_off_and_nothing_on_later():
+    held, keys = HeldKeys(0.2), queue.SimpleQueue()
+    on, states = False, []
+    for typed_s, then_s in ((0.0, 0.2), (3.0, 3.2), (6.0, 6.2)):
+        keys.put("space")
+        for now_s in (typed_s, then_s):
+            held.take(keys, ns(now_s))
+            on = held.toggled("space", on)
+            states.append(on)
+    assert states == [False, True, False, False, False, True]
 
 
 def test_a_terminal_that_can_reports_repeats_and_releases_until_the_end(terminal, caplog):

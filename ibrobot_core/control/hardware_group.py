@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
-from ibrobot_core.interfaces import (
+from ibrobot_core.interfaces.hardware import (
     Condition,
     EpisodeSetup,
     Hardware,

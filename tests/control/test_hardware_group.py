@@ -12,7 +12,7 @@ from ibrobot_testing.contexts import make_robot
 from ibrobot_core.api import EpisodeSetup
 from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.errors import HardwareError, NotSupported
-from ibrobot_core.interfaces import Hardware, JointReading, Signal, Torque, nan_vector
+from ibrobot_core.interfaces.hardware import Hardware, JointReading, Signal, Torque, nan_vector
 from ibrobot_core.robot import Vector
 
 ROBOT = make_robot()

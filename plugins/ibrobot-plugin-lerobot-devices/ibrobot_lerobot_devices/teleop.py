@@ -147,11 +147,7 @@ class LeRobotTeleop(Teleop):
         key = self._options.deadman_key
         match self._options.deadman:
             case "toggle":
-                if not self._toggled:
-                    self._toggled = key in self._held.presses
-                elif key in self._held.touched:  # whatever comes while it follows pauses, and starts nothing later
-                    self._toggled = False
-                    self._held.forget()
+                self._toggled = self._held.toggled(key, self._toggled)
                 return self._toggled
             case "hold":
                 return self._held.held(key)
