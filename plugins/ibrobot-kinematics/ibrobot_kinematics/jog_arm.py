@@ -5,7 +5,7 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from ibrobot_core.api import Robot, TeleopError, Vector, ns
+from ibrobot_core.api import JointReading, Robot, TeleopError, Vector, ns, seconds
 from ibrobot_core.app import Bus
 from ibrobot_kinematics.clearance import world_clearance
 from ibrobot_kinematics.errors import KinematicsError
@@ -14,6 +14,9 @@ from ibrobot_kinematics.servo import Servo
 
 _LEVER_M = 0.1
 """Length that corresponds to one radian when twists are compared [m]."""
+
+_LONGEST_STEP_S = 0.1
+"""Longest step of a jog [s]: after a pause of the host the robot does not jump."""
 
 
 class JogArm:
@@ -166,6 +169,8 @@ class VelocityJog:
         self._setpoint: Vector | None = None
         self._direction = np.zeros(len(arm.robot.joints))
         self._twist = np.zeros(6)
+        self._moved_ns: int | None = None
+        """Time of the last step [ns]; None at rest."""
 
     def restart(self, measured: Vector) -> None:
         """Begin from the measured positions [rad], shape (J,)."""
@@ -173,6 +178,24 @@ class VelocityJog:
         self._direction[:] = 0.0
         self._twist[:] = 0.0
         self._arm.stop_tool()
+
+    @property
+    def setpoint(self) -> Vector:
+        """The last setpoints [rad], shape (J,); after a `step` from rest, the measured positions."""
+        assert self._setpoint is not None
+        return self._setpoint
+
+    def rest(self) -> None:
+        """Command nothing: the next `step` begins from the measured positions."""
+        self._moved_ns = None
+
+    def step(self, measured: JointReading) -> float:
+        """Begin a step at the time of a measurement; returns its length [s], for `move`: 0 from rest, at most 0.1 s."""
+        before_ns, self._moved_ns = self._moved_ns, measured.stamp_ns
+        if before_ns is None:
+            self.restart(measured.position)
+            return 0.0
+        return min(max(seconds(measured.stamp_ns - before_ns), 0.0), _LONGEST_STEP_S)
 
     def move(self, measured: Vector, motion: JogMotion, dt: float) -> Vector:
         """The setpoints after a motion of `dt` [s], shape (J,).

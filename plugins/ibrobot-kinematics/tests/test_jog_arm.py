@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ibrobot_kinematics import JogArm, JogMotion, VelocityJog
 from ibrobot_testing import make_robot
 
-from ibrobot_core.api import Description, Joint, Robot, TeleopError, Vector
+from ibrobot_core.api import Description, Joint, JointReading, Robot, TeleopError, Vector, ns
 
 from .arms import BENT, FIVE, write_arm
 
@@ -113,6 +113,15 @@ def test_a_restart_forgets_the_lead():
         jog.move(STILL, one(0, 1.0), DT)
     jog.restart(STILL)
     np.testing.assert_array_equal(jog.move(STILL, JogMotion(STILL), DT), STILL)
+
+
+def test_a_step_from_rest_begins_where_the_robot_is_and_a_pause_is_no_long_step():
+    jog, there = VelocityJog(JogArm(make_robot(), "gripper"), 0.1), np.full(6, 0.2)
+    steps = [jog.step(JointReading(ns(at_s), there, STILL, STILL)) for at_s in (1.0, 1.02, 0.9, 5.0)]
+    assert steps == pytest.approx([0.0, 0.02, 0.0, 0.1])
+    jog.rest()
+    assert jog.step(JointReading(ns(6.0), STILL, STILL, STILL)) == 0.0
+    np.testing.assert_array_equal(jog.setpoint, STILL)
 
 
 def test_a_restart_stops_the_tool(tmp_path):

@@ -16,7 +16,6 @@ from ibrobot_core.api import (
     TeleopCommand,
     TeleopError,
     ns,
-    seconds,
 )
 from ibrobot_gamepad.controls import Controls
 from ibrobot_gamepad.devices import Device, DeviceGone
@@ -29,8 +28,6 @@ _LOOK_NS = ns(0.5)
 """Period of the search while no device is connected."""
 _REST_NS = ns(2.0)
 """Time for which the deadman of a device that reports only changes may be held at rest [ns]."""
-_LONGEST_STEP_S = 0.1
-"""Maximum motion of one command [s]: after a pause of the host the robot does not jump."""
 _POSE = "pose "
 """Prefix of the function of a button that drives to a pose."""
 
@@ -84,8 +81,7 @@ class JogTeleop(Teleop):
     def _release(self) -> None:
         self._toggle_ns: int | None = None
         """When the toggle button was pressed [ns]; None after the toggle, or while it is released."""
-        self._moved_ns: int | None = None
-        """When the last setpoint was computed [ns]; None while nothing moves."""
+        self._jog.rest()
 
     @override
     def connect(self) -> None:
@@ -101,7 +97,6 @@ class JogTeleop(Teleop):
         # Discards buttons pressed before, except for the emergency stop.
         self._take(self._poll(measured.stamp_ns), measured.stamp_ns)
         self._release()
-        self._jog.restart(measured.position)
 
     @override
     def read(self, measured: JointReading) -> TeleopCommand:
@@ -115,12 +110,9 @@ class JogTeleop(Teleop):
             return TeleopCommand(None, estop=True, events=events)
         self._toggle_after_long_press(measured)
         if not self.deadman.allows(now_ns) or self._controls is None:
-            self._moved_ns = None
+            self._jog.rest()
             return TeleopCommand(None, events=events)
-        if self._moved_ns is None:
-            self._jog.restart(measured.position)
-        dt = min(seconds(now_ns - self._moved_ns), _LONGEST_STEP_S) if self._moved_ns is not None else 0.0
-        self._moved_ns = now_ns
+        dt = self._jog.step(measured)
         setpoint = self._jog.move(measured.position, self._motion(self._controls), dt)
         return TeleopCommand(dict(zip(self._ctx.robot.joint_names, setpoint.tolist(), strict=True)), events=events)
 

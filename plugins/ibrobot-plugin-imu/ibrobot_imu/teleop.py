@@ -11,14 +11,12 @@ import serial
 from ibrobot_kinematics import JogArm, JogMotion, VelocityJog
 from ibrobot_kinematics.rotations import from_rpy, log
 
-from ibrobot_core.api import Context, HeldKeys, JointReading, Teleop, TeleopCommand, TeleopError, Vector, ns, seconds
+from ibrobot_core.api import Context, HeldKeys, JointReading, Teleop, TeleopCommand, TeleopError, Vector, ns
 from ibrobot_imu.messages import READERS
 from ibrobot_imu.options import TILTS, TOOL_AXES, ImuOptions
 
 _MOST_BYTES = 4096
 """Most bytes read at once: a third of a second at 115200 baud."""
-_LONGEST_STEP_S = 0.1
-"""Maximum motion of one command [s]: after a pause of the host the robot does not jump."""
 _SILENT_NS = ns(1.0)
 """Time without a valid message until a warning [ns]."""
 
@@ -47,7 +45,6 @@ class ImuTeleop(Teleop):
         self._key_deadman = options.deadman == "key"
         self._zero: Vector | None = None
         """The orientation at the press; None while released."""
-        self._moved_ns: int | None = None
 
     @override
     def connect(self) -> None:
@@ -79,7 +76,7 @@ class ImuTeleop(Teleop):
     def activate(self, measured: JointReading) -> None:
         self._held.take(self._keys, measured.stamp_ns)
         self._held.forget()
-        self._zero = self._moved_ns = None
+        self._zero = None
         self._received_ns = measured.stamp_ns
         self._orientation = None
 
@@ -105,10 +102,9 @@ class ImuTeleop(Teleop):
             self._zero = None
             return TeleopCommand(None)
         if self._zero is None:
-            self._zero, self._moved_ns = orientation, None
-            self._jog.restart(measured.position)
-        dt = min(seconds(now_ns - self._moved_ns), _LONGEST_STEP_S) if self._moved_ns is not None else 0.0
-        self._moved_ns = now_ns
+            self._zero = orientation
+            self._jog.rest()
+        dt = self._jog.step(measured)
         setpoint = self._jog.move(measured.position, self._motion(self._zero.T @ orientation), dt)
         return TeleopCommand(dict(zip(self._ctx.robot.joint_names, setpoint.tolist(), strict=True)))
 

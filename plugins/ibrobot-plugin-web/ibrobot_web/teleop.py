@@ -18,11 +18,9 @@ from ibrobot_core.api import (
     Teleop,
     TeleopCommand,
     TeleopError,
-    Vector,
     documented,
     ns,
     option,
-    seconds,
 )
 from ibrobot_core.app import Bus, Service
 from ibrobot_web.messages import Motion
@@ -30,8 +28,6 @@ from ibrobot_web.options import WebTeleopOptions
 
 _SAME_PRESS_NS = 500_000
 """Two presses begin further apart [ns]; the begin of one may differ by less from message to message."""
-_LONGEST_STEP_S = 0.1
-"""Longest motion of one command [s], so that the robot does not jump after a pause of the host."""
 
 
 @documented
@@ -90,9 +86,6 @@ class WebTeleop(Teleop):
         self._request: Jog | None = None
         self._released_ns = -1
         """The end of the last press [ns]: presses that began earlier do not count."""
-        self._moved_ns: int | None = None
-        """When the last setpoint was computed [ns]; None while the deadman is released."""
-        self._setpoint: Vector | None = None
         self._connected = False
 
     @override
@@ -141,8 +134,7 @@ class WebTeleop(Teleop):
         with self._lock:
             self._end_press(self._ctx.clock.now_ns())
         self.deadman.disarm(self._ctx.clock.now_ns())
-        self._moved_ns = self._setpoint = None
-        self._jog.restart(measured.position)
+        self._jog.rest()
 
     @override
     def read(self, measured: JointReading) -> TeleopCommand:
@@ -156,17 +148,12 @@ class WebTeleop(Teleop):
                 self._end_press(clock_ns)
                 self.deadman.disarm(clock_ns)
             request = self._request
-        now_ns = measured.stamp_ns
         if request is None:
-            self._moved_ns = self._setpoint = None
+            self._jog.rest()
             return TeleopCommand(None)
-        if self._moved_ns is None or self._setpoint is None:
-            self._jog.restart(measured.position)
-            self._setpoint = measured.position.copy()
-        dt = min(max(seconds(now_ns - self._moved_ns), 0.0), _LONGEST_STEP_S) if self._moved_ns is not None else 0.0
-        self._moved_ns = now_ns
-        self._setpoint = self._jog.move(measured.position, self._motion(request, self._setpoint, dt), dt)
-        return TeleopCommand(dict(zip(self._ctx.robot.joint_names, self._setpoint.tolist(), strict=True)))
+        dt = self._jog.step(measured)
+        setpoint = self._jog.move(measured.position, self._motion(request, dt), dt)
+        return TeleopCommand(dict(zip(self._ctx.robot.joint_names, setpoint.tolist(), strict=True)))
 
     @override
     def disconnect(self) -> None:
@@ -178,7 +165,8 @@ class WebTeleop(Teleop):
                     for service in (JOG, RELEASE):
                         self._ctx.bus.unserve(service)
         self._connected = False
-        self._request = self._moved_ns = self._setpoint = None
+        self._request = None
+        self._jog.rest()
 
     @override
     def help(self) -> str:
@@ -194,7 +182,7 @@ class WebTeleop(Teleop):
         if not self._tool and (any(request.linear) or any(request.turn)):
             raise TeleopError("moving the tool needs robot.description.mjcf: set it")
 
-    def _motion(self, request: Jog, setpoint: Vector, dt: float) -> JogMotion:
+    def _motion(self, request: Jog, dt: float) -> JogMotion:
         options, robot = self._options, self._ctx.robot
         if request.pose:
             still = np.zeros(len(robot.joints))
@@ -204,7 +192,7 @@ class WebTeleop(Teleop):
             velocity[robot.indices((joint,))] = speed * options.joint_speed
         for joint, target in request.targets.items():
             index = robot.indices((joint,))
-            wanted = (target - setpoint[index]) / dt if dt > 0 else 0.0
+            wanted = (target - self._jog.setpoint[index]) / dt if dt > 0 else 0.0
             velocity[index] = np.clip(wanted, -options.joint_speed, options.joint_speed)
         linear, turn = np.asarray(request.linear), np.asarray(request.turn)
         return JogMotion(velocity, linear * options.tool_speed, turn * options.turn_speed)
