@@ -15,13 +15,8 @@ from ibrobot_data.plural import plural
 OUTCOMES = {"success": "successful", "failure": "failed", "unknown": "not judged"}
 MISSING = {"refuse": "leave the episode out", "skip": "leave the tick out", "hold": "repeat the last value"}
 ONLY = {"all": "all", "interventions": "commanded by the operator", "policy": "commanded by the policy"}
-UNITS = dict(
-    zip(
-        NORM_MODES,
-        ("radians", "degrees, as LeRobot's drivers", "-100 to 100, as LeRobot's drivers"),
-        strict=True,
-    )
-)
+_UNITS = ("radians", "degrees, as LeRobot's drivers", "-100 to 100, as LeRobot's drivers")
+UNITS = dict(zip(NORM_MODES, _UNITS, strict=True))
 
 
 def _some(instance: object, attribute: object, paths: tuple[Path, ...]) -> None:

@@ -13,7 +13,6 @@ from ibrobot_core.api import (
     NotSupported,
     String,
     TeleopCommand,
-    TeleopDescriptor,
     TeleopError,
     documented,
     option,
@@ -30,7 +29,7 @@ from ibrobot_core.app import (
     SourceWorker,
 )
 from ibrobot_data.handover import Handover
-from ibrobot_data.options import COMMANDER, HANDOVER, OPERATOR, POLICY, EpisodesOptions, options_of
+from ibrobot_data.options import COMMANDER, HANDOVER, OPERATOR, POLICY, EpisodesOptions, has_button, options_of
 
 
 @documented
@@ -109,7 +108,13 @@ class Corrections(SourceWorker):
         session.on_state.append(self._label)
         self.on_end.callback(session.on_state.remove, self._label)
         self._keys = session.request.keys() if session.request.keys is not None else None
-        if self._keys is None and self._options.takeover == "button" and not self._has_button():
+        assert self.mode.inference is not None
+        devices = self.mode.inference.devices.values()
+        if (
+            self._keys is None
+            and self._options.takeover == "button"
+            and not has_button(session, devices, "intervention")
+        ):
             session.log.warning(
                 "without a terminal and a button of %s, only the service %s takes the robot from the policy; "
                 "`episodes: {takeover: deadman}` lets the deadman take it, too",
@@ -192,18 +197,6 @@ class Corrections(SourceWorker):
         if pressed:
             held.forget()
         return pressed
-
-    def _has_button(self) -> bool:
-        """Whether one of the devices has a button for takeovers."""
-        config, registry = self.session.config, self.session.registry
-        assert self.mode.inference is not None
-        for name in self.mode.inference.devices.values():
-            device = config.teleoperation[name]
-            descriptor = registry.find("teleop", device.type)
-            assert isinstance(descriptor, TeleopDescriptor)
-            if "intervention" in descriptor.events(device.options):
-                return True
-        return False
 
     def _tick(self, presses: int) -> None:
         session = self.session

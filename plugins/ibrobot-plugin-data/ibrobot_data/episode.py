@@ -8,7 +8,7 @@ import logging
 import shutil
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from errno import EDQUOT, ENOSPC
 from pathlib import Path
 from typing import Any
@@ -79,10 +79,6 @@ class Job:
     episode: Path
     source: str
     unit: Path
-
-    def making(self) -> Path:
-        """A unique name for the incomplete unit, since another process may convert the episode at the same time."""
-        return self.unit.with_name(f"{self.unit.name}{MAKING}{uuid4().hex}")
 
 
 @attrs.frozen
@@ -161,30 +157,24 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
     Raises:
         DiskFull: if the disk of the unit is full.
     """
-    making = job.making()
+    # Another process may convert the episode at the same time.
+    making = job.unit.with_name(f"{job.unit.name}{MAKING}{uuid4().hex}")
     report = EpisodeReport(job.source)
-    with ExitStack() as stack:
-        return _convert(job, making, report, progress, stack)
-
-
-def _convert(
-    job: Job, making: Path, report: EpisodeReport, progress: Callable[[int], None], stack: ExitStack
-) -> EpisodeReport:
     try:
-        if EpisodeAddress.of(job.episode).number is None:
-            stack.enter_context(Ownership(job.episode, "is being converted", shared=True))
-        key = unit_key(job)
-        reader = installed_plugins().open_episode(job.episode)
-        stack.callback(reader.close)
-        summary = reader.summary()
-        if unwanted := unwanted_outcome(summary, job.request):  # it was marked meanwhile
-            return attrs.evolve(report, outcome=summary.outcome, passed_over=unwanted)
-        report = attrs.evolve(_described(report, summary, job.request), identity=identity(reader, summary))
-        unit = _write(job, key, reader, summary, report, making, progress)
-        if unit is None:
-            return attrs.evolve(report, passed_over=_NOTHING[job.request.only])
-        _sync(making)
-        _put(making, job.unit, key)
+        with ExitStack() as stack:
+            if EpisodeAddress.of(job.episode).number is None:
+                stack.enter_context(Ownership(job.episode, "is being converted", shared=True))
+            key = unit_key(job)
+            reader = stack.enter_context(closing(installed_plugins().open_episode(job.episode)))
+            summary = reader.summary()
+            if unwanted := unwanted_outcome(summary, job.request):  # it was marked meanwhile
+                return attrs.evolve(report, outcome=summary.outcome, passed_over=unwanted)
+            report = attrs.evolve(_described(report, summary, job.request), identity=identity(reader, summary))
+            unit = _write(job, key, reader, summary, report, making, progress)
+            if unit is None:
+                return attrs.evolve(report, passed_over=_NOTHING[job.request.only])
+            _sync(making)
+            _put(making, job.unit, key)
     except (IbrobotError, OSError) as error:
         shutil.rmtree(making, ignore_errors=True)
         stop_if_full(error, job.source)

@@ -10,7 +10,7 @@ from uuid import NAMESPACE_OID, uuid4, uuid5
 
 import ibrobot_core
 from ibrobot_core.api import MODEL_ANSWERS, Contract, EpisodeStart, ModelAnswer, RecorderError, String
-from ibrobot_core.app import InUse, Ownership, RecordingConfig, RobotConfig, calibrations
+from ibrobot_core.app import InUse, Ownership, RecordingConfig, RobotConfig, RunAccess, calibrations
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.options import COMMANDER
 
@@ -44,45 +44,41 @@ def take_next_folder(recording: RecordingConfig) -> Ownership:
 
 
 def episode_start(
-    config: RobotConfig, recording: RecordingConfig, topics: Mapping[str, str], directory: Path, *, mode: str,
-    seed: int, stamp_ns: int, lockstep: bool, prompt: str = "", plugins: Mapping[str, str] | None = None,
-    policy: Mapping[str, str] | None = None, factors: Mapping[str, float] | None = None,
-) -> EpisodeStart:  # fmt: skip
+    session: RunAccess, recording: RecordingConfig, directory: Path, *, number: int, stamp_ns: int, prompt: str
+) -> EpisodeStart:
     """The start of an episode.
 
+    For `topics: contract` it has all topics of the contract, including those not published yet, who commands, and of a
+    model its further observations and its answers; otherwise it has the requested topics that are on the bus, and more
+    may follow (`any_topic`). With lockstep, equal runs give equal bytes.
+
     Args:
-        config: the robot.
+        session: the run.
         recording: its `recording` section.
-        topics: topic -> message type for every topic on the bus. For `topics: contract` the episode has all topics of
-            the contract, including those not published yet, who commands, and of a model its further observations and
-            its answers; otherwise it has the requested ones of these topics, and more may follow (`any_topic`).
         directory: the folder of the episode.
-        mode: the control mode.
-        seed: the seed of the scene.
+        number: number of the episode in the run, from 1.
         stamp_ns: start of the episode [ns].
-        lockstep: whether equal runs must give equal bytes.
         prompt: the operator's description of the task.
-        plugins: package -> version of the plugins.
-        policy: the acting policy and its weights; None without a policy.
-        factors: what the simulated episode has drawn, e.g. the position of a cube; None or empty otherwise.
 
     Raises:
         RecorderError: if the dataset has another contract.
     """
+    config, policy = session.config, session.command_source.described()
+    topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
     contract = Contract.from_config(config)
     EpisodeDataset(recording.folder).join(contract, config.robot.name, config.robot.robot_type)
     metadata = {
-        "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": mode, "prompt": prompt,
+        "robot": config.robot.name, "robot_type": config.robot.robot_type, "mode": session.mode, "prompt": prompt,
         "contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint(),
         "config": json.dumps(config.document, default=str), "calibration": json.dumps(calibrations(config)),
-        "ibrobot_version": ibrobot_core.__version__, "plugin_versions": json.dumps(dict(plugins or {})),
-        "seed": str(seed),
+        "ibrobot_version": ibrobot_core.__version__, "plugin_versions": json.dumps(dict(session.registry.versions())),
+        "seed": str(session.request.seed + number - 1),
     }  # fmt: skip
     if policy is not None:
         metadata["policy"] = json.dumps(dict(policy))
-    if factors:
-        metadata["factors"] = json.dumps(dict(factors))
-    metadata["uuid"] = str(uuid5(NAMESPACE_OID, json.dumps(metadata)) if lockstep else uuid4())
+    if session.factors:
+        metadata["factors"] = json.dumps(dict(session.factors))
+    metadata["uuid"] = str(uuid5(NAMESPACE_OID, json.dumps(metadata)) if session.request.lockstep else uuid4())
     if recording.topics == "contract":
         kept = {**contract.topics, **({COMMANDER: String.ros_type} if COMMANDER in topics else {})}
         kept = {**model_topics(config, policy), **kept}

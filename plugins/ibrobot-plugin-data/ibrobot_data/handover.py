@@ -33,9 +33,10 @@ class Handover:
         self._lower, self._upper = robot.lower[self._columns], robot.upper[self._columns]
         self._max_velocity = robot.max_velocity[self._columns]
         self._max_acceleration = robot.max_acceleration[self._columns]
-        self._forget()
+        self.begin()
 
-    def _forget(self) -> None:
+    def begin(self) -> None:
+        """Forget all states, since another source commands the joints."""
         self._seen_ns = 0
         self._command = self._velocity = np.zeros(len(self._joints))
         """The last command [rad] and its velocity [rad/s]."""
@@ -47,10 +48,6 @@ class Handover:
         """When braking ends [ns]."""
         self._gap, self._fade_ns, self._fade_s = self._command, 0, 1.0
         """Offset from the devices' positions that fades out [rad], start of the fade [ns], and its duration [s]."""
-
-    def begin(self) -> None:
-        """Forget all states, since another source commands the joints."""
-        self._forget()
 
     def see(self, state: ControlState) -> None:
         """Take in a new state of control."""

@@ -6,10 +6,11 @@ from collections.abc import Callable
 from math import inf
 from typing import override
 
-from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, TeleopDescriptor, ViewerDescriptor, seconds
+from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, ViewerDescriptor, seconds
 from ibrobot_core.app import DiskFull, Event, RunAccess, RunHooks
 from ibrobot_data.cues import ENDING_S, Cues
 from ibrobot_data.episode_service import RECORD, START, EpisodeService
+from ibrobot_data.options import has_button
 from ibrobot_data.plural import plural
 from ibrobot_data.recording_session import Session as SessionEvent
 
@@ -110,7 +111,7 @@ class Operator(RunHooks):
             self._begin(self._prompt)
 
     def _is_over(self) -> bool:
-        """Whether the last episode is written and heard of, and its pause has passed, in which it can be redone."""
+        """Whether the last episode is written, its cue has ended, and so has the pause in which it can be redone."""
         heard = not (self._service.writing or self._cues.playing)
         return heard and (self._auto or self._clock_s() >= self._not_before_s)
 
@@ -297,10 +298,4 @@ def _can_begin(run: RunAccess) -> bool:
         others.append((run.registry.find("transport", transport.type).offers, transport.options))
     if any(offers(options, service.name) for offers, options in others for service in (START, RECORD)):
         return True
-    for name in run.config.control_modes[run.mode].devices.values():
-        device = run.config.teleoperation[name]
-        descriptor = run.registry.find("teleop", device.type)
-        assert isinstance(descriptor, TeleopDescriptor)
-        if "start" in descriptor.events(device.options):
-            return True
-    return False
+    return has_button(run, run.config.control_modes[run.mode].devices.values(), "start")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 import attrs
@@ -11,7 +11,7 @@ from ibrobot_core.api import OptionFault, TeleopDescriptor, documented, option
 from ibrobot_core.app import RUN_KEYS, check_key, installed_plugins
 
 if TYPE_CHECKING:
-    from ibrobot_core.app import RobotConfig
+    from ibrobot_core.app import RobotConfig, RunAccess
 
 COMMANDER = "/commander"
 """Topic (std_msgs/msg/String) with who commands the robot at each state of control, in modes with `intervene`."""
@@ -57,6 +57,17 @@ def options_of(config: RobotConfig) -> EpisodesOptions:
         return EpisodesOptions()
     assert isinstance(section.options, EpisodesOptions)
     return section.options
+
+
+def has_button(run: RunAccess, devices: Iterable[str], event: str) -> bool:
+    """Whether one of these teleoperation devices of a run has a button for an event."""
+    for name in devices:
+        device = run.config.teleoperation[name]
+        descriptor = run.registry.find("teleop", device.type)
+        assert isinstance(descriptor, TeleopDescriptor)
+        if event in descriptor.events(device.options):
+            return True
+    return False
 
 
 def check_keys(config: RobotConfig) -> Iterator[OptionFault]:

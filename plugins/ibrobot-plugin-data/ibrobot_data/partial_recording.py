@@ -62,8 +62,7 @@ class PartialRecording(RecordingWorker):
     @override
     def work(self, timeout_s: float) -> None:
         super().work(timeout_s)
-        presses = self._presses()
-        if presses % 2 and self._present is not None:
+        if self._presses() % 2 and self._present is not None:
             now_ns = self.session.bus.snapshot_ns()
             if self._open:
                 self._end_part(now_ns, "unknown")

@@ -24,7 +24,7 @@ from ibrobot_core.api import (
 _DENSE = 1.5
 """Longest median time between commands at the rate of control [periods]."""
 _ROUNDING = 1e-6
-"""Of a time in periods."""
+"""Tolerance of times [periods]."""
 
 
 @attrs.frozen(eq=False)

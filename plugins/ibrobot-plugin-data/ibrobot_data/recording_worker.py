@@ -135,18 +135,13 @@ class RecordingWorker(SessionWorker):
         Raises:
             RecorderError: if it cannot be recorded in its dataset.
         """
-        session = self.session
         self._sizes = {}
         self._watch_model()
-        topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
         owned = take_next_folder(self._config)
         try:
             start = episode_start(
-                session.config, self._config, topics, owned.path, mode=session.mode,
-                seed=session.request.seed + number - 1, stamp_ns=stamp_ns, lockstep=session.request.lockstep,
-                prompt=prompt, plugins=session.registry.versions(),
-                policy=session.command_source.described(), factors=session.factors,
-            )  # fmt: skip
+                self.session, self._config, owned.path, number=number, stamp_ns=stamp_ns, prompt=prompt
+            )
         except BaseException:
             owned.close()
             raise

@@ -106,9 +106,8 @@ def convert(
         if units:
             _merge(request, old, units, [source for source in plan.sources if reports[source].error])
         clear_staging(staging)
-    size = sum(path.stat().st_size for path in request.out.rglob("*") if path.is_file()) if request.out.exists() else 0
     ordered = tuple(reports[source] for source in plan.sources)
-    return Report(request.out, ordered, size, time.monotonic() - begin, plan.resumed)
+    return Report(request.out, ordered, size_of(request.out), time.monotonic() - begin, plan.resumed)
 
 
 def plan_conversion(request: ConversionRequest, episodes: Sequence[Path]) -> tuple[str, ...]:
@@ -124,6 +123,11 @@ def _merge(
     if writer.summary(request.out) != old:
         raise DatasetError(f"{request.out}: another program has changed it; run the same command again")
     writer.merge(request.out, [unit.dataset for unit in units], provenance(request, old, units, failed))
+
+
+def size_of(folder: Path) -> int:
+    """Total size of the files in a folder [bytes]; 0 if there is none."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder.exists() else 0
 
 
 def clear_staging(staging: Path) -> None:
@@ -230,13 +234,10 @@ class _Plan:
     def _add(self, job: Job, known: KnownEpisodes) -> None:
         source, report = job.source, EpisodeReport(job.source)
         try:
-            reader = installed_plugins().open_episode(job.episode)
-            try:
+            with closing(installed_plugins().open_episode(job.episode)) as reader:
                 summary = reader.summary()
                 self._labelled = self._labelled or is_labelled(summary)
                 there = known.find(source, reader, summary)
-            finally:
-                reader.close()
         except (IbrobotError, OSError) as error:
             self._reports[source] = attrs.evolve(report, error=str(error))
             return
@@ -336,11 +337,8 @@ class _Plan:
 
 
 def _identity(episode: Path) -> str:
-    reader = installed_plugins().open_episode(episode)
-    try:
+    with closing(installed_plugins().open_episode(episode)) as reader:
         return identity(reader, reader.summary())
-    finally:
-        reader.close()
 
 
 def _convert_in_pool(job: Job, progress: Callable[[int], None]) -> EpisodeReport:

@@ -118,18 +118,13 @@ class _Following:
         return self.end_ns is not None and self._max_age_ns is not None and t_ns - self.end_ns > self._max_age_ns
 
 
-class _Tasks:
-    """Messages with a text, each replaced by the index of its text in `texts`."""
-
-    def __init__(self, messages: Iterable[Recorded], part: SignalPart, texts: list[str]) -> None:
-        self._messages, self._part, self._texts = messages, part, texts
-
-    def __iter__(self) -> Iterator[Recorded]:
-        for item in self._messages:
-            text = _text_at(item.message, self._part.path)
-            if text not in self._texts:
-                self._texts.append(text)
-            yield attrs.evolve(item, topic=_source_of(self._part), message=Int32(self._texts.index(text)))
+def _with_tasks(messages: Iterable[Recorded], part: SignalPart, texts: list[str]) -> Iterator[Recorded]:
+    """Replace each message by the index of its text in `texts`, to which new ones are added."""
+    for item in messages:
+        text = _text_at(item.message, part.path)
+        if text not in texts:
+            texts.append(text)
+        yield attrs.evolve(item, topic=_source_of(part), message=Int32(texts.index(text)))
 
 
 class _Source:
@@ -151,7 +146,7 @@ class _Source:
         for part in contract.signal_parts:
             if part.key == TASK_KEY:
                 name = _source_of(part)
-                streams[name] = _Tasks(shifted.get(name) or reader.messages({part.topic}), part, tasks)
+                streams[name] = _with_tasks(shifted.get(name) or reader.messages({part.topic}), part, tasks)
         self._messages = heapq.merge(*streams.values(), key=lambda item: item.received_ns)
         self._read: deque[Recorded] = deque(islice(self._messages, 1))
         """Read ahead, to know whether there is a message at or after a tick."""

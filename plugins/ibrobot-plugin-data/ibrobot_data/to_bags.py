@@ -7,7 +7,7 @@ import logging
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +33,12 @@ from ibrobot_data.episode import stop_if_full
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_start import episode_folder
 from ibrobot_data.request import EpisodeReport, Report
-from ibrobot_data.run import STAGING, clear_staging, own_staging
+from ibrobot_data.run import STAGING, Watch, clear_staging, own_staging, size_of
 
 _DIGEST = "source_digest"
 """Key of the metadata: hash that identifies the dataset's episode."""
 _PROGRESS_EVERY = 30
 """Messages of a topic between two progress reports."""
-
-type Watch = Callable[[int, int, EpisodeReport | None], None]
 
 
 @attrs.frozen
@@ -81,9 +79,7 @@ def convert_to_bags(request: BagRequest, watch: Watch = lambda done, total, repo
             reports = _convert_all(request, watch)
     except OSError as error:
         raise RecorderError(f"{request.out}: cannot be written: {error.strerror}") from error
-    files = [path for path in request.out.rglob("*") if path.is_file()] if request.out.exists() else []
-    size = sum(path.stat().st_size for path in files)
-    return Report(request.out, tuple(reports), size, time.monotonic() - begin, resumed=0)
+    return Report(request.out, tuple(reports), size_of(request.out), time.monotonic() - begin, resumed=0)
 
 
 def _convert_all(request: BagRequest, watch: Watch) -> list[EpisodeReport]:
@@ -120,23 +116,20 @@ class _Job:
     def run(self, progress: Callable[[int], None]) -> EpisodeReport:
         """Convert the episode. After a fault, the report has the error and no files remain."""
         report = EpisodeReport(self._path.name)
-        reader: EpisodeReader | None = None
         try:
-            reader = installed_plugins().open_episode(self._path, self._request.given)
-            summary = reader.summary()
-            prompt = summary.metadata.get("prompt") or self._request.prompt
-            report = attrs.evolve(report, outcome=summary.outcome, prompt=prompt, start_ns=summary.start_ns)
-            self._target.parent.mkdir(parents=True, exist_ok=True)
-            with Ownership(self._target, "is being written"):
-                if self._target.exists():
-                    return attrs.evolve(report, passed_over=self._known(summary, reader.digest()))
-                frames = self._write(reader, summary, self._check(summary), prompt, progress)
+            with closing(installed_plugins().open_episode(self._path, self._request.given)) as reader:
+                summary = reader.summary()
+                prompt = summary.metadata.get("prompt") or self._request.prompt
+                report = attrs.evolve(report, outcome=summary.outcome, prompt=prompt, start_ns=summary.start_ns)
+                self._target.parent.mkdir(parents=True, exist_ok=True)
+                with Ownership(self._target, "is being written"):
+                    if self._target.exists():
+                        return attrs.evolve(report, passed_over=self._known(summary, reader.digest()))
+                    frames = self._write(reader, summary, self._check(summary), prompt, progress)
         except (IbrobotError, OSError) as error:
             stop_if_full(error, report.source)
             return attrs.evolve(report, error=str(error))
         finally:
-            if reader is not None:
-                reader.close()
             shutil.rmtree(self._making, ignore_errors=True)
             with suppress(OSError):  # not empty
                 self._target.parent.rmdir()
@@ -144,11 +137,8 @@ class _Job:
 
     def _known(self, summary: EpisodeSummary, digest: str) -> str:
         """The reason not to convert it: the target exists and is this episode."""
-        reader = installed_plugins().open_episode(self._target)
-        try:
+        with closing(installed_plugins().open_episode(self._target)) as reader:
             there = reader.summary()
-        finally:
-            reader.close()
         found = there.metadata.get("source", "a recording"), there.metadata.get(_DIGEST)
         if found != (self._source(summary), digest):
             raise RecorderError(f"{self._target}: is another episode ({found[0]}); convert into another folder")
