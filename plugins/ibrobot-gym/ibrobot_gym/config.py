@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from ibrobot_core.api import HardwareDescriptor
 from ibrobot_core.app import RobotConfig, find_config, from_document, installed_plugins, load_config
@@ -41,26 +40,18 @@ def environment_config(
     assert isinstance(descriptor, HardwareDescriptor)
     type_ = descriptor.sensors["camera"]
     names = {f"gym_{camera}": camera for camera in cameras}
-    shown = {RENDERED: rendered} if rendered is not None else {}
-    if not names and not shown:
+    if not names and rendered is None:
         return config
     height, width = size
-
-    def peripheral(camera: str, of: str, shape: Mapping[str, int]) -> dict[str, Any]:
-        rate_hz = config.contract.rate_hz
-        return {
-            "name": camera, "kind": "camera", "type": type_, "camera": of, "fps": rate_hz, "encoding": "raw", **shape,
-        }  # fmt: skip
-
+    camera = {"kind": "camera", "type": type_, "fps": config.contract.rate_hz, "encoding": "raw"}
+    added = [{"name": name, "camera": of, "width": width, "height": height, **camera} for name, of in names.items()]
+    if rendered is not None:
+        added.append({"name": RENDERED, "camera": rendered, "width": 640, "height": 480, **camera})
     document = dict(config.document)
-    document["peripherals"] = [
-        *document.get("peripherals", ()),
-        *(peripheral(camera, of, {"width": width, "height": height}) for camera, of in names.items()),
-        *(peripheral(camera, of, {"width": 640, "height": 480}) for camera, of in shown.items()),
-    ]
+    document["peripherals"] = [*document.get("peripherals", ()), *added]
     observed = [
-        {"key": f"observation.images.{of}", "peripheral": camera, "align": {"strategy": "asof", "tol_ms": 100.0}}
-        for camera, of in names.items()
+        {"key": f"observation.images.{of}", "peripheral": name, "align": {"strategy": "asof", "tol_ms": 100.0}}
+        for name, of in names.items()
     ]
     contract = dict(document.get("contract", {}))
     document["contract"] = {**contract, "observations": [*contract.get("observations", ()), *observed]}

@@ -136,7 +136,7 @@ class _Reader:
             raise self._wrong("graphs", graphs, f"be plain names of {wanted} that end in .onnx")
         contract, norm_mode = self._trained()
         clip = content.get("clip")
-        if clip is not None and not self._positive(clip):
+        if clip is not None and not (_finite(clip) and clip > 0):
             raise self._wrong("clip", clip, "be a positive number, or null")
         return Manifest(
             self._path, self._value("type", str), shapes, self._whole("history", 0, _MAX_STEPS), action_size,
@@ -171,10 +171,6 @@ class _Reader:
         if len(value) != size or not all(_finite(number) for number in value):
             raise self._wrong(key, value, f"be {size} finite numbers")
         return np.array(value, np.float64)
-
-    @staticmethod
-    def _positive(value: Any) -> bool:
-        return _finite(value) and value > 0
 
     def _noise(self) -> Noise | None:
         value = self._content.get(NOISE)

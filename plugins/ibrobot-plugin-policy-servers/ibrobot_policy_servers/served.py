@@ -1,4 +1,4 @@
-"""A policy that runs on a server of another project: the mapping, and what makes a server's answers safe to use."""
+"""A policy on a server of another project: the mapping to its requests, and the checks of its answers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TASK = "task"
 
 
 class ServedPolicy(Policy):
-    """A policy on a server. `load` connects, compares what the server states, and makes one request.
+    """A policy on a server. `load` connects, checks the server's metadata, and makes one request.
 
     A request that fails closes the connection, so that a late answer reaches no later request. The next request
     connects again, and fails if the server's metadata has changed.
@@ -107,10 +107,7 @@ class ServedPolicy(Policy):
         for each in self._options.observations:
             value = _observation(frame, each)
             if each is self._reference:
-                order = [each.joints.index(joint) for joint in self._joints if joint in each.joints]
-                positions = dict(
-                    zip([each.joints[i] for i in order], np.asarray(value, np.float64)[order], strict=True)
-                )
+                positions = dict(zip(each.joints, value.astype(np.float64), strict=True))
                 tensors[REFERENCE] = np.array([positions.get(joint, 0.0) for joint in self._joints])
             tensors[each.observation] = _converted(value, each)
         if self.spec.prompt:

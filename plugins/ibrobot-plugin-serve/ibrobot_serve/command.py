@@ -129,15 +129,15 @@ def _share(ctx: click.Context, param: click.Parameter, value: str) -> float:
     type=click.Choice(["ibrobot", *_PORTS]),
     default="ibrobot",
     show_default=True,
-    help="Whose clients are answered; for openpi and gr00t, --listen is HOST:PORT, by default on this machine.",
+    help="Protocol of the clients; for openpi and gr00t, --listen is HOST:PORT, by default on this machine.",
 )
 def serve(what: str, **options: Any) -> None:
     """Run a model for robots on other machines.
 
     CONFIG is a robot YAML, which names model and transport; MODEL_DIR is a folder with a model, for --type.
     Robots use it by `execution_mode: distributed`. Ctrl-C or SIGTERM answers pending requests, then ends.
-    With --protocol openpi or gr00t, clients of these use it, and need the key in the environment variable
-    IBROBOT_API_KEY.
+    With --protocol openpi or gr00t, it answers clients of these projects, which must send the key in the environment
+    variable IBROBOT_API_KEY, if that is set.
     """
     registry = installed_plugins()
     handler = logging.StreamHandler(sys.stderr)
@@ -214,7 +214,6 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
     given = [Override.of(f"--transport {each}", f"transport.{each}") for each in options["transport_options"]]
     changes = (*options["overrides"], *listening, *given)
     config = load_config(path, overrides=changes, sim=options["sim"], registry=registry, communicates=True)
-    model = _chosen(config, path, options)
     section = config.transport
     if section is None or section.type == "local":
         raise click.UsageError(
@@ -222,22 +221,23 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
             f"--set 'transport={{type: {example_type('transport')}}}' --listen ENDPOINT"
         )
     make = partial(registry.find("transport", section.type).make, section.options, _context(config.robot))
-    return options["name"] or model, build_policy(config, registry, model), make
+    return *_of_config(config, path, registry, options), make
 
 
 def _from_folder(
     folder: Path, registry: Registry, options: dict[str, Any]
 ) -> tuple[str, Policy, Callable[[], Transport]]:
     """Name, policy and transport of a folder with a model."""
-    policy, context = _policy_of_folder(folder, registry, options)
+    name, policy, context = _of_folder(folder, registry, options)
     transport = registry.default("transport")
     transports = registry.find("transport", transport)
     given = [*_listening(registry, transport, options["listen"]), *options["transport_options"]]
     settings = single_options(transports.options, given, "--listen, --transport", "--transport")
-    return options["name"] or folder.absolute().name, policy, partial(transports.make, settings, context)
+    return name, policy, partial(transports.make, settings, context)
 
 
-def _policy_of_folder(folder: Path, registry: Registry, options: dict[str, Any]) -> tuple[Policy, Context]:
+def _of_folder(folder: Path, registry: Registry, options: dict[str, Any]) -> tuple[str, Policy, Context]:
+    """Name and policy of a folder with a model, and the context for its transport."""
     if not folder.is_dir():
         raise click.UsageError(f"{folder}: no such folder; with --type, give a folder with a model")
     if options["model"]:
@@ -245,17 +245,18 @@ def _policy_of_folder(folder: Path, registry: Registry, options: dict[str, Any])
     context = _context(Robot("server", ()))
     policies = registry.find("policy", options["type_"])
     overrides = [f"path={folder.absolute()}", *options["overrides"]]
-    return policies.make(single_options(policies.options, overrides, str(folder)), context), context
+    policy = policies.make(single_options(policies.options, overrides, str(folder)), context)
+    return options["name"] or folder.absolute().name, policy, context
 
 
-def _chosen(config: RobotConfig, path: Path, options: dict[str, Any]) -> str:
-    """The name of the model to serve."""
+def _of_config(config: RobotConfig, path: Path, registry: Registry, options: dict[str, Any]) -> tuple[str, Policy]:
+    """Name and policy of the model to serve."""
     model: str = options["model"] or (next(iter(config.models)) if len(config.models) == 1 else "")
     if model not in config.models:
         raise click.UsageError(
             f"--model: one of {', '.join(config.models) or 'none'} in {path}, got {options['model']}"
         )
-    return model
+    return options["name"] or model, build_policy(config, registry, model)
 
 
 def _serve_clients(what: str, registry: Registry, options: dict[str, Any]) -> None:
@@ -268,13 +269,11 @@ def _serve_clients(what: str, registry: Registry, options: dict[str, Any]) -> No
     host, port = _host_and_port(options["listen"], key, _PORTS[protocol])
     with wrong_input():
         if options["type_"]:
-            policy, _ = _policy_of_folder(Path(what), registry, options)
-            name = options["name"] or Path(what).absolute().name
+            name, policy, _ = _of_folder(Path(what), registry, options)
         else:
             path = find_config(what, registry)
             config = load_config(path, overrides=options["overrides"], sim=options["sim"], registry=registry)
-            chosen = _chosen(config, path, options)
-            name, policy = options["name"] or chosen, build_policy(config, registry, chosen)
+            name, policy = _of_config(config, path, registry, options)
     try:
         policy.load()
         stopping = threading.Event()
