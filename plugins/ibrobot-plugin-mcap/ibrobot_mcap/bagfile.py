@@ -89,10 +89,7 @@ class BagFile:
             text = topic.definition or definition(topic.type)
             encoding = "ros2idl" if is_idl(text) else "ros2msg"
             self._schemas[topic.type] = self._writer.register_schema(topic.type, encoding, text.encode())
-        metadata = {
-            "offered_qos_profiles": _qos_text(topic.latched),
-            "topic_type_hash": topic.type_hash(),
-        }
+        metadata = {"offered_qos_profiles": _qos_text(topic.latched), "topic_type_hash": topic.type_hash()}
         with _whole_records(self._output):
             number = self._writer.register_channel(topic.name, "cdr", self._schemas[topic.type], metadata)
         self._channels[topic] = number

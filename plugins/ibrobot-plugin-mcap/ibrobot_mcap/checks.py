@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 
@@ -31,16 +32,15 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
         return [str(error)]
     problems = []
     times: dict[str, _Times] = defaultdict(_Times)
-    try:
-        summary, repeated, short = reader.summary(), reader.repeated(), reader.short()
+    with closing(reader):
+        summary, repeated, short = reader.summary(), reader.source.repeated, reader.short()
         if not summary.finished:
             problems.append("unfinished; `ibrobot episodes repair` makes it whole")
-        for item in reader.messages():
-            times[item.topic].take(item)
-    except RecorderError as error:
-        problems.append(str(error))
-    finally:
-        reader.close()
+        try:
+            for item in reader.messages():
+                times[item.topic].take(item)
+        except RecorderError as error:
+            problems.append(str(error))
     contract = Contract.of_episode(summary.metadata)
     absent = [topic for topic in (contract.topics if contract is not None else ()) if topic not in times]
     problems += [f"no message of {topic}, which is in its contract" for topic in absent]

@@ -42,13 +42,9 @@ class MessageCompressed(Source):
 
     def __init__(self, path: Path, source: Source) -> None:
         self._path, self._source = path, source
-        self.finished, self.custom, self.types, self.counts = (
-            source.finished,
-            source.custom,
-            source.types,
-            source.counts,
-        )
-        self.stated, self.definitions, self.repeated = source.stated, source.definitions, source.repeated
+        self.finished, self.custom, self.types = source.finished, source.custom, source.types
+        self.counts, self.stated, self.repeated = source.counts, source.stated, source.repeated
+        self.definitions = source.definitions
         self.latched, self.start_ns, self.end_ns = source.latched, source.start_ns, source.end_ns
 
     @override

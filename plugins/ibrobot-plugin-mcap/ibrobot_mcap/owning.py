@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from ibrobot_core.api import RecorderError
@@ -104,10 +104,7 @@ def _is_whole(episode: Path) -> bool:
     if not is_rosbag2(episode):
         return False
     try:
-        reader = Rosbag2Reader(episode)
+        with closing(Rosbag2Reader(episode)) as reader:
+            return reader.finished and not reader.short()
     except RecorderError:
         return False
-    try:
-        return reader.finished and not reader.short()
-    finally:
-        reader.close()

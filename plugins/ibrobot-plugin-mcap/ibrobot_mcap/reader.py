@@ -63,33 +63,34 @@ class Rosbag2Reader(EpisodeReader):
         self._closing = ExitStack()
         try:
             with reading(path):
-                self._source = self._open(info or BagInfo())
+                self.source = self._open(info or BagInfo())
+                """Its files."""
             info = info or self._recorded() or BagInfo()
-            self._codec = Codec(self._source.definitions)
-            self._types = {topic: self._delivered(topic, type_) for topic, type_ in self._source.types.items()}
+            self._codec = Codec(self.source.definitions)
+            self._types = {topic: self._delivered(topic, type_) for topic, type_ in self.source.types.items()}
         except BaseException:
             self.close()
             raise
         self._is_part = not path.is_dir() and len(info.files) > 1
-        self.stated: Mapping[str, int] = info.counts if path.is_dir() else self._source.stated
+        self.stated: Mapping[str, int] = info.counts if path.is_dir() else self.source.stated
         """Topic -> number of messages according to the bag's metadata, including copies in later files."""
         self._stated_types = info.types
         beside = {} if path.is_dir() else custom_beside(path)
-        self._custom = dict(beside or info.custom or self._source.custom)
+        self._custom = dict(beside or info.custom or self.source.custom)
 
     @property
     def finished(self) -> bool:
         """Whether its writer finished it, and no file is truncated."""
-        return self._finished and self._source.finished
+        return self._finished and self.source.finished
 
     def short(self) -> dict[str, int]:
         """Topic -> number of messages in the metadata that are missing from the files."""
-        counts = Counter(self._source.counts) + Counter(self._source.repeated)
+        counts = Counter(self.source.counts) + Counter(self.source.repeated)
         return {topic: stated - counts[topic] for topic, stated in self.stated.items() if stated > counts[topic]}
 
     @override
     def summary(self) -> EpisodeSummary:
-        source = self._source
+        source = self.source
         custom = dict(self._custom)
         dropped = _read_counts(custom.pop(DROPPED, "{}"))
         short = self.short()
@@ -111,7 +112,7 @@ class Rosbag2Reader(EpisodeReader):
 
     @override
     def messages_since(self, stamp_ns: int, topics: Collection[str] | None = None) -> Iterator[Recorded]:
-        source, short = self._source, self.short()
+        source, short = self.source, self.short()
         if short and source.finished:  # the gap is in the middle: the rest would not match the recording
             missing = ", ".join(f"{count} of {self.stated[topic]} of {topic}" for topic, count in short.items())
             raise RecorderError(
@@ -137,16 +138,11 @@ class Rosbag2Reader(EpisodeReader):
 
     def raw(self) -> Iterator[Raw]:
         """The stored messages, not decoded, in the order of receipt."""
-        return self._source.messages(frozenset(self._source.types))
-
-    @property
-    def topics(self) -> Collection[str]:
-        """The topics in its files, with or without messages."""
-        return self._source.types.keys()
+        return self.source.messages(frozenset(self.source.types))
 
     def stored(self, topic: str) -> Topic:
         """A stored topic (compressed images are `CompressedImage`), with the bag's definition of its type."""
-        source, type_ = self._source, self._source.types[topic]
+        source, type_ = self.source, self.source.types[topic]
         definition = source.definitions.get(type_, "")
         try:
             type_hash = self._codec.type_hash(type_)
@@ -156,17 +152,9 @@ class Rosbag2Reader(EpisodeReader):
             type_hash = ""  # a definition in an unknown format
         return Topic(topic, type_, topic in source.latched, definition, type_hash)
 
-    def repeated(self) -> Mapping[str, int]:
-        """Topic -> number of copies in later files of a split episode, which `messages` skips."""
-        return self._source.repeated
-
     def compression(self) -> str:
         """Compression of its chunks, as a value of the recorder's option; `none` if that has no equivalent."""
-        return self._source.compression if self._source.compression in COMPRESSIONS else "none"
-
-    def latched(self) -> frozenset[str]:
-        """Topics with offered QoS transient local."""
-        return self._source.latched
+        return self.source.compression if self.source.compression in COMPRESSIONS else "none"
 
     @override
     def close(self) -> None:
@@ -176,7 +164,7 @@ class Rosbag2Reader(EpisodeReader):
         """The type in which `messages` delivers a topic; that of compressed images depends on the first one."""
         if type_ != CompressedImage.ros_type:
             return type_
-        first = next(self._source.messages({topic}), None)
+        first = next(self.source.messages({topic}), None)
         if first is None:
             return type_
         try:
@@ -187,7 +175,7 @@ class Rosbag2Reader(EpisodeReader):
 
     def _recorded(self) -> BagInfo | None:
         """The newest metadata record, for an episode without `metadata.yaml`."""
-        source = self._source
+        source = self.source
         texts = [
             record.metadata[RECORD_KEY]
             for record in (source.metadata if isinstance(source, McapSource) else ())

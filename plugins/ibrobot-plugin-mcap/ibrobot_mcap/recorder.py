@@ -102,7 +102,7 @@ class McapRecorder(Recorder):
 
     @override
     def waiting(self) -> int:
-        thread = self._thread
+        thread = self._thread  # `end` may remove it meanwhile
         return 0 if thread is None else thread.size
 
     @override

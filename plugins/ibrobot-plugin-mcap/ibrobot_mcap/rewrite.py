@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import closing
 from pathlib import Path
 from uuid import NAMESPACE_OID, UUID, uuid5
 
@@ -58,12 +58,9 @@ def rewrite(
     Raises:
         RecorderError: if `source` cannot be read or `target` cannot be written; `target` is then removed.
     """
-    with ExitStack() as stack:
-        reader = Rosbag2Reader(source)
-        stack.callback(reader.close)
+    with closing(Rosbag2Reader(source)) as reader:
         summary = reader.summary()
-        latched = reader.latched()
-        topics = {name: reader.stored(name) for name in reader.topics}
+        topics = {name: reader.stored(name) for name in reader.source.types}
         start_ns = summary.start_ns if begin_ns is None else begin_ns
         metadata, outcome = {**summary.metadata, **(marks or {})}, summary.outcome
         if begin_ns is not None or end_ns is not None:
@@ -81,7 +78,7 @@ def rewrite(
             for raw in reader.raw():
                 if end_ns is not None and raw.received_ns > end_ns:
                     break
-                if begin_ns is not None and raw.received_ns < begin_ns and raw.topic not in latched:
+                if begin_ns is not None and raw.received_ns < begin_ns and raw.topic not in reader.source.latched:
                     continue
                 received_ns = max(raw.received_ns, start_ns)
                 storage.write(Item(topics[raw.topic], memoryview(raw.data), received_ns, raw.published_ns))
@@ -90,11 +87,8 @@ def rewrite(
         except BaseException:
             storage.discard()
             raise
-    written = Rosbag2Reader(target)
-    try:
+    with closing(Rosbag2Reader(target)) as written:
         return Rewritten(target, written.summary())
-    finally:
-        written.close()
 
 
 def _of_a_part(
@@ -122,11 +116,8 @@ def repair(path: Path) -> Rewritten | None:
 
 
 def _repair(path: Path) -> Rewritten | None:
-    reader = Rosbag2Reader(path)
-    try:
+    with closing(Rosbag2Reader(path)) as reader:
         before, short = reader.summary(), reader.short()
-    finally:
-        reader.close()
     if before.finished and not short:
         return None
     if not path.is_dir():

@@ -91,12 +91,9 @@ class McapFile:
         self.schemas: dict[int, Schema] = {}
         self.blocks: list[Block] = []
         self.metadata: list[Metadata] = []
-        self.library = ""
         self.stated: dict[int, int] = {}
         """Channel -> number of messages in the file's statistics; empty if it has none."""
         self.finished = False
-        self.size = 0
-        """Number of bytes up to the end of the last complete record."""
         try:
             self._file: BinaryIO = path.open("rb")
         except OSError as error:
@@ -179,7 +176,7 @@ class McapFile:
         start = file.read(len(MAGIC))
         if start != MAGIC[: len(start)]:
             raise RecorderError(f"{self.path}: not an MCAP file: begins with {start.hex(' ')}")
-        self.size = position = len(MAGIC)
+        position = len(MAGIC)
         repeated = False
         while position + _RECORD.size <= end:
             file.seek(position)
@@ -199,7 +196,6 @@ class McapFile:
                 self.blocks[-1].indices[channel] = content + _INDEX_HEAD.size, size
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.HEADER, Opcode.STATISTICS):
                 repeated = self._note(opcode, memoryview(file.read(length))) or repeated
-            self.size = position
             if opcode == Opcode.FOOTER:
                 file.seek(position)
                 self.finished = file.read(len(MAGIC)) == MAGIC
@@ -229,7 +225,7 @@ class McapFile:
         elif opcode == Opcode.STATISTICS:
             self.stated = dict(Statistics.read(stream).channel_message_counts)
         elif opcode == Opcode.HEADER:
-            self.library = Header.read(stream).library
+            Header.read(stream)
         else:
             metadata = Metadata.read(stream)
             self.metadata.append(metadata)

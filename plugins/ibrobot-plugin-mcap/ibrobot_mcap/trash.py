@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -66,6 +66,16 @@ def discard(episode: Path) -> Trashed:
         return _discard(episode, DELETED)
 
 
+def check_is_episode(episode: Path) -> None:
+    """Check that a folder is an episode, before it is deleted.
+
+    Raises:
+        RecorderError: if it is not.
+    """
+    if not (episode.is_dir() and is_rosbag2(episode)):
+        raise RecorderError(f"{episode}: is not an episode; nothing was deleted")
+
+
 def delete(episode: Path) -> None:
     """Delete an episode for good; of a link to one, the link.
 
@@ -74,8 +84,7 @@ def delete(episode: Path) -> None:
         RecorderError: if it is not an episode's folder, or cannot be removed.
     """
     with owning(episode, "is being deleted"):
-        if not (episode.is_dir() and is_rosbag2(episode)):
-            raise RecorderError(f"{episode}: is not an episode; nothing was deleted")
+        check_is_episode(episode)
         try:
             if episode.is_symlink():
                 episode.unlink()
@@ -86,8 +95,7 @@ def delete(episode: Path) -> None:
 
 
 def _discard(episode: Path, done: str) -> Trashed:
-    if not (episode.is_dir() and is_rosbag2(episode)):
-        raise RecorderError(f"{episode}: is not an episode; nothing was moved")
+    check_is_episode(episode)
     try:
         link = os.readlink(episode) if episode.is_symlink() else None
         trashed = Trashed(_new_folder(episode.parent / TRASH), episode.name, done, link)
@@ -146,11 +154,8 @@ def copy_part(episode: Path, output: Path, begin_s: float, end_s: float | None) 
 
 
 def _copy_part(episode: Path, output: Path, begin_s: float, end_s: float | None) -> Rewritten:
-    reader = Rosbag2Reader(episode)
-    try:
+    with closing(Rosbag2Reader(episode)) as reader:
         summary = reader.summary()
-    finally:
-        reader.close()
     start_ns, length_ns = summary.start_ns, summary.end_ns - summary.start_ns
     begin_ns = ns(begin_s)
     end_ns = length_ns if end_s is None else ns(end_s)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import click
 
-from ibrobot_core.api import RecorderError
 from ibrobot_core.app import Declined, declared, echo, wrong_input
 from ibrobot_mcap import DELETE
 from ibrobot_mcap.changes import Changed, DeleteOptions
@@ -22,11 +21,9 @@ def delete(options: DeleteOptions, events: bool) -> None:
     from ibrobot_mcap import trash
     from ibrobot_mcap.commands.ask import confirmed
     from ibrobot_mcap.commands.find_episodes import size_of, size_text
-    from ibrobot_mcap.reader import is_rosbag2
 
     for episode in options.episodes:
-        if not (episode.is_dir() and is_rosbag2(episode)):
-            raise RecorderError(f"{episode}: is not an episode; nothing was deleted")
+        trash.check_is_episode(episode)
     for episode in options.episodes:
         if options.to_trash:
             trashed = trash.discard(episode)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -44,11 +44,8 @@ def opened(path: Path) -> Iterator[Rosbag2Reader]:
         episodes = episodes_in(path)
         count = "an episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
         raise RecorderError(f"{path}: is a folder with {count}; choose one, e.g. {episodes[0]}")
-    reader = Rosbag2Reader(path)
-    try:
+    with closing(Rosbag2Reader(path)) as reader:
         yield reader
-    finally:
-        reader.close()
 
 
 def summary_of(path: Path) -> EpisodeSummary:

@@ -61,16 +61,8 @@ def list_episodes(path: Path, as_json: bool) -> None:
         table = Table(box=None, padding=(0, 1))
         wide = console.width >= _WIDE
         prompts = ("prompt",) if wide else ()
-        for heading in (
-            "episode",
-            "began (UTC)" if wide else "began",
-            "s",
-            "messages",
-            "lost",
-            "outcome",
-            "size",
-            *prompts,
-        ):
+        began = "began (UTC)" if wide else "began"
+        for heading in ("episode", began, "s", "messages", "lost", "outcome", "size", *prompts):
             right = heading in ("s", "messages", "lost", "size")
             table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "prompt")
         for row in rows:
