@@ -100,7 +100,7 @@ def _share(ctx: click.Context, param: click.Parameter, value: str) -> float:
     default=30.0,
     show_default=True,
     metavar="S",
-    help="A model that works on one batch for longer hangs: requests fail, and the server restarts.",
+    help="A model that works on one batch for longer counts as hanging: requests fail, and the server restarts.",
 )
 @click.option(
     "--canary",

@@ -15,7 +15,7 @@ class ProcessOptions:
     """Options of `execution_mode: process`."""
 
     hang_timeout: float = option(
-        30.0, unit="s", gt=0, help="a model that works on one request for longer hangs and is replaced"
+        30.0, unit="s", gt=0, help="a model that works on one request for longer counts as hanging, and is replaced"
     )
     accept_new_weights: bool = option(False, help=_NEW_WEIGHTS.format("process"))
 
