@@ -109,12 +109,8 @@ class Corrections(SourceWorker):
         self.on_end.callback(session.on_state.remove, self._label)
         self._keys = session.request.keys() if session.request.keys is not None else None
         assert self.mode.inference is not None
-        devices = self.mode.inference.devices.values()
-        if (
-            self._keys is None
-            and self._options.takeover == "button"
-            and not has_button(session, devices, "intervention")
-        ):
+        by_button = has_button(session, self.mode.inference.devices.values(), "intervention")
+        if self._keys is None and self._options.takeover == "button" and not by_button:
             session.log.warning(
                 "without a terminal and a button of %s, only the service %s takes the robot from the policy; "
                 "`episodes: {takeover: deadman}` lets the deadman take it, too",
