@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from uuid import uuid4
 
@@ -56,22 +57,34 @@ class Place:
         return cls(*(out / each for each in paths))
 
 
-def run_episode(out: Path, policy: Policy, seed: int, document: str) -> Result:
-    """Run an episode in lockstep, and write its recording and result.
+@attrs.frozen
+class EpisodeJob:
+    """An episode to run, or to film."""
 
-    Args:
-        out: the folder of the evaluation.
-        policy: the policy.
-        seed: the seed.
-        document: hash of the robot YAML with which the evaluation began.
+    out: Path
+    """The folder of the evaluation."""
+    policy: Policy
+    seed: int
+    document: str
+    """Hash of the robot YAML with which the evaluation began."""
+
+    @property
+    def place(self) -> Place:
+        """The place of the episode."""
+        return Place.of(self.out, self.policy, self.seed)
+
+
+def run_episode(job: EpisodeJob, progress: Callable[[int], None]) -> Result:
+    """Run an episode in lockstep, and write its recording and result. For the processes of a pool.
 
     Raises:
         IbrobotError: e.g. if the policy fails, or the recording is incomplete.
     """
-    place = Place.of(out, policy, seed)
-    if document_hash(policy.load()) != document:
+    hide_messages()
+    place, policy, seed = job.place, job.policy, job.seed
+    if document_hash(policy.load()) != job.document:
         raise ComponentFailed(f"{policy.config}: changed during the evaluation")
-    scratch = out / SCRATCH / uuid4().hex  # another process may run the episode at the same time
+    scratch = job.out / SCRATCH / uuid4().hex  # another process may run the episode at the same time
     config, recordings = recorded_in(scratch, policy.load(seed))
     runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=seed, episodes=1)))
     session = runtime.session
@@ -96,6 +109,11 @@ def run_episode(out: Path, policy: Policy, seed: int, document: str) -> Result:
     write(place.result, json.dumps(attrs.asdict(result), indent=1) + "\n")
     shutil.rmtree(scratch)
     return result
+
+
+def hide_messages() -> None:
+    """Keep the messages of runs in this process out of the evaluation's log."""
+    logging.getLogger("ibrobot").setLevel(logging.ERROR)
 
 
 def recorded_in(folder: Path, config: RobotConfig) -> tuple[RobotConfig, Path]:

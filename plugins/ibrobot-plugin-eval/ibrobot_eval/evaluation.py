@@ -14,9 +14,8 @@ import attrs
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import ComponentFailed, Done, Job, installed_plugins, owned
 from ibrobot_eval.comparison import Decision
-from ibrobot_eval.episodes import SCRATCH, Place, Result, write
-from ibrobot_eval.film import can_film
-from ibrobot_eval.jobs import EpisodeJob, film_in_pool, run_in_pool
+from ibrobot_eval.episodes import SCRATCH, EpisodeJob, Place, Result, hide_messages, run_episode, write
+from ibrobot_eval.film import can_film, film
 from ibrobot_eval.options import SETTINGS, EvalOptions
 from ibrobot_eval.policies import Identity, Policy, identify
 
@@ -76,9 +75,9 @@ class Evaluation:
         total = len(seeds) * len(self.policies)
         self._decision.look(self.results())
         if todo and self._decision.after is None:
-            with self._running(run_in_pool, todo) as done:
+            with self._running(run_episode, todo) as done:
                 for job, result in done:
-                    file = Place.of(job.out, job.policy, job.seed).result
+                    file = job.place.result
                     if not file.exists():
                         raise DatasetError(
                             f"{file}: not found after a machine of the pool wrote it: --out must be in a folder that "
@@ -105,10 +104,10 @@ class Evaluation:
             failed = [each.seed for each in results[policy.label] if not each.success][:most]
             if failed and can_film(policy):
                 todo += [self._job(policy, seed) for seed in failed]
-        todo = [job for job in todo if not Place.of(job.out, job.policy, job.seed).video.exists()]
+        todo = [job for job in todo if not job.place.video.exists()]
         if todo:
             begin(len(todo))
-            with self._running(film_in_pool, todo) as done:
+            with self._running(_film, todo) as done:
                 for _ in done:
                     pass
 
@@ -144,6 +143,12 @@ class Evaluation:
                 place.result.unlink(missing_ok=True)
                 shutil.rmtree(place.episode, ignore_errors=True)
         return {label: results[:decided] for label, results in found.items()}
+
+
+def _film(job: EpisodeJob, progress: Callable[[int], None]) -> None:
+    """Film a finished episode. For the processes of a pool."""
+    hide_messages()
+    film(job.place.video, job.policy, Result.read(job.place.result))
 
 
 def _result[R](done: Done[R]) -> tuple[Any, R]:
