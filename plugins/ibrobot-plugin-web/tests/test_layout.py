@@ -158,6 +158,6 @@ async def look() -> None:
         await browser.close()
 
 
-def test_what_one_looks_at_and_does_is_in_sight_without_scrolling() -> None:
+def test_pictures_and_controls_are_visible_without_scrolling() -> None:
     pytest.importorskip("playwright.async_api", reason="needs playwright: pip install playwright")
     asyncio.run(asyncio.wait_for(look(), 120))

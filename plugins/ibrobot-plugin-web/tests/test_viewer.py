@@ -171,7 +171,7 @@ def test_a_server_that_is_stopped_ends_the_run(monkeypatch: pytest.MonkeyPatch) 
         viewer.close()
 
 
-def test_messages_that_the_server_cannot_have_sent_are_dropped_and_a_bug_behind_stop_ends_the_run(
+def test_invalid_messages_of_the_server_are_dropped_and_an_error_while_receiving_ends_the_run(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     viewer = WebViewer(OPTIONS, make_context())

@@ -15,7 +15,6 @@ export class Player {
     this.cameras = [];
     this.series = null;
     this.cut = null;
-    this.frames = 0;
     this.build();
   }
 
@@ -193,7 +192,6 @@ export class Player {
       say(camera.caption, content.size ? camera.name : `${camera.name}: no picture at this time`);
       if (content.size && this.path === path) {
         paint(camera.canvas, await createImageBitmap(content));
-        this.frames += 1;
       }
     } catch (error) {
       say(camera.caption, `${camera.name}: ${error.message}`);
