@@ -21,6 +21,16 @@ def test_the_size_of_pictures_is_height_and_width() -> None:
     assert descriptor.picture(OpenCvOptions("0", width=64, height=48)) == (48, 64)
 
 
+def test_only_a_v4l2_device_is_one_that_two_may_not_open(tmp_path: Path) -> None:
+    (descriptor,) = (each for each in ibrobot_camera.ibrobot_sensors() if each.type == "opencv")
+    video = tmp_path / "pick.mp4"
+    video.touch()
+    used = [
+        descriptor.devices(OpenCvOptions(source)) for source in (7, "/dev/video7", str(video), "rtsp://a/b", "none")
+    ]
+    assert used == [{"device": "/dev/video7"}] * 2 + [{}] * 3
+
+
 @pytest.mark.parametrize(
     ("text", "wrong"),
     [

@@ -132,6 +132,8 @@ def test_a_robot_without_a_gripper_has_no_gripper_controls():
     robot = attrs.evolve(make_robot(), groups={})
     options = GamepadOptions(cartesian=False)
     assert not {"gripper_open", "gripper_close"} & set(control_map(options, robot).buttons)
+    own = attrs.evolve(options, buttons={"estop": "left_trigger"})
+    assert control_map(own, robot).buttons["estop"] == "left_trigger", "nothing else has it"
     wrong = attrs.evolve(options, buttons={"gripper": "misc"})
     with pytest.raises(TeleopError, match=r"^buttons\.gripper: the robot has no group 'gripper'$"):
         control_map(wrong, robot)

@@ -37,7 +37,9 @@ class Ui:
     def keep[T: Closes](self, kind: type[T]) -> T:
         """The one object of a class that requests share until the server ends, made at the first call."""
         with self._lock:
-            found: T = self._kept[kind] if kind in self._kept else self._kept.setdefault(kind, kind())
+            if kind not in self._kept:
+                self._kept[kind] = kind()
+            found: T = self._kept[kind]
         return found
 
     def close(self) -> None:
