@@ -47,11 +47,10 @@ from ibrobot_core.interfaces import (
     JointReading as JointReading,
     Torque as Torque,
     Holding as Holding,
-    Condition as Condition,
-    Severity as Severity,
     Signal as Signal,
     EpisodeSetup as EpisodeSetup,
     Scene as Scene,
+    SceneObject as SceneObject,
     Sensor as Sensor,
     Teleop as Teleop,
     TeleopCommand as TeleopCommand,
@@ -60,7 +59,8 @@ from ibrobot_core.interfaces import (
 )
 from ibrobot_core.interfaces.hardware import (
     SimulatedHardware as SimulatedHardware,
-    SceneObject as SceneObject,
+    Condition as Condition,
+    Severity as Severity,
     nan_vector as nan_vector,
 )
 from ibrobot_core.interfaces.teleop import Approach as Approach

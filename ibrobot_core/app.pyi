@@ -169,7 +169,7 @@ from ibrobot_core.interfaces.pool import (
 )
 
 # Guides
-from ibrobot_core.interfaces.guide import Guide as Guide, Question as Question
+from ibrobot_core.interfaces import Guide as Guide, Question as Question
 
 # Reports
 from ibrobot_core.reports import (

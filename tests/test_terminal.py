@@ -204,8 +204,8 @@ def received(subscriber: queue.SimpleQueue[str], number: int) -> queue.SimpleQue
 
 
 def test_whatever_comes_switches_a_toggle_off_and_nothing_on_later():
-    held, keys = HeldKeys(0.2), queue.SimpleQueue()
-    on, states = False, []
+    held, on, states = HeldKeys(0.2), False, []
+    keys: queue.SimpleQueue[str] = queue.SimpleQueue()
     for typed_s, then_s in ((0.0, 0.2), (3.0, 3.2), (6.0, 6.2)):
         keys.put("space")
         for now_s in (typed_s, then_s):

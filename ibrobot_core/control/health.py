@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 
 from ibrobot_core.config.schema import Shedding
-from ibrobot_core.interfaces import Condition, Severity
+from ibrobot_core.interfaces.hardware import Condition, Severity
 from ibrobot_core.units import ns
 
 _Key = tuple[str, str]

@@ -10,7 +10,7 @@ import pytest
 
 from ibrobot_core.control.phase import PERMITTED, TRANSITIONS, Cause, Phase
 from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Condition, Severity
+from ibrobot_core.interfaces.hardware import Condition, Severity
 from ibrobot_core.units import NS_PER_S
 
 RELAXES = {"control": {"stop": "relax"}}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ibrobot_core.errors import ConfigError, HardwareError
-from ibrobot_core.interfaces import Condition, Severity
+from ibrobot_core.interfaces.hardware import Condition, Severity
 
 HOT = Condition(
     "lift", "temperature", 58.0, "deg C", Severity.WARNING, "lift is at 58 deg C, above 55: let it rest", True

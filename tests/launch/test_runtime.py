@@ -11,7 +11,7 @@ import pytest
 
 from ibrobot_core.config.schema import ObservationSpec
 from ibrobot_core.errors import ComponentFailed, NotSupported, TeleopError
-from ibrobot_core.interfaces import Condition, Severity
+from ibrobot_core.interfaces.hardware import Condition, Severity
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import DiagnosticArray, DiagnosticStatus, KeyValue

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, override
 
-from ibrobot_core.interfaces import Severity
+from ibrobot_core.interfaces.hardware import Severity
 from ibrobot_core.launch.session import SessionWorker
 from ibrobot_core.launch.views import RunView
 from ibrobot_core.messages import (
