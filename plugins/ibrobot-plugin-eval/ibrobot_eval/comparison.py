@@ -118,18 +118,14 @@ def compare(results: Mapping[str, Sequence[Result]], margin: float) -> list[Comp
             looks.append((test.pairs.episodes, test.pairs.difference, test.interval.low, test.interval.high))
         tests.append(test)
         courses.append((*looks[: -1 : len(looks) // _POINTS + 1], looks[-1]))
-    fixed = [mcnemar_exact(test.pairs) for test in tests]
-    adjusted, fixed_adjusted = holm([test.p_value for test in tests]), holm(fixed)
+    p_values = holm([test.p_value for test in tests])
+    fixed_p_values = holm([mcnemar_exact(test.pairs) for test in tests])
     found = []
-    for (first, second), test, course, p_value, mcnemar_p in zip(
-        couples, tests, courses, adjusted, fixed_adjusted, strict=True
-    ):
-        verdict = _verdict(test, p_value, margin)
-        undecided = verdict == UNDECIDED and test.pairs.episodes > 0
-        more = episodes_to_decide(test.pairs, margin, level) if undecided else None
-        fixed_interval = tango(test.pairs, level)
-        outcome = (test.pairs, fixed_interval, mcnemar_p, test.interval, p_value, verdict, more, margin, course)
-        found.append(Comparison(first, second, *outcome))
+    for couple, test, course, p_value, fixed_p in zip(couples, tests, courses, p_values, fixed_p_values, strict=True):
+        pairs, verdict = test.pairs, _verdict(test, p_value, margin)
+        more = episodes_to_decide(pairs, margin, level) if verdict == UNDECIDED and pairs.episodes else None
+        fixed = (tango(pairs, level), fixed_p)
+        found.append(Comparison(*couple, pairs, *fixed, test.interval, p_value, verdict, more, margin, course))
     return found
 
 
