@@ -44,9 +44,9 @@ from ibrobot_core.units import NS_PER_S as NS_PER_S, ns as ns, seconds as second
 from ibrobot_core.interfaces import (
     Context as Context,
     Hardware as Hardware,
+    SimulatedHardware as SimulatedHardware,
     JointReading as JointReading,
     Torque as Torque,
-    Holding as Holding,
     Signal as Signal,
     EpisodeSetup as EpisodeSetup,
     Scene as Scene,
@@ -58,7 +58,7 @@ from ibrobot_core.interfaces import (
     Viewer as Viewer,
 )
 from ibrobot_core.interfaces.hardware import (
-    SimulatedHardware as SimulatedHardware,
+    Holding as Holding,
     Condition as Condition,
     Severity as Severity,
     nan_vector as nan_vector,

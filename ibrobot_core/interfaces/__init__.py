@@ -8,10 +8,10 @@ from ibrobot_core.interfaces.guide import Guide, Question
 from ibrobot_core.interfaces.hardware import (
     EpisodeSetup,
     Hardware,
-    Holding,
     JointReading,
     SceneObject,
     Signal,
+    SimulatedHardware,
     Torque,
 )
 from ibrobot_core.interfaces.planner import Planner

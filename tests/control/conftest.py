@@ -20,8 +20,8 @@ from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.descriptors import ExecutorDescriptor, HardwareDescriptor
 from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Context, Holding, JointReading, Torque
-from ibrobot_core.interfaces.hardware import Condition
+from ibrobot_core.interfaces import Context, JointReading, Torque
+from ibrobot_core.interfaces.hardware import Condition, Holding
 from ibrobot_core.plugins import Entry, Registry, discover
 from ibrobot_core.robot import Vector
 

@@ -30,7 +30,7 @@ from ibrobot_core.descriptors import (
     TransportDescriptor,
 )
 from ibrobot_core.errors import HardwareError, MissingDependency, TeleopError
-from ibrobot_core.interfaces import Holding
+from ibrobot_core.interfaces.hardware import Holding
 
 
 class Scene(FakeHardware):

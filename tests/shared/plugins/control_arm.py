@@ -12,7 +12,7 @@ from ibrobot_testing.fakes import FakeHardware, FakeTrajectoryExecutor
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import ExecutorDescriptor, HardwareDescriptor
 from ibrobot_core.errors import HardwareError
-from ibrobot_core.interfaces import Holding
+from ibrobot_core.interfaces.hardware import Holding
 from ibrobot_core.options import option
 
 

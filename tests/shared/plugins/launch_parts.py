@@ -32,7 +32,7 @@ from ibrobot_core.descriptors import (
     TeleopDescriptor,
 )
 from ibrobot_core.errors import HardwareError, MissingDependency, PolicyError, SensorError
-from ibrobot_core.interfaces import Holding
+from ibrobot_core.interfaces.hardware import Holding
 from ibrobot_core.options import option
 
 EVENTS: list[tuple[Any, ...]] = []
