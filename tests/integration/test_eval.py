@@ -61,7 +61,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def arguments(*more: object) -> list[str]:
-    return ["eval", "picks.yaml", "--mode", "scripted", "--mode", "faulty", "--episodes", "3", *map(str, more)]
+    policies = ("--mode", "scripted", "--mode", "faulty")
+    return ["eval", "picks.yaml", *policies, "--episodes", "3", "--videos", "1", *map(str, more)]
 
 
 def evaluate(folder: Path, *more: object) -> subprocess.CompletedProcess[str]:
@@ -180,8 +181,8 @@ def test_workers_end_with_a_killed_command_and_write_nothing_more(start: Any, fo
 
 
 def test_merged_shards_are_the_whole_evaluation(folder: Path, whole: Path) -> None:
-    for number in (2, 1):
-        done = evaluate(folder, "--out", f"part{number}", "--shard", f"{number}/2", "--jobs", 1)
+    for number, videos in ((2, 0), (1, 1)):
+        done = evaluate(folder, "--out", f"part{number}", "--shard", f"{number}/2", "--videos", videos, "--jobs", 1)
         assert done.returncode == 0, done.stderr
     with chdir(folder):
         twice = run_here("eval", "merge", "part1", "part2", "part1", "--out", "merged")
