@@ -95,6 +95,8 @@ def _encoder(codec: str, options: LeRobotOptions) -> Encoder:
         settings |= {"crf": str(options.crf), "threads": str(options.threads)}
         if codec == "hevc":
             settings["x265-params"] = f"log-level=error:bframes=0:pools={options.threads}"
+        else:
+            settings["x264-params"] = "cpu-independent=1"  # otherwise, now and then the bytes differ
     elif codec.endswith("nvenc"):
         settings |= {"rc": "constqp", "qp": str(options.crf)}
     else:
