@@ -214,14 +214,14 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
     given = [Override.of(f"--transport {each}", f"transport.{each}") for each in options["transport_options"]]
     changes = (*options["overrides"], *listening, *given)
     config = load_config(path, overrides=changes, sim=options["sim"], registry=registry, communicates=True)
-    section = config.transport
+    served, section = _of_config(config, path, registry, options), config.transport
     if section is None or section.type == "local":
         raise click.UsageError(
             f"{path} names no transport to robots: add "
             f"--set 'transport={{type: {example_type('transport')}}}' --listen ENDPOINT"
         )
     make = partial(registry.find("transport", section.type).make, section.options, _context(config.robot))
-    return *_of_config(config, path, registry, options), make
+    return *served, make
 
 
 def _from_folder(

@@ -30,7 +30,7 @@ _LONGEST_NAME = 100
 def _near(instance: object, attribute: attrs.Attribute[Any], value: Sequence[float] | None) -> None:
     # Written so that NaN fails it.
     if not all(abs(number) <= FURTHEST for number in value or ()):
-        raise ValueError(f"{attribute.name} is {value}, must be numbers from -{FURTHEST:g} to {FURTHEST:g}")
+        raise ValueError(f"must be numbers from -{FURTHEST:g} to {FURTHEST:g}, got {list(value or ())}")
 
 
 @documented
