@@ -24,7 +24,7 @@ WAIT_S = 120.0
 PATIENT = ("--set", "control.peer_timeout=5")
 """A busy machine may hold up a run for longer than the 0.3 s after which the robot is stopped."""
 PRESS_S = 2.0
-"""Time in which a press is held, or counts as released by a stall of the page [s]."""
+"""Time after which a press that moves nothing counts as ended [s]."""
 REST_NS = 300_000_000
 STATE = """JSON.stringify({
     operating: ibrobot.operating, held: ibrobot.deadman.held, faults: ibrobot.status?.faults, state: ibrobot.state,
@@ -75,14 +75,14 @@ class Tab:
             self.page.wait_for_timeout(50)
 
     def hold(self, press: Callable[[], None], release: Callable[[], None], met: Callable[[], Any]) -> None:
-        """Press, and again where the page has stalled, which releases the deadman, until a condition is met."""
+        """Press, and again after a while, until a condition is met: a stall of the page or of the run ends a press."""
         press_s = -math.inf
 
         def moves() -> bool:
             nonlocal press_s
             if met():
                 return True
-            if time.monotonic() > press_s + PRESS_S and not self.ask("ibrobot.deadman.held"):
+            if time.monotonic() > press_s + PRESS_S:
                 release()
                 press()
                 press_s = time.monotonic()
