@@ -39,9 +39,10 @@ def main() -> int:
         command = [program, "launch", "so101", "--headless", "--duration", "3"]
         command += ["--set", "teleoperation.leader.deadman=none"]  # the deadman is a key, which needs a terminal
         # Emulators beside other work answer late.
-        for patience in ("control.state_timeout=60", *(f"{section}.lost_replies=2000" for section in sides)):
-            command += ["--set", patience]
+        command += ["--set", "control.state_timeout=60"]
         for section, calibration in sides.items():
+            for patience in ("retries=200", "lost_replies=2000"):
+                command += ["--set", f"{section}.{patience}"]
             port = stack.enter_context(emulator(program, calibration, environment))
             command += ["--set", f"{section}.port={port}"]
         return subprocess.run(command, check=False, env=environment, cwd=Path(folder)).returncode
