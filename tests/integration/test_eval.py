@@ -44,7 +44,7 @@ def write_picks(folder: Path) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with the robot YAML `picks`, of each test's own: one that runs again begins anew."""
+    """A new folder with the robot YAML `picks` for each test, so that a rerun starts from scratch."""
     (tmp_path / "eval").mkdir()
     return write_picks(tmp_path / "eval")
 
