@@ -29,10 +29,18 @@ from train_pick_cube import CONFIG, NORMALISED, run
 DEMONSTRATIONS, CORRECTIONS = 1000, 2000
 """Seeds of the first demonstration and of the first corrected episode; trials begin at 0."""
 ARCHITECTURE = (
-    "--policy.type=act", "--policy.use_vae=false", "--policy.dim_model=128", "--policy.n_heads=4",
-    "--policy.dim_feedforward=256", "--policy.n_encoder_layers=2", "--policy.dropout=0.0", "--policy.chunk_size=30",
-    "--policy.n_action_steps=30", f"--policy.normalization_mapping={NORMALISED}", "--policy.device=cpu",
-)  # fmt: skip
+    "--policy.type=act",
+    "--policy.use_vae=false",
+    "--policy.dim_model=128",
+    "--policy.n_heads=4",
+    "--policy.dim_feedforward=256",
+    "--policy.n_encoder_layers=2",
+    "--policy.dropout=0.0",
+    "--policy.chunk_size=30",
+    "--policy.n_action_steps=30",
+    f"--policy.normalization_mapping={NORMALISED}",
+    "--policy.device=cpu",
+)
 OPERATOR = (
     "--set",
     "control_modes.learned.inference={model: act, intervene: operator}",

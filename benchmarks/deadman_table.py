@@ -642,9 +642,17 @@ def cut(trial: Trial) -> None:
 
 
 EVENTS: dict[str, Callable[[Trial], None]] = {
-    "unplug": unplug, "replug": replug, "freeze": freeze, "thaw": thaw, "stop": stop, "fault": fault,
-    "mode switch": switch, "key repeat": repeat, "host paused": pause, "network cut": cut,
-}  # fmt: skip
+    "unplug": unplug,
+    "replug": replug,
+    "freeze": freeze,
+    "thaw": thaw,
+    "stop": stop,
+    "fault": fault,
+    "mode switch": switch,
+    "key repeat": repeat,
+    "host paused": pause,
+    "network cut": cut,
+}
 
 
 @attrs.frozen

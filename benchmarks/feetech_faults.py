@@ -125,19 +125,24 @@ def document(folder: Path) -> dict[str, Any]:
             "groups": {"all": list(JOINTS), "gripper": ["gripper"]},
         },
         "hardware": {
-            "type": "feetech_so101", "port": str(folder / "follower"), "calibration": str(folder / "follower.json"),
+            "type": "feetech_so101",
+            "port": str(folder / "follower"),
+            "calibration": str(folder / "follower.json"),
             "anchored": [],
         },
         "teleoperation": {
             "leader": {
-                "type": "so101_leader", "port": str(folder / "leader"), "calibration": str(folder / "leader.json"),
-                "scaled": [], "deadman": "toggle",
+                "type": "so101_leader",
+                "port": str(folder / "leader"),
+                "calibration": str(folder / "leader.json"),
+                "scaled": [],
+                "deadman": "toggle",
             }
         },
         "executors": {"position": {"type": "position", "group": "all"}},
         "control_modes": {"teleop": {"executors": ["position"], "teleop": "leader"}},
         "default_control_mode": "teleop",
-    }  # fmt: skip
+    }
 
 
 def arm(folder: Path, name: str, clock: SteppedClock, seed: int) -> Emulator:
@@ -455,17 +460,23 @@ def main() -> int:
     print(
         json.dumps(
             {
-                "simulated_s": bench.ticks / 100, "took_s": round(time.monotonic() - begun, 1),
-                "incidents": tally.incidents, "unnamed": tally.unnamed,
-                "faults": Counter(kind_of(fault) for fault in tally.faults), "resets": tally.resets,
-                "worst_lead_rad": round(tally.worst_lead, 3), "max_lead_rad": config.robot.max_lead.round(3).tolist(),
+                "simulated_s": bench.ticks / 100,
+                "took_s": round(time.monotonic() - begun, 1),
+                "incidents": tally.incidents,
+                "unnamed": tally.unnamed,
+                "faults": Counter(kind_of(fault) for fault in tally.faults),
+                "resets": tally.resets,
+                "worst_lead_rad": round(tally.worst_lead, 3),
+                "max_lead_rad": config.robot.max_lead.round(3).tolist(),
                 "worst_motion_at_rest_rad": round(tally.worst_still, 4),
-                "violations": tally.violations, "examples": tally.examples,
-                "safety": counters["safety"], "bus": counters["hardware"]["hardware"],
+                "violations": tally.violations,
+                "examples": tally.examples,
+                "safety": counters["safety"],
+                "bus": counters["hardware"]["hardware"],
             },
             indent=2,
         )
-    )  # fmt: skip
+    )
     return 1 if tally.unnamed or tally.violations else 0
 
 

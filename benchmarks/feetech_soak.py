@@ -104,10 +104,17 @@ def main() -> int:
         core.close()
     bus = counters["hardware"]["hardware"]
     result = {
-        "ticks": ticks, "took_s": round(time.monotonic() - begun, 1), "stale_ticks": stale, "faults": faults,
-        "wrong_positions": wrong, "worst_error_rad": round(worst, 4), "commands_too_fast": outside,
-        "emulator": done, "bus": bus, "safety": counters["safety"],
-    }  # fmt: skip
+        "ticks": ticks,
+        "took_s": round(time.monotonic() - begun, 1),
+        "stale_ticks": stale,
+        "faults": faults,
+        "wrong_positions": wrong,
+        "worst_error_rad": round(worst, 4),
+        "commands_too_fast": outside,
+        "emulator": done,
+        "bus": bus,
+        "safety": counters["safety"],
+    }
     print(json.dumps(result, indent=2))
     counted = bus["timeouts"] + bus["bad_packets"] + bus["discarded_bytes"]
     return 1 if wrong or outside or counted < done["dropped"] else 0

@@ -144,9 +144,13 @@ class MovingRobot(Robot):
         """All that was counted, as JSON values."""
         assert isinstance(self.policy, Sine)
         return {
-            "chunks": self.chunks, "holds": self.holds, "worst": self.worst, "servers": self.servers,
-            "wrong": self.policy.wrong, "failures": self.engine.stats.failures,
-        }  # fmt: skip
+            "chunks": self.chunks,
+            "holds": self.holds,
+            "worst": self.worst,
+            "servers": self.servers,
+            "wrong": self.policy.wrong,
+            "failures": self.engine.stats.failures,
+        }
 
 
 def robots(endpoints: list[str], first: int, count: int) -> None:
@@ -297,11 +301,13 @@ def run(count: int, seconds: float, models: dict[str, Path]) -> int:
     trying = sum(any(server == servers[2].id for _, server in robot["servers"]) for robot in answers)
     summary = {
         "again_s": {name: {"robots": robots, "seconds": seconds} for name, (robots, seconds) in again.items()},
-        "canary_robots": trying, "worst_step": round(max(robot["worst"] for robot in answers), 3),
-        "holds": sum(len(robot["holds"]) for robot in answers), "drain_exit": drained,
+        "canary_robots": trying,
+        "worst_step": round(max(robot["worst"] for robot in answers), 3),
+        "holds": sum(len(robot["holds"]) for robot in answers),
+        "drain_exit": drained,
         "wrong_answers": sum(robot["wrong"] for robot in answers),
         "failures": sum(robot["failures"] for robot in answers),
-    }  # fmt: skip
+    }
     print(json.dumps(summary))
     late = [name for name, (_, waited_s) in again.items() if waited_s > AGAIN_S]
     return int(bool(late or drained or summary["wrong_answers"] or summary["worst_step"] > 1 or not trying))

@@ -81,10 +81,14 @@ def random_policy(kind: str, path: Path) -> Path:
     policy.save_pretrained(path)
     shapes = {STATE: (6,), TOP: (3, 1, 1), "action": (6,)}
     statistics = {
-        key: {"mean": np.zeros(n, np.float32), "std": np.ones(n, np.float32), "min": -np.ones(n, np.float32),
-              "max": np.ones(n, np.float32)}
+        key: {
+            "mean": np.zeros(n, np.float32),
+            "std": np.ones(n, np.float32),
+            "min": -np.ones(n, np.float32),
+            "max": np.ones(n, np.float32),
+        }
         for key, n in shapes.items()
-    }  # fmt: skip
+    }
     for processor in make_pre_post_processors(config, dataset_stats=statistics):
         processor.save_pretrained(path)
     return path
@@ -158,10 +162,12 @@ def main() -> int:
             "observations": given.observations,
             "largest_difference": difference,
             **{f"{name}_ms": round(value, 1) for name, value in medians.items()},
-            **{f"{name}_mib": memory_mib(name, place, given.threads)
-               for name, place in (("torch", checkpoint), ("onnx", exported.folder))},
+            **{
+                f"{name}_mib": memory_mib(name, place, given.threads)
+                for name, place in (("torch", checkpoint), ("onnx", exported.folder))
+            },
             "export_s": round(exported.seconds, 1),
-        }  # fmt: skip
+        }
     print(json.dumps(result))
     return int(difference >= LIMIT or medians["onnx"] >= medians["torch"])
 

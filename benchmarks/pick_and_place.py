@@ -260,12 +260,20 @@ def main() -> int:
     touched = sum(bool(outcome.touched) for outcome in outcomes)
     beyond = sum(bool(outcome.beyond) for outcome in outcomes)
     durations = [outcome.duration_s for outcome in outcomes if outcome.placed]
-    print(json.dumps({
-        "tasks": len(outcomes), "placed": placed, "touched": touched, "beyond_limits": beyond,
-        "repeated": len(again), "equal": equal,
-        "median_s": round(float(np.median(durations)), 2) if durations else None,
-        "wall_s": round(perf_counter() - begin, 1),
-    }))  # fmt: skip
+    print(
+        json.dumps(
+            {
+                "tasks": len(outcomes),
+                "placed": placed,
+                "touched": touched,
+                "beyond_limits": beyond,
+                "repeated": len(again),
+                "equal": equal,
+                "median_s": round(float(np.median(durations)), 2) if durations else None,
+                "wall_s": round(perf_counter() - begin, 1),
+            }
+        )
+    )
     good = placed >= 0.95 * len(outcomes) and not touched and not beyond and equal == len(again)
     return 0 if good else 1
 

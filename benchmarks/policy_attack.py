@@ -229,9 +229,14 @@ def strangers(protocol: str, port: int, stop: threading.Event, frames: int) -> i
 
 
 ATTACKS: Mapping[str, Callable[[str, int, threading.Event, int], int] | None] = {
-    "none": None, "damaged": damaged, "1 GB": gigabytes, "slow": slow, "others": others, "deaf": deaf,
+    "none": None,
+    "damaged": damaged,
+    "1 GB": gigabytes,
+    "slow": slow,
+    "others": others,
+    "deaf": deaf,
     "strangers": strangers,
-}  # fmt: skip
+}
 
 
 def asked(protocol: str, port: int, stop: threading.Event) -> dict[str, Any]:
@@ -255,9 +260,12 @@ def asked(protocol: str, port: int, stop: threading.Event) -> dict[str, Any]:
     with suppress(Exception):
         client.close()
     return {
-        "answers": len(times_ms), "errors": errors, "wrong": wrong, "p50_ms": round(float(np.median(times_ms)), 2),
+        "answers": len(times_ms),
+        "errors": errors,
+        "wrong": wrong,
+        "p50_ms": round(float(np.median(times_ms)), 2),
         "longest_ms": round(max(times_ms), 1),
-    }  # fmt: skip
+    }
 
 
 def main() -> int:
@@ -273,8 +281,13 @@ def main() -> int:
             for name, attack in ATTACKS.items():
                 stop, count = threading.Event(), [0]
 
-                def run(attack: Any = attack, stop: threading.Event = stop, count: list[int] = count, port: int = port,
-                        protocol: str = protocol) -> None:  # fmt: skip
+                def run(
+                    attack: Any = attack,
+                    stop: threading.Event = stop,
+                    count: list[int] = count,
+                    port: int = port,
+                    protocol: str = protocol,
+                ) -> None:
                     if attack is not None:
                         count[0] = attack(protocol, port, stop, given.frames)
 

@@ -187,10 +187,17 @@ def main() -> int:
     given = parser.parse_args()
     logging.disable(logging.CRITICAL)
     kind, python, code = next(
-        (each for each in (("openpi", given.openpi, THEIRS), ("vla_eval", given.vla_eval, VLA_EVAL),
-                           ("gr00t", given.gr00t, GR00T)) if each[1]),
+        (
+            each
+            for each in (
+                ("openpi", given.openpi, THEIRS),
+                ("vla_eval", given.vla_eval, VLA_EVAL),
+                ("gr00t", given.gr00t, GR00T),
+            )
+            if each[1]
+        ),
         ("ours", sys.executable, OURS),
-    )  # fmt: skip
+    )
     rng, wrong = np.random.default_rng(0), 0
     with served(python, code, given.checkout) as port:
         policy = policy_of(kind, port)

@@ -48,9 +48,12 @@ class Peer:
         )
         reach = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(DOMAIN)}
         self._process = subprocess.Popen(
-            [python, str(PEER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            [python, str(PEER)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
             env={**os.environ, **found, **reach},
-        )  # fmt: skip
+        )
         self.answer()
 
     def send(self, method: str, **keywords: Any) -> None:

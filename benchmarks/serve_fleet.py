@@ -120,9 +120,13 @@ class Robot:
     """A dispatcher on its ticks, in a thread."""
 
     def __init__(
-        self, number: int, network: Transport, watermark: Any, policy: Policy | None = None,
+        self,
+        number: int,
+        network: Transport,
+        watermark: Any,
+        policy: Policy | None = None,
         send: Callable[[int, int, Vector], None] = lambda *_: None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         robot = self.robot = make_robot()
         joints = robot.joint_names
         config = RobotConfig(

@@ -229,12 +229,19 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
         server.kill()
     answered = made.answered
     summary = {
-        "kills": kills, "known_worst_ms": round(max(known) * 1e3, 1),
-        "held_worst_s": round(max(held), 3), "held_limit_s": PLAN_S + STALE_S + SETTLE_S,
-        "resumed_worst_s": round(max(resumed), 3), "requests": stats.requests, "chunks": stats.chunks,
-        "failures": stats.failures, "timeouts": stats.timeouts, "answered_twice": len(answered) - len(set(answered)),
-        "first": grown[:1], "last": grown[-1:],
-    }  # fmt: skip
+        "kills": kills,
+        "known_worst_ms": round(max(known) * 1e3, 1),
+        "held_worst_s": round(max(held), 3),
+        "held_limit_s": PLAN_S + STALE_S + SETTLE_S,
+        "resumed_worst_s": round(max(resumed), 3),
+        "requests": stats.requests,
+        "chunks": stats.chunks,
+        "failures": stats.failures,
+        "timeouts": stats.timeouts,
+        "answered_twice": len(answered) - len(set(answered)),
+        "first": grown[:1],
+        "last": grown[-1:],
+    }
     print(json.dumps(summary))
     first, last = (grown[0], grown[-1]) if grown else (resources(), resources())
     good = (

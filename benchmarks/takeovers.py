@@ -645,12 +645,17 @@ def converted(trial: Trial, folder: Path) -> dict[str, Any]:
         for column in pq.read_table(table, columns=["intervention", "next.done"]).columns
     )
     return {
-        "lost_messages": lost, "frames": len(trial.seen), "unequal_frames": unequal, "rows": len(got),
-        "skipped_rows": report.skipped, "intervention_rows": sum(got),
-        "corrections": len(corrections.stretches), "correction_rows": corrections.frames,
+        "lost_messages": lost,
+        "frames": len(trial.seen),
+        "unequal_frames": unequal,
+        "rows": len(got),
+        "skipped_rows": report.skipped,
+        "intervention_rows": sum(got),
+        "corrections": len(corrections.stretches),
+        "correction_rows": corrections.frames,
         "wrong_dones": sum(done[:-1]) + (not done[-1]),
         "wrong_interventions": sum(a != b for a, b in zip(got, wanted, strict=True)),
-    }  # fmt: skip
+    }
 
 
 def is_good(found: dict[str, Any]) -> bool:

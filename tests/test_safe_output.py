@@ -107,9 +107,15 @@ def sources() -> Iterator[Path]:
 
 
 _RICH = {
-    "Console": "Screen of ibrobot_core.screen", "Text": "text of ibrobot_core.screen", "print": "echo",
-    "markup": "nothing", "escape": "nothing", "Prompt": "click.prompt", "inspect": "echo", "pretty": "echo",
-}  # fmt: skip
+    "Console": "Screen of ibrobot_core.screen",
+    "Text": "text of ibrobot_core.screen",
+    "print": "echo",
+    "markup": "nothing",
+    "escape": "nothing",
+    "Prompt": "click.prompt",
+    "inspect": "echo",
+    "pretty": "echo",
+}
 _ONE_WAY = {Path("ibrobot_core/safe_output.py"), Path("ibrobot_core/screen.py")}
 
 
@@ -161,10 +167,16 @@ def test_all_text_goes_one_way():
 @pytest.mark.parametrize(
     "code",
     [
-        "from rich.console import Console", "import rich", "from rich import print", "click.echo(1)", "print(1)",
+        "from rich.console import Console",
+        "import rich",
+        "from rich import print",
+        "click.echo(1)",
+        "print(1)",
         "from rich.live import Live\nLive(a)",
-        "TextColumn('{task.description}')", "Panel(a, title=name)", "from rich.text import Text",
+        "TextColumn('{task.description}')",
+        "Panel(a, title=name)",
+        "from rich.text import Text",
     ],
-)  # fmt: skip
+)
 def test_the_check_finds_ways_around(code: str):
     assert list(ways_around(ast.parse(code)))

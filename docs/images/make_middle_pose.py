@@ -21,9 +21,14 @@ def main() -> None:
     spec.visual.global_.offwidth, spec.visual.global_.offheight = SIZE
     spec.visual.headlight.ambient = (0.45, 0.45, 0.45)
     spec.add_texture(
-        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        rgb1=(1, 1, 1), rgb2=(1, 1, 1), width=8, height=8,
-    )  # fmt: skip
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=(1, 1, 1),
+        rgb2=(1, 1, 1),
+        width=8,
+        height=8,
+    )
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(2, 2, 0.1), rgba=(0.93, 0.93, 0.95, 1))
     model = spec.compile()
     data = mujoco.MjData(model)

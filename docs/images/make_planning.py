@@ -38,9 +38,14 @@ def scene(world: World) -> mujoco.MjModel:
     spec.visual.global_.offwidth, spec.visual.global_.offheight = SIZE
     spec.visual.headlight.ambient = [0.45] * 3
     spec.add_texture(
-        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[1, 1, 1], rgb2=[0.9, 0.93, 0.96], width=64, height=384,
-    )  # fmt: skip
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[1, 1, 1],
+        rgb2=[0.9, 0.93, 0.96],
+        width=64,
+        height=384,
+    )
     spec.worldbody.add_light(pos=[0.3, -0.3, 1.2], dir=[-0.1, 0.3, -1])
     for name, thing in world.objects.items():
         placed, quaternion, shape = matrix(thing.pose), np.zeros(4), thing.shape

@@ -316,9 +316,15 @@ def test_deep_check_wants_weights_only_where_they_are_loaded(
     monkeypatch.setattr(FakePolicy, "check_weights", check_weights)
     transport = ("--set", "transport={type: net}") if mode == "far" else ()
     ran = ibrobot(
-        "config", "check", "mini.yaml", "--sim", "--deep", "--set",
-        f"control_modes.policy.inference.execution_mode={mode}", *transport,
-    )  # fmt: skip
+        "config",
+        "check",
+        "mini.yaml",
+        "--sim",
+        "--deep",
+        "--set",
+        f"control_modes.policy.inference.execution_mode={mode}",
+        *transport,
+    )
     assert ran.code == code
     assert ran.err == ("" if code == 0 else "error: mini.yaml: models.net: model.safetensors is missing\n")
 

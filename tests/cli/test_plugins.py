@@ -68,9 +68,15 @@ def test_show_as_json(ibrobot: Ibrobot, robot: Path) -> None:
     hardware, sensor = json.loads(ibrobot("plugins", "show", "fake_arm", "--json").out)
 
     assert hardware["options"][1] == {
-        "name": "max_speed", "type": "float", "unit": "rad/s", "required": False, "default": 3.0,
-        "allowed": "> 0, ≤ 6.5", "secret": False, "help": "speed limit of the servos",
-    }  # fmt: skip
+        "name": "max_speed",
+        "type": "float",
+        "unit": "rad/s",
+        "required": False,
+        "default": 3.0,
+        "allowed": "> 0, ≤ 6.5",
+        "secret": False,
+        "help": "speed limit of the servos",
+    }
     assert sensor["options"] == []
 
 

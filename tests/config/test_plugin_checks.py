@@ -166,7 +166,15 @@ def test_independent_mistakes_are_reported_at_once(base: str, load_text: Load) -
     found = faults(load_text, text).splitlines()
     keys = [line.split(": ")[1] for line in found]
     assert keys == [
-        "robot.joints.pan.lower", "robot.description.poses.home", "hardware.baudd", "peripherals.top.fps",
-        "executors.grip_position.group", "control_modes.plan.executors.0", "teleoperation.stick.port",
-        "teleoperation.stick.inverted.0", "contract.rate_hz", "control.rate_hz", "control.stop",
-    ], found  # fmt: skip
+        "robot.joints.pan.lower",
+        "robot.description.poses.home",
+        "hardware.baudd",
+        "peripherals.top.fps",
+        "executors.grip_position.group",
+        "control_modes.plan.executors.0",
+        "teleoperation.stick.port",
+        "teleoperation.stick.inverted.0",
+        "contract.rate_hz",
+        "control.rate_hz",
+        "control.stop",
+    ], found

@@ -90,10 +90,17 @@ class Rig:
         names = ROBOT.joint_names
         spec = PolicySpec({"observation.state": (SIZE,)}, names, SIZE, chunk_size, rate_hz, prefix=prefix)
         self.dispatcher = Dispatcher(
-            make_contract(safety_behavior), spec, DispatchConfig(watermark, strategy, Smoothing(enabled, coeff)), ROBOT,
-            self.bus, self.client, self._take, timeout_s, "pick the cube",
+            make_contract(safety_behavior),
+            spec,
+            DispatchConfig(watermark, strategy, Smoothing(enabled, coeff)),
+            ROBOT,
+            self.bus,
+            self.client,
+            self._take,
+            timeout_s,
+            "pick the cube",
             report=lambda chunk, now_ns, outcome: self.reports.append((chunk.id, outcome, chunk.error)),
-        )  # fmt: skip
+        )
         self.dispatcher.begin(7)
 
     def _take(self, *plan: Any) -> None:

@@ -149,9 +149,12 @@ def test_a_chunk_that_begins_after_the_arm_was_held_leads_in() -> None:
 
 @settings(deadline=None)
 @given(
-    enabled=st.booleans(), late=st.integers(0, 10), every=st.integers(1, 20),
-    distance=st.floats(-2, 2), coeff=coefficients,
-)  # fmt: skip
+    enabled=st.booleans(),
+    late=st.integers(0, 10),
+    every=st.integers(1, 20),
+    distance=st.floats(-2, 2),
+    coeff=coefficients,
+)
 def test_after_a_hold_no_step_is_faster_than_the_joint(
     enabled: bool, late: int, every: int, distance: float, coeff: float
 ) -> None:

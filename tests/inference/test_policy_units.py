@@ -31,12 +31,17 @@ CONTRACT = Contract(
     30.0,
     (
         ObservationPart(
-            "observation.state", "/joint_states", "sensor_msgs/msg/JointState",
-            tuple(f"position.{joint}" for joint in JOINTS), None, Align(), Feature("float32", (len(JOINTS),)),
+            "observation.state",
+            "/joint_states",
+            "sensor_msgs/msg/JointState",
+            tuple(f"position.{joint}" for joint in JOINTS),
+            None,
+            Align(),
+            Feature("float32", (len(JOINTS),)),
         ),
     ),
     (ActionPart("arm", "/commands", "std_msgs/msg/Float64MultiArray", "hold", JOINTS),),
-)  # fmt: skip
+)
 
 
 def units(norm_mode: str, calibration: Mapping[str, Mapping[str, Any]] = CALIBRATION) -> JointUnits:

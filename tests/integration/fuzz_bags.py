@@ -59,12 +59,17 @@ CONTRACT = Contract(
     30.0,
     (
         ObservationPart(
-            "observation.state", "/joint_states", JointState.ros_type, tuple(f"position.{j}" for j in JOINTS), None,
-            Align(), Feature("float32", (2,), JOINTS),
+            "observation.state",
+            "/joint_states",
+            JointState.ros_type,
+            tuple(f"position.{j}" for j in JOINTS),
+            None,
+            Align(),
+            Feature("float32", (2,), JOINTS),
         ),
     ),
     (ActionPart("arm", "/commands", Float64MultiArray.ros_type, "hold", JOINTS),),
-)  # fmt: skip
+)
 SPAN_NS = 1_200_000_000
 RATES = {"/joint_states": 100, "/commands": 50}
 EDGES = (0, 1, 127, 128, 255, 2**15, 2**16 - 1, 2**31, 2**32 - 1, 2**40, 2**63 - 1, 2**63, 2**64 - 1)

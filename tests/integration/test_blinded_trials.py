@@ -213,8 +213,11 @@ def test_reset_task_is_performed_by_the_command_for_tasks() -> None:
     assert isinstance(tasks, click.Group)
     given = tasks.commands[verb].make_context(verb, words).params
     assert (given["file"], given["config"], given["sim"], given["headless"]) == (
-        "clear table.yaml", "arm.yaml", True, True,
-    )  # fmt: skip
+        "clear table.yaml",
+        "arm.yaml",
+        True,
+        True,
+    )
 
 
 @pytest.mark.parametrize(

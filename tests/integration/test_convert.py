@@ -395,9 +395,15 @@ def test_foreign_bags_by_the_contract_alone(
     )
     (tmp_path / "robot.yaml").write_text(ROBOT.replace("  actions:", f"    {lamp_too}\n  actions:"))
     result = run(
-        tmp_path / "bag", "--config", tmp_path / "robot.yaml", "--prompt", "blink", "--no-videos",
-        "--out", tmp_path / "set",
-    )  # fmt: skip
+        tmp_path / "bag",
+        "--config",
+        tmp_path / "robot.yaml",
+        "--prompt",
+        "blink",
+        "--no-videos",
+        "--out",
+        tmp_path / "set",
+    )
     assert result.code == 0, result.err
     found = rows(tmp_path / "set")
     np.testing.assert_array_equal(found["observation.state"][:, 0], np.arange(30))

@@ -49,10 +49,16 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("bags") / "blocks"
     for number in range(1, 4):
         record(
-            root / f"episodes/episode_{number:06d}", number, 0.3 + 0.2 * number, f"sort {number}",
-            outcome="failure" if number == 2 else "success", mode=f"mode {number}", robot="bench",
-            config=json.dumps(ROBOT), calibration=json.dumps({"arm": CALIBRATION}),
-        )  # fmt: skip
+            root / f"episodes/episode_{number:06d}",
+            number,
+            0.3 + 0.2 * number,
+            f"sort {number}",
+            outcome="failure" if number == 2 else "success",
+            mode=f"mode {number}",
+            robot="bench",
+            config=json.dumps(ROBOT),
+            calibration=json.dumps({"arm": CALIBRATION}),
+        )
     return root
 
 

@@ -25,14 +25,19 @@ CAMERA = (
 def test_cells_of_the_depth_camera_are_obstacles():
     registry = installed_plugins()
     config = load_config(
-        find_config("so101_blind", registry), sim=True, mode="moveit_planning", registry=registry,
+        find_config("so101_blind", registry),
+        sim=True,
+        mode="moveit_planning",
+        registry=registry,
         overrides=(
-            CAMERA, "simulation.start_pose=home", "control_modes.moveit_planning.planner={type: rrt_connect}",
+            CAMERA,
+            "simulation.start_pose=home",
+            "control_modes.moveit_planning.planner={type: rrt_connect}",
             "world={clouds: {depth: {topic: /camera/depth/image_raw, cell: 0.01, margin: 0.03, reach: 0.6}}, objects: "
             "{table: {shape: box, size: [2, 2, 0.02], position: [0, 0, -0.011]}, "
             "bin: {shape: box, size: [0.3, 0.3, 0.2], position: [0.1, 0.24, 0.1]}}}",
         ),
-    )  # fmt: skip
+    )
     runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, seed=3)))
     try:
         runtime.start()

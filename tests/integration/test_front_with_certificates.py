@@ -83,10 +83,14 @@ def front(ibrobot: tuple[str, ...], openpi: OpenpiServer, tmp_path: Path) -> Ite
     names = ("--server", "127.0.0.1", "--robot", "robot1", "--robot", "robot2")
     subprocess.run([*ibrobot, "certs", str(lab), *names], check=True, capture_output=True)
     model = {
-        "type": "openpi", "url": openpi.url, "horizon": 10, "rate_hz": 30, "prompt": [],
+        "type": "openpi",
+        "url": openpi.url,
+        "horizon": 10,
+        "rate_hz": 30,
+        "prompt": [],
         "observations": [{"observation": STATE, "key": ["state"], "shape": [6]}],
         "actions": [{"joints": list(JOINTS)}],
-    }  # fmt: skip
+    }
     tls = {name: str(path) for name, path in attrs.asdict(certificates(lab, "127.0.0.1")).items()}
     given = {"models.pi": model, "transport": {"type": "zenoh", "tls": tls}}
     overrides = [

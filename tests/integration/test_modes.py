@@ -78,9 +78,14 @@ class Terminal:
         self.slave = slave
         self.shown = ""
         self.process = subprocess.Popen(
-            command, cwd=folder, stdin=slave, stdout=slave, stderr=slave, start_new_session=True,
+            command,
+            cwd=folder,
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            start_new_session=True,
             preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - so that Ctrl-C is a signal
-        )  # fmt: skip
+        )
 
     def type(self, keys: str) -> None:
         os.write(self.master, keys.encode())

@@ -206,9 +206,14 @@ def check_rows(reader: Any, spec: Contract, seen: list[Frame], sent: list[tuple[
 def test_pictures_of_a_motion_jpeg_camera(tmp_path: Path) -> None:
     """What it sent is in the bag byte by byte, and its decoding is what a policy saw and what a dataset gets."""
     image = ObservationPart(
-        "observation.images.top", "/camera/top/image_raw", "sensor_msgs/msg/Image", (), ImageSpec(),
-        Align("hold", "header"), Feature("image", (-1, -1, 3)),
-    )  # fmt: skip
+        "observation.images.top",
+        "/camera/top/image_raw",
+        "sensor_msgs/msg/Image",
+        (),
+        ImageSpec(),
+        Align("hold", "header"),
+        Feature("image", (-1, -1, 3)),
+    )
     spec = Contract(30.0, (image,), ())
     clock = RealClock()
     bus = Bus(clock)

@@ -51,9 +51,14 @@ def front(runs: Runs, site: Site, openpi: OpenpiServer) -> Iterator[InferenceSer
     """A server of the model `net`, on the transport `shared`, which asks the openpi server."""
     site.add("shared-network", "shared_network.py")
     options = OpenpiOptions(
-        url=openpi.url, observations=(ObservationMap("observation.state", ("state",), (2,)),),
-        actions=(ActionMap(("pan", "grip")),), horizon=10, rate_hz=25.0, prompt=(), timeout=30.0,
-    )  # fmt: skip
+        url=openpi.url,
+        observations=(ObservationMap("observation.state", ("state",), (2,)),),
+        actions=(ActionMap(("pan", "grip")),),
+        horizon=10,
+        rate_hz=25.0,
+        prompt=(),
+        timeout=30.0,
+    )
     ctx = host_context(robot=runs.make(MODEL.format(url=openpi.url)).session.config.robot)
     policy = ServedPolicy(options, ctx, OpenpiConnection(options, ctx.log))
     policy.load()
@@ -97,9 +102,12 @@ def test_a_recording_tells_what_the_model_was_asked_and_answered(
     transport = DISTRIBUTED[1:] if engine == "distributed" else ()
     mode = f"control_modes.policy.inference.execution_mode={engine}"
     runtime = runs.start(
-        MODEL.format(url=openpi.url), mode, *transport, f"recording={{type: mcap, root: {tmp_path}, dataset: picks}}",
+        MODEL.format(url=openpi.url),
+        mode,
+        *transport,
+        f"recording={{type: mcap, root: {tmp_path}, dataset: picks}}",
         episodes=1,
-    )  # fmt: skip
+    )
     motion(runtime)
     runtime.stop()
     episode = tmp_path / "picks/episodes/episode_000001"

@@ -109,9 +109,14 @@ def test_another_contract_is_refused_with_both_sides(replay: Command, picks: Pat
     assert "so101_blind.yaml: 50" in done.stderr
     assert "recorded: 30" in done.stderr
     done = replay(
-        picks / "episode_000001", "so101_blind", "--sim", "--lockstep", "--force-contract", "--set",
+        picks / "episode_000001",
+        "so101_blind",
+        "--sim",
+        "--lockstep",
+        "--force-contract",
+        "--set",
         "contract.rate_hz=50",
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr
 
 

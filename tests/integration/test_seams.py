@@ -28,11 +28,18 @@ from ibrobot_core.app import Command, Service, fields, flag_of, installed_plugin
 pytestmark = pytest.mark.integration
 PAGE = Path(inspect.getfile(ibrobot_web)).parent
 MOVES: tuple[RunCommand, ...] = (
-    messages.Reset(), messages.SetMode("web"), messages.BeginEpisode("pick"), messages.EndEpisode("failure"),
-    messages.DiscardEpisode(), messages.RedoEpisode(), messages.SetSmoothing(enabled=False),
-    messages.Intervene(take=True), messages.GoTo("home"), messages.Cancel(),
+    messages.Reset(),
+    messages.SetMode("web"),
+    messages.BeginEpisode("pick"),
+    messages.EndEpisode("failure"),
+    messages.DiscardEpisode(),
+    messages.RedoEpisode(),
+    messages.SetSmoothing(enabled=False),
+    messages.Intervene(take=True),
+    messages.GoTo("home"),
+    messages.Cancel(),
     messages.Preview(messages.Target(joints={"j0": 0.1})),
-)  # fmt: skip
+)
 """The commands of a page that call services of the run."""
 
 

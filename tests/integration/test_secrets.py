@@ -43,9 +43,14 @@ class Lab:
     def run(self, *arguments: object, ok: bool = True) -> str:
         words = [str(argument) for argument in arguments]
         done = subprocess.run(
-            [sys.executable, "-c", "from ibrobot_core.cli.main import main; main()", *words], cwd=self.folder,
-            env={**os.environ, **SECRETS}, capture_output=True, text=True, timeout=120, check=False,
-        )  # fmt: skip
+            [sys.executable, "-c", "from ibrobot_core.cli.main import main; main()", *words],
+            cwd=self.folder,
+            env={**os.environ, **SECRETS},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
         self.printed[" ".join(words)] = done.stdout + done.stderr
         assert (done.returncode == 0) == ok, done.stderr[-2000:]
         return done.stdout

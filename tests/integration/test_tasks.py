@@ -36,8 +36,15 @@ def test_bundled_task_picks_the_cube_and_puts_it_into_the_bin():
     task = json.loads(done.stdout.splitlines()[-1])["task"]
     assert (task["name"], task["outcome"], task["success"]) == ("pick the cube", "SUCCEEDED", True)
     assert [step["name"] for step in task["steps"]] == [
-        "open", "down to the cube", "grasp", "lift", "over the bin", "release", "check", "back",
-    ]  # fmt: skip
+        "open",
+        "down to the cube",
+        "grasp",
+        "lift",
+        "over the bin",
+        "release",
+        "check",
+        "back",
+    ]
     assert task["steps"][6]["facts"]["distance_m"] < 0.06
 
 
@@ -112,8 +119,13 @@ def test_planned_motions_of_a_task_are_recorded_with_the_actions_of_the_contract
         reader.close()
     assert (summary.outcome, summary.metadata["prompt"], commander) == ("success", "turn and open", "planner")
     assert contract.features()["action"].names == (
-        "shoulder_pan.pos", "shoulder_lift.pos", "elbow_flex.pos", "wrist_flex.pos", "wrist_roll.pos", "gripper.pos",
-    )  # fmt: skip
+        "shoulder_pan.pos",
+        "shoulder_lift.pos",
+        "elbow_flex.pos",
+        "wrist_flex.pos",
+        "wrist_roll.pos",
+        "gripper.pos",
+    )
     # Each action is what the robot was told at some tick, in order, from the start to the goals.
     told = np.array(commands, dtype=np.float32)
     found = [int(np.abs(told - action).max(axis=1).argmin()) for action in actions]

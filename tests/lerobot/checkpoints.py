@@ -60,9 +60,15 @@ def diffusion(**changes: Any) -> DiffusionConfig:
 def vqbet(**changes: Any) -> VQBeTConfig:
     """One camera, five observations."""
     small = {
-        "gpt_n_layer": 1, "gpt_n_head": 2, "gpt_hidden_dim": 32, "gpt_input_dim": 32, "gpt_output_dim": 32,
-        "vqvae_embedding_dim": 16, "vqvae_enc_hidden_dim": 16, "offset_loss_weight": 1.0,
-    }  # fmt: skip
+        "gpt_n_layer": 1,
+        "gpt_n_head": 2,
+        "gpt_hidden_dim": 32,
+        "gpt_input_dim": 32,
+        "gpt_output_dim": 32,
+        "vqvae_embedding_dim": 16,
+        "vqvae_enc_hidden_dim": 16,
+        "offset_loss_weight": 1.0,
+    }
     given = features(STATE, TOP) | small | {"crop_shape": (84, 84)} | changes
     return VQBeTConfig(pretrained_backbone_weights=None, **given)
 
@@ -169,9 +175,16 @@ def language_model(path: Path) -> Path:
         image_seq_len=4,
     ).save_pretrained(path)
     text = {
-        "model_type": "llama", "hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 2, "head_dim": 8,
-        "num_attention_heads": 4, "num_key_value_heads": 2, "vocab_size": len(_WORDS), "pad_token_id": 1,
-    }  # fmt: skip
+        "model_type": "llama",
+        "hidden_size": 32,
+        "intermediate_size": 32,
+        "num_hidden_layers": 2,
+        "head_dim": 8,
+        "num_attention_heads": 4,
+        "num_key_value_heads": 2,
+        "vocab_size": len(_WORDS),
+        "pad_token_id": 1,
+    }
     vision = {
         "hidden_size": 16,
         "intermediate_size": 16,

@@ -31,10 +31,18 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A policy of random weights, which moves the arm above its rest pose."""
     inputs = {STATE: PolicyFeature(FeatureType.STATE, (SIZE,)), SCENE: PolicyFeature(FeatureType.ENV, (10,))}
     config = ACTConfig(
-        input_features=inputs, output_features={"action": PolicyFeature(FeatureType.ACTION, (SIZE,))}, device="cpu",
-        dim_model=32, n_heads=2, dim_feedforward=32, n_encoder_layers=1, use_vae=False, chunk_size=8, n_action_steps=1,
+        input_features=inputs,
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (SIZE,))},
+        device="cpu",
+        dim_model=32,
+        n_heads=2,
+        dim_feedforward=32,
+        n_encoder_layers=1,
+        use_vae=False,
+        chunk_size=8,
+        n_action_steps=1,
         pretrained_backbone_weights=None,
-    )  # fmt: skip
+    )
     joints = {"mean": np.array([0, -1.3, 1.2, 0.8, 0, 0.3], np.float32), "std": np.full(SIZE, 0.3, np.float32)}
     return save(config, tmp_path_factory.mktemp("policy") / "checkpoint", {STATE: joints, "action": joints})
 
@@ -56,10 +64,18 @@ def ours(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lerobot_eval(checkpoint: Path, out: Path, episodes: int, seed: int, *more: str) -> Path:
     """Run LeRobot's command; returns its folder."""
     command = (
-        str(Path(sys.executable).with_name("lerobot-eval")), f"--policy.path={checkpoint}", "--policy.device=cpu",
-        "--env.type=ibrobot", "--env.task=Push-v0", f"--env.overrides={json.dumps(OVERRIDES)}",
-        f"--eval.n_episodes={episodes}", "--eval.batch_size=1", f"--seed={seed}", f"--output_dir={out}", *more,
-    )  # fmt: skip
+        str(Path(sys.executable).with_name("lerobot-eval")),
+        f"--policy.path={checkpoint}",
+        "--policy.device=cpu",
+        "--env.type=ibrobot",
+        "--env.task=Push-v0",
+        f"--env.overrides={json.dumps(OVERRIDES)}",
+        f"--eval.n_episodes={episodes}",
+        "--eval.batch_size=1",
+        f"--seed={seed}",
+        f"--output_dir={out}",
+        *more,
+    )
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return out

@@ -28,9 +28,13 @@ LEADER = (XL330_M077,) * 6
 ENDS = (900, 3100)
 """Positions between which the hand moves each joint at calibration [ticks]."""
 PATIENT = (
-    "control.state_timeout=60", "hardware.lost_readings=1000", "hardware.blocked=60",
-    "teleoperation.leader.lost_readings=1000", "teleoperation.leader.blocked=60", "teleoperation.leader.deadman=none",
-)  # fmt: skip
+    "control.state_timeout=60",
+    "hardware.lost_readings=1000",
+    "hardware.blocked=60",
+    "teleoperation.leader.lost_readings=1000",
+    "teleoperation.leader.blocked=60",
+    "teleoperation.leader.deadman=none",
+)
 """A busy machine may keep the emulators, threads of this process, from answering."""
 PATIENT_SDK = """
 import select

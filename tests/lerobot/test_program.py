@@ -34,9 +34,12 @@ pytestmark = pytest.mark.lerobot
 PLUGINS = Path(__file__).parents[1] / "shared" / "plugins"
 ROBOT = ("--robot.type=ibrobot", "--robot.config=so101_blind", "--robot.sim=true")
 WAVING = (
-    "--teleop.type=ibrobot", "--teleop.config=so101_blind", "--teleop.sim=true", "--teleop.device=waving",
+    "--teleop.type=ibrobot",
+    "--teleop.config=so101_blind",
+    "--teleop.sim=true",
+    "--teleop.device=waving",
     "--teleop.overrides=['teleoperation.waving={type: waving}']",
-)  # fmt: skip
+)
 
 
 @pytest.fixture
@@ -70,9 +73,17 @@ def test_commands_drive_a_simulated_robot(run: Callable[..., None], tmp_path: Pa
     dataset = tmp_path / "dataset"
     data = ("--dataset.repo_id=me/wave", f"--dataset.root={dataset}")
     run(
-        "record", *ROBOT, *WAVING, *data, "--dataset.num_episodes=1", "--dataset.episode_time_s=2",
-        "--dataset.reset_time_s=0", "--dataset.single_task=wave", "--dataset.push_to_hub=false", "--play_sounds=false",
-    )  # fmt: skip
+        "record",
+        *ROBOT,
+        *WAVING,
+        *data,
+        "--dataset.num_episodes=1",
+        "--dataset.episode_time_s=2",
+        "--dataset.reset_time_s=0",
+        "--dataset.single_task=wave",
+        "--dataset.push_to_hub=false",
+        "--play_sounds=false",
+    )
     info = json.loads((dataset / "meta" / "info.json").read_text())
     theirs = SO101Follower(SO101FollowerConfig(port="/dev/null", id="any", calibration_dir=tmp_path))
     names = list(theirs.action_features)
@@ -97,10 +108,17 @@ def test_rollout_drives_a_simulated_robot_with_cameras(run: Callable[..., None],
     pictures = {"mean": np.full((3, 1, 1), 0.5, np.float32), "std": np.full((3, 1, 1), 0.3, np.float32)}
     policy = save(config, tmp_path / "checkpoint", {STATE: joints, TOP: pictures, WRIST: pictures, "action": joints})
     run(
-        "rollout", "--robot.type=ibrobot", "--robot.config=so101", "--robot.sim=true", f"--policy.path={policy}",
-        "--policy.device=cpu", "--duration=1", "--task=wave", "--play_sounds=false",
+        "rollout",
+        "--robot.type=ibrobot",
+        "--robot.config=so101",
+        "--robot.sim=true",
+        f"--policy.path={policy}",
+        "--policy.device=cpu",
+        "--duration=1",
+        "--task=wave",
+        "--play_sounds=false",
         "--return_to_initial_position=false",
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture
@@ -115,9 +133,12 @@ def follower(tmp_path: Path) -> Iterator[tuple[str, ...]]:
             servo.set("max_position_limit", 3400)
         camera = "{type: made_up, width: 320, height: 240, fps: 30}"
         yield (
-            "--robot.type=so101_follower", f"--robot.port={emulator.port}", "--robot.id=arm",
-            f"--robot.calibration_dir={tmp_path}", f"--robot.cameras={{top: {camera}, wrist: {camera}}}",
-        )  # fmt: skip
+            "--robot.type=so101_follower",
+            f"--robot.port={emulator.port}",
+            "--robot.id=arm",
+            f"--robot.calibration_dir={tmp_path}",
+            f"--robot.cameras={{top: {camera}, wrist: {camera}}}",
+        )
 
 
 @pytest.mark.long
@@ -134,11 +155,18 @@ def test_datasets_have_the_features_of_lerobots_own_and_policies_of_one_run_on_t
         out = tmp_path / "out" / name
         dataset = (f"--dataset.repo_id=me/{name}", f"--dataset.root={tmp_path / name}")
         run(
-            "record", *robot, *WAVING, "--teleop.pose=home", *dataset,
-            "--dataset.num_episodes=1", "--dataset.episode_time_s=2",
-            "--dataset.reset_time_s=0", "--dataset.single_task=wave", "--dataset.push_to_hub=false",
+            "record",
+            *robot,
+            *WAVING,
+            "--teleop.pose=home",
+            *dataset,
+            "--dataset.num_episodes=1",
+            "--dataset.episode_time_s=2",
+            "--dataset.reset_time_s=0",
+            "--dataset.single_task=wave",
+            "--dataset.push_to_hub=false",
             "--play_sounds=false",
-        )  # fmt: skip
+        )
         info = json.loads((tmp_path / name / "meta" / "info.json").read_text())
         features[name] = info["features"]
         run(
@@ -151,9 +179,15 @@ def test_datasets_have_the_features_of_lerobots_own_and_policies_of_one_run_on_t
     for name, robot in robots.items():
         (other,) = (policy for of, policy in policies.items() if of != name)
         run(
-            "rollout", *robot, f"--policy.path={other}", "--policy.device=cpu", "--duration=1", "--task=wave",
-            "--play_sounds=false", "--return_to_initial_position=false",
-        )  # fmt: skip
+            "rollout",
+            *robot,
+            f"--policy.path={other}",
+            "--policy.device=cpu",
+            "--duration=1",
+            "--task=wave",
+            "--play_sounds=false",
+            "--return_to_initial_position=false",
+        )
 
 
 def test_a_fault_is_an_exception_with_its_text(tmp_path: Path) -> None:

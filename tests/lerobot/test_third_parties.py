@@ -32,9 +32,17 @@ def test_a_robot_without_motors_holds_its_pose(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.startswith("dummy.yaml: dummy_follower, 7 joints\n")
     done = ibrobot(
-        tmp_path, "launch", "dummy.yaml", "--headless", "--duration", "1",
-        "--set", "control.state_timeout=20", "--set", "hardware.blocked=10",
-    )  # fmt: skip
+        tmp_path,
+        "launch",
+        "dummy.yaml",
+        "--headless",
+        "--duration",
+        "1",
+        "--set",
+        "control.state_timeout=20",
+        "--set",
+        "hardware.blocked=10",
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "faults     none" in done.stdout
     assert "[DEBUG DUMMY] Received Action" in done.stdout + done.stderr  # the package prints what it is sent

@@ -63,9 +63,15 @@ class Servo:
 
     def __attrs_post_init__(self) -> None:
         for name, value in {
-            "model_number": self.model, "firmware": 46, "id": self.id, "baud_rate": 3, "operating_mode": POSITION_MODE,
-            "max_position": RESOLUTION - 1, "voltage": 120, "temperature": 30,
-        }.items():  # fmt: skip
+            "model_number": self.model,
+            "firmware": 46,
+            "id": self.id,
+            "baud_rate": 3,
+            "operating_mode": POSITION_MODE,
+            "max_position": RESOLUTION - 1,
+            "voltage": 120,
+            "temperature": 30,
+        }.items():
             self.set(name, value)
 
     def get(self, name: str) -> int:

@@ -18,9 +18,15 @@ JOINTS = "/joint_states"
 
 
 def make_episode(
-    path: Path, seconds: float = 1.0, *, joints: Sequence[str] = ("pan", "tilt"), cameras: Sequence[str] = ("top",),
-    outcome: str = "success", signals: Mapping[str, Sequence[float]] | None = None, **metadata: Any,
-) -> Path:  # fmt: skip
+    path: Path,
+    seconds: float = 1.0,
+    *,
+    joints: Sequence[str] = ("pan", "tilt"),
+    cameras: Sequence[str] = ("top",),
+    outcome: str = "success",
+    signals: Mapping[str, Sequence[float]] | None = None,
+    **metadata: Any,
+) -> Path:
     """Record an episode at 50 Hz. Joint i moves by i + 1 rad/s; the pixels of pictures are the number of the tick.
 
     `signals`: topic -> vector that it has all the time.

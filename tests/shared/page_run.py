@@ -46,9 +46,14 @@ def page_run(*arguments: str, folder: Path | None = None, command: Sequence[str]
     """
     with tempfile.TemporaryFile("w+", encoding="utf-8") as log:
         run = subprocess.Popen(
-            [*IBROBOT, *command, *arguments, *_WEB], cwd=folder, stdout=log, stderr=log, stdin=subprocess.DEVNULL,
-            start_new_session=True, env={**os.environ, "CI": "1"},
-        )  # fmt: skip
+            [*IBROBOT, *command, *arguments, *_WEB],
+            cwd=folder,
+            stdout=log,
+            stderr=log,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+            env={**os.environ, "CI": "1"},
+        )
         try:
             yield _address(run, log)
         finally:

@@ -61,7 +61,13 @@ BASES: Mapping[str, Message] = {
     each.ros_type: each
     for each in (
         PointCloud2(
-            Header(0, "base"), 1, 50, tuple(PointField(name, 4 * i, 7) for i, name in enumerate("xyz")), False, 12, 600,
+            Header(0, "base"),
+            1,
+            50,
+            tuple(PointField(name, 4 * i, 7) for i, name in enumerate("xyz")),
+            False,
+            12,
+            600,
             np.full(150, 0.2, np.float32).view(np.uint8),
         ),
         Image(Header(0, "base"), 4, 6, "16UC1", 12, np.full(24, 300, np.uint16).view(np.uint8)),
@@ -71,7 +77,7 @@ BASES: Mapping[str, Message] = {
             Header(0, ""), 1, 0, "act", "", "", "", "used", "", 20.0, 10.0, 0.0, 33_333_333, ("gripper",), np.zeros(1)
         ),
     )
-}  # fmt: skip
+}
 """Messages that make sense; generated ones differ from them in some fields."""
 TEXTS = (
     "", "home", "rest", "up", "xyz=0.2,0.0,0.1", "xyz=1e308,0,0", "xyz=nan,0,0", "shoulder_pan=0.5",

@@ -27,9 +27,14 @@ def ui_process(folder: Path) -> Iterator[str]:
     """Run `ibrobot ui` in a folder, and yield the address of its page."""
     with tempfile.TemporaryFile("w+", encoding="utf-8") as log:
         served = subprocess.Popen(
-            [*IBROBOT, "ui", "--port", "0", "--no-browser"], cwd=folder, stdout=log, stderr=log,
-            stdin=subprocess.DEVNULL, start_new_session=True, env={**os.environ, "CI": "1"},
-        )  # fmt: skip
+            [*IBROBOT, "ui", "--port", "0", "--no-browser"],
+            cwd=folder,
+            stdout=log,
+            stderr=log,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+            env={**os.environ, "CI": "1"},
+        )
         try:
             deadline_s = time.monotonic() + 60
             found = None

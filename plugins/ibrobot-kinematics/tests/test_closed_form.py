@@ -26,8 +26,14 @@ JOINTS = ("a", "b", "c", "d", "e")
 SHARES = st.lists(st.floats(0.02, 0.98), min_size=5, max_size=5).map(np.array)
 
 
-def build(limit: float, *, signs: tuple[int, ...] = (1, 1, 1, 1, 1), euler: str = "0 0 0", aside: float = -0.0002,
-          off: str = "0.012 0.001") -> KinematicModel:  # fmt: skip
+def build(
+    limit: float,
+    *,
+    signs: tuple[int, ...] = (1, 1, 1, 1, 1),
+    euler: str = "0 0 0",
+    aside: float = -0.0002,
+    off: str = "0.012 0.001",
+) -> KinematicModel:
     """An arm like the SO-101 with names that say nothing; its tool points along the forearm."""
     axes = ("0 0 {}", "0 {} 0", "0 {} 0", "0 {} 0", "{} 0 0")
     places = ("0.04 0.01 0.06", "0.03 0 0.05", "0.03 0 0.11", "0.135 0 0.005", f"0.06 {aside} 0")

@@ -100,9 +100,11 @@ class Phone(Component):
 @hookimpl
 def ibrobot_sections() -> Iterator[SectionDescriptor]:
     yield SectionDescriptor(
-        type="phone", make=lambda options, session: Phone("phone", "a phone"), summary="a phone",
+        type="phone",
+        make=lambda options, session: Phone("phone", "a phone"),
+        summary="a phone",
         offers=lambda options, service: service == "/record_episode",
-    )  # fmt: skip
+    )
 
 
 @hookimpl

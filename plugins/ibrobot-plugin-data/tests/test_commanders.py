@@ -54,8 +54,14 @@ def commanders(mode: dict[str, Any], *messages: tuple[int, str]) -> Commanders:
 def test_the_newest_message_says_who_commands() -> None:
     found = commanders({}, (10, "policy"), (20, "policy"), (30, "handover"), (40, "operator"))
     assert [found.at(t) for t in (0, 10, 29, 30, 39, 40, 99)] == [
-        "policy", "policy", "policy", "handover", "handover", "operator", "operator",
-    ]  # fmt: skip
+        "policy",
+        "policy",
+        "policy",
+        "handover",
+        "handover",
+        "operator",
+        "operator",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -63,10 +63,18 @@ def rows(tmp_path: Path) -> list[list[dict[str, Any]]]:
 
 
 def record(
-    folder: Path, seed: float = 0.0, seconds: float = 1.0, *, outcome: str = "success", prompt: str = "pick",
-    gap: tuple[float, float] = (0.0, 0.0), commanders: Mapping[float, str] | None = None,
-    contract: Contract | None = CONTRACT, damaged: bool = False, **metadata: str,
-) -> Path:  # fmt: skip
+    folder: Path,
+    seed: float = 0.0,
+    seconds: float = 1.0,
+    *,
+    outcome: str = "success",
+    prompt: str = "pick",
+    gap: tuple[float, float] = (0.0, 0.0),
+    commanders: Mapping[float, str] | None = None,
+    contract: Contract | None = CONTRACT,
+    damaged: bool = False,
+    **metadata: str,
+) -> Path:
     """Record states at 100 Hz and commands at 50 Hz: both are `seed` plus the time [s].
 
     Args:

@@ -329,9 +329,14 @@ def test_the_first_episodes_of_two_runs_agree_on_one_contract(runs: Runs, monkey
 
 
 NO_TEXT = {
-    "mapping": {"task": "pick"}, "list": ["pick"], "number": 3, "nan": float("nan"), "surrogate": "pick \ud800",
-    "zero": "pick\0", "long": "x" * 200_000,
-}  # fmt: skip
+    "mapping": {"task": "pick"},
+    "list": ["pick"],
+    "number": 3,
+    "nan": float("nan"),
+    "surrogate": "pick \ud800",
+    "zero": "pick\0",
+    "long": "x" * 200_000,
+}
 
 
 @pytest.mark.parametrize("prompt", NO_TEXT.values(), ids=NO_TEXT)

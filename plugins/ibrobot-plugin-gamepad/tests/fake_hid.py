@@ -59,11 +59,16 @@ class FakeHidapi(ModuleType):
     def enumerate(self) -> list[dict[str, Any]]:
         return [
             {
-                "path": each.path, "vendor_id": each.vendor, "product_id": each.product, "serial_number": each.serial,
-                "product_string": each.name, "usage_page": 0x01, "usage": each.usage,
+                "path": each.path,
+                "vendor_id": each.vendor,
+                "product_id": each.product,
+                "serial_number": each.serial,
+                "product_string": each.name,
+                "usage_page": 0x01,
+                "usage": each.usage,
             }
             for each in self.bus
-        ]  # fmt: skip
+        ]
 
     def device(self) -> _Opened:
         return _Opened(self.bus)
@@ -108,9 +113,15 @@ HAT_REST = 8
 _HAT = {(0, 1): 0, (1, 1): 1, (1, 0): 2, (1, -1): 3, (0, -1): 4, (-1, -1): 5, (-1, 0): 6, (-1, 1): 7, (0, 0): HAT_REST}
 _FACE = {"west": 0x10, "south": 0x20, "east": 0x40, "north": 0x80}
 _SHOULDERS = {
-    "left_shoulder": 0x01, "right_shoulder": 0x02, "left_trigger": 0x04, "right_trigger": 0x08, "back": 0x10,
-    "start": 0x20, "left_stick": 0x40, "right_stick": 0x80,
-}  # fmt: skip
+    "left_shoulder": 0x01,
+    "right_shoulder": 0x02,
+    "left_trigger": 0x04,
+    "right_trigger": 0x08,
+    "back": 0x10,
+    "start": 0x20,
+    "left_stick": 0x40,
+    "right_stick": 0x80,
+}
 _EXTRAS = {"guide": 0x01, "touchpad": 0x02, "misc": 0x04}
 
 
@@ -149,8 +160,14 @@ def with_checksum(report: bytes) -> bytes:
 
 
 def spacemouse(
-    *, x: float = 0, y: float = 0, z: float = 0, roll: float = 0, pitch: float = 0, yaw: float = 0,
-) -> bytes:  # fmt: skip
+    *,
+    x: float = 0,
+    y: float = 0,
+    z: float = 0,
+    roll: float = 0,
+    pitch: float = 0,
+    yaw: float = 0,
+) -> bytes:
     """A report 1 with all six axes: forward, left, up, and turns about them."""
     counts = (-y, -x, -z, -pitch, -roll, -yaw)
     return struct.pack("<B6h", 1, *(round(350 * each) for each in counts))

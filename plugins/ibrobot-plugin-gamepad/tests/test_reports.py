@@ -135,8 +135,13 @@ def test_switch_pro_scales_sticks_by_its_calibration():
     ends = switch(packed((2000 + 1400, 2100 - 1600), (2050 - 1450, 2040 + 1320)), (0b1000_1000, 0b10, 0b0100_0010))
     state = read(parse, ends)
     assert moved(state) == {
-        "left_x": 1.0, "left_y": -1.0, "right_x": -1.0, "right_y": 1.0, "right_trigger": 1.0, "dpad_y": 1.0,
-    }  # fmt: skip
+        "left_x": 1.0,
+        "left_y": -1.0,
+        "right_x": -1.0,
+        "right_y": 1.0,
+        "right_trigger": 1.0,
+        "dpad_y": 1.0,
+    }
     assert state.buttons == {"east", "start", "left_shoulder"}
 
 
@@ -159,10 +164,17 @@ def test_a_damaged_bluetooth_report_is_left_out(report: bytes):
 
 
 @pytest.mark.parametrize("model", ALL, ids=lambda model: model.name)
-@given(reports=st.lists(st.binary(max_size=80) | st.integers(0, 255).flatmap(
-    lambda number: st.sampled_from([7, 9, 10, 13, 16, 17, 64, 78]).flatmap(
-        lambda size: st.binary(min_size=size - 1, max_size=size - 1).map(lambda rest: bytes([number]) + rest))),
-    max_size=8))  # fmt: skip
+@given(
+    reports=st.lists(
+        st.binary(max_size=80)
+        | st.integers(0, 255).flatmap(
+            lambda number: st.sampled_from([7, 9, 10, 13, 16, 17, 64, 78]).flatmap(
+                lambda size: st.binary(min_size=size - 1, max_size=size - 1).map(lambda rest: bytes([number]) + rest)
+            )
+        ),
+        max_size=8,
+    )
+)
 def test_whatever_comes_is_a_state_within_bounds_or_nothing(model: Model, reports: list[bytes]):
     parse = model.start()
     for report in reports:

@@ -273,8 +273,13 @@ def test_a_stop_pressed_while_the_mode_begins_is_not_lost(rig: Rig):
     assert rig.tick().estop
 
 
-EVENTS = {"start": "start", "success": "south", "failure": "right_stick", "discard": "back",
-          "intervention": "left_stick"}  # fmt: skip
+EVENTS = {
+    "start": "start",
+    "success": "south",
+    "failure": "right_stick",
+    "discard": "back",
+    "intervention": "left_stick",
+}
 
 
 @pytest.mark.parametrize(("event", "button"), EVENTS.items(), ids=EVENTS)

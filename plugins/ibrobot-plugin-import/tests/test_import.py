@@ -77,8 +77,10 @@ def test_servos_of_ib_robot_become_joints() -> None:
     assert new["robot"]["description"]["poses"]["reset"] == [0.1, -1.5, 1.5, 0.0, 0.0, 0.0]
     assert new["contract"]["observations"][1]["select"] == [f"position.{name}" for name in joints]
     assert new["hardware"] == {
-        "type": "feetech_so101", "port": "/dev/ttyACM7", "calibration": "${HOME}/.calibrate/bench.json",
-    }  # fmt: skip
+        "type": "feetech_so101",
+        "port": "/dev/ttyACM7",
+        "calibration": "${HOME}/.calibrate/bench.json",
+    }
     assert refused["robot.peripherals.laser.port"] == "there is no plugin here for a lidar with driver ldlidar"
     assert refused["robot.left_over"] == "not known as a key of IB-Robot"
 

@@ -13,10 +13,15 @@ from hypothesis import strategies as st
 from ibrobot_lerobot.arrow import table_of, to_array
 
 _SCALARS = {
-    pa.bool_(): st.booleans(), pa.uint8(): st.integers(0, 255), pa.int32(): st.integers(-(2**31), 2**31 - 1),
-    pa.int64(): st.integers(-(2**63), 2**63 - 1), pa.float32(): st.floats(width=32, allow_nan=False),
-    pa.float64(): st.floats(allow_nan=False), pa.string(): st.text(), pa.binary(): st.binary(),
-}  # fmt: skip
+    pa.bool_(): st.booleans(),
+    pa.uint8(): st.integers(0, 255),
+    pa.int32(): st.integers(-(2**31), 2**31 - 1),
+    pa.int64(): st.integers(-(2**63), 2**63 - 1),
+    pa.float32(): st.floats(width=32, allow_nan=False),
+    pa.float64(): st.floats(allow_nan=False),
+    pa.string(): st.text(),
+    pa.binary(): st.binary(),
+}
 
 
 @st.composite

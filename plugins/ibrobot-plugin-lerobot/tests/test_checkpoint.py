@@ -49,12 +49,17 @@ CONTRACT = Contract(
     25.0,
     (
         ObservationPart(
-            STATE, "/joint_states", JointState.ros_type, tuple(f"position.{joint}" for joint in JOINTS), None, Align(),
+            STATE,
+            "/joint_states",
+            JointState.ros_type,
+            tuple(f"position.{joint}" for joint in JOINTS),
+            None,
+            Align(),
             Feature("float32", (6,)),
         ),
     ),
     (ActionPart("arm", "/commands", Float64MultiArray.ros_type, "hold", JOINTS),),
-)  # fmt: skip
+)
 
 
 def step(name: str, **config: Any) -> dict[str, Any]:

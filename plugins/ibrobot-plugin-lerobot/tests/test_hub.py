@@ -33,9 +33,13 @@ def run(hub: Hub, tmp_path: Path) -> Iterator[Run]:
 
     def start(*arguments: object, token: str | None = TOKEN) -> subprocess.Popen[str]:
         environment = {
-            **os.environ, "HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path / "home"), "HF_HUB_DISABLE_XET": "1",
-            "HF_HUB_DISABLE_TELEMETRY": "1", "HF_HUB_DOWNLOAD_TIMEOUT": "60",
-        }  # fmt: skip
+            **os.environ,
+            "HF_ENDPOINT": hub.url,
+            "HF_HOME": str(tmp_path / "home"),
+            "HF_HUB_DISABLE_XET": "1",
+            "HF_HUB_DISABLE_TELEMETRY": "1",
+            "HF_HUB_DOWNLOAD_TIMEOUT": "60",
+        }
         environment.pop("HF_TOKEN", None)
         if token is not None:
             environment["HF_TOKEN"] = token

@@ -42,17 +42,27 @@ STEP_NS = round(1e9 / FPS)
 def contract(names: tuple[str, ...] = ("a", "b", "c"), *, camera: bool = True) -> Contract:
     parts = [
         ObservationPart(
-            "observation.state", "/joint_states", JointState.ros_type, tuple(f"position.{n}" for n in names), None,
-            Align(), Feature("float32", (3,), tuple(f"{n}.pos" for n in names)),
+            "observation.state",
+            "/joint_states",
+            JointState.ros_type,
+            tuple(f"position.{n}" for n in names),
+            None,
+            Align(),
+            Feature("float32", (3,), tuple(f"{n}.pos" for n in names)),
         )
-    ]  # fmt: skip
+    ]
     if camera:
         parts.append(
             ObservationPart(
-                "observation.images.top", "/top", Image.ros_type, (), ImageSpec(), Align(),
+                "observation.images.top",
+                "/top",
+                Image.ros_type,
+                (),
+                ImageSpec(),
+                Align(),
                 Feature("image", (-1, -1, 3), ("height", "width", "channels")),
             )
-        )  # fmt: skip
+        )
     return Contract(FPS, tuple(parts), (ActionPart("arm", "/arm", Float64MultiArray.ros_type, "hold", names),))
 
 

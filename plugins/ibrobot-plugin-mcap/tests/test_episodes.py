@@ -92,10 +92,16 @@ def test_every_command_takes_the_names_that_list_prints(tmp_path, monkeypatch):
     assert run("list", tmp_path / "episodes").splitlines()[1].split()[0] == f"{tmp_path}/episodes/pick:12"
     for name in ("pick:12", "episodes/pick:12", f"{tmp_path}/episodes/pick:12"):
         for command in (
-            ("list", name), ("info", name), ("verify", name), ("repair", name), ("mark", name, "success"),
-            ("export", name, JOINTS, "-o", "joints.csv"), ("trim", name, "--to", "0.5", "-o", "part"),
-            ("trim", name, "--in-place", "--to", "0.9"), ("delete", name, "--yes"),
-        ):  # fmt: skip
+            ("list", name),
+            ("info", name),
+            ("verify", name),
+            ("repair", name),
+            ("mark", name, "success"),
+            ("export", name, JOINTS, "-o", "joints.csv"),
+            ("trim", name, "--to", "0.5", "-o", "part"),
+            ("trim", name, "--in-place", "--to", "0.9"),
+            ("delete", name, "--yes"),
+        ):
             assert "no such" not in run(*command)
         assert not path.exists()
         (tmp_path / "joints.csv").unlink()

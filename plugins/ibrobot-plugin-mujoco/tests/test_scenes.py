@@ -75,9 +75,16 @@ class _Suite(SceneSuite[mujoco.MjSpec, World]):
     def looks(self, world: World) -> Vector:
         model = world.model
         parts = (
-            model.geom_size, model.geom_rbound, model.geom_rgba, model.geom_friction, model.body_mass,
-            model.light_diffuse, model.cam_pos, model.cam_quat, world.data.mocap_pos,
-        )  # fmt: skip
+            model.geom_size,
+            model.geom_rbound,
+            model.geom_rgba,
+            model.geom_friction,
+            model.body_mass,
+            model.light_diffuse,
+            model.cam_pos,
+            model.cam_quat,
+            world.data.mocap_pos,
+        )
         return np.concatenate([np.ravel(part) for part in parts])
 
     @override

@@ -33,9 +33,14 @@ def arm(tmp_path_factory) -> Arm:
 
 
 SHAPES = {
-    "box": Box((0.2, 0.2, 0.2)), "sphere": Sphere(0.1), "cylinder": Cylinder(0.1, 0.2), "capsule": Capsule(0.05, 0.1),
-    "mesh": Mesh(CORNERS, FACES), "hull": Mesh(CORNERS, FACES, convex=True), "voxels": voxels(BLOCK, 0.01),
-}  # fmt: skip
+    "box": Box((0.2, 0.2, 0.2)),
+    "sphere": Sphere(0.1),
+    "cylinder": Cylinder(0.1, 0.2),
+    "capsule": Capsule(0.05, 0.1),
+    "mesh": Mesh(CORNERS, FACES),
+    "hull": Mesh(CORNERS, FACES, convex=True),
+    "voxels": voxels(BLOCK, 0.01),
+}
 
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)

@@ -92,9 +92,17 @@ def test_text_and_picture(yaml: Path, tmp_path: Path):
         raise result.exception
     headings = [line.split("  ")[0] for line in result.stdout.splitlines()]
     assert headings == [
-        "planner", "goal", "joints at the goal", "off the goal", "path", "duration", "path of the tool", "clearance",
-        "peak velocities", "planned in",
-    ]  # fmt: skip
+        "planner",
+        "goal",
+        "joints at the goal",
+        "off the goal",
+        "path",
+        "duration",
+        "path of the tool",
+        "clearance",
+        "peak velocities",
+        "planned in",
+    ]
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 

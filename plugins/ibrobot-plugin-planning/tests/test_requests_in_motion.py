@@ -180,16 +180,31 @@ def some(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
 
 POLICIES = st.sampled_from(["refuse", "nearest", "keep_axis", "arm_plane", "current", "free", "no"])
 GOAL = some(
-    pose=NAMES, joints=JOINT_VALUES, xyz=THREE, axis=THREE, rpy=THREE, quaternion=st.lists(NUMBERS, max_size=4),
-    joint_tolerance=NUMBERS, position_tolerance=NUMBERS, angle_tolerance=NUMBERS, beyond_reach=POLICIES,
-)  # fmt: skip
+    pose=NAMES,
+    joints=JOINT_VALUES,
+    xyz=THREE,
+    axis=THREE,
+    rpy=THREE,
+    quaternion=st.lists(NUMBERS, max_size=4),
+    joint_tolerance=NUMBERS,
+    position_tolerance=NUMBERS,
+    angle_tolerance=NUMBERS,
+    beyond_reach=POLICIES,
+)
 TOOL = st.fixed_dictionaries({"xyz": st.tuples(NUMBERS, NUMBERS, NUMBERS).map(list)}, optional={"axis": THREE})
 GOALS = st.one_of(GOAL, TOOL)
 SCALINGS = {"velocity_scaling": NUMBERS, "acceleration_scaling": NUMBERS}
 OBJECT = some(
-    shape=st.sampled_from(["box", "sphere", "cylinder", "capsule", "plane", "mesh"]), size=THREE, radius=NUMBERS,
-    height=NUMBERS, position=THREE, rpy=THREE, link=NAMES, may_touch=st.lists(NAMES, max_size=2), file=NAMES,
-)  # fmt: skip
+    shape=st.sampled_from(["box", "sphere", "cylinder", "capsule", "plane", "mesh"]),
+    size=THREE,
+    radius=NUMBERS,
+    height=NUMBERS,
+    position=THREE,
+    rpy=THREE,
+    link=NAMES,
+    may_touch=st.lists(NAMES, max_size=2),
+    file=NAMES,
+)
 SPHERE = st.fixed_dictionaries(
     {"shape": st.just("sphere"), "radius": NUMBERS, "position": THREE}, optional={"link": NAMES, "rpy": THREE}
 )

@@ -55,9 +55,14 @@ def described(tmp_path):
 def test_links_have_the_names_of_the_urdf(described):
     names = urdf_names(robot_arm(described), read_urdf(described.description.urdf))
     assert names == {
-        "base": "foot_link", "turret": "turret_link", "upper": "upper_link", "lower": "lower_link",
-        "wrist": "wrist_link", "hand": "hand_link", "finger": "finger_link",
-    }  # fmt: skip
+        "base": "foot_link",
+        "turret": "turret_link",
+        "upper": "upper_link",
+        "lower": "lower_link",
+        "wrist": "wrist_link",
+        "hand": "hand_link",
+        "finger": "finger_link",
+    }
 
 
 def test_a_written_srdf_is_read_with_groups_poses_and_pairs(described, tmp_path):

@@ -213,8 +213,13 @@ def test_objects_of_the_simulated_scene_are_where_the_simulation_has_them(make, 
     bus = scene_run(make, tmp_path).session.bus
     world = bus.call(SNAPSHOT, None)
     assert {name: type(thing.shape) for name, thing in world.objects.items()} == {
-        "table": Plane, "floor": Plane, "post": Capsule, "cube": Box, "ball": Sphere, "can": Cylinder,
-    }  # fmt: skip
+        "table": Plane,
+        "floor": Plane,
+        "post": Capsule,
+        "cube": Box,
+        "ball": Sphere,
+        "can": Cylinder,
+    }
     assert at(world, "cube") == (0.2, 0.05, 0.06)
     poses = np.array([0.1, 0.2, 0.3, 1, 0, 0, 0, 0.4, 0.5, 0.6, 0, 0, 0, 1])
     bus.publish(POSES, Float64MultiArray(poses))

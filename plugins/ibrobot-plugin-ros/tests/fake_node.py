@@ -14,9 +14,16 @@ from ibrobot_ros.wire import Frame, Wire
 
 PACKAGE = Path(sys.modules["ibrobot_ros.wire"].__file__ or "").parent
 HELLO = {
-    "op": "hello", "python": "python", "version": "3.12", "rclpy": "rclpy", "distro": "jazzy", "rmw": "rmw_none",
-    "domain": "0", "range": "LOCALHOST", "interfaces": ["std_srvs"],
-}  # fmt: skip
+    "op": "hello",
+    "python": "python",
+    "version": "3.12",
+    "rclpy": "rclpy",
+    "distro": "jazzy",
+    "rmw": "rmw_none",
+    "domain": "0",
+    "range": "LOCALHOST",
+    "interfaces": ["std_srvs"],
+}
 
 
 def write(folder: Path, behaviour: str = "") -> Path:

@@ -36,10 +36,15 @@ ARRAYS = DTYPES.flatmap(lambda code: hnp.arrays(code, hnp.array_shapes(min_dims=
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)
 I64 = st.integers(-(2**63), 2**63 - 1)
 ANY = {
-    "id": st.integers(0, 2**64 - 1), "robot": TEXTS, "fingerprint": TEXTS, "text": st.just("") | TEXTS,
-    "tensors": st.dictionaries(TEXTS.filter(bool), ARRAYS, max_size=4), "stamp_ns": I64, "seed": I64,
+    "id": st.integers(0, 2**64 - 1),
+    "robot": TEXTS,
+    "fingerprint": TEXTS,
+    "text": st.just("") | TEXTS,
+    "tensors": st.dictionaries(TEXTS.filter(bool), ARRAYS, max_size=4),
+    "stamp_ns": I64,
+    "seed": I64,
     "latency_ms": st.floats(0, 1e9),
-}  # fmt: skip
+}
 WAITS, COUNTS = st.integers(0, 2**63 - 1), st.integers(0, 2**64 - 1)
 MESSAGES = st.builds(WireMessage, kind=st.just(WireKind.REQUEST), deadline_ns=WAITS, episode=COUNTS, **ANY) | st.builds(
     WireMessage, kind=st.sampled_from((WireKind.ANSWER, WireKind.FAILURE)), queued_ns=WAITS, pace_ns=COUNTS, **ANY

@@ -37,8 +37,14 @@ from ibrobot_core.api import (
 )
 from ibrobot_core.app import RequestError, begin_operation, operate
 
-AXES = {"shoulder_pan": "0 0 1", "shoulder_lift": "0 1 0", "elbow_flex": "0 1 0", "wrist_flex": "0 1 0",
-        "wrist_roll": "1 0 0", "gripper": "0 0 1"}  # fmt: skip
+AXES = {
+    "shoulder_pan": "0 0 1",
+    "shoulder_lift": "0 1 0",
+    "elbow_flex": "0 1 0",
+    "wrist_flex": "0 1 0",
+    "wrist_roll": "1 0 0",
+    "gripper": "0 0 1",
+}
 PLACES = ("0 0 0.05", "0 0 0.05", "0.15 0 0", "0.15 0 0", "0.05 0 0", "0.03 0.01 0")
 BENT = np.array([0.3, -0.6, 1.1, 0.2, 0.2, 0.4])
 TOPIC = TwistOptions().topic

@@ -25,8 +25,12 @@ sys.path.insert(0, str(Path(__file__).parents[3] / "tests/shared"))
 
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
 SIZES = {
-    "phone": (390, 844), "zoom": (640, 400), "tablet": (820, 1180), "wide": (1920, 1080), "desktop": (1280, 800),
-}  # fmt: skip
+    "phone": (390, 844),
+    "zoom": (640, 400),
+    "tablet": (820, 1180),
+    "wide": (1920, 1080),
+    "desktop": (1280, 800),
+}
 """Width and height [px]; 1280x800 at 200 % has the layout of half its size. The last one stays set."""
 CHECKED = ("phone", "desktop")
 """Sizes at which axe checks: the layouts differ in these."""

@@ -233,9 +233,15 @@ async def control_is_lost(found: Scene, address: str) -> int:
 
 
 ROWS = (
-    renderer_stalls, renderer_stalls_for_5_s, page_hides, network_is_cut, server_stalls, stops, mode_switches,
+    renderer_stalls,
+    renderer_stalls_for_5_s,
+    page_hides,
+    network_is_cut,
+    server_stalls,
+    stops,
+    mode_switches,
     control_is_lost,
-)  # fmt: skip
+)
 HOLD_S = 0.3
 PATIENCE_S = 1.0
 """Slack for a machine that runs other tests, too; an idle one needs none."""

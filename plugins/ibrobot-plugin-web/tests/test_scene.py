@@ -46,8 +46,9 @@ def test_a_robot_of_several_arms_has_its_model_several_times(tmp_path: Path) -> 
     joints = [joint["name"] for body in scene["bodies"] for joint in body["joints"]]
     assert joints == [f"{arm}j{i}" for arm in arms for i in range(7)]
     assert {arm: scene["bodies"][tip["body"]]["name"] for arm, tip in scene["tips"].items()} == {
-        "left_": "left_link6", "right_": "right_link6",
-    }  # fmt: skip
+        "left_": "left_link6",
+        "right_": "right_link6",
+    }
     bases = [body["pos"][1] for body in scene["bodies"] if body["name"].endswith("link0")]
     assert bases == [0.2, -0.2]
 

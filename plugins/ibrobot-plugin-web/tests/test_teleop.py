@@ -235,8 +235,10 @@ def test_a_press_whose_begin_is_known_to_a_tenth_of_a_millisecond_stays_one(erro
 def test_the_devices_of_a_mode_share_the_services() -> None:
     context = host_context()
     names = ("left", "right")
-    robots = {name: attrs.evolve(context.robot, joints=context.robot.joints[part]) for name, part in
-              zip(names, (slice(0, 3), slice(3, 6)), strict=True)}  # fmt: skip
+    robots = {
+        name: attrs.evolve(context.robot, joints=context.robot.joints[part])
+        for name, part in zip(names, (slice(0, 3), slice(3, 6)), strict=True)
+    }
     devices = {
         name: WebTeleop(WebTeleopOptions(), attrs.evolve(context, name=name, robot=robot))
         for name, robot in robots.items()

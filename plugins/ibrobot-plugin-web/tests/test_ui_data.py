@@ -231,9 +231,14 @@ def test_an_episode_is_converted_and_its_dataset_shown_and_played(tmp_path: Path
 
     names = ("pan", "tilt")
     state = ObservationPart(
-        "observation.state", JOINTS, JointState.ros_type, tuple(f"position.{name}" for name in names), None, Align(),
+        "observation.state",
+        JOINTS,
+        JointState.ros_type,
+        tuple(f"position.{name}" for name in names),
+        None,
+        Align(),
         Feature("float32", (2,), tuple(f"{name}.pos" for name in names)),
-    )  # fmt: skip
+    )
     contract = Contract(10, (state,), ()).canonical()
     make_episode(tmp_path / "pick/episodes/episode_000001", cameras=(), prompt="pick", contract=contract)
 

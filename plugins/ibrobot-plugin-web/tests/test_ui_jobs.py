@@ -90,9 +90,15 @@ def test_values_of_a_form_become_arguments_that_give_the_same_options(ui: Ui, tm
     )
     words = arguments(found)
     assert words == [
-        "--heat=90.5", "--cups=2", "--roast=light", "--flavour=nut", "--flavour=berry", "--milk", "--",
+        "--heat=90.5",
+        "--cups=2",
+        "--roast=light",
+        "--flavour=nut",
+        "--flavour=berry",
+        "--milk",
+        "--",
         str(tmp_path / "well"),
-    ]  # fmt: skip
+    ]
     seen: list[Any] = []
     attrs_only = attrs.evolve(BREW, events=())
     click.command()(declared(attrs_only)(seen.append)).main(words, standalone_mode=False)
@@ -187,9 +193,13 @@ for text, choices in (("go on?", [Choice(key="y", text="yes"), Choice(key="n", t
         command = Command("brew", "Brew coffee.", lambda: click.Command("brew"), BrewOptions, (Poured, Ask))
         self.ui = Ui(Folders([folder]), Jobs(folder))
         self.job = self.ui.jobs.start(
-            "brew", "Brew", ["-c", self.PROGRAM], program=(sys.executable,), asks=True,
+            "brew",
+            "Brew",
+            ["-c", self.PROGRAM],
+            program=(sys.executable,),
+            asks=True,
             read=event_reader(self.ui.folders, command),
-        )  # fmt: skip
+        )
         (folder / "a.jpg").write_bytes(b"picture")
         (folder.parent / "b.jpg").write_bytes(b"secret")
 
@@ -214,10 +224,11 @@ def test_a_job_asks_and_is_answered(asking: Asking) -> None:
     ui, job = asking.ui, asking.job
     asking.until(lambda: job.facts.get("ask") is not None)
     assert job.json()["facts"]["ask"] == {
-        "ask": 1, "text": "go on?",
+        "ask": 1,
+        "text": "go on?",
         "choices": ({"key": "y", "text": "yes", "urgent": False}, {"key": "n", "text": "no", "urgent": False}),
         "sights": ({"camera": "top", "wanted": "a.jpg", "live": "../b.jpg"},),
-    }  # fmt: skip
+    }
     with pytest.raises(IbrobotError, match="'x' is no answer; the answers are: y, n"):
         answer(ui, GiveAnswer(number=job.number, ask=1, answer="x"))
     with pytest.raises(IbrobotError, match="was answered already"):

@@ -41,9 +41,12 @@ def taste(folder: Path) -> list[ReportSection]:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     descriptor = ReportDescriptor(
-        "tasting", "Tastings", lambda path: (path / FILE).is_file(),
-        lambda path: [taste(path)[0].title], taste,
-    )  # fmt: skip
+        "tasting",
+        "Tastings",
+        lambda path: (path / FILE).is_file(),
+        lambda path: [taste(path)[0].title],
+        taste,
+    )
     registry = Registry(reports=[descriptor])
     for module in (recordings, reports):
         monkeypatch.setattr(module, "installed_plugins", lambda: registry)
@@ -68,10 +71,15 @@ def test_reports_are_listed_and_shown(folder: Path) -> None:
         assert text == {"kind": "text", "text": "fine", "role": "verdict"}
         assert (table["columns"], table["rows"], plots["pictures"]) == (["cup", "taste"], [["1", "nut"]], ["<svg/>"])
         assert cases["cases"] == [
-            {"title": "cup 1", "text": "cold", "command": "brew --cup 1", "episode": "good/one",
-             "video": "good/one.mp4"},
+            {
+                "title": "cup 1",
+                "text": "cold",
+                "command": "brew --cup 1",
+                "episode": "good/one",
+                "video": "good/one.mp4",
+            },
             {"title": "cup 2", "text": "gone", "command": "", "episode": "", "video": ""},
-        ]  # fmt: skip
+        ]
 
     run_ui([folder], test)
 

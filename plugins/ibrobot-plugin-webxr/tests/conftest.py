@@ -6,8 +6,14 @@ from pathlib import Path
 
 import pytest
 
-AXES = {"shoulder_pan": "0 0 1", "shoulder_lift": "0 1 0", "elbow_flex": "0 1 0", "wrist_flex": "0 1 0",
-        "wrist_roll": "1 0 0", "gripper": "0 0 1"}  # fmt: skip
+AXES = {
+    "shoulder_pan": "0 0 1",
+    "shoulder_lift": "0 1 0",
+    "elbow_flex": "0 1 0",
+    "wrist_flex": "0 1 0",
+    "wrist_roll": "1 0 0",
+    "gripper": "0 0 1",
+}
 _PLACES = ("0 0 0.05", "0 0 0.05", "0.15 0 0", "0.15 0 0", "0.05 0 0", "0.03 0.01 0")
 
 

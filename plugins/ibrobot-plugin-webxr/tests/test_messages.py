@@ -16,8 +16,14 @@ VALUES = st.recursive(
     max_leaves=8,
 )
 KEYS = ("type", "n", "t", "heading", "hands", "event", "camera")
-HAND = {"position": [0, 1, 0], "orientation": [0, 0, 0, 1], "clutch": True, "gripper": 0.5, "open": 0,
-        "move": [0, 0, 1]}  # fmt: skip
+HAND = {
+    "position": [0, 1, 0],
+    "orientation": [0, 0, 0, 1],
+    "clutch": True,
+    "gripper": 0.5,
+    "open": 0,
+    "move": [0, 0, 1],
+}
 GOOD = {"type": "hands", "n": 1, "t": 2.5, "heading": 0.1, "hands": {"right": HAND}}
 
 

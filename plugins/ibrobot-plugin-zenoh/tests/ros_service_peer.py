@@ -9,9 +9,13 @@ from zenoh_ros2_sdk import ROS2ServiceClient, ROS2ServiceServer
 
 port, digest = int(sys.argv[1]), sys.argv[2]
 TYPE: dict[str, Any] = {
-    "srv_type": "std_srvs/srv/SetBool", "request_definition": "bool data\n",
-    "response_definition": "bool success\nstring message\n", "type_hash": digest, "domain_id": 0, "router_port": port,
-}  # fmt: skip
+    "srv_type": "std_srvs/srv/SetBool",
+    "request_definition": "bool data\n",
+    "response_definition": "bool success\nstring message\n",
+    "type_hash": digest,
+    "domain_id": 0,
+    "router_port": port,
+}
 
 
 def answer(request: Any) -> Any:

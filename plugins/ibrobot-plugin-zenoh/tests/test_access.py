@@ -27,9 +27,15 @@ from .pair import WAIT_S, free_endpoint, keep
 
 REQUESTS = 20
 CLAIMED = [
-    "**", "*/**", "ibrobot/**", "ibrobot/service/**", "ibrobot/service/infer/net", "ibrobot/service/*/infer/net",
-    "ibrobot/service/robot1/infer/net", "ibrobot/service/robot2/infer/net",
-]  # fmt: skip
+    "**",
+    "*/**",
+    "ibrobot/**",
+    "ibrobot/service/**",
+    "ibrobot/service/infer/net",
+    "ibrobot/service/*/infer/net",
+    "ibrobot/service/robot1/infer/net",
+    "ibrobot/service/robot2/infer/net",
+]
 """What the attacker declares that it answers."""
 
 
@@ -63,14 +69,19 @@ class Lab:
         config = zenoh.Config()
         folder = self.folder / name
         for key, value in {
-            "mode": "client", "connect/endpoints": [self.endpoint], "connect/timeout_ms": int(1000 * WAIT_S),
-            "scouting/multicast/enabled": False, "transport/shared_memory/enabled": False,
+            "mode": "client",
+            "connect/endpoints": [self.endpoint],
+            "connect/timeout_ms": int(1000 * WAIT_S),
+            "scouting/multicast/enabled": False,
+            "transport/shared_memory/enabled": False,
             "timestamping/enabled": True,
             "transport/link/tls": {
-                "root_ca_certificate": str(folder / "ca.pem"), "enable_mtls": True,
-                "connect_certificate": str(folder / "certificate.pem"), "connect_private_key": str(folder / "key.pem"),
+                "root_ca_certificate": str(folder / "ca.pem"),
+                "enable_mtls": True,
+                "connect_certificate": str(folder / "certificate.pem"),
+                "connect_private_key": str(folder / "key.pem"),
             },
-        }.items():  # fmt: skip
+        }.items():
             config.insert_json5(key, json.dumps(value))
         with zenoh.open(config) as session:
             yield session

@@ -153,10 +153,17 @@ def test_only_the_mode_can_be_set(robot: tuple[Any, str]):
 @pytest.mark.parametrize(
     ("value", "kind"),
     [
-        (True, "BOOL"), (3, "INTEGER"), (0.5, "DOUBLE"), ("a", "STRING"), ([True], "BOOL_ARRAY"),
-        ([1, 2], "INTEGER_ARRAY"), ([0.5, 1.5], "DOUBLE_ARRAY"), (["a"], "STRING_ARRAY"), (None, "NOT_SET"),
+        (True, "BOOL"),
+        (3, "INTEGER"),
+        (0.5, "DOUBLE"),
+        ("a", "STRING"),
+        ([True], "BOOL_ARRAY"),
+        ([1, 2], "INTEGER_ARRAY"),
+        ([0.5, 1.5], "DOUBLE_ARRAY"),
+        (["a"], "STRING_ARRAY"),
+        (None, "NOT_SET"),
     ],
-)  # fmt: skip
+)
 def test_values_keep_their_types(value: Any, kind: str):
     made = to_parameter(value)
     assert (made["type"], from_parameter(made)) == (ParameterType[kind], value)

@@ -109,8 +109,10 @@ def test_services_of_a_ros_2_node_of_another_make():
     script = Path(__file__).with_name("ros_service_peer.py")
     with subprocess.Popen(
         [sys.executable, str(script), endpoint.rpartition(":")[2], SET_BOOL.hash],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    ) as peer:  # fmt: skip
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as peer:
         assert peer.stdout is not None
         try:
             assert peer.stdout.readline() == "True naïve\n"

@@ -20,8 +20,14 @@ from ibrobot_core import api
 from ibrobot_core.api import MESSAGE_TYPES, CameraInfo, Header, Image, Imu, Int32, JointState, Message, String
 
 STAMP = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9 + 999_999_999)
-FIXED = {"k": 9, "r": 9, "p": 12, "orientation_covariance": 9, "angular_velocity_covariance": 9,
-         "linear_acceleration_covariance": 9}  # fmt: skip
+FIXED = {
+    "k": 9,
+    "r": 9,
+    "p": 12,
+    "orientation_covariance": 9,
+    "angular_velocity_covariance": 9,
+    "linear_acceleration_covariance": 9,
+}
 RANGES = {
     "std_msgs/msg/Int8": (-(2**7), 2**7 - 1),
     "std_msgs/msg/Int32": (-(2**31), 2**31 - 1),

@@ -214,9 +214,15 @@ WRONG = {
 
 
 ALONE = {
-    LosesEveryThousandth, JointStatesOnly, IgnoresAnyTopic, LosesDropped, SizeOfNothing, SizeRaises, SizeOfAll,
+    LosesEveryThousandth,
+    JointStatesOnly,
+    IgnoresAnyTopic,
+    LosesDropped,
+    SizeOfNothing,
+    SizeRaises,
+    SizeOfAll,
     MetadataAtTheEnd,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("wrong", "caught_by"), WRONG.items(), ids=lambda v: getattr(v, "__name__", v))

@@ -44,9 +44,15 @@ class HidDevice:
     """
 
     def __init__(
-        self, vendor: int, product: int, report_descriptor: bytes, name: str, *,
-        features: Mapping[int, bytes] = {}, on_output: Callable[[bytes], bytes | None] = lambda report: None,
-    ) -> None:  # fmt: skip
+        self,
+        vendor: int,
+        product: int,
+        report_descriptor: bytes,
+        name: str,
+        *,
+        features: Mapping[int, bytes] = {},
+        on_output: Callable[[bytes], bytes | None] = lambda report: None,
+    ) -> None:
         self._features = features
         self._on_output = on_output
         self._file = os.open("/dev/uhid", os.O_RDWR | os.O_CLOEXEC)

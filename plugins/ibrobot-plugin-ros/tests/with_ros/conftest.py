@@ -95,8 +95,11 @@ class Peer:
         }
         self.process = subprocess.Popen(
             [PYTHON, str(HERE / script), *arguments],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
         assert self._answer() is None
 
     def ask(self, method: str, **keywords):

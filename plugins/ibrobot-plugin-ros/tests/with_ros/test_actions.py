@@ -41,9 +41,13 @@ def test_cancels_at_random_times(start, peer):
     for i in range(scaled(100)):
         side = 1.0 if i % 2 else -1.0
         outcome = peer.ask(
-            "follow", action=ACTION, joints=ARM, points=to(side, side, side, at=1.5), then="cancel",
+            "follow",
+            action=ACTION,
+            joints=ARM,
+            points=to(side, side, side, at=1.5),
+            then="cancel",
             after_s=made.uniform(0.0, 0.5),
-        )  # fmt: skip
+        )
         assert (outcome["status"], outcome["error_code"]) == ("CANCELED", 0), outcome
     run.check_steps()
 
@@ -54,9 +58,13 @@ def test_a_new_goal_replaces_the_old_at_random_times(start, peer):
     for i in range(scaled(100)):
         side = 0.6 if i % 2 else -0.6
         peer.ask(
-            "follow", action=ACTION, joints=ARM, points=to(side, side, side, at=1.2), then="leave",
+            "follow",
+            action=ACTION,
+            joints=ARM,
+            points=to(side, side, side, at=1.2),
+            then="leave",
             after_s=made.uniform(0.0, 0.3),
-        )  # fmt: skip
+        )
     last = peer.ask("follow", action=ACTION, joints=ARM, points=to(0.0, 0.0, 0.0, at=1.0))
     assert last["status"] == "SUCCEEDED"
     for outcome in peer.ask("outcomes"):
@@ -91,9 +99,13 @@ def test_tolerances_end_a_goal_with_their_codes(start, peer):
     path = peer.ask("follow", action=ACTION, joints=ARM, points=far, path_tolerance=[("pan", 1e-9)])
     assert (path["status"], path["error_code"]) == ("ABORTED", -4), path
     goal = peer.ask(
-        "follow", action=ACTION, joints=ARM, points=to(0.0, 0.0, 0.0, at=2.0), goal_tolerance=[("pan", 1e-12)],
+        "follow",
+        action=ACTION,
+        joints=ARM,
+        points=to(0.0, 0.0, 0.0, at=2.0),
+        goal_tolerance=[("pan", 1e-12)],
         goal_time=0.01,
-    )  # fmt: skip
+    )
     assert (goal["status"], goal["error_code"]) == ("ABORTED", -5), goal
 
 

@@ -39,9 +39,11 @@ def test_a_trajectory_moves_the_other_robot(begin, controller, peers):
     run = begin()
     peers.append(Peer())
     outcome = peers[-1].ask(
-        "follow", action="/arm_trajectory/follow_joint_trajectory", joints=JOINTS[:3],
+        "follow",
+        action="/arm_trajectory/follow_joint_trajectory",
+        joints=JOINTS[:3],
         points=[[1.0, [0.3, -0.2, 0.1], [0.0] * 3]],
-    )  # fmt: skip
+    )
     assert outcome["status"] == "SUCCEEDED"
     state = controller.ask("state")
     assert state["position"][:3] == pytest.approx([0.3, -0.2, 0.1], abs=0.03)

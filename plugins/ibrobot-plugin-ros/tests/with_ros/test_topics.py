@@ -148,9 +148,11 @@ def test_names_get_the_namespace(start, peer):
     start("ros.namespace=lab/one")
     assert peer.ask("await_topic", topic="/lab/one/joint_states")
     outcome = peer.ask(
-        "follow", action="/lab/one/arm_trajectory/follow_joint_trajectory", joints=["pan", "lift", "roll"],
+        "follow",
+        action="/lab/one/arm_trajectory/follow_joint_trajectory",
+        joints=["pan", "lift", "roll"],
         points=[[0.3, [0.1] * 3, [0.0] * 3]],
-    )  # fmt: skip
+    )
     assert outcome["status"] == "SUCCEEDED"
 
 
