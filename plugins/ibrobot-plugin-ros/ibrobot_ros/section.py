@@ -7,9 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any, override
 
-from ibrobot_ros2.calls import Calls
 from ibrobot_ros2.goals import Actions, with_goals
-from ibrobot_ros2.inference import serve_chunks
 
 from ibrobot_core.api import DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
 from ibrobot_core.app import CONTROL, Component, ComponentFailed, RunAccess, error_line
@@ -49,12 +47,10 @@ class RosNode(Component):
         self._lockstep = session.request.lockstep
         self.topics = Topics(options, session)
         self._actions = Actions(
-            session, with_goals(session) if options.actions else (), lambda name: ros_name(name, options.namespace),
-            "ros", options.gripper_action,
+            session, with_goals(session) if options.actions else (), options.offers,
+            lambda name: ros_name(name, options.namespace), "ros", options.gripper_action,
         )  # fmt: skip
         self._services = Services(options, session)
-        self._calls = Calls(session, options.offers, lambda name: ros_name(name, options.namespace), "ros")
-        self._end_chunks: Callable[[], None] = lambda: None
         self._node: NodeProcess | None = None
         self._wire: Wire | None = None
         self._ending = threading.Event()
@@ -92,12 +88,10 @@ class RosNode(Component):
         self.topics.open()
         self._services.open()
         if not self._lockstep:
-            self._end_chunks = serve_chunks(session)
+            self._actions.open()
         self._declare(self._node.wire)
         if self._lockstep:
             return
-        session.on_goal.append(self._actions.take_event)
-        session.on_state.append(self._actions.take_state)
         for name, work in (("ros", self._receive), ("ros topics", self._send)):
             thread = threading.Thread(target=work, name=name, daemon=True)
             self._threads.append(thread)
@@ -118,23 +112,18 @@ class RosNode(Component):
 
     @override
     def stop(self) -> None:
-        session = self._session
         self._ending.set()
         if self._wire is not None and not self._wire.closed:
             self._wire.wake()
         for thread in self._threads:
             thread.join(_STOP_S)
         self._threads.clear()
-        for calls, call in ((session.on_goal, self._actions.take_event), (session.on_state, self._actions.take_state)):
-            if call in calls:
-                calls.remove(call)  # type: ignore[arg-type]
         wire, self._wire = self._wire, None
         if wire is not None:
             self._send_rest(wire)
         self.topics.close()
         self._services.close()
-        self._end_chunks()
-        self._calls.close()
+        self._actions.close()
         if wire is not None:
             wire.send({"op": "end"})
             wire.flush(1.0)
@@ -153,7 +142,6 @@ class RosNode(Component):
         self._services.declare(wire)
         if not self._lockstep:
             self._actions.declare(wire)
-            self._calls.declare(wire)
         self._wire = wire
 
     def _send(self) -> None:
@@ -197,7 +185,7 @@ class RosNode(Component):
             self._pinged_s = now_s
             wire.send({"op": "ping"})
             self._services.refresh(wire)
-            self._calls.refresh(wire)
+            self._actions.refresh(wire)
         silent_s = now_s - self._heard_s
         if silent_s > _SILENT_S and not self._trouble:
             assert self._node is not None
@@ -235,20 +223,18 @@ class RosNode(Component):
             "matched": lambda: self.topics.take_subscribers(head["topic"], head["subscribers"]),
             "dropped": lambda: self._note_flood(head["topic"], head["count"]),
             "trouble": lambda: self.topics.tell(f"{head['topic']}: {head['what']}"),
-            "goal": lambda: self._take_goal(wire, head, payload),
-            "cancel": lambda: self._services.submit(
-                self._calls.cancel if "service" in head else self._actions.cancel, wire, head["goal"]
-            ),
+            "goal": lambda: self._services.submit(self._decide, wire, head, self._session.stops),
+            "cancel": lambda: self._services.submit(self._decide, wire, head, self._session.stops),
             "call": lambda: self._services.take_call(wire, head),
             "pong": lambda: None,
         }  # fmt: skip
         takes[head["op"]]()
 
-    def _take_goal(self, wire: Wire, head: dict[str, Any], payload: bytes) -> None:
-        if "service" in head:
-            self._services.submit(self._calls.take_goal, wire, head)
-        else:
-            self._services.submit(self._actions.take_goal, wire, head, payload, self._session.stops)
+    def _decide(self, wire: Wire, head: dict[str, Any], stops: int) -> None:
+        """Answer a goal, or a cancel, which was received after `stops` emergency stops."""
+        number, actions = head["goal"], self._actions
+        accepted = actions.cancel(wire, number) if head["op"] == "cancel" else actions.take_goal(wire, head, stops)
+        wire.send({"op": "decided", "goal": number, "accepted": accepted})
 
     def _note_flood(self, topic: str, count: int) -> None:
         self.topics.counts[f"dropped {topic}"] += count

@@ -1,4 +1,4 @@
-"""Goals, feedback and results of control_msgs's actions as plain data, and a client of actions."""
+"""A client of actions, with goals, feedback and results as plain data."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from enum import IntEnum
 from typing import Any
 
 import attrs
-import numpy as np
 from ibrobot_ros2.interfaces import ActionType, from_cdr
 
-from ibrobot_core.api import NS_PER_S, Message, TransportError
+from ibrobot_core.api import TransportError
 from ibrobot_zenoh.sharing import TopicTransport
 
 _ANSWER_S = 10.0
@@ -28,94 +27,6 @@ class Status(IntEnum):
     SUCCEEDED = 4
     CANCELED = 5
     ABORTED = 6
-
-
-class Kind:
-    """What differs between the actions of executors."""
-
-    def request(self, goal: Any) -> tuple[dict[str, Any], Message | None]:
-        """A goal for the run: its fields, and its trajectory."""
-        raise NotImplementedError
-
-    def feedback(self, head: Mapping[str, Any], joints: list[str]) -> dict[str, Any]:
-        """The feedback of a state of the joints."""
-        raise NotImplementedError
-
-    def result(self, head: Mapping[str, Any], joints: list[str]) -> dict[str, Any]:
-        """The result of an ended goal."""
-        raise NotImplementedError
-
-
-class _Trajectory(Kind):
-    def request(self, goal: Any) -> tuple[dict[str, Any], Message | None]:
-        def tolerances(each: Any) -> list[list[Any]]:
-            return [[t.name, t.position, t.velocity, t.acceleration] for t in each]
-
-        return {
-            "path_tolerance": tolerances(goal.path_tolerance),
-            "goal_tolerance": tolerances(goal.goal_tolerance),
-            "goal_time_ns": goal.goal_time_tolerance_ns,
-            "stamp_ns": goal.trajectory.header.stamp_ns,
-            "other_joints": list(goal.multi_dof_trajectory.joint_names),
-        }, goal.trajectory
-
-    def feedback(self, head: Mapping[str, Any], joints: list[str]) -> dict[str, Any]:
-        desired, actual = np.array(head["desired"]), np.array(head["actual"])
-        passed = _time(head["passed_ns"])
-        return {
-            "header": {"stamp": _time(head["stamp_ns"])},
-            "joint_names": joints,
-            "desired": {"positions": desired, "time_from_start": passed},
-            "actual": {"positions": actual, "velocities": head["velocity"], "time_from_start": passed},
-            "error": {"positions": desired - actual, "time_from_start": passed},
-        }
-
-    def result(self, head: Mapping[str, Any], joints: list[str]) -> dict[str, Any]:
-        return {"error_code": head["code"], "error_string": head["message"]}
-
-
-class _Gripper(Kind):
-    def request(self, goal: Any) -> tuple[dict[str, Any], Message | None]:
-        return {"position": goal.command.position, "max_effort": goal.command.max_effort}, None
-
-    def feedback(self, head: Mapping[str, Any], joints: list[str]) -> dict[str, Any]:
-        return {"position": head["actual"][0], "effort": head["effort"][0], **_ends(head)}
-
-    def result(self, head: Mapping[str, Any], joints: list[str]) -> dict[str, Any]:
-        return {"position": head["position"], "effort": head["effort"], **_ends(head)}
-
-
-class _ParallelGripper(Kind):
-    def request(self, goal: Any) -> tuple[dict[str, Any], Message | None]:
-        command = goal.command
-        return {
-            "names": list(command.name),
-            "position": list(command.position),
-            "velocity": list(command.velocity),
-            "max_effort": list(command.effort),
-        }, None
-
-    def feedback(self, head: Mapping[str, Any], joints: list[str]) -> dict[str, Any]:
-        return {"state": {"name": joints, "position": head["actual"], "effort": head["effort"]}}
-
-    def result(self, head: Mapping[str, Any], joints: list[str]) -> dict[str, Any]:
-        state = {"name": joints, "position": [head["position"]], "effort": [head["effort"]]}
-        return {"state": state, **_ends(head)}
-
-
-ACTIONS: dict[str, Kind] = {
-    "control_msgs/action/FollowJointTrajectory": _Trajectory(),
-    "control_msgs/action/GripperCommand": _Gripper(),
-    "control_msgs/action/ParallelGripperCommand": _ParallelGripper(),
-}
-
-
-def _ends(head: Mapping[str, Any]) -> dict[str, bool]:
-    return {name: bool(head.get(name, False)) for name in ("stalled", "reached_goal")}
-
-
-def _time(stamp_ns: int) -> dict[str, int]:
-    return dict(zip(("sec", "nanosec"), divmod(stamp_ns, NS_PER_S), strict=True))
 
 
 @attrs.frozen

@@ -9,17 +9,14 @@ from functools import partial
 from typing import Any, Literal, override
 
 import attrs
-from ibrobot_ros2 import decode, encode
-from ibrobot_ros2.calls import Calls
 from ibrobot_ros2.goals import Actions, with_goals
-from ibrobot_ros2.inference import serve_chunks
 from ibrobot_ros2.interfaces import ActionType, ServiceType, action_type, fields_of, service_type, to_cdr
-from ibrobot_ros2.offers import Offer, Offers
+from ibrobot_ros2.offers import Offer, Offers, time_of
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, NotSupported, did_you_mean
 from ibrobot_core.app import CONTROL, RunAccess, SessionWorker, TransportLink
 from ibrobot_zenoh.ros2 import absolute
-from ibrobot_zenoh.ros_goals import ACTIONS, Kind, Status
+from ibrobot_zenoh.ros_goals import Status
 from ibrobot_zenoh.sharing import Reply, transport_of
 
 _ENDED_KEPT = 100
@@ -92,11 +89,8 @@ class _Server:
 
     name: str
     type: ActionType
-    kind: Kind | None
-    """None for an action that a service of the run is."""
-    target: str
-    """The executor, or the service."""
-    joints: list[str]
+    address: dict[str, str]
+    """The executor, or the service, that it is for."""
     goals: OrderedDict[tuple[int, ...], _Goal] = attrs.field(factory=OrderedDict)
     """Goals by their ids, the oldest first."""
 
@@ -130,13 +124,11 @@ class RosActions(SessionWorker):
             if name not in known:
                 hint = did_you_mean(name, known, "executors that do")
                 raise NotSupported(f"transport.share.actions: {name} is no executor that takes goals{hint}")
-        self._actions = Actions(session, executors, self._named, "zenoh", gripper_action)
-        self._calls = Calls(session, is_shared, self._named, "zenoh")
+        self._actions = Actions(session, executors, is_shared, self._named, "zenoh", gripper_action)
         self._lock = threading.RLock()
         self._count = 0
         self._goals: dict[int, _Goal] = {}
         """Goals that have not ended, by number."""
-        self._decisions = threading.local()
         self._ends: list[Callable[[], None]] = []
 
     def _named(self, name: str) -> str:
@@ -145,40 +137,29 @@ class RosActions(SessionWorker):
     @override
     def setup(self) -> None:
         self._transport = transport_of(self._link)
-        self._ends.append(serve_chunks(self.session))
+        self._actions.open()
         self._actions.declare(self)
-        self._calls.declare(self)
-        self.session.on_goal.append(self._actions.take_event)
-        self.session.on_state.append(self._actions.take_state)
 
     @override
     def work(self, timeout_s: float) -> None:
         self.session.finished.wait(min(timeout_s, _LOOK_S))
-        self._calls.refresh(self)
+        self._actions.refresh(self)
 
     @override
     def teardown(self) -> None:
-        for calls, call in (
-            (self.session.on_goal, self._actions.take_event),
-            (self.session.on_state, self._actions.take_state),
-        ):
-            if call in calls:
-                calls.remove(call)  # type: ignore[arg-type]
         ends, self._ends = self._ends, []
         for end in ends:
             end()
-        self._calls.close()
+        self._actions.close()
 
     def send(self, head: Mapping[str, Any]) -> None:
         """Take what the run says of its actions and goals."""
-        takes = {"action": self._offer, "decided": self._decide, "feedback": self._feed, "ended": self._conclude}
+        takes = {"action": self._offer, "feedback": self._feed, "ended": self._conclude}
         takes[head["op"]](head)
 
     def _offer(self, head: Mapping[str, Any]) -> None:
-        server = _Server(
-            head["name"], action_type(head["type"]), ACTIONS.get(head["type"]), head.get("executor") or head["service"],
-            head.get("joints", []),
-        )  # fmt: skip
+        address = {key: head[key] for key in ("executor", "service") if key in head}
+        server = _Server(head["name"], action_type(head["type"]), address)
         services: tuple[tuple[str, ServiceType, Any, bool], ...] = (
             ("send_goal", server.type.send_goal, self._take_goal, False),
             ("cancel_goal", server.type.cancel_goal, self._cancel, True),
@@ -201,27 +182,16 @@ class RosActions(SessionWorker):
                 return
             self._count += 1
             goal = server.goals[uuid] = self._goals[self._count] = _Goal(self._count, uuid, now_ns, server)
-        if server.kind is None:
-            self._calls.take_goal(self, {"goal": goal.number, "service": server.target, "fields": request["goal"]})
-        else:
-            message: Any = decode(server.type.send_goal.request, to_cdr(server.type.send_goal.request, request))
-            fields, trajectory = server.kind.request(message.goal)
-            head = {"goal": goal.number, "executor": server.target, "fields": fields}
-            payload = encode(trajectory).tobytes() if trajectory is not None else b""
-            self._actions.take_goal(self, head, payload, stops)
+        head = {"goal": goal.number, **server.address, "fields": request["goal"]}
+        accepted = self._actions.take_goal(self, head, stops)
         with self._lock:
-            if self._decisions.last and goal.status is Status.ACCEPTED:
+            if accepted and goal.status is Status.ACCEPTED:
                 goal.status = Status.EXECUTING
-            elif not self._decisions.last:
+            elif not accepted:
                 self._goals.pop(goal.number, None)
                 server.goals.pop(uuid, None)
-        sec, nanosec = divmod(now_ns, NS_PER_S)
-        reply({"accepted": self._decisions.last, "stamp": {"sec": sec, "nanosec": nanosec}})
+        reply({"accepted": accepted, "stamp": time_of(now_ns)})
         self._publish_status(server)
-
-    def _decide(self, head: Mapping[str, Any]) -> None:
-        """Note the decision, which comes in the thread that asked."""
-        self._decisions.last = head["accepted"]
 
     def _cancel(self, server: _Server, request: dict[str, Any], reply: Reply) -> None:
         """Cancel one goal, or all, or all up to a time, as ROS's action servers."""
@@ -240,8 +210,7 @@ class RosActions(SessionWorker):
         chosen = [each for each in running if self._is_meant(each, uuid, until_ns)]
         canceling = []
         for goal in chosen:
-            (self._actions if server.kind is not None else self._calls).cancel(self, goal.number)
-            if self._decisions.last:
+            if self._actions.cancel(self, goal.number):
                 with self._lock:
                     if goal.result is None:
                         goal.status = Status.CANCELING
@@ -304,13 +273,9 @@ class RosActions(SessionWorker):
 
 def _fields(server: _Server, head: Mapping[str, Any], part: Literal["feedback", "result"]) -> dict[str, Any]:
     """The fields of feedback or a result, without those that its type lacks."""
-    if server.kind is not None:
-        fields = server.kind.feedback if part == "feedback" else server.kind.result
-        return fields(head, server.joints)
     known = fields_of(f"{server.type.name}_{part.capitalize()}")
     return {name: value for name, value in head["values"].items() if name in known}
 
 
 def _info(goal: _Goal) -> dict[str, Any]:
-    sec, nanosec = divmod(goal.stamp_ns, NS_PER_S)
-    return {"goal_id": {"uuid": list(goal.uuid)}, "stamp": {"sec": sec, "nanosec": nanosec}}
+    return {"goal_id": {"uuid": list(goal.uuid)}, "stamp": time_of(goal.stamp_ns)}

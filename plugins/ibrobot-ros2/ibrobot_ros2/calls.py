@@ -1,19 +1,18 @@
 """Services of a run that take their time, as actions of ROS: the request is the goal, and the answer is the result.
 
-Heads are as in `goals`; their key `service` is the service, and `values` are the fields of a result or of feedback.
+Goals and heads are as in `goals`; their key `service` is the service.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import attrs
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import RunView, Service
-from ibrobot_ros2.goals import Wire
 from ibrobot_ros2.offers import with_ns
 from ibrobot_ros2.services import plain
 
@@ -21,6 +20,13 @@ _FEEDBACK_S = 0.5
 _MOST = 8
 """Most goals under way; further ones are rejected."""
 _END_S = 5.0
+
+
+class Wire(Protocol):
+    """Passes heads to clients. `op` is `action` (an action is offered), `feedback` or `ended`."""
+
+    def send(self, head: Mapping[str, Any]) -> object:
+        """Pass one on."""
 
 
 @attrs.define(eq=False)
@@ -76,39 +82,37 @@ class Calls:
                 self._declared.add(name)
                 wire.send({"op": "action", "name": self._named(name), "type": service.ros_type, "service": name})
 
-    def take_goal(self, wire: Wire, head: Mapping[str, Any]) -> None:
-        """Call a service, in a thread of its own."""
+    def take_goal(self, wire: Wire, head: Mapping[str, Any]) -> bool:
+        """Call a service, in a thread of its own; returns whether the goal is accepted."""
         number, service = head["goal"], self._session.bus.services().get(head["service"])
         with self._lock:
-            accepted = service is not None and len(self._goals) < _MOST
-            if service is not None and accepted:
-                goal = self._goals[wire, number] = _Goal(wire, number, service)
-        wire.send({"op": "decided", "goal": number, "accepted": accepted})
-        if not accepted:
+            goal = _Goal(wire, number, service) if service is not None and len(self._goals) < _MOST else None
+            if goal is not None:
+                self._goals[wire, number] = goal
+        if goal is None:
             why = f"{_MOST} goals are under way" if service is not None else "nobody serves it now"
             self._session.log.warning("%s: goal for %s rejected: %s", self._who, head["service"], why)
-            return
+            return False
         self._start(self._call, goal, with_ns(head["fields"]))
         if goal.service.progress is not None:
             self._start(self._report, goal, goal.service.progress)
+        return True
 
-    def cancel(self, wire: Wire, number: int) -> None:
-        """Cancel a goal for its client."""
+    def cancel(self, wire: Wire, number: int) -> bool:
+        """Cancel a goal for its client; returns whether it is canceled."""
         with self._lock:
             goal = self._goals.get((wire, number))
-            accepted = goal is not None and goal.service.cancel is not None
-            if goal is not None:
-                goal.canceled = accepted
-        if goal is not None and goal.service.cancel is not None:
-            try:
-                self._session.bus.call(goal.service.cancel)
-            except IbrobotError as error:
-                with self._lock:
-                    # One that has ended meanwhile has ended as canceled.
-                    accepted = goal.ended.is_set()
-                    goal.canceled = accepted
-                self._session.log.warning("%s: %s: cancel failed: %s", self._who, goal.service.name, error)
-        wire.send({"op": "decided", "goal": number, "accepted": accepted})
+            if goal is None or goal.service.cancel is None:
+                return False
+            goal.canceled = True
+        try:
+            self._session.bus.call(goal.service.cancel)
+        except IbrobotError as error:
+            with self._lock:
+                # One that has ended meanwhile has ended as canceled.
+                goal.canceled = goal.ended.is_set()
+            self._session.log.warning("%s: %s: cancel failed: %s", self._who, goal.service.name, error)
+        return goal.canceled
 
     def close(self) -> None:
         """Wait for the calls under way, which end with the run."""

@@ -1,6 +1,7 @@
-"""Goals of ROS's actions for the executors of a run, as ros2_control's controllers take them.
+"""Goals of ROS's actions for the executors of a run, as ros2_control's controllers take them, and for its services.
 
-What speaks to clients (a node of rclpy's, or Zenoh) passes heads: plain mappings whose key `op` says what they are.
+What speaks to clients (a node of rclpy's, or Zenoh) passes goals as plain mappings of ROS's fields, and gets heads:
+plain mappings whose key `op` says what they are. The key `values` of a head has the fields of feedback or of a result.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Collection, Mapping
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Any
 
 import attrs
 import numpy as np
@@ -17,13 +18,18 @@ from ibrobot_core.api import (
     NS_PER_S,
     ExecutorDescriptor,
     GoalRejected,
+    Header,
     IbrobotError,
+    JointReading,
     JointTrajectory,
+    JointTrajectoryPoint,
     seconds,
     trajectory_goal,
 )
 from ibrobot_core.app import ControlState, ExecutorConfig, RunAccess
-from ibrobot_ros2.codec import decode
+from ibrobot_ros2.calls import Calls, Wire
+from ibrobot_ros2.inference import serve_chunks
+from ibrobot_ros2.offers import time_of, with_ns
 
 GRIPPER_ACTIONS = ("GripperCommand", "ParallelGripperCommand")
 """Actions of control_msgs for executors that take a position."""
@@ -65,13 +71,6 @@ class _Goal:
     """Whether its client canceled it."""
 
 
-class Wire(Protocol):
-    """Passes heads to clients. `op` is `action` (an action is offered), `decided`, `feedback` or `ended`."""
-
-    def send(self, head: Mapping[str, Any]) -> object:
-        """Pass one on."""
-
-
 def action_of(executor: ExecutorConfig, gripper_action: str) -> tuple[str, str]:
     """The name of an executor's action, and its type."""
     if executor.goals == "trajectory":
@@ -91,11 +90,12 @@ def with_goals(session: RunAccess) -> dict[str, ExecutorConfig]:
 
 
 class Actions:
-    """Passes goals and cancels of ROS to control, and what becomes of them back.
+    """Passes goals and cancels of ROS to the run, and what becomes of them back.
 
     Args:
         session: the run.
         executors: names of those that are offered.
+        is_offered: whether a service of the bus is offered; those that take their time are actions.
         named: the full name of an action, from that without namespace.
         who: where goals come from, for the log and their names, e.g. `ros`.
         gripper_action: the action of executors that take a position.
@@ -105,18 +105,16 @@ class Actions:
     """
 
     def __init__(
-        self,
-        session: RunAccess,
-        executors: Collection[str],
-        named: Callable[[str], str],
-        who: str,
-        gripper_action: str = GRIPPER_ACTIONS[0],
-    ) -> None:
+        self, session: RunAccess, executors: Collection[str], is_offered: Callable[[str], bool],
+        named: Callable[[str], str], who: str, gripper_action: str,
+    ) -> None:  # fmt: skip
         self._session = session
         self._named = named
         self._who = who
         self._gripper_action = gripper_action
         self._executors = {name: each for name, each in with_goals(session).items() if name in executors}
+        self._calls = Calls(session, is_offered, named, who)
+        self._end_chunks: Callable[[], None] = lambda: None
         self._lock = threading.Lock()
         self._goals: dict[str, _Goal] = {}
         """Goals under way, by their name in control."""
@@ -124,29 +122,45 @@ class Actions:
         self._node = 0
         """Number of the node: goals of one that is gone are not those of the next."""
 
+    def open(self) -> None:
+        """Begin to follow what becomes of goals."""
+        self._end_chunks = serve_chunks(self._session)
+        self._session.on_goal.append(self._take_event)
+        self._session.on_state.append(self._take_state)
+
+    def close(self) -> None:
+        """Wait for the calls under way, which end with the run."""
+        if self._take_event in self._session.on_goal:
+            self._session.on_goal.remove(self._take_event)
+            self._session.on_state.remove(self._take_state)
+        self._end_chunks()
+        self._calls.close()
+
     def declare(self, wire: Wire) -> None:
         """Tell a new node which actions it offers."""
         self._wire = wire
         self._node += 1
         for executor in self._executors.values():
             name, type_name = action_of(executor, self._gripper_action)
-            wire.send(
-                {
-                    "op": "action",
-                    "name": self._named(name),
-                    "type": type_name,
-                    "executor": executor.name,
-                    "joints": list(executor.joints),
-                }
-            )
+            wire.send({"op": "action", "name": self._named(name), "type": type_name, "executor": executor.name})
+        self._calls.declare(wire)
 
-    def take_goal(self, wire: Wire, head: Mapping[str, Any], payload: bytes, stops: int) -> None:
-        """Decide about a goal, which was received after `stops` emergency stops."""
+    def refresh(self, wire: Wire) -> None:
+        """Tell the node which actions are new."""
+        self._calls.refresh(wire)
+
+    def take_goal(self, wire: Wire, head: Mapping[str, Any], stops: int) -> bool:
+        """Take a goal, which was received after `stops` emergency stops; returns whether it is accepted.
+
+        The keys of `head` are `goal`, its number, `executor` or `service`, and `fields`.
+        """
+        if "service" in head:
+            return self._calls.take_goal(wire, head)
         executor = self._executors[head["executor"]]
         name = self._name(head["goal"])
         now_ns = self._session.clock.now_ns()
         try:
-            goal = self._read(executor, head["fields"], payload)
+            goal = self._read(executor, with_ns(head["fields"]))
             if self._session.faults:
                 raise _Invalid(f"refused before a reset: {self._session.faults[-1]}")
             if self._session.held:
@@ -159,24 +173,18 @@ class Actions:
                 self._goals.pop(name, None)
             code = error.code if isinstance(error, _Invalid) else TrajectoryCode.INVALID_GOAL
             self._session.log.warning("%s: goal for %s rejected: %s: %s", self._who, executor.name, code.name, error)
-            wire.send({"op": "decided", "goal": head["goal"], "accepted": False})
-        else:
-            wire.send({"op": "decided", "goal": head["goal"], "accepted": True})
+            return False
+        return True
 
-    def cancel(self, wire: Wire, number: int) -> None:
-        """Cancel a goal for its client."""
-        accepted = False
+    def cancel(self, wire: Wire, number: int) -> bool:
+        """Cancel a goal for its client; returns whether it is canceled."""
         with self._lock:
             found = self._goals.get(self._name(number))
             if found is not None:
-                found.canceled = accepted = True
-        if found is not None:
-            try:
-                self._session.control.call("cancel", executor=found.executor)
-            except IbrobotError as error:
-                accepted = False
-                self._session.log.warning("%s: %s: cancel failed: %s", self._who, found.executor, error)
-        wire.send({"op": "decided", "goal": number, "accepted": accepted})
+                found.canceled = True
+        if found is None:
+            return self._calls.cancel(wire, number)
+        return self._stop(found.executor)
 
     def abandon(self, why: str) -> None:
         """Cancel all goals, since nobody can cancel them any more: the robot holds."""
@@ -184,12 +192,18 @@ class Actions:
             abandoned = {goal.executor for goal in self._goals.values()}
         for executor in abandoned:
             self._session.log.warning("%s: %s holds: %s", self._who, executor, why)
-            try:
-                self._session.control.call("cancel", executor=executor)
-            except IbrobotError as error:
-                self._session.log.warning("%s: %s: cancel failed: %s", self._who, executor, error)
+            self._stop(executor)
 
-    def take_event(self, event: Mapping[str, Any]) -> None:
+    def _stop(self, executor: str) -> bool:
+        """Cancel the goal of an executor; returns whether that succeeded."""
+        try:
+            self._session.control.call("cancel", executor=executor)
+        except IbrobotError as error:
+            self._session.log.warning("%s: %s: cancel failed: %s", self._who, executor, error)
+            return False
+        return True
+
+    def _take_event(self, event: Mapping[str, Any]) -> None:
         """Report the end of a goal."""
         if event["state"] == "executing":
             return
@@ -203,40 +217,45 @@ class Actions:
             state = "aborted"  # replaced, or the robot stopped: ROS knows only cancels by clients
         if state == "aborted":
             code = _EXCEEDED.get(result.get("exceeded"), TrajectoryCode.INVALID_GOAL)
-        measured, index = self._session.measured(), self._index(goal.executor)[0]
-        self._wire.send(
-            {
-                "op": "ended",
-                "goal": goal.number,
-                "state": state,
-                "code": int(code),
-                "message": event["message"],
-                "position": float(measured.position[index]),
-                "effort": float(measured.effort[index]),
-                **{key: result[key] for key in ("stalled", "reached_goal") if key in result},
-            }
-        )
+        if self._executors[goal.executor].goals == "trajectory":
+            values: dict[str, Any] = {"error_code": int(code), "error_string": event["message"]}
+        else:
+            values = self._gripper(goal.executor, self._session.measured())
+            values |= {key: bool(result[key]) for key in ("stalled", "reached_goal") if key in result}
+        self._wire.send({"op": "ended", "goal": goal.number, "state": state, "values": values})
 
-    def take_state(self, state: ControlState) -> None:
+    def _take_state(self, state: ControlState) -> None:
         """Send feedback of the goals under way."""
         with self._lock:
             due = [goal for goal in self._goals.values() if state.stamp_ns - goal.fed_ns >= FEEDBACK_NS]
         for goal in due:
             goal.fed_ns = state.stamp_ns
-            columns = self._index(goal.executor)
+            follows = self._executors[goal.executor].goals == "trajectory"
+            values = self._motion(goal, state) if follows else self._gripper(goal.executor, state)
             assert self._wire is not None
-            self._wire.send(
-                {
-                    "op": "feedback",
-                    "goal": goal.number,
-                    "stamp_ns": state.stamp_ns,
-                    "passed_ns": max(0, state.stamp_ns - goal.begun_ns),
-                    "desired": state.command[columns].tolist(),
-                    "actual": state.position[columns].tolist(),
-                    "velocity": state.velocity[columns].tolist(),
-                    "effort": state.effort[columns].tolist(),
-                }
-            )
+            self._wire.send({"op": "feedback", "goal": goal.number, "values": values})
+
+    def _motion(self, goal: _Goal, state: ControlState) -> dict[str, Any]:
+        """Feedback of FollowJointTrajectory."""
+        columns = self._index(goal.executor)
+        desired, actual = state.command[columns], state.position[columns]
+        passed = {"time_from_start": time_of(max(0, state.stamp_ns - goal.begun_ns))}
+        return {
+            "header": {"stamp": time_of(state.stamp_ns)},
+            "joint_names": list(self._executors[goal.executor].joints),
+            "desired": {"positions": desired.tolist(), **passed},
+            "actual": {"positions": actual.tolist(), "velocities": state.velocity[columns].tolist(), **passed},
+            "error": {"positions": (desired - actual).tolist(), **passed},
+        }
+
+    def _gripper(self, executor: str, state: ControlState | JointReading) -> dict[str, Any]:
+        """Position and effort in feedback and results of the grippers' actions."""
+        column = self._index(executor)[0]
+        position, effort = float(state.position[column]), float(state.effort[column])
+        if self._gripper_action == GRIPPER_ACTIONS[0]:
+            return {"position": position, "effort": effort}
+        joints = list(self._executors[executor].joints)
+        return {"state": {"name": joints, "position": [position], "effort": [effort]}}
 
     def _name(self, number: int) -> str:
         """The name in control of a goal of the present node."""
@@ -245,48 +264,49 @@ class Actions:
     def _index(self, executor: str) -> Any:
         return self._session.config.robot.indices(self._executors[executor].joints)
 
-    def _read(self, executor: ExecutorConfig, fields: Mapping[str, Any], payload: bytes) -> dict[str, Any]:
+    def _read(self, executor: ExecutorConfig, goal: Mapping[str, Any]) -> dict[str, Any]:
         """The goal in the executor's form.
 
         Raises:
             _Invalid: if ros2_control would reject it, too.
         """
         if executor.goals == "trajectory":
-            message = decode(JointTrajectory.ros_type, payload)
-            assert isinstance(message, JointTrajectory)
-            return self._trajectory(executor, fields, message)
-        if "names" not in fields:
-            return {"position": fields["position"], "max_effort": fields["max_effort"]}
-        if list(fields["names"]) not in ([], list(executor.joints)):
-            raise _Invalid(f"names must be {', '.join(executor.joints)}, got {', '.join(fields['names'])}")
-        if len(fields["position"]) != 1 or len(fields["max_effort"]) > 1:
-            raise _Invalid(f"needs one position, and at most one effort, got {fields['position']}")
-        if fields["velocity"]:
+            return self._trajectory(executor, goal)
+        command = goal["command"]
+        if self._gripper_action == GRIPPER_ACTIONS[0]:
+            return {"position": command["position"], "max_effort": command["max_effort"]}
+        if list(command["name"]) not in ([], list(executor.joints)):
+            raise _Invalid(f"names must be {', '.join(executor.joints)}, got {', '.join(command['name'])}")
+        if len(command["position"]) != 1 or len(command["effort"]) > 1:
+            raise _Invalid(f"needs one position, and at most one effort, got {command['position']}")
+        if command["velocity"]:
             raise _Invalid("a velocity cannot be given: the executor's option velocity is used")
-        return {"position": fields["position"][0], "max_effort": (fields["max_effort"] or [0.0])[0]}
+        return {"position": command["position"][0], "max_effort": (command["effort"] or [0.0])[0]}
 
-    def _trajectory(
-        self, executor: ExecutorConfig, fields: Mapping[str, Any], message: JointTrajectory
-    ) -> dict[str, Any]:
-        if fields["other_joints"]:
+    def _trajectory(self, executor: ExecutorConfig, fields: Mapping[str, Any]) -> dict[str, Any]:
+        trajectory = fields["trajectory"]
+        if fields["multi_dof_trajectory"]["joint_names"]:
             raise _Invalid("multi_dof_trajectory: joints with several degrees of freedom are not supported")
-        if sorted(message.joint_names) != sorted(executor.joints):
+        if sorted(trajectory["joint_names"]) != sorted(executor.joints):
             raise _Invalid(
                 f"joint_names must be, in any order, {', '.join(executor.joints)}; got "
-                f"{', '.join(message.joint_names) or 'none'}",
+                f"{', '.join(trajectory['joint_names']) or 'none'}",
                 TrajectoryCode.INVALID_JOINTS,
             )
-        goal = trajectory_goal(self._begun(executor, message, fields["stamp_ns"]))
+        points = tuple(JointTrajectoryPoint(**point) for point in trajectory["points"])
+        message = JointTrajectory(Header(**trajectory["header"]), tuple(trajectory["joint_names"]), points)
+        goal = trajectory_goal(self._begun(message))
         for key in ("path_tolerance", "goal_tolerance"):
             goal[key] = _tolerances(key, fields[key])
-        goal["goal_time"] = seconds(fields["goal_time_ns"])
+        goal["goal_time"] = seconds(fields["goal_time_tolerance_ns"])
         return goal
 
-    def _begun(self, executor: ExecutorConfig, message: JointTrajectory, stamp_ns: int) -> JointTrajectory:
-        """A trajectory that begins now, of one that begins at a stamp; 0 stands for now.
+    def _begun(self, message: JointTrajectory) -> JointTrajectory:
+        """A trajectory that begins now, of one that begins at its stamp; 0 stands for now.
 
         What has passed is left out. Until a stamp in the future, the joints hold.
         """
+        stamp_ns = message.header.stamp_ns
         late_ns = self._session.clock.now_ns() - stamp_ns if stamp_ns else 0
         if not late_ns:
             return message
@@ -310,9 +330,11 @@ class Actions:
         return attrs.evolve(message, points=tuple(points))
 
 
-def _tolerances(key: str, given: list[list[Any]]) -> dict[str, float]:
+def _tolerances(key: str, given: list[dict[str, Any]]) -> dict[str, float]:
     """Tolerances of positions by joint; 0 stands for the executor's own, below 0 for none, as in ros2_control."""
-    for name, _, velocity, acceleration in given:
-        if velocity > 0 or acceleration > 0:
-            raise _Invalid(f"{key}: {name}: tolerances of velocities and accelerations are not checked; leave them out")
-    return {name: position if position >= 0 else -1.0 for name, position, _, _ in given}
+    for each in given:
+        if each["velocity"] > 0 or each["acceleration"] > 0:
+            raise _Invalid(
+                f"{key}: {each['name']}: tolerances of velocities and accelerations are not checked; leave them out"
+            )
+    return {each["name"]: each["position"] if each["position"] >= 0 else -1.0 for each in given}

@@ -89,6 +89,12 @@ class Offers:
             return {"success": False, "message": "the service failed; the robot's log has the cause"}
 
 
+def time_of(stamp_ns: int) -> dict[str, int]:
+    """A time or a duration [ns] as ROS's fields."""
+    sec, nanosec = divmod(stamp_ns, NS_PER_S)
+    return {"sec": sec, "nanosec": nanosec}
+
+
 def with_ns(value: Any) -> Any:
     """A plain request of ROS as runs take them: a time `x` is `x_ns` [ns]."""
     if isinstance(value, Mapping):
