@@ -26,6 +26,8 @@ from ibrobot_zenoh.ros2 import SharedService, SharedTopic
 
 type Reply = Callable[[Mapping[str, Any]], None]
 type RosHandler = Callable[[dict[str, Any], Reply], object]
+LIST_S = 2.0
+"""How long to wait for the names on a network, unless the caller says [s]."""
 _DEPTH = 10
 """Queue size of a topic for the network; when it is full, the bus drops and counts the oldest message."""
 
@@ -115,7 +117,7 @@ class TopicTransport(Transport):
         """
 
     @abstractmethod
-    def shared_services(self, timeout_s: float) -> list[SharedService]:
+    def shared_services(self, timeout_s: float = LIST_S) -> list[SharedService]:
         """The services of ROS 2 nodes, by name; waits up to `timeout_s` [s] for the answer.
 
         Raises:
@@ -123,7 +125,7 @@ class TopicTransport(Transport):
         """
 
     @abstractmethod
-    def shared_topics(self, timeout_s: float) -> list[SharedTopic]:
+    def shared_topics(self, timeout_s: float = LIST_S) -> list[SharedTopic]:
         """All shared topics, by name; waits up to `timeout_s` [s] for the answer.
 
         Raises:

@@ -8,7 +8,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable
-from typing import Any
+from typing import Any, override
 
 import zenoh
 import zenoh.ext
@@ -17,7 +17,7 @@ from ibrobot_ros2.interfaces import ServiceType
 
 from ibrobot_core.api import Context, IbrobotError, Message, TransportError
 from ibrobot_zenoh.connection import Connection, Declared, first_line
-from ibrobot_zenoh.identity import Identity, Role
+from ibrobot_zenoh.identity import Role, own_identity
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.ros2 import (
     ADMIN,
@@ -31,6 +31,7 @@ from ibrobot_zenoh.ros2 import (
     topics_of_tokens,
     type_of_key,
 )
+from ibrobot_zenoh.sharing import LIST_S, TopicTransport
 from ibrobot_zenoh.workers import Workers
 
 DEPTH = 100
@@ -54,17 +55,17 @@ class _Group:
 class _Publisher:
     """A published topic. If latched, its newest message is also sent to later subscribers, and after connecting."""
 
-    def __init__(self, topics: Topics, topic: str, type_name: str, *, latched: bool) -> None:
+    def __init__(self, transport: RosTransport, topic: str, type_name: str, *, latched: bool) -> None:
         self.type_name = type_name
         self.latched = latched
-        self._topics = topics
+        self._transport = transport
         self._topic = topic
         self._gid = uuid.uuid4().bytes
         self._lock = threading.Lock()
         self._sequence = 0
         self._newest: bytes | None = None
         self._publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher | None = None
-        topics.connection.declare(self._declare)
+        transport.connection.declare(self._declare)
 
     def publish(self, payload: bytes) -> None:
         with self._lock:
@@ -89,7 +90,7 @@ class _Publisher:
             raise TransportError(f"{self._topic}: {first_line(error)}") from error
 
     def _declare(self, session: zenoh.Session) -> Declared:
-        options = self._topics.options
+        options = self._transport.options
         hashed = options.type_hashes
         key = topic_key(options.domain, self._topic, self.type_name, hashed=hashed)
         qos: dict[str, Any] = {
@@ -102,8 +103,8 @@ class _Publisher:
             publisher = zenoh.ext.declare_advanced_publisher(session, key, cache=cache, publisher_detection=True, **qos)
         else:
             publisher = session.declare_publisher(key, **qos)
-        token = self._topics.node(session).publisher_token(
-            self._topics.next_number(), self._topic, self.type_name, hashed=hashed, latched=self.latched
+        token = self._transport.node(session).publisher_token(
+            self._transport.next_number(), self._topic, self.type_name, hashed=hashed, latched=self.latched
         )
         alive = session.liveliness().declare_token(token)
         with self._lock:
@@ -113,57 +114,65 @@ class _Publisher:
         return _Group(alive, publisher)
 
 
-class Topics:
-    """Publishes and receives messages, and lists topics.
+class RosTransport(TopicTransport):
+    """The half of the transport that ROS 2 nodes take part in: publishes and receives messages, and lists names.
 
-    Args:
-        connection: the session.
-        options: domain, namespace, and whether types have hashes.
-        own: identity of this machine.
-        ctx: its robot's name becomes the node's name.
+    Raises:
+        TransportError: as `Connection`.
 
     Attributes:
-        namespace: prefix of the names of topics; empty for none.
+        options: the options.
+        connection: the session.
+        own: identity of this machine; None if it has none.
     """
 
-    def __init__(self, connection: Connection, options: ZenohOptions, own: Identity | None, ctx: Context) -> None:
-        self.connection = connection
+    def __init__(self, options: ZenohOptions, ctx: Context) -> None:
         self.options = options
-        self._own = own
-        default = own.name if own is not None and own.role is Role.ROBOT else ""
-        self.namespace = default if options.namespace is None else options.namespace
+        self.own = own_identity(options)
+        self.connection = Connection(options, ctx.log)
+        default = self.own.name if self.own is not None and self.own.role is Role.ROBOT else ""
+        self._namespace = default if options.namespace is None else options.namespace
         self._log = ctx.log
         self._name = "ibrobot_" + re.sub(r"\W", "_", ctx.robot.name)
         self._lock = threading.Lock()
         self._publishers: dict[str, _Publisher] = {}
+        self._workers: set[Workers[Any]] = set()
         self._number = 0
         self._is_known = False
         """Whether ROS 2 nodes see this node."""
 
-    def publish(self, topic: str, message: Message, *, latched: bool) -> None:
-        """See `TopicTransport.publish_message`."""
-        self.connection.check_open()
+    @property
+    @override
+    def node_name(self) -> str:
+        return absolute(self._name, self.namespace)
+
+    @property
+    @override
+    def namespace(self) -> str:
+        return self._namespace
+
+    @override
+    def publish_message(self, topic: str, message: Message, *, latched: bool = False) -> None:
         name = absolute(topic, self.namespace)
-        if self._own is not None:
-            self._own.check_may_publish(name)
+        if self.own is not None:
+            self.own.check_may_publish(name)
         self.publish_cdr(name, message.ros_type, encode(message).tobytes(), latched=latched)
 
-    def publish_cdr(self, name: str, type_name: str, payload: bytes, *, latched: bool) -> None:
-        """Publish the bytes of a message under its full name.
-
-        Raises:
-            TransportError: if it is too large, or the topic has another type.
-        """
-        if len(payload) > self.options.max_message_size:
-            limit = self.options.max_message_size
-            raise TransportError(f"{name}: a message of {len(payload)} bytes is larger than max_message_size, {limit}")
+    @override
+    def publish_cdr(self, name: str, type_name: str, payload: bytes, *, latched: bool = False) -> None:
+        self.connection.check_open()
+        self._check_size(len(payload), name)
         publisher = self._publisher(name, type_name, latched=latched)
         if publisher.type_name != type_name:
             raise TransportError(f"topic {name} carries {publisher.type_name}, not {type_name}")
         publisher.publish(payload)
 
+    def _check_size(self, size: int, name: str) -> None:
+        if size > (limit := self.options.max_message_size):
+            raise TransportError(f"{name}: a message of {size} bytes is larger than max_message_size, {limit}")
+
     def is_heard(self, topic: str, type_name: str, timeout_s: float) -> bool:
-        """See `ZenohTransport.is_heard`."""
+        """Whether a topic of a type has a subscriber; waits up to `timeout_s` [s] for one."""
         publisher = self._publisher(absolute(topic, self.namespace), type_name, latched=False)
         deadline = time.monotonic() + timeout_s
         while not publisher.is_heard and time.monotonic() + _AGAIN_S < deadline:
@@ -184,7 +193,7 @@ class Topics:
             self._is_known = True
             self.connection.declare(lambda session: session.liveliness().declare_token(self.node(session).node_token()))
 
-    def announce_server(self, name: str, kind: ServiceType) -> Callable[[], None]:
+    def _announce(self, name: str, kind: ServiceType) -> Callable[[], None]:
         """Show the server of a service to ROS 2 nodes; returns a function that ends it."""
         with self._lock:
             self._be_known()
@@ -195,16 +204,13 @@ class Topics:
             )
         )
 
-    def subscribe(self, topic: str, callback: Callable[[Message], object]) -> tuple[Callable[[], None], Workers[Any]]:
-        """See `TopicTransport`; returns a function that unsubscribes, and the thread that calls `callback`."""
-        return self.subscribe_cdr(
-            absolute(topic, self.namespace), lambda type_name, data: callback(decode(type_name, data))
-        )
+    @override
+    def subscribe_messages(self, topic: str, callback: Callable[[Message], object]) -> Callable[[], None]:
+        name = absolute(topic, self.namespace)
+        return self.subscribe_cdr(name, lambda type_name, data: callback(decode(type_name, data)))
 
-    def subscribe_cdr(
-        self, name: str, callback: Callable[[str, bytes], object]
-    ) -> tuple[Callable[[], None], Workers[Any]]:
-        """As `subscribe`, with the type and the bytes of each message; those that raise IbrobotError are skipped."""
+    @override
+    def subscribe_cdr(self, name: str, callback: Callable[[str, bytes], object]) -> Callable[[], None]:
         warn_once = _Once(self._log)
 
         def deliver(sample: zenoh.Sample) -> None:
@@ -224,14 +230,14 @@ class Topics:
         end = self.connection.declare(
             lambda session: zenoh.ext.declare_advanced_subscriber(session, key, take, history=history)
         )
-        return end, subscriber
+        return self._keep(end, subscriber)
 
-    def shared(self, timeout_s: float) -> list[SharedTopic]:
-        """See `TopicTransport.shared_topics`."""
+    @override
+    def shared_topics(self, timeout_s: float = LIST_S) -> list[SharedTopic]:
         return topics_of_tokens(self._settled_tokens(timeout_s))
 
-    def services(self, timeout_s: float) -> list[SharedService]:
-        """See `TopicTransport.shared_services`."""
+    @override
+    def shared_services(self, timeout_s: float = LIST_S) -> list[SharedService]:
         return services_of_tokens(self._settled_tokens(timeout_s))
 
     def _settled_tokens(self, timeout_s: float) -> set[str]:
@@ -247,11 +253,6 @@ class Topics:
         replies = self.connection.session().liveliness().get(f"{ADMIN}/{self.options.domain}/**", timeout=timeout_s)
         return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
-    @property
-    def node_name(self) -> str:
-        """The full name of the node."""
-        return absolute(self._name, self.namespace)
-
     def node(self, session: zenoh.Session) -> Node:
         """The node of the publishers on `session`."""
         return Node(self.options.domain, str(session.info.zid()), self._name)
@@ -260,6 +261,27 @@ class Topics:
         """A number for a publisher, from 1."""
         self._number += 1  # always under the connection's lock
         return self._number
+
+    @override
+    def close(self) -> None:
+        with self._lock:
+            workers, self._workers = self._workers, set()
+        for each in workers:
+            each.end()
+        self.connection.close()
+
+    def _keep(self, end_declared: Callable[[], None], workers: Workers[Any]) -> Callable[[], None]:
+        """Have `close` end workers; returns a function that ends them, and what feeds them."""
+        with self._lock:
+            self._workers.add(workers)
+
+        def end() -> None:
+            end_declared()
+            workers.end()
+            with self._lock:
+                self._workers.discard(workers)
+
+        return end
 
 
 class _Once:

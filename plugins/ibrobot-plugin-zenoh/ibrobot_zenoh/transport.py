@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import uuid
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -11,17 +10,16 @@ from typing import Any, override
 import zenoh
 from ibrobot_ros2.interfaces import ServiceType
 
-from ibrobot_core.api import Context, Handler, Message, Payload, TransportError
+from ibrobot_core.api import Context, Handler, Payload, TransportError
 from ibrobot_core.app import HANDLER_THREADS
 from ibrobot_zenoh.access import ANYBODY, SERVED, SERVICES, TOPICS
-from ibrobot_zenoh.connection import Connection, first_line
-from ibrobot_zenoh.identity import own_identity
+from ibrobot_zenoh.connection import first_line
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.presence import Presence
-from ibrobot_zenoh.ros2 import SharedService, SharedTopic, service_key
+from ibrobot_zenoh.ros2 import service_key
 from ibrobot_zenoh.ros_calls import RosServer, call
-from ibrobot_zenoh.sharing import RosHandler, TopicTransport
-from ibrobot_zenoh.topics import Topics
+from ibrobot_zenoh.sharing import RosHandler
+from ibrobot_zenoh.topics import RosTransport
 from ibrobot_zenoh.workers import Workers
 
 SUBSCRIBER_DEPTH = 1000
@@ -56,34 +54,22 @@ def _sendable(payload: Payload) -> bytes | bytearray:
     return payload.tobytes()
 
 
-class ZenohTransport(TopicTransport):
-    """Payloads over Zenoh, under the keys of `ibrobot_zenoh.access`; messages as ROS 2 nodes send them.
-
-    Raises:
-        TransportError: as `Connection`.
-    """
+class ZenohTransport(RosTransport):
+    """Payloads over Zenoh, under the keys of `ibrobot_zenoh.access`; messages as ROS 2 nodes send them."""
 
     def __init__(self, options: ZenohOptions, ctx: Context) -> None:
-        self._log = ctx.log
-        self._options = options
-        self._largest = options.max_message_size
-        own = own_identity(options)
-        self._name = ANYBODY if own is None else own.name
-        self._own = own
-        self._connection = Connection(options, ctx.log)
-        self._topics = Topics(self._connection, options, own, ctx)
-        self._presence = Presence(self._connection)
-        self._lock = threading.Lock()
+        super().__init__(options, ctx)
+        self._sender_name = ANYBODY if self.own is None else self.own.name
+        self._presence = Presence(self.connection)
         self._served: set[str] = set()
-        self._workers: list[Workers[Any]] = []
 
     @override
     def publish(self, topic: str, payload: Payload) -> None:
         self._check_size(len(payload), topic)
-        if self._own is not None:
-            self._own.check_may_publish(topic)
+        if self.own is not None:
+            self.own.check_may_publish(topic)
         key = _key(TOPICS, topic)
-        session = self._connection.open_session
+        session = self.connection.open_session
         if session is not None:  # without a session there are no subscribers
             # May wait for the link, but never for a subscriber, as these have queues.
             try:
@@ -103,11 +89,11 @@ class ZenohTransport(TopicTransport):
                 self._log.warning("%s is too slow: a payload was dropped", name)
 
         key = _key(TOPICS, topic)
-        return self._keep(self._connection.declare(lambda session: session.declare_subscriber(key, take)), subscriber)
+        return self._keep(self.connection.declare(lambda session: session.declare_subscriber(key, take)), subscriber)
 
     @override
     def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
-        return self._serve(name, handler, workers, lambda payload: False, self._largest)
+        return self._serve(name, handler, workers, lambda payload: False, self.options.max_message_size)
 
     @override
     def serve_with_urgent(
@@ -151,7 +137,7 @@ class ZenohTransport(TopicTransport):
 
         end = self._declare_server(
             name, key, take,
-            lambda: self._connection.declare(lambda session: session.liveliness().declare_token(token)),
+            lambda: self.connection.declare(lambda session: session.liveliness().declare_token(token)),
         )  # fmt: skip
         return self._keep(self._keep(end, server), urgent)
 
@@ -163,7 +149,7 @@ class ZenohTransport(TopicTransport):
         with self._lock:
             if name in self._served:
                 raise TransportError(f"{name} already has a server in this process")
-            end_queries = self._connection.declare(lambda session: session.declare_queryable(key, take, complete=True))
+            end_queries = self.connection.declare(lambda session: session.declare_queryable(key, take, complete=True))
             self._served.add(name)
         end_token = announce()
 
@@ -177,9 +163,9 @@ class ZenohTransport(TopicTransport):
 
     @override
     def request(self, name: str, payload: Payload, timeout_s: float) -> Payload:
-        key = _key(f"{SERVICES}/{self._name}", name)
+        key = _key(f"{SERVICES}/{self._sender_name}", name)
         self._check_size(len(payload), name)
-        session = self._connection.session()
+        session = self.connection.session()
         try:
             # Replies go to a channel of this call, so a late reply is discarded.
             replies = session.get(
@@ -200,109 +186,36 @@ class ZenohTransport(TopicTransport):
             if failure is not None and failure.encoding == _FAILED:
                 raise TransportError(f"{name} failed: {failure.payload.to_bytes().decode(errors='replace')}")
             raise TransportError(f"no answer from {name} within {timeout_s} s")
-        hint = f"; or its list of robots lacks {self._name!r}" if self._own is not None else ""
+        hint = f"; or its list of robots lacks {self._sender_name!r}" if self.own is not None else ""
         raise TransportError(f"nobody serves {name}, or not any more{hint}")
 
     @override
     def watch(self, name: str, changed: Callable[[bool], object]) -> Callable[[], None]:
         _key(SERVED, name)  # check the name
-        self._connection.check_open()
+        self.connection.check_open()
         return self._keep(*self._presence.watch(name.removeprefix("/"), changed))
 
     @override
     def served(self, prefix: str) -> frozenset[str]:
-        self._connection.check_open()
+        self.connection.check_open()
         return self._presence.served(prefix.removeprefix("/"))
-
-    @override
-    def publish_message(self, topic: str, message: Message, *, latched: bool = False) -> None:
-        self._topics.publish(topic, message, latched=latched)
-
-    @override
-    def subscribe_messages(self, topic: str, callback: Callable[[Message], object]) -> Callable[[], None]:
-        return self._keep(*self._topics.subscribe(topic, callback))
-
-    @override
-    def publish_cdr(self, name: str, type_name: str, payload: bytes, *, latched: bool = False) -> None:
-        self._connection.check_open()
-        self._topics.publish_cdr(name, type_name, payload, latched=latched)
-
-    @override
-    def subscribe_cdr(self, name: str, callback: Callable[[str, bytes], object]) -> Callable[[], None]:
-        return self._keep(*self._topics.subscribe_cdr(name, callback))
 
     @override
     def serve_ros(
         self, name: str, kind: ServiceType, handler: RosHandler, *, urgent: bool = False
     ) -> Callable[[], None]:
         server = RosServer(name, kind, handler, self._log, URGENT_WAITING if urgent else REQUESTS_WAITING)
-        key = service_key(self._options.domain, name, kind, hashed=self._options.type_hashes)
-        end = self._declare_server(name, key, server.take, lambda: self._topics.announce_server(name, kind))
+        key = service_key(self.options.domain, name, kind, hashed=self.options.type_hashes)
+        end = self._declare_server(name, key, server.take, lambda: self._announce(name, kind))
         return self._keep(end, server.workers)
 
     @override
     def call_ros(self, name: str, kind: ServiceType, request: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
-        key = service_key(self._options.domain, name, kind, hashed=self._options.type_hashes)
-        return call(self._connection.session(), key, name, kind, request, timeout_s)
-
-    @override
-    def shared_services(self, timeout_s: float) -> list[SharedService]:
-        return self._topics.services(timeout_s)
-
-    @property
-    @override
-    def node_name(self) -> str:
-        return self._topics.node_name
-
-    @property
-    @override
-    def namespace(self) -> str:
-        return self._topics.namespace
-
-    def await_connection(self, timeout_s: float) -> bool:
-        """Wait up to `timeout_s` [s] for the other side; returns whether it has answered."""
-        return self._connection.answered.wait(timeout_s)
-
-    @property
-    def why_not_connected(self) -> str:
-        """Why there is no connection yet."""
-        return self._connection.why_not
-
-    def is_heard(self, topic: str, type_name: str, timeout_s: float) -> bool:
-        """Whether a topic of a type has a subscriber; waits up to `timeout_s` [s] for one."""
-        return self._topics.is_heard(topic, type_name, timeout_s)
-
-    @override
-    def shared_topics(self, timeout_s: float) -> list[SharedTopic]:
-        return self._topics.shared(timeout_s)
-
-    @override
-    def close(self) -> None:
-        with self._lock:
-            workers, self._workers = self._workers, []
-        for each in workers:
-            each.end()
-        self._connection.close()
-
-    def _keep(self, end_declared: Callable[[], None], workers: Workers[Any]) -> Callable[[], None]:
-        with self._lock:
-            self._workers.append(workers)
-
-        def end() -> None:
-            end_declared()
-            workers.end()
-            with self._lock:
-                if workers in self._workers:
-                    self._workers.remove(workers)
-
-        return end
+        key = service_key(self.options.domain, name, kind, hashed=self.options.type_hashes)
+        return call(self.connection.session(), key, name, kind, request, timeout_s)
 
     def _sender(self, query: zenoh.Query) -> str | None:
         """The sender of a request, from its key: the access list permits only keys of the own name."""
-        if not self._connection.knows_who_asks:
+        if not self.connection.knows_who_asks:
             return None
         return str(query.key_expr).removeprefix(f"{SERVICES}/").partition("/")[0]
-
-    def _check_size(self, size: int, name: str) -> None:
-        if size > self._largest:
-            raise TransportError(f"{name}: a message of {size} bytes is larger than max_message_size, {self._largest}")

@@ -40,7 +40,7 @@ from .pair import WAIT_S, free_endpoint, router, wait_for
 PATIENT = """
 from importlib import import_module
 import_module("ibrobot_zenoh.commands.network")._CONNECT_S = 30.0
-import_module("ibrobot_zenoh.commands.topic")._LIST_S = 30.0
+import_module("ibrobot_zenoh.transport").ZenohTransport.shared_topics.__defaults__ = (30.0,)
 """
 STATE = JointState(Header(5, "base"), ("pan",), [0.5])
 
@@ -82,8 +82,8 @@ def _without_shared_memory(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def _patient_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(network_module, "_CONNECT_S", WAIT_S)
-    for name in ("_LIST_S", "_HEARD_S"):
-        monkeypatch.setattr(f"ibrobot_zenoh.commands.topic.{name}", WAIT_S)
+    monkeypatch.setattr(ZenohTransport.shared_topics, "__defaults__", (WAIT_S,))
+    monkeypatch.setattr("ibrobot_zenoh.commands.topic._HEARD_S", WAIT_S)
 
 
 def run(*arguments: str) -> str:

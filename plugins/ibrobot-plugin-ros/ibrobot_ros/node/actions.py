@@ -57,7 +57,7 @@ class Actions:
         except LookupError as error:
             self._wire.send({"op": "trouble", "topic": head["name"], "what": f"not in ROS: {error}"})
             return
-        address = {key: head[key] for key in ("executor", "service") if key in head}
+        address: dict[str, Any] = {key: head[key] for key in ("executor", "service") if key in head}
         asked: list[_Goal] = []
 
         def ask(request: Any) -> Any:

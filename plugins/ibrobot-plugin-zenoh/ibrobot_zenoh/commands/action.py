@@ -10,12 +10,10 @@ from ibrobot_ros2.interfaces import action_type
 
 from ibrobot_core.api import NotSupported, TransportError
 from ibrobot_core.app import dump_yaml, echo, parse_yaml, wrong_input
-from ibrobot_zenoh.commands.network import connected, network_options
+from ibrobot_zenoh.commands.network import Network, on_network
 from ibrobot_zenoh.ros2 import absolute, actions_of
 from ibrobot_zenoh.ros_goals import Ended, SentGoal, Status
 from ibrobot_zenoh.transport import ZenohTransport
-
-_LIST_S = 2.0
 
 
 @click.group()
@@ -24,26 +22,23 @@ def action() -> None:
 
 
 @action.command(name="list")
-@network_options
+@on_network
 @click.option("-t", "--show-types", is_flag=True, help="Show the types, too.")
-def list_(config: str | None, endpoints: tuple[str, ...], domain: int | None, show_types: bool) -> None:
+def list_(network: Network, show_types: bool) -> None:
     """List the actions that robots and ROS 2 nodes offer."""
-    with connected(config, endpoints, domain) as transport:
-        for name, type_name in actions_of(transport.shared_services(_LIST_S)):
+    with network as transport:
+        for name, type_name in actions_of(transport.shared_services()):
             echo(f"{name} [{type_name}]" if show_types else name)
 
 
 @action.command()
-@network_options
+@on_network
 @click.argument("name", metavar="ACTION")
 @click.argument("type_name", metavar="TYPE")
 @click.argument("text", metavar="GOAL")
 @click.option("-f", "--feedback", is_flag=True, help="Show the feedback, too.")
 @click.option("--timeout", default=600.0, show_default=True, type=click.FloatRange(0.01), help="Longest wait [s].")
-def send(
-    config: str | None, endpoints: tuple[str, ...], domain: int | None, name: str, type_name: str, text: str,
-    feedback: bool, timeout: float,
-) -> None:  # fmt: skip
+def send(network: Network, name: str, type_name: str, text: str, feedback: bool, timeout: float) -> None:
     """Send GOAL, as YAML, to ACTION, and wait for its result. Ctrl-C cancels the goal.
 
     E.g. `ibrobot action send /grip/gripper_cmd control_msgs/action/GripperCommand '{command: {position: 1}}'`.
@@ -52,7 +47,7 @@ def send(
     document.raise_problems()
     with wrong_input():
         kind = action_type(type_name)
-    with connected(config, endpoints, domain) as transport:
+    with network as transport:
         _check_type(transport, absolute(name), type_name)
         shown: Callable[[dict[str, Any]], object] = lambda each: echo(f"Feedback:\n{dump_yaml(each)}")  # noqa: E731
         goal = SentGoal(transport, absolute(name), kind, document.root or {}, shown if feedback else None)
@@ -68,7 +63,7 @@ action.add_command(click.Command("send_goal", params=send.params, callback=send.
 
 def _check_type(transport: ZenohTransport, name: str, type_name: str) -> None:
     """Raise for an action of another type, which would look as if nobody served it."""
-    known = dict(actions_of(transport.shared_services(_LIST_S)))
+    known = dict(actions_of(transport.shared_services()))
     if known.get(name, type_name) != type_name:
         raise NotSupported(f"{name} is a {known[name]}, not a {type_name}")
     if name not in known:

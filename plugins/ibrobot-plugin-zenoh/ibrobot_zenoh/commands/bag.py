@@ -29,7 +29,7 @@ from ibrobot_core.api import (
     ns,
 )
 from ibrobot_core.app import EpisodePath, echo, installed_plugins, wrong_input
-from ibrobot_zenoh.commands.network import connected, network_options
+from ibrobot_zenoh.commands.network import Network, on_network
 
 CLOCK = "/clock"
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
@@ -46,7 +46,7 @@ def bag() -> None:
 
 @bag.command()
 @click.argument("episode", type=EpisodePath())
-@network_options
+@on_network
 @click.option("-r", "--rate", default=1.0, show_default=True, type=click.FloatRange(0.001, 1000), help="Speed.")
 @click.option("-l", "--loop", is_flag=True, help="Begin again at the end, until Ctrl-C.")
 @click.option("--start-offset", default=0.0, metavar="S", type=click.FloatRange(0), help="Begin so many seconds in.")
@@ -58,9 +58,8 @@ def bag() -> None:
 @click.option("--exclude-topics", multiple=True, metavar="TOPIC", help="Leave out this topic; can be repeated.")
 @click.option("-m", "--remap", "renamed", multiple=True, metavar="OLD:=NEW", help="Play a topic under another name.")
 def play(
-    episode: Path, config: str | None, endpoints: tuple[str, ...], domain: int | None, rate: float, loop: bool,
-    start_offset: float, clock_hz: float | None, topics: tuple[str, ...], exclude_topics: tuple[str, ...],
-    renamed: tuple[str, ...],
+    network: Network, episode: Path, rate: float, loop: bool, start_offset: float, clock_hz: float | None,
+    topics: tuple[str, ...], exclude_topics: tuple[str, ...], renamed: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Play EPISODE: publish its messages at their times, with their stamps.
 
@@ -78,7 +77,7 @@ def play(
         if start_ns > summary.end_ns:
             length = (summary.end_ns - summary.start_ns) / NS_PER_S
             raise RecorderError(f"{episode}: --start-offset {start_offset:g} is after its end; it lasts {length:.1f} s")
-        with suppress(KeyboardInterrupt), connected(config, endpoints, domain) as transport:
+        with suppress(KeyboardInterrupt), network as transport:
             player = Player(RealClock(), transport.publish_message, chosen, rate, clock_hz)
             while True:
                 player.play(reader.messages_since(start_ns, list(chosen)), start_ns)

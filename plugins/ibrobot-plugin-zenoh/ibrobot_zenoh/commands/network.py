@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from functools import wraps
 from typing import Any
 
 import attrs
@@ -20,15 +21,21 @@ _EVERYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
 """All addresses to listen on -> the one to reach such a server from this machine."""
 
 
-def network_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that select the network."""
-    for decorate in (
-        click.option("--domain", type=click.IntRange(0, 232), help="ROS 2 domain.  [default: the YAML's, or 0]"),
-        click.option("--endpoint", "endpoints", multiple=True, metavar="URL", help="E.g. tcp/127.0.0.1:7447."),
-        click.option("--config", metavar="CONFIG", help="The robot YAML whose transport section to use."),
-    ):
-        command = decorate(command)
-    return command
+type Network = AbstractContextManager[ZenohTransport]
+"""A context with a connected transport."""
+
+
+def on_network(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that select the network; `command` receives it as its first argument."""
+
+    @click.option("--config", metavar="CONFIG", help="The robot YAML whose transport section to use.")
+    @click.option("--endpoint", "endpoints", multiple=True, metavar="URL", help="E.g. tcp/127.0.0.1:7447.")
+    @click.option("--domain", type=click.IntRange(0, 232), help="ROS 2 domain.  [default: the YAML's, or 0]")
+    @wraps(command)
+    def run(config: str | None, endpoints: tuple[str, ...], domain: int | None, **arguments: Any) -> None:
+        command(_connected(config, endpoints, domain), **arguments)
+
+    return run
 
 
 def options_from(config: str | None, endpoints: tuple[str, ...], domain: int | None) -> ZenohOptions:
@@ -65,8 +72,8 @@ def _here(endpoint: str) -> str:
 
 
 @contextmanager
-def connected(config: str | None, endpoints: tuple[str, ...], domain: int | None) -> Iterator[ZenohTransport]:
-    """A context with a connected transport.
+def _connected(config: str | None, endpoints: tuple[str, ...], domain: int | None) -> Iterator[ZenohTransport]:
+    """The network.
 
     Raises:
         TransportError: if there is no answer.
@@ -76,8 +83,8 @@ def connected(config: str | None, endpoints: tuple[str, ...], domain: int | None
     log.setLevel(logging.ERROR)  # the error has the reason
     transport = ZenohTransport(options, Context("topic", RealClock(), log, Robot("command_line", ())))
     try:
-        if not transport.await_connection(_CONNECT_S):
-            raise TransportError(f"not connected: {transport.why_not_connected}")
+        if not transport.connection.answered.wait(_CONNECT_S):
+            raise TransportError(f"not connected: {transport.connection.why_not}")
         yield transport
     finally:
         transport.close()

@@ -9,12 +9,11 @@ from ibrobot_ros2.interfaces import ServiceType, service_type
 
 from ibrobot_core.api import NotSupported, TransportError
 from ibrobot_core.app import dump_yaml, echo, parse_yaml
-from ibrobot_zenoh.commands.network import connected, network_options
+from ibrobot_zenoh.commands.network import Network, on_network
 from ibrobot_zenoh.ros2 import absolute
 from ibrobot_zenoh.ros_parameters import ParameterType, from_parameter, to_parameter
 from ibrobot_zenoh.transport import ZenohTransport
 
-_LIST_S = 2.0
 _ANSWER_S = 5.0
 _LIST = "list_parameters"
 
@@ -31,16 +30,13 @@ def _ask(transport: ZenohTransport, node: str, name: str, request: dict[str, Any
 
 
 @param.command(name="list")
-@network_options
+@on_network
 @click.argument("node", required=False)
 @click.option("--param-prefixes", "prefixes", multiple=True, metavar="PREFIX", help="List only these, e.g. control.")
 @click.option("--param-type", "typed", is_flag=True, help="Show the types, too.")
-def list_(
-    config: str | None, endpoints: tuple[str, ...], domain: int | None, node: str | None, prefixes: tuple[str, ...],
-    typed: bool,
-) -> None:  # fmt: skip
+def list_(network: Network, node: str | None, prefixes: tuple[str, ...], typed: bool) -> None:
     """List the parameters of NODE, or of all nodes."""
-    with connected(config, endpoints, domain) as transport:
+    with network as transport:
         nodes = [absolute(node)] if node else _nodes(transport)
         for each in nodes:
             names = _ask(transport, each, _LIST, {"prefixes": list(prefixes)})["result"]["names"]
@@ -54,22 +50,20 @@ def list_(
 
 def _nodes(transport: ZenohTransport) -> list[str]:
     """The nodes that have parameters."""
-    services = transport.shared_services(_LIST_S)
+    services = transport.shared_services()
     return [
         each.name.removesuffix(f"/{_LIST}") for each in services if each.name.endswith(f"/{_LIST}") and each.servers
     ]
 
 
 @param.command()
-@network_options
+@on_network
 @click.argument("node")
 @click.argument("name", metavar="PARAMETER")
 @click.option("--hide-type", is_flag=True, help="Show only the value.")
-def get(
-    config: str | None, endpoints: tuple[str, ...], domain: int | None, node: str, name: str, hide_type: bool
-) -> None:
+def get(network: Network, node: str, name: str, hide_type: bool) -> None:
     """Show the value of a PARAMETER of NODE."""
-    with connected(config, endpoints, domain) as transport:
+    with network as transport:
         (found,) = _ask(transport, node, "get_parameters", {"names": [name]})["values"]
     kind, value = ParameterType(found["type"]), from_parameter(found)
     if kind is ParameterType.NOT_SET:
@@ -80,16 +74,16 @@ def get(
 
 
 @param.command(name="set")
-@network_options
+@on_network
 @click.argument("node")
 @click.argument("name", metavar="PARAMETER")
 @click.argument("text", metavar="VALUE")
-def set_(config: str | None, endpoints: tuple[str, ...], domain: int | None, node: str, name: str, text: str) -> None:
+def set_(network: Network, node: str, name: str, text: str) -> None:
     """Set a PARAMETER of NODE to VALUE, as YAML."""
     document = parse_yaml(text, "VALUE")
     document.raise_problems()
     parameter = {"name": name, "value": to_parameter(document.root)}
-    with connected(config, endpoints, domain) as transport:
+    with network as transport:
         (result,) = _ask(transport, node, "set_parameters", {"parameters": [parameter]})["results"]
     if not result["successful"]:
         raise TransportError(f"{absolute(node)}: {name} cannot be set: {result['reason']}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import re
 from collections.abc import Callable, Mapping
@@ -14,11 +13,10 @@ from ibrobot_ros2.services import DETAILS, SERVICES, Call, decode_answer, encode
 
 from ibrobot_core.api import NotSupported, TransportError
 from ibrobot_core.app import dump_yaml, echo, parse_yaml
-from ibrobot_zenoh.commands.network import connected, network_options
+from ibrobot_zenoh.commands.network import Network, on_network
 from ibrobot_zenoh.ros2 import HIDDEN, absolute
 from ibrobot_zenoh.transport import ZenohTransport
 
-_LIST_S = 2.0
 _TYPE = re.compile(r"\w+/srv/\w+")
 
 
@@ -28,15 +26,9 @@ def service() -> None:
 
 
 def _command(function: Callable[..., None]) -> click.Command:
-    """Make a command of `service` whose function receives a connected transport and the robot's namespace."""
-
-    @functools.wraps(function)
-    def run(config: str | None, endpoints: tuple[str, ...], domain: int | None, **arguments: Any) -> None:
-        with connected(config, endpoints, domain) as transport:
-            function(transport, **arguments)
-
-    named = click.option("--namespace", default="", metavar="NAME", help="The robot's namespace, e.g. arm1.")(run)
-    return service.command(function.__name__.rstrip("_"))(network_options(named))
+    """Make a command of `service` whose function receives the network and the robot's namespace."""
+    named = click.option("--namespace", default="", metavar="NAME", help="The robot's namespace, e.g. arm1.")(function)
+    return service.command(function.__name__.rstrip("_"))(on_network(named))
 
 
 def _ask(transport: ZenohTransport, namespace: str, call: Call, timeout_s: float) -> Any:
@@ -48,15 +40,16 @@ def _ask(transport: ZenohTransport, namespace: str, call: Call, timeout_s: float
 
 @_command
 @click.option("-t", "--show-types", "typed", is_flag=True, help="Show types: those that ROS 2 nodes can call have one.")
-def list_(transport: ZenohTransport, namespace: str, typed: bool) -> None:
+def list_(network: Network, namespace: str, typed: bool) -> None:
     """List the services of the robot, and of ROS 2 nodes."""
-    types = {each.name: each.type for each in transport.shared_services(_LIST_S) if each.servers}
-    try:
-        own = _ask(transport, namespace, Call(SERVICES), 5.0)
-    except TransportError:
-        if not types:
-            raise
-        own = []  # the network has ROS 2 nodes alone
+    with network as transport:
+        types = {each.name: each.type for each in transport.shared_services() if each.servers}
+        try:
+            own = _ask(transport, namespace, Call(SERVICES), 5.0)
+        except TransportError:
+            if not types:
+                raise
+            own = []  # the network has ROS 2 nodes alone
     shown = {name for name in types if HIDDEN not in name}  # as in ros2: not those of actions
     for name in sorted({*own, *shown}):
         echo(f"{name} [{types[name]}]" if typed and name in types else name)
@@ -64,9 +57,10 @@ def list_(transport: ZenohTransport, namespace: str, typed: bool) -> None:
 
 @_command
 @click.argument("name", metavar="SERVICE")
-def show(transport: ZenohTransport, namespace: str, name: str) -> None:
+def show(network: Network, namespace: str, name: str) -> None:
     """Show what SERVICE does, its request and its answer."""
-    details = _ask(transport, namespace, Call(DETAILS, name), 5.0)
+    with network as transport:
+        details = _ask(transport, namespace, Call(DETAILS, name), 5.0)
     echo(f"{name}: {details['help']}")
     echo("request:" if details["request"] else "request: none")
     for key in details["request"]:
@@ -91,9 +85,7 @@ def _key_line(key: Mapping[str, Any]) -> str:
 @click.argument("words", metavar="[TYPE] [REQUEST]", nargs=-1)
 @click.option("--timeout", default=60.0, show_default=True, type=click.FloatRange(0.01), help="Longest wait [s].")
 @click.option("--text", is_flag=True, help="Send REQUEST as text, unparsed.")
-def call(
-    transport: ZenohTransport, namespace: str, name: str, words: tuple[str, ...], timeout: float, text: bool
-) -> None:
+def call(network: Network, namespace: str, name: str, words: tuple[str, ...], timeout: float, text: bool) -> None:
     """Call SERVICE with REQUEST, as YAML, and print the answer.
 
     E.g. `ibrobot service call /planning/go_to home` or `… /world/remove '{name: can}'`. With TYPE, it calls a service
@@ -108,10 +100,11 @@ def call(
         document = parse_yaml(request, "REQUEST")
         document.raise_problems()
         value = document.root
-    if is_ros:
-        full = absolute(name, namespace)
-        answer: Any = transport.call_ros(full, service_type(words[0]), value or {}, timeout)
-    else:
-        answer = _ask(transport, namespace, Call(name, value), timeout)
+    with network as transport:
+        if is_ros:
+            full = absolute(name, namespace)
+            answer: Any = transport.call_ros(full, service_type(words[0]), value or {}, timeout)
+        else:
+            answer = _ask(transport, namespace, Call(name, value), timeout)
     if answer is not None:
         echo(dump_yaml(answer).removesuffix("\n") if isinstance(answer, dict | list) else str(answer))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import queue
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import wraps
 from itertools import pairwise
 from typing import Any
 
@@ -15,12 +15,11 @@ import click
 
 from ibrobot_core.api import Message, TransportError
 from ibrobot_core.app import echo
-from ibrobot_zenoh.commands.network import connected, network_options
+from ibrobot_zenoh.commands.network import Network, on_network
 from ibrobot_zenoh.commands.text import message_from, shown
 from ibrobot_zenoh.ros2 import HIDDEN
 from ibrobot_zenoh.transport import ZenohTransport
 
-_LIST_S = 2.0
 _HEARD_S = 1.0
 """How long `pub` waits for a subscriber [s]."""
 
@@ -31,14 +30,14 @@ def topic() -> None:
 
 
 def _command(function: Callable[..., None]) -> click.Command:
-    """Make a command of `topic` whose function receives a connected transport."""
+    """Make a command of `topic` whose function receives a connected transport, and which Ctrl-C ends."""
 
-    @functools.wraps(function)
-    def run(config: str | None, endpoints: tuple[str, ...], domain: int | None, **arguments: Any) -> None:
-        with suppress(KeyboardInterrupt), connected(config, endpoints, domain) as transport:
+    @wraps(function)
+    def run(network: Network, **arguments: Any) -> None:
+        with suppress(KeyboardInterrupt), network as transport:
             function(transport, **arguments)
 
-    return topic.command(function.__name__.rstrip("_"))(network_options(run))
+    return topic.command(function.__name__.rstrip("_"))(on_network(run))
 
 
 @_command
@@ -51,7 +50,7 @@ def _command(function: Callable[..., None]) -> click.Command:
 )
 def list_(transport: ZenohTransport, types: bool) -> None:
     """List the shared topics."""
-    shared = [each for each in transport.shared_topics(_LIST_S) if HIDDEN not in each.name]
+    shared = [each for each in transport.shared_topics() if HIDDEN not in each.name]
     if not shared:
         echo("no topics are shared", err=True)
     for each in shared:
@@ -131,7 +130,7 @@ def pub(
     if count is not None and rate is None:
         rate = 1.0
     message = message_from(type_name, text)
-    known = {each.type for each in transport.shared_topics(_LIST_S) if each.name == name and each.publishers}
+    known = {each.type for each in transport.shared_topics() if each.name == name and each.publishers}
     if known - {message.ros_type}:
         raise TransportError(f"topic {name} carries {', '.join(sorted(known))}, not {message.ros_type}")
     while not (heard := transport.is_heard(name, message.ros_type, _HEARD_S)) and wait:
@@ -148,7 +147,7 @@ def pub(
 
 def _warn_if_unpublished(transport: ZenohTransport, name: str) -> None:
     """Warn if a topic has no publisher."""
-    published = [each.name for each in transport.shared_topics(_LIST_S) if each.publishers]
+    published = [each.name for each in transport.shared_topics() if each.publishers]
     if name not in published:
         echo(f"{name} has no publisher yet; available: {', '.join(published) or 'none'}", err=True)
 
