@@ -18,7 +18,7 @@ from ibrobot_http.server import ServerThread
 from ibrobot_testing.http import HttpSuite, Served
 from ibrobot_web.options import WebOptions
 from ibrobot_web.server.page_guard import page_guard
-from ibrobot_web.ui.context import Ui
+from ibrobot_web.ui.context import Ui, request_of
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.server import LARGEST_REQUEST, ROUTED, make_app, routes_of
@@ -52,7 +52,7 @@ def paths(method: str) -> tuple[str, ...]:
 def keys_of(method: str, path: str) -> set[str]:
     """The keys of a request."""
     _, _, view, name = path.split("/")
-    return {field.name for field in attrs.fields(routes_of(view)[f"{method} /{name}"].request)}
+    return {field.name for field in attrs.fields(request_of(routes_of(view)[f"{method} /{name}"]))}
 
 
 async def status(browser: aiohttp.ClientSession, method: str, path: str, **more: Any) -> int:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 from ibrobot_web.model_edit import with_model
-from ibrobot_web.ui.context import Ui
+from ibrobot_web.ui.context import Ui, read_facts
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import read_form
 from ibrobot_web.ui.job_runner import Jobs
@@ -39,8 +39,8 @@ def ui(tmp_path: Path) -> Ui:
 
 def ask(ui: Ui, view: str, route: str, facts: Any = None) -> Any:
     """The answer of a view to plain facts."""
-    found = routes_of(view)[route]
-    return found.answer(ui, found.read(facts or {}))
+    handler = routes_of(view)[route]
+    return handler(ui, **read_facts(handler, facts or {}))
 
 
 @pytest.mark.parametrize("name", ["so101", "so101_blind", "so101_pick_cube", "bi_so101"])

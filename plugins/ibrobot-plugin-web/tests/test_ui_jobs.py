@@ -16,7 +16,7 @@ from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import arguments, form_of, in_page_words, read_form
 from ibrobot_web.ui.job_runner import Jobs
-from ibrobot_web.ui.jobs import GiveAnswer, NamesSight, answer, event_reader, sight
+from ibrobot_web.ui.jobs import answer, event_reader, sight
 
 from ibrobot_core.api import IbrobotError, MissingDependency, option
 from ibrobot_core.app import Ask, Command, Event, Registry, Shown, declared
@@ -230,30 +230,30 @@ def test_a_job_asks_and_is_answered(asking: Asking) -> None:
         "sights": ({"camera": "top", "wanted": "a.jpg", "live": "../b.jpg"},),
     }
     with pytest.raises(IbrobotError, match="'x' is no answer; the answers are: y, n"):
-        answer(ui, GiveAnswer(number=job.number, ask=1, answer="x"))
+        answer(ui, number=job.number, ask=1, answer="x")
     with pytest.raises(IbrobotError, match="was answered already"):
-        answer(ui, GiveAnswer(number=job.number, ask=2, answer="y"))
-    answer(ui, GiveAnswer(number=job.number, ask=1, answer="y"))
+        answer(ui, number=job.number, ask=2, answer="y")
+    answer(ui, number=job.number, ask=1, answer="y")
     with pytest.raises(IbrobotError, match="was answered already"):
-        answer(ui, GiveAnswer(number=job.number, ask=1, answer="n"))
+        answer(ui, number=job.number, ask=1, answer="n")
     asking.until(lambda: (job.facts.get("ask") or {}).get("ask") == 2)
-    answer(ui, GiveAnswer(number=job.number, ask=2, answer='so\nthat, "it" ends'))
+    answer(ui, number=job.number, ask=2, answer='so\nthat, "it" ends')
     asking.until(lambda: job.state == "done")
     assert list(job.lines) == ["answered: y", "answered: so", 'that, "it" ends']
     assert "ask" not in job.facts
     with pytest.raises(IbrobotError, match="was answered already"):
-        answer(ui, GiveAnswer(number=job.number, ask=2, answer="late"))
+        answer(ui, number=job.number, ask=2, answer="late")
 
 
 def test_pictures_of_questions_are_those_in_the_opened_folders(asking: Asking) -> None:
     asking.until(lambda: asking.job.facts.get("ask") is not None)
     ask = {"number": asking.job.number, "ask": 1}
-    assert sight(asking.ui, NamesSight(**ask, sight=0, which="wanted")).content == b"picture"
+    assert sight(asking.ui, **ask, sight=0, which="wanted").content == b"picture"
     with pytest.raises(IbrobotError, match="outside the opened folders"):
-        sight(asking.ui, NamesSight(**ask, sight=0, which="live"))
+        sight(asking.ui, **ask, sight=0, which="live")
     for wrong in ({**ask, "sight": 1}, {**ask, "ask": 2, "sight": 0}):
         with pytest.raises(IbrobotError, match="no such picture"):
-            sight(asking.ui, NamesSight(**wrong, which="wanted"))
+            sight(asking.ui, **wrong, which="wanted")
 
 
 def test_a_job_that_asks_ends_with_the_page_s_server(asking: Asking) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Mapping
+from functools import cache
+from inspect import signature
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, get_type_hints
 
 import attrs
 
-from ibrobot_core.api import option
 from ibrobot_core.app import RequestError, RequestLimits, Service
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
@@ -57,43 +58,49 @@ class File:
     content_type: str
 
 
+type Handler = Callable[..., Any]
+"""Answers a request: a function of the `Ui`, whose further parameters are the facts of the request.
+
+Bounds and checks of a fact stand in the place of its default, as `option`. It returns what JSON can express, a
+`Picture` or a `File`; it runs in a thread, may block, and raises IbrobotError with what the page shows.
+"""
+type Routes = dict[str, Handler]
+"""Method and path below that of the view, e.g. `GET /list` -> what answers it."""
 _LIMITS = RequestLimits(values=10_000, text=4_500, depth=3)
 _WHOLE = re.compile(r"-?\d{1,18}")
 
 
-@attrs.frozen(eq=False)
-class Route[Q]:
-    """How a view answers a request.
+@cache
+def request_of(handler: Handler) -> type[Any]:
+    """The class of the requests that a function answers, with its parameters except the first as fields."""
+    kinds = get_type_hints(handler)
+    facts = list(signature(handler).parameters.values())[1:]
+    fields = {each.name: each.default for each in facts if each.default is not each.empty}
+    fields["__annotations__"] = {each.name: kinds[each.name] for each in facts}
+    return attrs.frozen(kw_only=True)(type("Request", (), fields))
 
-    The request, the query of a GET or the JSON object of a POST, is checked against its class before anything runs.
+
+def read_facts(handler: Handler, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments for a handler from the JSON object of a POST, checked before anything runs.
+
+    Raises:
+        RequestError: if they do not fit.
     """
+    try:
+        request = Service("", request_of(handler), object, limits=_LIMITS).read(facts)
+    except RequestError as error:
+        raise RequestError(str(error).removeprefix(": ")) from None
+    return attrs.asdict(request, recurse=False)
 
-    answer: Callable[[Ui, Q], Any]
-    """Returns what JSON can express, a `Picture` or a `File`. It runs in a thread, may block, and raises IbrobotError
-    with what the page shows."""
-    request: type[Q]
-    """Class of the request, with its fields as `option`."""
 
-    def read_query(self, query: Mapping[str, str]) -> Q:
-        """The request in a query, whose values are texts.
+def read_query(handler: Handler, query: Mapping[str, str]) -> dict[str, Any]:
+    """As `read_facts`, from the query of a GET, whose values are texts.
 
-        Raises:
-            RequestError: if it does not fit.
-        """
-        attrs.resolve_types(self.request)  # type: ignore[type-var]
-        kinds = {field.name: field.type for field in attrs.fields(self.request)}  # type: ignore[arg-type]
-        return self.read({name: _typed(text, kinds.get(name)) for name, text in query.items()})
-
-    def read(self, facts: Any) -> Q:
-        """The request in a JSON object.
-
-        Raises:
-            RequestError: if it does not fit.
-        """
-        try:
-            return Service("", self.request, object, limits=_LIMITS).read(facts)
-        except RequestError as error:
-            raise RequestError(str(error).removeprefix(": ")) from None
+    Raises:
+        RequestError: if they do not fit.
+    """
+    kinds = get_type_hints(handler)
+    return read_facts(handler, {name: _typed(text, kinds.get(name)) for name, text in query.items()})
 
 
 def _typed(text: str, kind: Any) -> Any:
@@ -108,22 +115,3 @@ def _typed(text: str, kind: Any) -> Any:
         except ValueError:
             return text
     return text
-
-
-@attrs.frozen
-class NamesPath:
-    """A request about a file or folder."""
-
-    path: str = option(help="in an opened folder")
-
-
-def _some(instance: object, attribute: object, paths: tuple[str, ...]) -> None:
-    if not paths:
-        raise ValueError("choose at least one")
-
-
-@attrs.frozen
-class NamesPaths:
-    """A request about files or folders."""
-
-    paths: tuple[str, ...] = option(validator=_some, help="in opened folders")

@@ -6,24 +6,23 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.app import NoRequest
-from ibrobot_web.ui.context import NamesPath, Route, Ui
+from ibrobot_web.ui.context import Routes, Ui
 from ibrobot_web.ui.forms import run_command
 from ibrobot_web.ui.recordings import find_recordings
 
 
-def listing(ui: Ui, request: NoRequest) -> list[str]:
+def listing(ui: Ui) -> list[str]:
     """The datasets in the opened folders."""
     return [ui.folders.name(path) for path in find_recordings(ui.folders).datasets]
 
 
-def info(ui: Ui, request: NamesPath) -> dict[str, Any]:
+def info(ui: Ui, path: str) -> dict[str, Any]:
     """What a dataset contains."""
-    (found,) = run_command(ui, "datasets info", dataset=request.path)
-    return {**attrs.asdict(found), "path": ui.folders.name(ui.folders.find(request.path))}
+    (found,) = run_command(ui, "datasets info", dataset=path)
+    return {**attrs.asdict(found), "path": ui.folders.name(ui.folders.find(path))}
 
 
-ROUTES: dict[str, Route[Any]] = {
-    "GET /list": Route(listing, NoRequest),
-    "GET /info": Route(info, NamesPath),
+ROUTES: Routes = {
+    "GET /list": listing,
+    "GET /info": info,
 }

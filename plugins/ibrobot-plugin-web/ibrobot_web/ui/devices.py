@@ -14,14 +14,13 @@ from ibrobot_core.app import (
     Child,
     ComponentFailed,
     GuideDescriptor,
-    NoRequest,
     Question,
     install_command,
     installed_plugins,
     official_plugins,
 )
 from ibrobot_web.pictures import Picture
-from ibrobot_web.ui.context import Route, Ui
+from ibrobot_web.ui.context import Routes, Ui
 
 _MODULE = "ibrobot_web.ui.guide_process"
 _POLL_S = 0.1
@@ -154,45 +153,7 @@ def _table(message: Mapping[str, Any]) -> dict[str, Any]:
     return {name: message[name] for name in ("columns", "rows") if name in message}
 
 
-@attrs.frozen
-class StartGuide:
-    """Which guide to start."""
-
-    name: str = option(help="its name")
-    answers: Mapping[str, str | bool] = option(factory=dict, help="question -> answer")
-
-
-@attrs.frozen
-class AskState:
-    """A request for what a guide shows."""
-
-    after: int = option(0, ge=0, help="number of items that the page has")
-
-
-@attrs.frozen
-class NamesPicture:
-    """A request for a picture of a guide."""
-
-    picture: int = option(ge=0, help="its number")
-    n: int = option(0, help="number of the guide, so that browsers keep no picture of another one")
-
-
-@attrs.frozen
-class NamesGuide:
-    """A request about a guide that runs."""
-
-    number: int = option(ge=0, help="its number")
-
-
-@attrs.frozen
-class GiveAnswer(NamesGuide):
-    """An answer to what a guide asks."""
-
-    ask: int = option(ge=0, help="number of the question")
-    ok: bool = option(True, help="yes or no; true for what is done")
-
-
-def listing(ui: Ui, request: NoRequest) -> dict[str, Any]:
+def listing(ui: Ui) -> dict[str, Any]:
     """The guides of all plugins, with their questions, and the command that installs others if there are none."""
     guides = [
         {
@@ -207,13 +168,13 @@ def listing(ui: Ui, request: NoRequest) -> dict[str, Any]:
     return {"guides": guides, "install": "" if guides else install_command(others)}
 
 
-def start(ui: Ui, request: StartGuide) -> dict[str, int]:
-    """Start a guide."""
-    guide = next((each for each in installed_plugins().guides if each.name == request.name), None)
+def start(ui: Ui, name: str, answers: Mapping[str, str | bool] = option(factory=dict)) -> dict[str, int]:
+    """Start a guide, with the answers to its questions, by their names."""
+    guide = next((each for each in installed_plugins().guides if each.name == name), None)
     if guide is None:
-        raise IbrobotError(f"no guide {request.name!r}")
-    answers = {each.name: _answer(each, request.answers) for each in guide.questions()}
-    return {"number": ui.keep(Devices).start(guide, answers)}
+        raise IbrobotError(f"no guide {name!r}")
+    given = {each.name: _answer(each, answers) for each in guide.questions()}
+    return {"number": ui.keep(Devices).start(guide, given)}
 
 
 def _answer(question: Question, given: Mapping[str, Any]) -> str | bool:
@@ -228,7 +189,7 @@ def _answer(question: Question, given: Mapping[str, Any]) -> str | bool:
     return value
 
 
-def state(ui: Ui, request: AskState) -> dict[str, Any]:
+def state(ui: Ui, after: int = option(0, ge=0)) -> dict[str, Any]:
     """What the guide shows, from item number `after` on, and what it asks."""
     devices = ui.keep(Devices)
     with devices.lock:
@@ -237,35 +198,35 @@ def state(ui: Ui, request: AskState) -> dict[str, Any]:
             return {"number": 0, "state": "none", "items": [], "ask": None}
         return {
             "number": work.number, "name": work.name, "title": work.title, "state": work.state, "error": work.error,
-            "items": work.items[request.after :], "ask": work.ask,
+            "items": work.items[after:], "ask": work.ask,
         }  # fmt: skip
 
 
-def picture(ui: Ui, request: NamesPicture) -> Picture:
-    """A picture that the guide has shown."""
-    devices, index = ui.keep(Devices), request.picture
+def picture(ui: Ui, picture: int = option(ge=0), n: int = 0) -> Picture:
+    """A picture that the guide has shown; its number `n` keeps browsers from showing one of another guide."""
+    devices = ui.keep(Devices)
     with devices.lock:
-        if devices.work is None or index >= len(devices.work.pictures):
+        if devices.work is None or picture >= len(devices.work.pictures):
             raise IbrobotError("no such picture")
-        content = devices.work.pictures[index]
+        content = devices.work.pictures[picture]
     return Picture(content, "image/png" if content.startswith(b"\x89PNG") else "image/jpeg")
 
 
-def answer(ui: Ui, request: GiveAnswer) -> None:
-    """Answer what the guide asks."""
-    ui.keep(Devices).answer(request.number, request.ask, request.ok)
+def answer(ui: Ui, number: int, ask: int, ok: bool = True) -> None:
+    """Answer what the guide asks: yes or no; yes for what is done."""
+    ui.keep(Devices).answer(number, ask, ok)
 
 
-def cancel(ui: Ui, request: NamesGuide) -> None:
+def cancel(ui: Ui, number: int) -> None:
     """End the guide."""
-    ui.keep(Devices).cancel(request.number)
+    ui.keep(Devices).cancel(number)
 
 
-ROUTES: dict[str, Route[Any]] = {
-    "GET /list": Route(listing, NoRequest),
-    "GET /state": Route(state, AskState),
-    "GET /picture": Route(picture, NamesPicture),
-    "POST /start": Route(start, StartGuide),
-    "POST /answer": Route(answer, GiveAnswer),
-    "POST /cancel": Route(cancel, NamesGuide),
+ROUTES: Routes = {
+    "GET /list": listing,
+    "GET /state": state,
+    "GET /picture": picture,
+    "POST /start": start,
+    "POST /answer": answer,
+    "POST /cancel": cancel,
 }

@@ -10,52 +10,20 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import NoRequest
 from ibrobot_web.pictures import Picture
-from ibrobot_web.ui.context import NamesPath, NamesPaths, Route, Ui
+from ibrobot_web.ui.context import Routes, Ui
 from ibrobot_web.ui.forms import choices_of, run_command
 from ibrobot_web.ui.recordings import Episodes, existing, find_recordings, playback
 
 _LONGEST_S = 1e6
 
 
-@attrs.frozen
-class NamesTopic(NamesPath):
-    """A request about a topic of an episode."""
-
-    topic: str = option(help="its name")
+def _some(instance: object, attribute: object, paths: tuple[str, ...]) -> None:
+    if not paths:
+        raise ValueError("choose at least one")
 
 
-@attrs.frozen
-class NamesPicture(NamesTopic):
-    """A request for a picture."""
-
-    at_s: float = option(unit="s", ge=0, le=_LONGEST_S, help="time since the episode's begin")
-
-
-@attrs.frozen
-class Mark(NamesPaths):
-    """How episodes went."""
-
-    outcome: str = option(help="of all of them")
-
-
-@attrs.frozen
-class Trim(NamesPath):
-    """The part of an episode to keep."""
-
-    begin_s: float = option(unit="s", ge=0, le=_LONGEST_S, help="its begin, since the episode's")
-    end_s: float = option(unit="s", ge=0, le=_LONGEST_S, help="its end, since the episode's begin")
-
-
-@attrs.frozen
-class Restore(NamesPath):
-    """What to put back."""
-
-    id: str = option(help="as the trash lists it")
-
-
-def listing(ui: Ui, request: NoRequest) -> dict[str, Any]:
+def listing(ui: Ui) -> dict[str, Any]:
     """All episodes in the opened folders."""
     found = find_recordings(ui.folders)
     rows = [ui.keep(Episodes).row(ui, path) for path in found.episodes]
@@ -64,33 +32,33 @@ def listing(ui: Ui, request: NoRequest) -> dict[str, Any]:
     return {"episodes": rows, "complete": found.complete, "trashes": trashes, "outcomes": outcomes}
 
 
-def trash(ui: Ui, request: NamesPath) -> list[dict[str, Any]]:
+def trash(ui: Ui, path: str) -> list[dict[str, Any]]:
     """What can be undone in a folder, newest first."""
-    found = run_command(ui, "episodes trash", path=request.path)
-    folder = ui.folders.name(ui.folders.find(request.path))
+    found = run_command(ui, "episodes trash", path=path)
+    folder = ui.folders.name(ui.folders.find(path))
     rows = [{**attrs.asdict(each), "what": each.shown().text} for each in found]
     return [{**row, "path": ui.folders.name(Path(row["path"])), "folder": folder} for row in rows[::-1]]
 
 
-def facts_of(ui: Ui, request: NamesPath) -> dict[str, Any]:
+def facts_of(ui: Ui, path: str) -> dict[str, Any]:
     """What an episode contains, and the robot's motion."""
-    return playback(ui, request.path).facts()
+    return playback(ui, path).facts()
 
 
-def series(ui: Ui, request: NamesTopic) -> dict[str, Any]:
+def series(ui: Ui, path: str, topic: str) -> dict[str, Any]:
     """The numbers of a topic over time."""
-    return playback(ui, request.path).series(request.topic)
+    return playback(ui, path).series(topic)
 
 
-def picture(ui: Ui, request: NamesPicture) -> Picture:
+def picture(ui: Ui, path: str, topic: str, at_s: float = option(unit="s", ge=0, le=_LONGEST_S)) -> Picture:
     """A camera's picture at a time; empty if there is none."""
-    return playback(ui, request.path).picture(request.topic, request.at_s) or Picture(b"", "image/jpeg")
+    return playback(ui, path).picture(topic, at_s) or Picture(b"", "image/jpeg")
 
 
-def scene(ui: Ui, request: NamesPath) -> dict[str, Any]:
+def scene(ui: Ui, path: str) -> dict[str, Any]:
     """The robot's shapes."""
     try:
-        return _scene(json.dumps(playback(ui, request.path).description(ui.folders.find), sort_keys=True))
+        return _scene(json.dumps(playback(ui, path).description(ui.folders.find), sort_keys=True))
     except IbrobotError as error:
         return {"bodies": [], "meshes": [], "tips": {}, "problem": str(error)}
 
@@ -102,52 +70,54 @@ def _scene(description: str) -> dict[str, Any]:
     return make_scene(json.loads(description))
 
 
-def objects(ui: Ui, request: NamesPath) -> list[dict[str, Any]]:
+def objects(ui: Ui, path: str) -> list[dict[str, Any]]:
     """The objects of a simulated scene, and where they were."""
-    return playback(ui, request.path).objects(ui.folders.find)
+    return playback(ui, path).objects(ui.folders.find)
 
 
-def mark(ui: Ui, request: Mark) -> None:
+def mark(ui: Ui, outcome: str, paths: tuple[str, ...] = option(validator=_some)) -> None:
     """Judge episodes."""
-    run_command(ui, "episodes mark", episodes=existing(ui, request.paths), outcome=request.outcome)
+    run_command(ui, "episodes mark", episodes=existing(ui, paths), outcome=outcome)
 
 
-def trim(ui: Ui, request: Trim) -> None:
-    """Replace an episode by a part of it."""
+def trim(
+    ui: Ui, path: str, begin_s: float = option(unit="s", ge=0, le=_LONGEST_S),
+    end_s: float = option(unit="s", ge=0, le=_LONGEST_S),
+) -> None:  # fmt: skip
+    """Replace an episode by a part of it, in times since its begin."""
     ui.keep(Episodes).close()
-    begin_s, end_s = request.begin_s, request.end_s
-    run_command(ui, "episodes trim", episode=request.path, in_place=True, begin_s=begin_s, end_s=end_s)
+    run_command(ui, "episodes trim", episode=path, in_place=True, begin_s=begin_s, end_s=end_s)
 
 
-def delete(ui: Ui, request: NamesPaths) -> None:
+def delete(ui: Ui, paths: tuple[str, ...] = option(validator=_some)) -> None:
     """Move episodes to the trash."""
-    paths = existing(ui, request.paths)
+    found = existing(ui, paths)
     ui.keep(Episodes).close()
-    run_command(ui, "episodes delete", episodes=paths, to_trash=True)
+    run_command(ui, "episodes delete", episodes=found, to_trash=True)
 
 
-def restore(ui: Ui, request: Restore) -> None:
-    """Put an original back."""
+def restore(ui: Ui, path: str, id: str) -> None:
+    """Put an original back, by its id in the trash."""
     ui.keep(Episodes).close()
-    run_command(ui, "episodes trash", path=request.path, restore=request.id)
+    run_command(ui, "episodes trash", path=path, restore=id)
 
 
-def empty(ui: Ui, request: NamesPath) -> None:
+def empty(ui: Ui, path: str) -> None:
     """Delete what is in a trash for good."""
-    run_command(ui, "episodes trash", path=request.path, empty=True, yes=True)
+    run_command(ui, "episodes trash", path=path, empty=True, yes=True)
 
 
-def repair(ui: Ui, request: NamesPath) -> None:
+def repair(ui: Ui, path: str) -> None:
     """Repair an unfinished episode."""
     ui.keep(Episodes).close()
-    run_command(ui, "episodes repair", path=request.path)
+    run_command(ui, "episodes repair", path=path)
 
 
-ROUTES: dict[str, Route[Any]] = {
-    "GET /list": Route(listing, NoRequest), "GET /trash": Route(trash, NamesPath),
-    "GET /open": Route(facts_of, NamesPath), "GET /series": Route(series, NamesTopic),
-    "GET /picture": Route(picture, NamesPicture), "GET /scene": Route(scene, NamesPath),
-    "GET /objects": Route(objects, NamesPath), "POST /mark": Route(mark, Mark), "POST /trim": Route(trim, Trim),
-    "POST /delete": Route(delete, NamesPaths), "POST /restore": Route(restore, Restore),
-    "POST /empty": Route(empty, NamesPath), "POST /repair": Route(repair, NamesPath),
+ROUTES: Routes = {
+    "GET /list": listing, "GET /trash": trash,
+    "GET /open": facts_of, "GET /series": series,
+    "GET /picture": picture, "GET /scene": scene,
+    "GET /objects": objects, "POST /mark": mark, "POST /trim": trim,
+    "POST /delete": delete, "POST /restore": restore,
+    "POST /empty": empty, "POST /repair": repair,
 }  # fmt: skip

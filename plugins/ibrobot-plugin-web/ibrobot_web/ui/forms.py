@@ -51,20 +51,20 @@ def label_of(name: str, field: attrs.Attribute[Any]) -> str:
     return str(field.metadata["label"] or name.replace("_", " ").capitalize())
 
 
-def form_of(ui: Ui, name: str) -> dict[str, Any]:
+def form_of(ui: Ui, command: str) -> dict[str, Any]:
     """The form of a command, for browsers. `missing` says what the machine lacks for it."""
-    form: dict[str, Any] = {"title": title_of(name), "summary": "", "missing": "", "fields": [], "known": {}}
+    form: dict[str, Any] = {"title": title_of(command), "summary": "", "missing": "", "fields": [], "known": {}}
     try:
-        command = installed_plugins().command(name)
+        declared = installed_plugins().command(command)
     except IbrobotError as error:
         return {**form, "missing": str(error)}
-    shown = _shown(command)
+    shown = _shown(declared)
     wanted = {field.metadata["names"] for field in shown.values()}
-    form["summary"] = command.summary
+    form["summary"] = declared.summary
     form["known"] = {names: found for names, found in _known(ui).items() if names in wanted}
     form["fields"] = [_field_json(name, field) for name, field in shown.items()]
     try:
-        command.check()
+        declared.check()
     except IbrobotError as error:
         form["missing"] = str(error)
     return form

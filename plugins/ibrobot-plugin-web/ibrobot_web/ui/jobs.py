@@ -11,7 +11,7 @@ import attrs
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import Answer, Ask, Command, Failed, WireError, decode_event, installed_plugins
 from ibrobot_web.pictures import Picture
-from ibrobot_web.ui.context import Route, Ui
+from ibrobot_web.ui.context import Routes, Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import arguments, form_of, in_page_words, job_commands, read_form, title_of
 from ibrobot_web.ui.job_runner import Reader
@@ -26,60 +26,16 @@ def _short(instance: object, attribute: object, text: str) -> None:
         raise ValueError(f"at most {_LONGEST_ANSWER} characters")
 
 
-@attrs.frozen
-class NamesJob:
-    """A request about a job."""
-
-    number: int = option(ge=1, help="its number")
-
-
-@attrs.frozen
-class NamesCommand:
-    """A request about a command that runs as a job."""
-
-    command: str = option(help="its name")
-
-
-@attrs.frozen
-class FilledForm(NamesCommand):
-    """A filled form."""
-
-    values: Mapping[str, Any] = option(help="value of each field")
-
-
-@attrs.frozen(kw_only=True)
-class GiveAnswer(NamesJob):
-    """An answer to what a job asks."""
-
-    ask: int = option(ge=1, help="number of the question")
-    answer: str = option(validator=_short, help="key of the choice, or a text")
-
-
-@attrs.frozen(kw_only=True)
-class NamesSight(NamesJob):
-    """A request for a picture beside a question."""
-
-    ask: int = option(ge=1, help="number of the question")
-    sight: int = option(ge=0, help="number of the camera in the question, from 0")
-    which: str = option(choices=("wanted", "live"), help="which of its pictures")
-
-
-def form(ui: Ui, request: NamesCommand) -> dict[str, Any]:
-    """The form of a command."""
-    return form_of(ui, request.command)
-
-
-def start(ui: Ui, request: FilledForm) -> dict[str, int]:
+def start(ui: Ui, command: str, values: Mapping[str, Any]) -> dict[str, int]:
     """Run a command with the values of its form."""
-    if request.command not in job_commands():
-        raise IbrobotError(f"{request.command[:40]!r} is no job; the jobs are: {', '.join(job_commands())}")
-    command = installed_plugins().command(request.command)
-    options = read_form(ui, command, request.values)
+    if command not in job_commands():
+        raise IbrobotError(f"{command[:40]!r} is no job; the jobs are: {', '.join(job_commands())}")
+    declared = installed_plugins().command(command)
+    options = read_form(ui, declared, values)
     what = ", ".join(ui.folders.name(each) for each in _paths(options))
-    title = f"{title_of(command.name)} {what}"
     job = ui.jobs.start(
-        command.name, title, [command.name, "--events", *arguments(options)],
-        read=event_reader(ui.folders, command), asks=Ask in command.events,
+        command, f"{title_of(command)} {what}", [command, "--events", *arguments(options)],
+        read=event_reader(ui.folders, declared), asks=Ask in declared.events,
     )  # fmt: skip
     return {"number": job.number}
 
@@ -136,32 +92,34 @@ def event_reader(folders: Folders, command: Command) -> Reader:
     return read
 
 
-def cancel(ui: Ui, request: NamesJob) -> None:
+def cancel(ui: Ui, number: int) -> None:
     """End a job as Ctrl-C does; the second time at once."""
-    ui.jobs.cancel(request.number)
+    ui.jobs.cancel(number)
 
 
-def answer(ui: Ui, request: GiveAnswer) -> None:
+def answer(ui: Ui, number: int, ask: int, answer: str = option(validator=_short)) -> None:
     """Answer what a job asks."""
-    ui.jobs.answer(request.number, Answer(ask=request.ask, answer=request.answer))
+    ui.jobs.answer(number, Answer(ask=ask, answer=answer))
 
 
-def sight(ui: Ui, request: NamesSight) -> Picture:
-    """A picture beside the question of a job."""
-    asked = ui.jobs.get(request.number).facts.get("ask")
-    if asked is None or asked["ask"] != request.ask or request.sight >= len(asked["sights"]):
+def sight(
+    ui: Ui, number: int, ask: int, sight: int = option(ge=0), which: str = option(choices=("wanted", "live"))
+) -> Picture:
+    """A picture beside question number `ask` of a job, of a camera by its number in the question."""
+    asked = ui.jobs.get(number).facts.get("ask")
+    if asked is None or asked["ask"] != ask or sight >= len(asked["sights"]):
         raise IbrobotError("no such picture: the question was answered")
-    name = asked["sights"][request.sight][request.which]
+    name = asked["sights"][sight][which]
     try:
         return Picture(ui.folders.find(name).read_bytes(), "image/jpeg")
     except OSError as error:
         raise IbrobotError(f"{name}: cannot be read: {error.strerror}") from None
 
 
-ROUTES: dict[str, Route[Any]] = {
-    "GET /form": Route(form, NamesCommand),
-    "POST /start": Route(start, FilledForm),
-    "POST /cancel": Route(cancel, NamesJob),
-    "POST /answer": Route(answer, GiveAnswer),
-    "GET /sight": Route(sight, NamesSight),
+ROUTES: Routes = {
+    "GET /form": form_of,
+    "POST /start": start,
+    "POST /cancel": cancel,
+    "POST /answer": answer,
+    "GET /sight": sight,
 }

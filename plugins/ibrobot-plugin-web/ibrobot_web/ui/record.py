@@ -8,14 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import attrs
-
-from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import NoRequest, installed_plugins
-from ibrobot_web.ui.context import Route, Ui
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import installed_plugins
+from ibrobot_web.ui.context import Routes, Ui
 from ibrobot_web.ui.forms import arguments, form_of, read_form
 from ibrobot_web.ui.jobs import event_reader
-from ibrobot_web.ui.robots import RUN_DONE, Launch, read_address, run_arguments
+from ibrobot_web.ui.robots import RUN_DONE, read_address, run_arguments
 
 _COMMAND = "record"
 _ROOT = "episodes"
@@ -23,28 +21,14 @@ _ROOT = "episodes"
 _DATASET = re.compile(r"\w[\w .-]*(?:/\w[\w .-]*)*")
 
 
-@attrs.frozen
-class NamesDataset:
-    """A request about a dataset of episodes."""
-
-    dataset: str = option("default", help="its name")
-
-
-@attrs.frozen(kw_only=True)
-class RecordSession(Launch):
-    """What to record."""
-
-    values: Mapping[str, Any] = option(help="value of each field of the form")
-
-
-def form(ui: Ui, request: NoRequest) -> dict[str, Any]:
+def form(ui: Ui) -> dict[str, Any]:
     """The form of a session, beside the choice of the robot."""
     return form_of(ui, _COMMAND)
 
 
-def place(ui: Ui, request: NamesDataset) -> dict[str, Any]:
+def place(ui: Ui, dataset: str = "default") -> dict[str, Any]:
     """Where episodes go, how many the dataset has, how large they are, and the disk's free space."""
-    folder = _folder(ui, request.dataset)
+    folder = _folder(ui, dataset)
     episodes = [path for path in (folder / "episodes").glob("episode_*") if path.is_dir()]
     sizes = [sum(each.stat().st_size for each in path.rglob("*") if each.is_file()) for path in episodes]
     existing = folder
@@ -58,19 +42,19 @@ def place(ui: Ui, request: NamesDataset) -> dict[str, Any]:
     }
 
 
-def start(ui: Ui, request: RecordSession) -> dict[str, int]:
+def start(ui: Ui, robot: str, values: Mapping[str, Any], sim: bool = False, mode: str = "") -> dict[str, int]:
     """Begin a session: `ibrobot record`, which ends by itself after the last episode."""
     command = installed_plugins().command(_COMMAND)
-    values = dict(request.values)
-    folder = _folder(ui, str(values.pop("dataset", None) or "default"))
+    given = dict(values)
+    folder = _folder(ui, str(given.pop("dataset", None) or "default"))
     root = ui.folders.find(_ROOT)
-    options = read_form(ui, command, values)
+    options = read_form(ui, command, given)
     place = (f"--root={root}", f"--dataset={folder.relative_to(root)}")
     read_event = event_reader(ui.folders, command)
     job = ui.jobs.start(
         _COMMAND,
         f"Record {folder.name}",
-        [_COMMAND, "--events", *run_arguments(ui, request), *place, *arguments(options)],
+        [_COMMAND, "--events", *run_arguments(ui, robot, sim, mode), *place, *arguments(options)],
         read=lambda line: found if (found := read_event(line)) is not None else read_address(line),
         done_codes=RUN_DONE,
     )
@@ -85,8 +69,8 @@ def _folder(ui: Ui, dataset: str) -> Path:
     return ui.folders.find(str(Path(_ROOT) / dataset))
 
 
-ROUTES: dict[str, Route[Any]] = {
-    "GET /form": Route(form, NoRequest),
-    "GET /place": Route(place, NamesDataset),
-    "POST /start": Route(start, RecordSession),
+ROUTES: Routes = {
+    "GET /form": form,
+    "GET /place": place,
+    "POST /start": start,
 }

@@ -7,26 +7,12 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import Case, Cases, Plots, ReportDescriptor, ReportSection, Table, Text, installed_plugins
-from ibrobot_web.ui.context import File, NamesPath, Route, Ui
+from ibrobot_web.ui.context import File, Routes, Ui
 from ibrobot_web.ui.recordings import find_recordings
 
 _VIDEO = ".mp4"
-
-
-@attrs.frozen
-class NamesKind:
-    """A request about a kind of report."""
-
-    kind: str = option(help="its name")
-
-
-@attrs.frozen
-class NamesReport(NamesPath):
-    """A request for a report."""
-
-    kind: str = option(help="name of its kind")
 
 
 def _kind(name: str) -> ReportDescriptor:
@@ -36,9 +22,9 @@ def _kind(name: str) -> ReportDescriptor:
     return known[name]
 
 
-def listing(ui: Ui, request: NamesKind) -> list[dict[str, Any]]:
+def listing(ui: Ui, kind: str) -> list[dict[str, Any]]:
     """The folders of a kind in the opened folders, the newest first."""
-    descriptor = _kind(request.kind)
+    descriptor = _kind(kind)
     found = find_recordings(ui.folders).reports.get(descriptor.name, ())
     rows = []
     for folder in found:
@@ -51,10 +37,10 @@ def listing(ui: Ui, request: NamesKind) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: row["changed_s"], reverse=True)
 
 
-def show(ui: Ui, request: NamesReport) -> list[dict[str, Any]]:
+def show(ui: Ui, path: str, kind: str) -> list[dict[str, Any]]:
     """A report."""
-    folder = ui.folders.find(request.path)
-    descriptor = _kind(request.kind)
+    folder = ui.folders.find(path)
+    descriptor = _kind(kind)
     if not descriptor.reads(folder):
         raise IbrobotError(f"{ui.folders.name(folder)}: is not among the {descriptor.title.lower()}")
     try:
@@ -90,16 +76,16 @@ def _name(ui: Ui, path: Path) -> str:
         return ""
 
 
-def video(ui: Ui, request: NamesPath) -> File:
+def video(ui: Ui, path: str) -> File:
     """A video."""
-    path = ui.folders.find(request.path)
-    if path.suffix != _VIDEO or not path.is_file():
-        raise IbrobotError(f"{ui.folders.name(path)}: there is no such video")
-    return File(path, "video/mp4")
+    found = ui.folders.find(path)
+    if found.suffix != _VIDEO or not found.is_file():
+        raise IbrobotError(f"{ui.folders.name(found)}: there is no such video")
+    return File(found, "video/mp4")
 
 
-ROUTES: dict[str, Route[Any]] = {
-    "GET /list": Route(listing, NamesKind),
-    "GET /show": Route(show, NamesReport),
-    "GET /video": Route(video, NamesPath),
+ROUTES: Routes = {
+    "GET /list": listing,
+    "GET /show": show,
+    "GET /video": video,
 }

@@ -9,12 +9,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import attrs
-
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import (
     ConfigError,
-    NoRequest,
     RobotConfig,
     absent_sensors,
     describe_absent,
@@ -27,7 +24,7 @@ from ibrobot_core.app import (
     write_copy,
 )
 from ibrobot_web.modes import modes_json
-from ibrobot_web.ui.context import Route, Ui
+from ibrobot_web.ui.context import Routes, Ui
 
 _ROBOT = re.compile(r"^robot:", re.MULTILINE)
 _SUMMARY = re.compile(r"\A(?:#[^\n]*\n)+")
@@ -44,31 +41,7 @@ RUN_DONE = (0, 3)
 _checking = threading.Lock()
 
 
-@attrs.frozen
-class NamesRobot:
-    """A request about a robot."""
-
-    robot: str = option(help="name of a shipped robot, or path of its YAML")
-    sim: bool = option(False, help="whether in simulation")
-
-
-@attrs.frozen
-class Launch(NamesRobot):
-    """What to launch."""
-
-    mode: str = option("", help="control mode; empty: the robot's default")
-
-
-@attrs.frozen
-class CopyRobot:
-    """What to copy, and with which defaults."""
-
-    robot: str = option(help="name of a shipped robot, or path of its YAML")
-    file: str = option(help="the new file, in an opened folder")
-    values: Mapping[str, str] = option(factory=dict, help="variable -> its default in the copy")
-
-
-def listing(ui: Ui, request: NoRequest) -> list[dict[str, str]]:
+def listing(ui: Ui) -> list[dict[str, str]]:
     """The robots to choose from: `robot`, its summary, and where it is from."""
     found = []
     plugins = {config.name: config.summary for config in installed_plugins().configs}
@@ -107,18 +80,18 @@ def _summary(content: str) -> str:
     return re.split(r"(?<=[.:]) ", words, maxsplit=1)[0].rstrip(".:")
 
 
-def check(ui: Ui, request: NamesRobot) -> dict[str, Any]:
+def check(ui: Ui, robot: str, sim: bool = False) -> dict[str, Any]:
     """What `ibrobot config check` reports about a robot, and its modes and devices."""
-    robot, simulated = robot_of(ui, request.robot), request.sim
+    named = robot_of(ui, robot)
     registry = installed_plugins()
     with _checking:
         try:
-            path = find_config(robot, registry)
-            config = load_config(path, sim=simulated, registry=registry)
+            path = find_config(named, registry)
+            config = load_config(path, sim=sim, registry=registry)
         except ConfigError as error:
             return {"problems": [_problem(ui, each) for each in error.problems]}
         except IbrobotError as error:
-            return {"problems": [{"file": robot, "line": 0, "path": "", "message": str(error)}]}
+            return {"problems": [{"file": named, "line": 0, "path": "", "message": str(error)}]}
         notes = unavailable_modes(config.unavailable)
         if absent := describe_absent(absent_sensors(config, registry)):
             notes.append(f"runs start without {absent}")
@@ -160,20 +133,20 @@ def _mode_for_page(modes: Iterable[Mapping[str, Any]], default: str) -> str:
     return next(iter(own), default if default in names or not names else names[0])
 
 
-def launch(ui: Ui, request: Launch) -> dict[str, int]:
+def launch(ui: Ui, robot: str, sim: bool = False, mode: str = "") -> dict[str, int]:
     """Launch a robot with its page."""
-    robot = robot_of(ui, request.robot)
-    arguments = ["launch", *run_arguments(ui, request)]
-    job = ui.jobs.start("run", _title(robot, simulated=request.sim), arguments, read=read_address, done_codes=RUN_DONE)
+    title = f"{Path(robot).stem}{' in simulation' if sim else ''}"
+    arguments = ["launch", *run_arguments(ui, robot, sim, mode)]
+    job = ui.jobs.start("run", title, arguments, read=read_address, done_codes=RUN_DONE)
     return {"number": job.number}
 
 
-def copying(ui: Ui, request: NamesRobot) -> dict[str, Any]:
+def copying(ui: Ui, robot: str) -> dict[str, Any]:
     """What a copy of a robot YAML may have of its own: a name, and variables with what was found for them.
 
     A variable such as `IBROBOT_LEADER_PORT` is offered what the guides' question `port` offers.
     """
-    source = find_config(robot_of(ui, request.robot), installed_plugins())
+    source = find_config(robot_of(ui, robot), installed_plugins())
     found: dict[str, tuple[str, ...]] = {}
     for guide in installed_plugins().guides:
         for question in guide.questions():
@@ -187,13 +160,13 @@ def copying(ui: Ui, request: NamesRobot) -> dict[str, Any]:
     }
 
 
-def copy(ui: Ui, request: CopyRobot) -> dict[str, str]:
-    """Copy a robot YAML into an opened folder, as `ibrobot config copy` does."""
-    target = ui.folders.find(request.file)
+def copy(ui: Ui, robot: str, file: str, values: Mapping[str, str] = option(factory=dict)) -> dict[str, str]:
+    """Copy a robot YAML into an opened folder, as `ibrobot config copy` does; `values` are its defaults."""
+    target = ui.folders.find(file)
     if target.suffix not in (".yaml", ".yml"):
-        raise IbrobotError(f"{request.file}: the name of a robot YAML ends with .yaml")
-    source = find_config(robot_of(ui, request.robot), installed_plugins())
-    write_copy(source, target, {name: value for name, value in request.values.items() if value})
+        raise IbrobotError(f"{file}: the name of a robot YAML ends with .yaml")
+    source = find_config(robot_of(ui, robot), installed_plugins())
+    write_copy(source, target, {name: value for name, value in values.items() if value})
     return {"robot": ui.folders.name(target)}
 
 
@@ -206,18 +179,14 @@ def robot_of(ui: Ui, name: str) -> str:
     return name if name in shipped_configs(installed_plugins()) else str(ui.folders.find(name))
 
 
-def run_arguments(ui: Ui, request: Launch) -> list[str]:
+def run_arguments(ui: Ui, robot: str, sim: bool, mode: str) -> list[str]:
     """The arguments of a run: robot, body, mode and page."""
     return [
-        robot_of(ui, request.robot),
-        *(["--sim"] if request.sim else []),
-        *([f"--mode={request.mode}"] if request.mode else []),
+        robot_of(ui, robot),
+        *(["--sim"] if sim else []),
+        *([f"--mode={mode}"] if mode else []),
         *ui.run_options,
     ]
-
-
-def _title(robot: str, *, simulated: bool) -> str:
-    return f"{Path(robot).stem} in simulation" if simulated else Path(robot).stem
 
 
 def read_address(line: str) -> Mapping[str, Any] | None:
@@ -226,10 +195,10 @@ def read_address(line: str) -> Mapping[str, Any] | None:
     return found.groupdict() if found is not None else None
 
 
-ROUTES: dict[str, Route[Any]] = {
-    "GET /list": Route(listing, NoRequest),
-    "GET /check": Route(check, NamesRobot),
-    "GET /copying": Route(copying, NamesRobot),
-    "POST /copy": Route(copy, CopyRobot),
-    "POST /launch": Route(launch, Launch),
+ROUTES: Routes = {
+    "GET /list": listing,
+    "GET /check": check,
+    "GET /copying": copying,
+    "POST /copy": copy,
+    "POST /launch": launch,
 }

@@ -20,7 +20,7 @@ from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import ConfigError, error_text, installed_plugins
 from ibrobot_web.pictures import Picture
 from ibrobot_web.server.app import STATIC
-from ibrobot_web.ui.context import File, Route, Ui
+from ibrobot_web.ui.context import File, Handler, Routes, Ui, read_facts, read_query
 from ibrobot_web.ui.forms import job_commands, takes, title_of
 
 VIEWS = {
@@ -86,32 +86,32 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
     app.router.add_get("/api/session", session)
     app.router.add_get("/api/jobs", follow)
     for name in ROUTED:
-        for route, answered in routes_of(name).items():
+        for route, handler in routes_of(name).items():
             method, path = route.split()
-            app.router.add_route(method, f"/api/{name}{path}", functools.partial(_answer, answered, guard))
+            app.router.add_route(method, f"/api/{name}{path}", functools.partial(_answer, handler, guard))
     return app
 
 
-def routes_of(view: str) -> dict[str, Route[Any]]:
+def routes_of(view: str) -> Routes:
     """The requests of a view, e.g. `GET /list`, and how each is answered."""
-    routes: dict[str, Route[Any]] = import_module(f"ibrobot_web.ui.{view}").ROUTES
+    routes: Routes = import_module(f"ibrobot_web.ui.{view}").ROUTES
     return routes
 
 
-async def _answer(route: Route[Any], guard: Guard, request: web.Request) -> web.StreamResponse:
+async def _answer(handler: Handler, guard: Guard, request: web.Request) -> web.StreamResponse:
     """Answer a view's request, in a thread. Sessions for watching may only GET, which changes nothing."""
     if request.method == "GET":
-        facts = route.read_query(request.query)
+        facts = read_query(handler, request.query)
     else:
         if guard.role(request) != "drive":
             raise IbrobotError("this link is for watching only")
-        facts = route.read(await _body(request))
-    answer = await asyncio.to_thread(route.answer, request.app[_UI], facts)
-    if isinstance(answer, Picture):
-        return web.Response(body=answer.content, content_type=answer.content_type)
-    if isinstance(answer, File):
-        return web.FileResponse(answer.path, headers={"Content-Type": answer.content_type})
-    return web.json_response(answer, dumps=_dumps)
+        facts = read_facts(handler, await _body(request))
+    found = await asyncio.to_thread(handler, request.app[_UI], **facts)
+    if isinstance(found, Picture):
+        return web.Response(body=found.content, content_type=found.content_type)
+    if isinstance(found, File):
+        return web.FileResponse(found.path, headers={"Content-Type": found.content_type})
+    return web.json_response(found, dumps=_dumps)
 
 
 async def _body(request: web.Request) -> Mapping[str, Any]:
