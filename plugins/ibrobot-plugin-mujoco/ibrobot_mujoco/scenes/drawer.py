@@ -9,7 +9,7 @@ from typing import Any, ClassVar, override
 import mujoco
 import numpy as np
 
-from ibrobot_core.api import HardwareError, Robot, Vector
+from ibrobot_core.api import HardwareError, Vector
 from ibrobot_mujoco.scenes.options import DrawerOptions
 from ibrobot_mujoco.scenes.solids import FRICTION, hue
 from ibrobot_mujoco.scenes.table import CLEARANCE, REST_SPEED, TableScene
@@ -31,19 +31,12 @@ _TRIES = 1000
 _Box = mujoco.mjtGeom.mjGEOM_BOX
 
 
-class Drawer(TableScene):
+class Drawer(TableScene[DrawerOptions]):
     """Observation: position of the handle [m] (3), direction of the pull (2), opening [m]."""
 
+    further = ("handle.x", "handle.y", "handle.z", "pull.x", "pull.y", "opening")
+    placed = ("handle_x", "handle_y", "drawer_yaw", "drawer_damping")
     colours: ClassVar = {"drawer_colour": (f"{DRAWER}_front", f"{DRAWER}_handle")}
-
-    def __init__(self, options: DrawerOptions, robot: Robot) -> None:
-        super().__init__(options, robot)
-        self._given = options
-        self.values = ("handle.x", "handle.y", "handle.z", "pull.x", "pull.y", "opening")
-
-    @override
-    def placed(self) -> tuple[str, ...]:
-        return ("handle_x", "handle_y", "drawer_yaw", "drawer_damping")
 
     @override
     def add(self, spec: mujoco.MjSpec) -> None:
@@ -64,7 +57,7 @@ class Drawer(TableScene):
         )  # fmt: skip
         # Gaps keep the drawer from rubbing against the cabinet.
         inner, low = half - 0.003, 0.006
-        colour = hue(ends(self._given.drawer_colour)[0])
+        colour = hue(ends(self.options.drawer_colour)[0])
         parts: dict[str, tuple[Any, Any, Any]] = {
             "front": ([0.0, 0, _HEIGHT / 2], [0.004, inner, _HEIGHT / 2 - low], colour),
             "floor": ([_DEPTH / 2 - 0.01, 0, low + 0.002], [_DEPTH / 2 - 0.01, inner, 0.002], rgba),
@@ -79,7 +72,7 @@ class Drawer(TableScene):
 
     @override
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
-        given, model = self._given, world.model
+        given, model = self.options, world.model
         world.data.joint(DRAWER).qpos = 0.0
         bodies = {model.body(CABINET).id, model.body(DRAWER).id}
         for _ in range(_TRIES):
@@ -123,4 +116,4 @@ class Drawer(TableScene):
     def success(self, world: World) -> bool:
         """Whether the drawer is open, and does not move."""
         joint = world.data.joint(DRAWER)
-        return bool(joint.qpos[0] >= self._given.opened and abs(joint.qvel[0]) <= REST_SPEED)
+        return bool(joint.qpos[0] >= self.options.opened and abs(joint.qvel[0]) <= REST_SPEED)

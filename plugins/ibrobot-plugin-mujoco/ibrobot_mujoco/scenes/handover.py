@@ -24,22 +24,18 @@ _HALF_WAY_M = 0.05
 """Distance of the bar from the plane between both arms, on the side of the arm that gets it [m]."""
 
 
-class Handover(TableScene):
+class Handover(TableScene[HandoverOptions]):
     """Observation: the pose of the bar."""
 
     moving = (BAR,)
+    placed = ("bar_x", "bar_y", "bar_yaw")
     colours: ClassVar = {"bar_colour": (BAR,)}
 
     def __init__(self, options: HandoverOptions, robot: Robot) -> None:
         super().__init__(options, robot)
-        self._given = options
         if list(robot.description.arms) != ["left_", "right_"]:
             known = ", ".join(robot.description.arms) or "none"
             raise HardwareError(f"scene handover needs robot.description.arms left_ and right_, got {known}")
-
-    @override
-    def placed(self) -> tuple[str, ...]:
-        return ("bar_x", "bar_y", "bar_yaw")
 
     @override
     def add(self, spec: mujoco.MjSpec) -> None:
@@ -47,12 +43,12 @@ class Handover(TableScene):
         body.add_freejoint(name=BAR)
         body.add_geom(
             name=BAR, type=mujoco.mjtGeom.mjGEOM_BOX, size=[BAR_WIDTH / 2, BAR_LENGTH / 2, BAR_WIDTH / 2],
-            density=400.0, condim=4, friction=FRICTION, rgba=hue(ends(self._given.bar_colour)[0]),
+            density=400.0, condim=4, friction=FRICTION, rgba=hue(ends(self.options.bar_colour)[0]),
         )  # fmt: skip
 
     @override
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
-        given = self._given
+        given = self.options
 
         def draw() -> tuple[float, float, float, float]:
             return rng.uniform(*given.bar_x), rng.uniform(*given.bar_y), BAR_WIDTH / 2, rng.uniform(*given.bar_yaw)

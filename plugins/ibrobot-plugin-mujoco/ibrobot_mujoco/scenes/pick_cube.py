@@ -10,35 +10,30 @@ import numpy as np
 
 from ibrobot_core.api import Robot, Vector
 from ibrobot_mujoco.scenes.options import PickCubeOptions
-from ibrobot_mujoco.scenes.solids import BLUE, add_bin, add_cube, bin_centre, hue, is_in_bin
+from ibrobot_mujoco.scenes.solids import BLUE, add_bin, bin_centre, is_in_bin
 from ibrobot_mujoco.scenes.table import TableScene
-from ibrobot_mujoco.spans import ends
 from ibrobot_mujoco.world import World
 
 CUBE, BIN = "cube", "bin"
 
 
-class PickCube(TableScene):
+class PickCube(TableScene[PickCubeOptions]):
     """Observation: the cube's pose, then the centre of the bin [m] (3)."""
 
     moving = (CUBE,)
+    further = ("bin.x", "bin.y", "bin.z")
+    placed = ("cube_x", "cube_y", "cube_yaw")
     sizes: ClassVar = {"cube_size": (CUBE,)}
     colours: ClassVar = {"cube_colour": (CUBE,)}
 
     def __init__(self, options: PickCubeOptions, robot: Robot) -> None:
         super().__init__(options, robot)
-        self._given = options
         self._centre = bin_centre(options.bin_position)
-        self.values += ("bin.x", "bin.y", "bin.z")
-
-    @override
-    def placed(self) -> tuple[str, ...]:
-        return ("cube_x", "cube_y", "cube_yaw")
 
     @override
     def add(self, spec: mujoco.MjSpec) -> None:
-        add_cube(spec, CUBE, ends(self._given.cube_size)[0], hue(ends(self._given.cube_colour)[0]))
-        add_bin(spec, BIN, self._given.bin_position, BLUE)
+        super().add(spec)
+        add_bin(spec, BIN, self.options.bin_position, BLUE)
 
     @override
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:

@@ -9,42 +9,32 @@ from typing import ClassVar, override
 import mujoco
 import numpy as np
 
-from ibrobot_core.api import Robot, Vector
+from ibrobot_core.api import Vector
 from ibrobot_mujoco.scenes.options import PushOptions
-from ibrobot_mujoco.scenes.solids import add_cube, hue
 from ibrobot_mujoco.scenes.table import TableScene
-from ibrobot_mujoco.spans import ends
 from ibrobot_mujoco.world import World
 
 BLOCK, GOAL = "block", "goal"
 
 
-class Push(TableScene):
+class Push(TableScene[PushOptions]):
     """Observation: the block's pose, then the goal [m] (3)."""
 
     moving = (BLOCK,)
+    further = ("goal.x", "goal.y", "goal.z")
+    placed = ("block_x", "block_y", "block_yaw", "goal_x", "goal_y")
     sizes: ClassVar = {"block_size": (BLOCK,)}
     colours: ClassVar = {"block_colour": (BLOCK,)}
 
-    def __init__(self, options: PushOptions, robot: Robot) -> None:
-        super().__init__(options, robot)
-        self._given = options
-        self.values += ("goal.x", "goal.y", "goal.z")
-
-    @override
-    def placed(self) -> tuple[str, ...]:
-        return ("block_x", "block_y", "block_yaw", "goal_x", "goal_y")
-
     @override
     def add(self, spec: mujoco.MjSpec) -> None:
-        given = self._given
-        add_cube(spec, BLOCK, ends(given.block_size)[0], hue(ends(given.block_colour)[0]))
+        super().add(spec)
         # A mocap body can be placed in each episode, and stands still.
         mark = spec.worldbody.add_body(name=GOAL, mocap=True)
         mark.add_geom(
             name=GOAL,
             type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            size=[given.goal_tolerance, 0.0005, 0],
+            size=[self.options.goal_tolerance, 0.0005, 0],
             contype=0,
             conaffinity=0,
             rgba=[0.1, 0.55, 0.2, 1],
@@ -52,7 +42,7 @@ class Push(TableScene):
 
     @override
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
-        given = self._given
+        given = self.options
         distance, bearing = rng.uniform(*given.goal_distance), rng.uniform(*given.goal_bearing)
         goal = distance * math.cos(bearing), distance * math.sin(bearing)
         return *self.place_cube(world, BLOCK, rng, look["block_size"], "block"), *goal
@@ -71,4 +61,4 @@ class Push(TableScene):
     def success(self, world: World) -> bool:
         """Whether the block is at rest on the goal, and the robot does not touch it."""
         away = world.pose(BLOCK)[:2] - world.data.mocap_pos[0, :2]
-        return float(np.hypot(*away)) < self._given.goal_tolerance and self.at_rest(world, BLOCK)
+        return float(np.hypot(*away)) < self.options.goal_tolerance and self.at_rest(world, BLOCK)

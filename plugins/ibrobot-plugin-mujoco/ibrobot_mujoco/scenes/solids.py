@@ -27,11 +27,11 @@ def hue(value: float) -> Vector:
     return np.array([*colorsys.hsv_to_rgb(value % 1.0, 0.88, 0.85), 1.0])
 
 
-def add_cube(spec: mujoco.MjSpec, name: str, size: float, rgba: Sequence[float] | Vector) -> None:
-    """A cube that moves, with body, free joint and geom of one name."""
+def add_cube(spec: mujoco.MjSpec, name: str, size: float) -> None:
+    """A red cube that moves, with body, free joint and geom of one name."""
     body = spec.worldbody.add_body(name=name, pos=[0.24, 0, size / 2])
     body.add_freejoint(name=name)
-    body.add_geom(name=name, type=_Box, size=[size / 2] * 3, density=DENSITY, condim=4, friction=FRICTION, rgba=rgba)
+    body.add_geom(name=name, type=_Box, size=[size / 2] * 3, density=DENSITY, condim=4, friction=FRICTION, rgba=RED)
 
 
 def add_bin(spec: mujoco.MjSpec, name: str, position: tuple[float, float], rgba: Sequence[float]) -> None:

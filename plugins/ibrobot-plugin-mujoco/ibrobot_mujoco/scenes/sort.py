@@ -10,43 +10,37 @@ import numpy as np
 
 from ibrobot_core.api import Robot, Vector
 from ibrobot_mujoco.scenes.options import SortOptions
-from ibrobot_mujoco.scenes.solids import BLUE, RED, add_bin, add_cube, bin_centre, is_in_bin
+from ibrobot_mujoco.scenes.solids import BLUE, RED, add_bin, bin_centre, is_in_bin
 from ibrobot_mujoco.scenes.table import TableScene
-from ibrobot_mujoco.spans import ends
 from ibrobot_mujoco.world import World
 
 COLOURS = (RED, BLUE)
 NAMES = ("red", "blue")
 
 
-class Sort(TableScene):
+class Sort(TableScene[SortOptions]):
     """Observation: the poses of the cubes, the number of the bin of each (0 red, 1 blue), and the bins' centres."""
 
     def __init__(self, options: SortOptions, robot: Robot) -> None:
-        self._given = options
-        self.moving = tuple(f"cube{i + 1}" for i in range(options.cubes))  # type: ignore[misc]
+        self.moving = tuple(f"cube{i + 1}" for i in range(options.cubes))
+        bins = (f"{name}_bin.{axis}" for name in NAMES for axis in "xyz")
+        self.further = (*(f"{cube}.bin" for cube in self.moving), *bins)
+        self.placed = tuple(f"{cube}_{value}" for cube in self.moving for value in ("x", "y", "yaw", "bin"))
         self.sizes = {"cube_size": self.moving}  # type: ignore[misc]
         super().__init__(options, robot)
         self._centres = np.stack([bin_centre(options.red_bin), bin_centre(options.blue_bin)])
-        self.values += tuple(f"{cube}.bin" for cube in self.moving)
-        self.values += tuple(f"{name}_bin.{axis}" for name in NAMES for axis in "xyz")
         self._bins = np.zeros(options.cubes)
 
     @override
-    def placed(self) -> tuple[str, ...]:
-        return tuple(f"{cube}_{value}" for cube in self.moving for value in ("x", "y", "yaw", "bin"))
-
-    @override
     def add(self, spec: mujoco.MjSpec) -> None:
-        for cube in self.moving:
-            add_cube(spec, cube, ends(self._given.cube_size)[0], RED)
-        for name, position, rgba in zip(NAMES, (self._given.red_bin, self._given.blue_bin), (RED, BLUE), strict=True):
+        super().add(spec)
+        for name, position, rgba in zip(NAMES, (self.options.red_bin, self.options.blue_bin), (RED, BLUE), strict=True):
             add_bin(spec, f"{name}_bin", position, rgba)
 
     @override
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
         factors: list[float] = []
-        for cube, number in zip(self.moving, rng.integers(2, size=self._given.cubes), strict=True):
+        for cube, number in zip(self.moving, rng.integers(2, size=self.options.cubes), strict=True):
             factors += [*self.place_cube(world, cube, rng, look["cube_size"]), float(number)]
         return factors
 

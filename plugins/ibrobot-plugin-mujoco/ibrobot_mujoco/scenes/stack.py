@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, override
 
-import mujoco
 import numpy as np
 
-from ibrobot_core.api import Robot
 from ibrobot_mujoco.scenes.options import StackOptions
-from ibrobot_mujoco.scenes.solids import add_cube, hue
 from ibrobot_mujoco.scenes.table import TableScene
-from ibrobot_mujoco.spans import ends
 from ibrobot_mujoco.world import World
 
 CUBE, BASE = "cube", "base_cube"
@@ -20,26 +16,13 @@ _GAP = 0.004
 """Allowed difference between the cube's height and that of a cube that lies on the other [m]."""
 
 
-class Stack(TableScene):
+class Stack(TableScene[StackOptions]):
     """Observation: the poses of the cube and of the one below."""
 
     moving = (CUBE, BASE)
+    placed = ("cube_x", "cube_y", "cube_yaw", "base_x", "base_y", "base_yaw")
     sizes: ClassVar = {"cube_size": (CUBE,), "base_size": (BASE,)}
     colours: ClassVar = {"cube_colour": (CUBE,), "base_colour": (BASE,)}
-
-    def __init__(self, options: StackOptions, robot: Robot) -> None:
-        super().__init__(options, robot)
-        self._given = options
-
-    @override
-    def placed(self) -> tuple[str, ...]:
-        return ("cube_x", "cube_y", "cube_yaw", "base_x", "base_y", "base_yaw")
-
-    @override
-    def add(self, spec: mujoco.MjSpec) -> None:
-        given = self._given
-        add_cube(spec, CUBE, ends(given.cube_size)[0], hue(ends(given.cube_colour)[0]))
-        add_cube(spec, BASE, ends(given.base_size)[0], hue(ends(given.base_colour)[0]))
 
     @override
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:

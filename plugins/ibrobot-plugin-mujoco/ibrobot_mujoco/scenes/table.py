@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import ClassVar, override
 
-import attrs
 import mujoco
 import numpy as np
 
 from ibrobot_core.api import HardwareError, Robot, Scene, Vector
 from ibrobot_mujoco.scenes.options import SceneOptions
-from ibrobot_mujoco.scenes.solids import FRICTION, hue, resize_cube
+from ibrobot_mujoco.scenes.solids import FRICTION, add_cube, hue, resize_cube
 from ibrobot_mujoco.spans import Span, ends
 from ibrobot_mujoco.world import World, bodies_of
 
@@ -32,62 +32,43 @@ type Draw = Callable[[], tuple[float, float, float, float]]
 """Draws x, y, z [m] and yaw [rad]."""
 
 
-@attrs.frozen(eq=False)
-class _Original:
-    """Values of the compiled model, which factors modify."""
-
-    model: mujoco.MjModel
-    friction: Vector
-    diffuse: Vector
-    ambient: Vector
-    headlight: Vector
-    positions: Vector
-    turns: Vector
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel) -> _Original:
-        head = np.concatenate([model.vis.headlight.ambient, model.vis.headlight.diffuse])
-        return cls(
-            model, model.geom_friction[:, 0].copy(), model.light_diffuse.copy(), model.light_ambient.copy(), head,
-            model.cam_pos.copy(), model.cam_quat.copy(),
-        )  # fmt: skip
-
-
-class TableScene(Scene[mujoco.MjSpec, World]):
+class TableScene[O: SceneOptions](Scene[mujoco.MjSpec, World]):
     """A table without a task; the base class of this package's scenes.
 
     Attributes:
         moving: the bodies that move; their poses, position [m] and quaternion wxyz, begin the observation.
+        further: names of what the observation has after these.
+        placed: names of the factors that `arrange` returns.
         sizes: factor of an edge -> cubes that have it.
         colours: factor of a hue -> geoms that have it.
     """
 
-    moving: ClassVar[tuple[str, ...]] = ()
+    moving: tuple[str, ...] = ()
+    further: tuple[str, ...] = ()
+    placed: tuple[str, ...] = ()
     sizes: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     colours: ClassVar[Mapping[str, tuple[str, ...]]] = {}
 
-    def __init__(self, options: SceneOptions, robot: Robot) -> None:
-        self._options = options
+    def __init__(self, options: O, robot: Robot) -> None:
+        self.options = options
         self._robot = robot
         self._look = {name: ends(getattr(options, name)) for name in (*self.sizes, *self.colours, "friction", "light")}
         shift, turn = ends(options.camera_shift), ends(options.camera_turn)
         self._look |= dict(zip(_CAMERA, (shift,) * 3 + (turn,) * 3, strict=True))
         self._distractors = [f"distractor{i + 1}" for i in range(options.distractors)]
         self._of_robot: dict[str, frozenset[int]] = {}
-        self._original: _Original | None = None
-        placed = self.placed()
-        self.factors = (*placed, *self._look, "distractors")
-        self.values = tuple(
-            f"{body}.{part}" for body in self.moving for part in ("x", "y", "z", "qw", "qx", "qy", "qz")
-        )
+        self._originals: tuple[mujoco.MjModel, mujoco.MjModel] | None = None
+        """A model that factors modify, and a copy of it as it was compiled."""
+        self.factors = (*self.placed, *self._look, "distractors")
+        poses = (f"{body}.{part}" for body in self.moving for part in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+        self.values = (*poses, *self.further)
         self.poses = {body: 7 * i for i, body in enumerate(self.moving)}
 
-    def placed(self) -> tuple[str, ...]:
-        """Names of the factors that `arrange` returns."""
-        return ()
-
     def add(self, spec: mujoco.MjSpec) -> None:
-        """Add the objects of the task."""
+        """Add the objects of the task: the cubes of `sizes`, and what subclasses add."""
+        for name, cubes in self.sizes.items():
+            for cube in cubes:
+                add_cube(spec, cube, ends(getattr(self.options, name))[0])
 
     def arrange(self, world: World, rng: np.random.Generator, look: Mapping[str, float]) -> Sequence[float]:
         """Place the objects of the task; returns the values of `placed`."""
@@ -102,7 +83,8 @@ class TableScene(Scene[mujoco.MjSpec, World]):
     @override
     def begin(self, world: World, rng: np.random.Generator) -> Vector:
         look_rng, aside = rng.spawn(2)
-        look = {name: float(low + u * (high - low)) for (name, (low, high)), u in self._drawn(look_rng)}
+        drawn = zip(self._look.items(), look_rng.random(len(self._look)).tolist(), strict=True)
+        look = {name: float(low + u * (high - low)) for (name, (low, high)), u in drawn}
         free = [*self.moving, *self._distractors]
         for body in free:  # until it is placed, it is in nobody's way
             world.put(body, np.array([0, 0, -1.0, 1, 0, 0, 0]))
@@ -110,7 +92,7 @@ class TableScene(Scene[mujoco.MjSpec, World]):
         self._apply(world, values)
         if self.sizes:
             _recompute(world)
-        values |= dict(zip(self.placed(), self.arrange(world, rng, look), strict=True))
+        values |= dict(zip(self.placed, self.arrange(world, rng, look), strict=True))
         for body in self._distractors:
             self.place(world, body, partial(_aside, aside, world.model.geom(body).size), "distractors")
         values["distractors"] = len(self._distractors)
@@ -118,25 +100,22 @@ class TableScene(Scene[mujoco.MjSpec, World]):
         self.show(world, factors)
         return factors
 
-    def _drawn(self, rng: np.random.Generator) -> list[tuple[tuple[str, tuple[float, float]], float]]:
-        return list(zip(self._look.items(), rng.random(len(self._look)).tolist(), strict=True))
-
     @override
     def show(self, world: World, factors: Vector) -> None:
         self._apply(world, dict(zip(self.factors, factors.tolist(), strict=True)))
 
     def _apply(self, world: World, values: Mapping[str, float]) -> None:
         model = world.model
-        if self._original is None or self._original.model is not model:
-            self._original = _Original.of(model)
-        original = self._original
-        model.geom_friction[:, 0] = values["friction"] * original.friction
-        model.light_diffuse[:] = values["light"] * original.diffuse
-        model.light_ambient[:] = values["light"] * original.ambient
-        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = values["light"] * original.headlight.reshape(
-            2, 3
-        )
-        _move_cameras(original, [values[name] for name in _CAMERA])
+        if self._originals is None or self._originals[0] is not model:
+            self._originals = model, copy.copy(model)
+        original = self._originals[1]
+        light = values["light"]
+        model.geom_friction[:, 0] = values["friction"] * original.geom_friction[:, 0]
+        model.light_diffuse[:] = light * original.light_diffuse
+        model.light_ambient[:] = light * original.light_ambient
+        model.vis.headlight.ambient[:] = light * original.vis.headlight.ambient
+        model.vis.headlight.diffuse[:] = light * original.vis.headlight.diffuse
+        _move_cameras(model, original, [values[name] for name in _CAMERA])
         for name, cubes in self.sizes.items():
             for cube in cubes:
                 resize_cube(model, cube, values[name])
@@ -194,7 +173,7 @@ class TableScene(Scene[mujoco.MjSpec, World]):
         Raises:
             HardwareError: if the options leave no place.
         """
-        distance, bearing, yaw = (getattr(self._options, f"{of}_{name}") for name in ("distance", "bearing", "yaw"))
+        distance, bearing, yaw = (getattr(self.options, f"{of}_{name}") for name in ("distance", "bearing", "yaw"))
         options = f"{of}_distance {list(distance)} and {of}_bearing {list(bearing)}"
         x, y, _, turn = self.place(world, body, partial(_polar, rng, distance, bearing, yaw, size), options).tolist()
         return x, y, turn
@@ -247,12 +226,10 @@ def _recompute(world: World) -> None:
     world.data.qpos[:] = kept
 
 
-def _move_cameras(original: _Original, offsets: Sequence[float]) -> None:
-    model = original.model
-    fixed = model.cam_bodyid == 0
+def _move_cameras(model: mujoco.MjModel, original: mujoco.MjModel, offsets: Sequence[float]) -> None:
     turn, turned = np.empty(4), np.empty(4)
     mujoco.mju_euler2Quat(turn, np.array(offsets[3:]), "XYZ")
-    for camera in np.flatnonzero(fixed):
-        mujoco.mju_mulQuat(turned, turn, original.turns[camera])
+    for camera in np.flatnonzero(model.cam_bodyid == 0):
+        mujoco.mju_mulQuat(turned, turn, original.cam_quat[camera])
         model.cam_quat[camera] = turned
-        model.cam_pos[camera] = original.positions[camera] + offsets[:3]
+        model.cam_pos[camera] = original.cam_pos[camera] + offsets[:3]
