@@ -94,8 +94,7 @@ class NodeProcess:
     def _await_hello(self, interpreter: Interpreter, given_up: Any) -> Hello:
         deadline_s = time.monotonic() + _START_S
         while not self.wire.closed and time.monotonic() < deadline_s and not given_up():
-            for (head, _), *rest in filter(None, [self.wire.wait(_GLANCE_S)]):
-                self.wire.put_back(rest)
+            for head, _ in self.wire.wait(_GLANCE_S):  # one, since the node says no more before it is told to
                 if head.pop("op") == "hello":
                     return Hello(**head)
                 raise MissingDependency(

@@ -23,45 +23,40 @@ class Services:
         self._session = session
         self._found = Offers(session, options.offers, lambda name: ros_name(name, options.namespace))
         self._offers: dict[str, Offer] = {}
-        self._offered: set[str] = set()
-        self._calls: ThreadPoolExecutor | None = None
-        self._urgent: ThreadPoolExecutor | None = None
+        """What the present node offers."""
+        self._pools: dict[bool, ThreadPoolExecutor] = {}
+        """Threads for urgent services, and for others."""
 
     def open(self) -> None:
         """Begin to answer."""
-        self._calls = ThreadPoolExecutor(_WORKERS, "ros call")
-        self._urgent = ThreadPoolExecutor(_URGENT_WORKERS, "ros stop")
+        self._pools[False] = ThreadPoolExecutor(_WORKERS, "ros call")
+        self._pools[True] = ThreadPoolExecutor(_URGENT_WORKERS, "ros stop")
 
     def close(self) -> None:
         """Wait for the answers under way."""
-        for pool in (self._calls, self._urgent):
-            if pool is not None:
-                pool.shutdown(cancel_futures=True)
+        for pool in self._pools.values():
+            pool.shutdown(cancel_futures=True)
 
-    def submit(self, work: Any, *arguments: Any) -> None:
-        """Do other work that waits for the run, e.g. for a decision about a goal."""
-        assert self._calls is not None
-        self._calls.submit(self._contained, work, *arguments)
+    def submit(self, work: Any, *arguments: Any, urgent: bool = False) -> None:
+        """Do work that waits for the run, e.g. for a decision about a goal, in another thread."""
+        self._pools[urgent].submit(self._contained, work, *arguments)
 
     def declare(self, wire: Wire) -> None:
         """Tell a new node which services there are."""
-        self._offered.clear()
+        self._offers.clear()
         self.refresh(wire)
 
     def refresh(self, wire: Wire) -> None:
         """Tell the node which services are new."""
         for name, offer in self._found.found().items():
-            if name not in self._offered:
-                self._offered.add(name)
+            if name not in self._offers:
                 self._offers[name] = offer
                 wire.send({"op": "service", "name": name, "type": offer.type, "urgent": offer.urgent})
 
     def take_call(self, wire: Wire, head: Mapping[str, Any]) -> None:
-        """Answer a call, in a thread of its own."""
+        """Answer a call, in another thread."""
         offer = self._offers[head["service"]]
-        pool = self._urgent if offer.urgent else self._calls
-        assert pool is not None
-        pool.submit(self._contained, self._answer, wire, offer, head)
+        self.submit(self._answer, wire, offer, head, urgent=offer.urgent)
 
     def _answer(self, wire: Wire, offer: Offer, head: Mapping[str, Any]) -> None:
         wire.send({"op": "answer", "call": head["call"], **self._found.answer(offer, head["request"])})

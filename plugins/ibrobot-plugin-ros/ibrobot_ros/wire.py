@@ -36,7 +36,6 @@ class Wire:
         self._sending = threading.Lock()
         self._unsent: deque[memoryview] = deque()
         self._received = bytearray()
-        self._returned: list[Frame] = []
         self._wake, self._waker = os.pipe()
         os.set_blocking(self._waker, False)
         self.closed = False
@@ -72,9 +71,6 @@ class Wire:
 
     def wait(self, timeout_s: float) -> list[Frame]:
         """The frames that have arrived; waits up to `timeout_s` [s] for one, or for `wake`, and sends meanwhile."""
-        if self._returned:
-            frames, self._returned = self._returned, []
-            return frames
         if self.closed:
             return []
         sending = [self._socket] if self.backlog else []
@@ -86,10 +82,6 @@ class Wire:
             with self._sending:
                 self._flush()
         return self._read() if self._socket in ready else []
-
-    def put_back(self, frames: list[Frame]) -> None:
-        """Have the next `wait` return frames that another part is to take."""
-        self._returned = frames
 
     def flush(self, timeout_s: float) -> bool:
         """Wait up to `timeout_s` [s] until the peer has read all; returns whether it has. Not beside `wait`."""

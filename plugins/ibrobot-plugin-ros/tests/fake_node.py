@@ -53,7 +53,7 @@ def write(folder: Path, behaviour: str = "") -> Path:
 
 
 def sends(**answers: list[Frame]) -> str:
-    """The behaviour that sends frames when the first frame of a kind comes, e.g. `order` or `ping`."""
+    """The behaviour that sends frames when the first frame of a kind comes, e.g. `subscriber` or `ping`."""
     return json.dumps({op: [[head, body.hex()] for head, body in frames] for op, frames in answers.items()})
 
 
@@ -87,11 +87,13 @@ def _control(wire: Wire, state: str, offset: str, count: str) -> None:
     """Publish states, and follow commands at 3 rad/s."""
     text, begin, size = bytearray.fromhex(state), int(offset), 8 * int(count)
     position = np.frombuffer(text, np.float64, int(count), begin).copy()
-    command = position.copy()
+    command, told = position.copy(), False
     while not wire.closed:
         for head, payload in wire.wait(0.002):
             if head["op"] == "order":
                 wire.send(HELLO)
+            elif head["op"] == "subscriber":
+                told = True
                 wire.send({"op": "matched", "topic": "", "subscribers": 1})
             elif head["op"] == "message":
                 command = np.frombuffer(payload[-size:])
@@ -99,7 +101,8 @@ def _control(wire: Wire, state: str, offset: str, count: str) -> None:
                 os._exit(0)
         position += np.clip(command - position, -0.006, 0.006)
         text[begin : begin + size] = position.tobytes()
-        wire.send({"op": "message", "topic": "/joint_states"}, bytes(text))
+        if told:
+            wire.send({"op": "message", "topic": "/joint_states"}, bytes(text))
     os._exit(0)
 
 

@@ -50,7 +50,7 @@ def make(tmp_path):
 
     def make(*frames, later=(), **options):
         ctx = context()
-        python = fake_node.write(tmp_path, fake_node.sends(order=list(frames), message=list(later)))
+        python = fake_node.write(tmp_path, fake_node.sends(subscriber=list(frames), message=list(later)))
         hardware = Ros2Control(Ros2ControlOptions(controller="arm", python=str(python), **options), ctx)
         made.append(hardware)
         return hardware, ctx

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from enum import IntEnum
 from typing import Any, override
 
@@ -95,7 +96,7 @@ class RosParameters(Component):
         self._session = session
         self._link = link
         self._is_shared = is_shared
-        self._ends: list[Callable[[], None]] = []
+        self._ends = ExitStack()
 
     @override
     def start(self) -> None:
@@ -104,13 +105,11 @@ class RosParameters(Component):
         for name, handler in (("List", self._list), ("Get", self._get), ("Set", self._set)):
             kind = service_type(f"rcl_interfaces/srv/{name}Parameters")
             full = f"{transport.node_name}/{name.lower()}_parameters"
-            self._ends.append(transport.serve_ros(full, kind, handler))
+            self._ends.callback(transport.serve_ros(full, kind, handler))
 
     @override
     def stop(self) -> None:
-        ends, self._ends = self._ends, []
-        for end in ends:
-            end()
+        self._ends.close()
 
     def _list(self, request: dict[str, Any], reply: Reply) -> None:
         prefixes, depth = request["prefixes"], request["depth"]

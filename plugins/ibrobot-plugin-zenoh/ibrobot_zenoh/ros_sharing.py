@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, Literal, override
 
@@ -15,9 +16,10 @@ from ibrobot_ros2.offers import Offer, Offers, time_of
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, NotSupported, did_you_mean
 from ibrobot_core.app import CONTROL, RunAccess, SessionWorker, TransportLink
+from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.ros2 import absolute
 from ibrobot_zenoh.ros_goals import Status
-from ibrobot_zenoh.sharing import Reply, transport_of
+from ibrobot_zenoh.sharing import Reply, RosHandler, transport_of
 
 _ENDED_KEPT = 100
 """Number of ended goals whose results can still be asked for."""
@@ -25,46 +27,6 @@ _LOOK_S = 0.5
 """How often to look for services that a mode has brought."""
 _CANCELED, _REJECTED, _UNKNOWN, _OVER = 0, 1, 2, 3
 """Return codes of action_msgs/srv/CancelGoal."""
-
-
-class RosServices(SessionWorker):
-    """Answers calls of the shared services under types of ROS; those that a mode brings appear with it."""
-
-    def __init__(self, session: RunAccess, link: TransportLink, is_shared: Callable[[str], bool]) -> None:
-        super().__init__(session, "share:ros services", "services for ROS 2 nodes", (link.name,))
-        self._link = link
-        self._is_shared = is_shared
-        self._ends: dict[str, Callable[[], None]] = {}
-
-    @override
-    def setup(self) -> None:
-        self._transport = transport_of(self._link)
-        namespace = self._transport.namespace
-        self._offers = Offers(self.session, self._is_shared, lambda name: absolute(name, namespace))
-        self._look()
-
-    @override
-    def work(self, timeout_s: float) -> None:
-        self.session.finished.wait(min(timeout_s, _LOOK_S))
-        self._look()
-
-    def _look(self) -> None:
-        for name, offer in self._offers.found().items():
-            if name not in self._ends:
-                kind, urgent = service_type(offer.type), offer.urgent
-                answer = partial(self._answer, offer)
-                self._ends[name] = self._transport.serve_ros(name, kind, answer, urgent=urgent)
-
-    def _answer(self, offer: Offer, request: dict[str, Any], reply: Reply) -> None:
-        answer = self._offers.answer(offer, request)
-        known = fields_of(service_type(offer.type).response)
-        reply({name: value for name, value in answer.items() if name in known})
-
-    @override
-    def teardown(self) -> None:
-        for end in self._ends.values():
-            end()
-        self._ends.clear()
 
 
 @attrs.define(eq=False)
@@ -95,41 +57,39 @@ class _Server:
     """Goals by their ids, the oldest first."""
 
 
-class RosActions(SessionWorker):
-    """Offers executors and services as actions: three services and two topics each. The run decides about goals.
+class RosSharing(SessionWorker):
+    """Answers calls of the shared services under types of ROS, and offers executors and services as actions.
+
+    An action has three services and two topics. The run decides about goals. Services that a mode brings appear with
+    it.
 
     Args:
         session: the run.
         link: the network.
-        executors: executors that take goals of others.
-        gripper_action: type of the action of those that take a position.
-        is_shared: whether others may call a service; those that take their time are actions.
+        share: what is shared.
 
     Raises:
         NotSupported: for an executor that takes no goals.
     """
 
     session: RunAccess
-    sends_stops = True
 
-    def __init__(
-        self, session: RunAccess, link: TransportLink, executors: tuple[str, ...], gripper_action: str,
-        is_shared: Callable[[str], bool],
-    ) -> None:  # fmt: skip
-        summary = f"goals for {', '.join(executors) or 'services'}"
-        super().__init__(session, "share:actions", summary, (link.name, CONTROL))
+    def __init__(self, session: RunAccess, link: TransportLink, share: Share) -> None:
+        super().__init__(session, "share:ros", "services and actions for ROS 2 nodes", (link.name, CONTROL))
         self._link = link
         known = list(with_goals(session))
-        for name in executors:
+        for name in share.actions:
             if name not in known:
                 hint = did_you_mean(name, known, "executors that do")
                 raise NotSupported(f"transport.share.actions: {name} is no executor that takes goals{hint}")
-        self._actions = Actions(session, executors, is_shared, self._named, "zenoh", gripper_action)
+        self._offers = Offers(session, share.offers, self._named)
+        self._actions = Actions(session, share.actions, share.offers, self._named, "zenoh", share.gripper_action)
+        self._served: set[str] = set()
         self._lock = threading.RLock()
         self._count = 0
         self._goals: dict[int, _Goal] = {}
         """Goals that have not ended, by number."""
-        self._ends: list[Callable[[], None]] = []
+        self._ends = ExitStack()
 
     def _named(self, name: str) -> str:
         return absolute(name, transport_of(self._link).namespace)
@@ -139,18 +99,33 @@ class RosActions(SessionWorker):
         self._transport = transport_of(self._link)
         self._actions.open()
         self._actions.declare(self)
+        self._look()
 
     @override
     def work(self, timeout_s: float) -> None:
         self.session.finished.wait(min(timeout_s, _LOOK_S))
         self._actions.refresh(self)
+        self._look()
 
     @override
     def teardown(self) -> None:
-        ends, self._ends = self._ends, []
-        for end in ends:
-            end()
+        self._ends.close()
         self._actions.close()
+
+    def _look(self) -> None:
+        """Serve the services that are new."""
+        for name, offer in self._offers.found().items():
+            if name not in self._served:
+                self._served.add(name)
+                self._serve(name, service_type(offer.type), partial(self._answer, offer), urgent=offer.urgent)
+
+    def _serve(self, name: str, kind: ServiceType, handler: RosHandler, *, urgent: bool) -> None:
+        self._ends.callback(self._transport.serve_ros(name, kind, handler, urgent=urgent))
+
+    def _answer(self, offer: Offer, request: dict[str, Any], reply: Reply) -> None:
+        answer = self._offers.answer(offer, request)
+        known = fields_of(service_type(offer.type).response)
+        reply({name: value for name, value in answer.items() if name in known})
 
     def send(self, head: Mapping[str, Any]) -> None:
         """Take what the run says of its actions and goals."""
@@ -160,17 +135,10 @@ class RosActions(SessionWorker):
     def _offer(self, head: Mapping[str, Any]) -> None:
         address = {key: head[key] for key in ("executor", "service") if key in head}
         server = _Server(head["name"], action_type(head["type"]), address)
-        services: tuple[tuple[str, ServiceType, Any, bool], ...] = (
-            ("send_goal", server.type.send_goal, self._take_goal, False),
-            ("cancel_goal", server.type.cancel_goal, self._cancel, True),
-            ("get_result", server.type.get_result, self._get_result, False),
-        )
-        for name, kind, handler, urgent in services:
-            self._ends.append(
-                self._transport.serve_ros(
-                    f"{server.name}/_action/{name}", kind, partial(handler, server), urgent=urgent
-                )
-            )
+        name, kind = f"{server.name}/_action", server.type
+        self._serve(f"{name}/send_goal", kind.send_goal, partial(self._take_goal, server), urgent=False)
+        self._serve(f"{name}/cancel_goal", kind.cancel_goal, partial(self._cancel, server), urgent=True)
+        self._serve(f"{name}/get_result", kind.get_result, partial(self._get_result, server), urgent=False)
         self._publish_status(server)
 
     def _take_goal(self, server: _Server, request: dict[str, Any], reply: Reply) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping
+from contextlib import ExitStack
 from typing import Any, override
 
 import attrs
@@ -147,17 +148,17 @@ def components(share: Share, session: RunAccess, link: TransportLink) -> list[Co
     if session.request.lockstep and share.actions:
         raise NotSupported("transport.share.actions: a lockstep run cannot take goals of other machines")
     from ibrobot_zenoh.ros_parameters import RosParameters
-    from ibrobot_zenoh.ros_sharing import RosActions, RosServices
+    from ibrobot_zenoh.ros_sharing import RosSharing
 
     session.refuse_absent("transport.share.publish", share.publish.__contains__)
     subscribed: list[Component] = [SubscribedTopics(session, link, share.subscribe)] if share.subscribe else []
     served: list[Component] = []
     if share.services:
-        served += [SharedServices(session, link, share), RosServices(session, link, share.offers)]
+        served.append(SharedServices(session, link, share))
     if share.parameters:
         served.append(RosParameters(session, link, share.offers))
     if share.actions or share.services:
-        served.append(RosActions(session, link, share.actions, share.gripper_action, share.offers))
+        served.append(RosSharing(session, link, share))
     return [*(PublishedTopic(session, link, topic) for topic in share.publish), *subscribed, *served]
 
 
@@ -221,7 +222,7 @@ class SubscribedTopics(Component):
         self._link = link
         self._session = session
         self._topics = topics
-        self._ends: list[Callable[[], None]] = []
+        self._ends = ExitStack()
 
     @override
     def start(self) -> None:
@@ -236,7 +237,7 @@ class SubscribedTopics(Component):
                     topic,
                     topic,
                 )
-            self._ends.append(transport.subscribe_messages(topic, self._to_bus(topic)))
+            self._ends.callback(transport.subscribe_messages(topic, self._to_bus(topic)))
 
     def _to_bus(self, topic: str) -> Callable[[Message], None]:
         reported = False
@@ -254,9 +255,7 @@ class SubscribedTopics(Component):
 
     @override
     def stop(self) -> None:
-        ends, self._ends = self._ends, []
-        for end in ends:
-            end()
+        self._ends.close()
 
 
 class SharedServices(Component):
@@ -271,19 +270,17 @@ class SharedServices(Component):
         self._session = session
         self._link = link
         self._share = share
-        self._end: Callable[[], None] | None = None
+        self._ends = ExitStack()
 
     @override
     def start(self) -> None:
         transport = transport_of(self._link)
         name = endpoint(transport.namespace)
-        self._end = transport.serve_with_urgent(name, self._answer, self._is_urgent, _MOST_BYTES)
+        self._ends.callback(transport.serve_with_urgent(name, self._answer, self._is_urgent, _MOST_BYTES))
 
     @override
     def stop(self) -> None:
-        end, self._end = self._end, None
-        if end is not None:
-            end()
+        self._ends.close()
 
     def _is_urgent(self, payload: Payload) -> bool:
         """Whether a request is for an urgent service. It delays all other requests, so only short ones are read."""

@@ -43,7 +43,7 @@ def run(descriptor: int) -> None:
     rclpy.init(args=["--ros-args", "--log-level", "error"])
     wire.send({"op": "hello", **_found(rclpy)})
     if not order["probe"]:
-        Process(wire, order["name"]).serve()
+        serve(wire, order["name"])
     wire.flush(1.0)
     wire.close()
     rclpy.try_shutdown()
@@ -71,54 +71,46 @@ def _found(rclpy: Any) -> dict[str, Any]:
     }
 
 
-class Process:
-    """Passes frames of the run to the parts of the node."""
+def serve(wire: Wire, name: str) -> None:
+    """Do what the run asks until it closes the socket."""
+    from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 
-    def __init__(self, wire: Wire, name: str) -> None:
-        from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+    from ibrobot_ros.node.actions import Actions
+    from ibrobot_ros.node.services import Services
+    from ibrobot_ros.node.topics import Topics
 
-        from ibrobot_ros.node.actions import Actions
-        from ibrobot_ros.node.services import Services
-        from ibrobot_ros.node.topics import Topics
+    rclpy: Any = importlib.import_module("rclpy")
+    threads: list[threading.Thread] = []
 
-        self._wire = wire
-        rclpy: Any = importlib.import_module("rclpy")
+    def node(suffix: str, executor: Any) -> Any:
+        made = rclpy.create_node(f"{name}{suffix}", start_parameter_services=False)
+        executor.add_node(made)
+        threads.append(threading.Thread(target=executor.spin, name=f"ros{suffix}", daemon=True))
+        return made
 
-        def node(suffix: str, executor: Any) -> Any:
-            made = rclpy.create_node(f"{name}{suffix}", start_parameter_services=False)
-            executor.add_node(made)
-            thread = threading.Thread(target=executor.spin, name=f"ros{suffix}", daemon=True)
-            threads.append(thread)
-            return made
-
-        threads: list[threading.Thread] = []
-        # Three executors: neither a flood of messages nor slow services keep an emergency stop waiting.
-        calls = node("", MultiThreadedExecutor(_POOL))
-        urgent = node("_stop", SingleThreadedExecutor())
-        topics = Topics(node("_topics", SingleThreadedExecutor()), wire)
-        actions, services = Actions(calls, wire), Services(calls, urgent, wire)
-        self._does: dict[str, Callable[[dict[str, Any], bytes], None]] = {
-            "publisher": topics.add_publisher,
-            "message": topics.publish,
-            "subscriber": topics.add_subscriber,
-            "action": actions.add,
-            "decided": actions.decide,
-            "feedback": actions.give_feedback,
-            "ended": actions.end,
-            "service": services.add,
-            "answer": services.answer,
-            "ping": lambda head, payload: wire.send({"op": "pong"}),
-        }
-        self._watch, self._finish = topics.watch, topics.finish
-        for thread in threads:
-            thread.start()
-
-    def serve(self) -> None:
-        """Do what the run asks until it closes the socket."""
-        while not self._wire.closed:
-            for head, payload in self._wire.wait(_POLL_S):
-                if head["op"] == "end":
-                    self._finish()
-                    return
-                self._does[head["op"]](head, payload)
-            self._watch()
+    # Three executors: neither a flood of messages nor slow services keep an emergency stop waiting.
+    calls = node("", MultiThreadedExecutor(_POOL))
+    urgent = node("_stop", SingleThreadedExecutor())
+    topics = Topics(node("_topics", SingleThreadedExecutor()), wire)
+    actions, services = Actions(calls, wire), Services(calls, urgent, wire)
+    does: dict[str, Callable[[dict[str, Any], bytes], None]] = {
+        "publisher": topics.add_publisher,
+        "message": topics.publish,
+        "subscriber": topics.add_subscriber,
+        "action": actions.add,
+        "decided": actions.decide,
+        "feedback": actions.give_feedback,
+        "ended": actions.end,
+        "service": services.add,
+        "answer": services.answer,
+        "ping": lambda head, payload: wire.send({"op": "pong"}),
+    }
+    for thread in threads:
+        thread.start()
+    while not wire.closed:
+        for head, payload in wire.wait(_POLL_S):
+            if head["op"] == "end":
+                topics.finish()
+                return
+            does[head["op"]](head, payload)
+        topics.watch()
