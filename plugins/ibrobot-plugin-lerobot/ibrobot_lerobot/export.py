@@ -27,7 +27,7 @@ from ibrobot_lerobot.checkpoint import (
     read_checkpoint,
 )
 from ibrobot_lerobot.options import LeRobotPolicyOptions
-from ibrobot_lerobot.steps import Normalise, Steps, read_steps
+from ibrobot_lerobot.steps import Steps, read_steps
 
 MANIFEST = "onnx_policy.json"
 EXPORTED = ("act", "diffusion", "vqbet")
@@ -155,15 +155,8 @@ def _affine(post: Steps, size: int) -> tuple[list[float], list[float]]:
 
 
 def _unnormalised(post: Steps, action: Any) -> Any:
-    exact = Steps([_in_double(step) if isinstance(step, Normalise) else step for step in post.steps], ())
+    exact = post.of(lambda array: np.asarray(array, np.float64))
     return np.asarray(exact({ACTION: action.astype(np.float64)})[ACTION], np.float64)
-
-
-def _in_double(step: Normalise) -> Normalise:
-    statistics = {
-        key: (np.asarray(low, np.float64), np.asarray(span, np.float64)) for key, (low, span) in step.statistics.items()
-    }
-    return attrs.evolve(step, statistics=statistics)
 
 
 def _export(graph: Any, file: Path) -> float:

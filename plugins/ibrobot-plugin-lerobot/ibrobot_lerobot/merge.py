@@ -72,7 +72,8 @@ def merge(root: Path, parts: Sequence[Path], metadata: Mapping[str, Any]) -> Non
             shutil.rmtree(merging, ignore_errors=True)
             merging.mkdir()
             _Merge(merging, old).run(parts, metadata)
-            _sync(merging)  # the parts may be deleted afterwards
+            for path in (merging, *merging.rglob("*")):
+                sync(path)  # the parts may be deleted afterwards
             merging.rename(root / _MERGED)
         except (OSError, pa.ArrowException) as error:
             raise DatasetError(f"{root}: cannot be merged: {error}") from error
@@ -121,12 +122,6 @@ def _complete(root: Path) -> None:
         shutil.rmtree(merged)
     except OSError as error:
         raise DatasetError(f"{root}: the merge cannot be completed: {error}") from error
-
-
-def _sync(folder: Path) -> None:
-    """Flush a folder with all its files to the disk."""
-    for path in (folder, *folder.rglob("*")):
-        sync(path)
 
 
 @attrs.define

@@ -51,29 +51,21 @@ class PolicyModel:
     ) -> None:
         self._checkpoint = checkpoint
         self._device = torch.device(_device(options.device))
-        self._steps = steps.of(lambda array: torch.from_numpy(np.array(array)).to(self._device))
+        self.steps = steps.of(lambda array: torch.from_numpy(np.array(array)).to(self._device))
+        """The preprocessor's steps, on the network's device."""
         self._pictures = pictures
         threads = options.threads or max(1, _cores() - 1)
         torch.set_num_threads(threads)
-        self._policy = self._load(options)
+        self.network = self._load(options)
+        """LeRobot's policy."""
         self._autocast = getattr(torch, options.dtype) if options.dtype in ("bfloat16", "float16") else None
-        self._chunk = torch.compile(self._policy.predict_action_chunk) if options.compile else None
+        self._chunk = torch.compile(self.network.predict_action_chunk) if options.compile else None
         self._draws: Sequence[Draw] = ()
         """The random draws of a single request."""
         self._one_by_one = False
         """Whether random draws cannot be assigned to requests."""
         self._log = log
         log.info("%s on %s, %d threads", checkpoint.type, self._device, threads)
-
-    @property
-    def network(self) -> Any:
-        """LeRobot's policy."""
-        return self._policy
-
-    @property
-    def steps(self) -> Steps:
-        """The preprocessor's steps, on the network's device."""
-        return self._steps
 
     def warm_up(self, tensors: Tensors) -> None:
         """Run the network once and check that it returns an action chunk.
@@ -111,7 +103,8 @@ class PolicyModel:
             return [self.predict([tensors])[0] for tensors in batch]
         inputs = self.inputs(batch)
         devices = [self._device] if self._device.type == "cuda" else []
-        with torch.random.fork_rng(devices), torch.no_grad(), self._arithmetic():
+        autocast = torch.autocast(self._device.type, self._autocast) if self._autocast is not None else nullcontext()
+        with torch.random.fork_rng(devices), torch.no_grad(), autocast:
             draws = Draws([int(tensors["seed"][0]) for tensors in batch], self._device, self._draws)
             try:
                 with draws if self._chunk is None else nullcontext():  # a compiled network cannot be intercepted
@@ -138,7 +131,7 @@ class PolicyModel:
             for name in batch[0]
             if name not in _OWN and name not in self._pictures
         }
-        return inputs | self._steps(
+        return inputs | self.steps(
             {name: self._pixels([tensors[name] for tensors in batch]) for name in self._pictures}
         )
 
@@ -148,7 +141,7 @@ class PolicyModel:
         return pixels.movedim(-1, -3).contiguous().to(torch.float32) / 255
 
     def _run(self, inputs: dict[str, Any], batch: Sequence[Tensors]) -> torch.Tensor:
-        policy, request = self._policy, batch[0]
+        policy, request = self.network, batch[0]
         policy.reset()
         if "task" in request:
             inputs["task"] = [tensors["task"].tobytes().decode() for tensors in batch]
@@ -162,8 +155,8 @@ class PolicyModel:
 
     def _fill_queues(self, inputs: dict[str, Any]) -> None:
         """Fill LeRobot's queues of past observations with the request's, oldest first."""
-        queues = {key: queue for key, queue in getattr(self._policy, "_queues", {}).items() if key != ACTION}
-        cameras = [inputs[key] for key in self._policy.config.image_features if key in inputs]
+        queues = {key: queue for key, queue in getattr(self.network, "_queues", {}).items() if key != ACTION}
+        cameras = [inputs[key] for key in self.network.config.image_features if key in inputs]
         if not queues:
             return
         if self._checkpoint.n_obs_steps == 1:
@@ -197,9 +190,6 @@ class PolicyModel:
             raise PolicyError(f"{path}: LeRobot cannot load it: {error}") from error
         policy.to(self._device, torch.float32 if options.dtype == "float32" else None)
         return policy.eval()
-
-    def _arithmetic(self) -> Any:
-        return torch.autocast(self._device.type, self._autocast) if self._autocast is not None else nullcontext()
 
 
 def _cores() -> int:

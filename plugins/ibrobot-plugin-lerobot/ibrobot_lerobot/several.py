@@ -7,12 +7,11 @@ import sys
 from collections.abc import Callable, Iterable
 from contextlib import closing
 from pathlib import Path
-from typing import NoReturn
 
 import attrs
 
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import Failed, Job, echo, emit, installed_plugins
+from ibrobot_core.app import Event, Failed, Job, echo, emit, installed_plugins
 from ibrobot_lerobot import TRAIN
 from ibrobot_lerobot.trainer import progress, run_training
 from ibrobot_lerobot.training import Phase, Report, TrainOptions
@@ -43,25 +42,24 @@ def train_several(options: TrainOptions, *, events: bool) -> None:
             for number, done in enumerate(finished, 1):
                 failed += done.error is not None
                 text = f"{done.job.argument.out}: {done.error or 'trained'} ({number} of {len(jobs)})"
-                if events:
-                    emit(TRAIN, Phase(text))
-                else:
-                    echo(text, err=done.error is not None)
+                tell(text, Phase(text), events=events, err=done.error is not None)
     except KeyboardInterrupt:
-        _end(_KEPT, 130, events=events)
+        tell(_KEPT, Failed(_KEPT), events=events, err=True)
+        sys.exit(130)
     if failed:
-        _end(f"{failed} of {len(jobs)} trainings failed; the same command continues with them", 1, events=events)
+        text = f"{failed} of {len(jobs)} trainings failed; the same command continues with them"
+        tell(text, Failed(text), events=events, err=True)
+        sys.exit(1)
     if events:
         emit(TRAIN, Report(str(options.out)))
 
 
-def _end(text: str, code: int, *, events: bool) -> NoReturn:
-    """End the command with an error."""
+def tell(text: str, event: Event, *, events: bool, err: bool = False) -> None:
+    """Print an event for the program that started the command, or text for a terminal."""
     if events:
-        emit(TRAIN, Failed(text))
+        emit(TRAIN, event)
     else:
-        echo(text, err=True)
-    sys.exit(code)
+        echo(text, err=err)
 
 
 def train_in_pool(options: TrainOptions, count: Callable[[int], None]) -> Path:

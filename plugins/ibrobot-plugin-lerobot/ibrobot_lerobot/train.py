@@ -10,7 +10,7 @@ import click
 
 from ibrobot_core.app import Failed, declared, echo, emit, wrong_input
 from ibrobot_lerobot import TRAIN
-from ibrobot_lerobot.several import train_several
+from ibrobot_lerobot.several import tell, train_several
 from ibrobot_lerobot.trainer import INTERRUPTED, progress, run_training, saving_step
 from ibrobot_lerobot.training import Begin, Phase, Progress, Report, TrainOptions
 from ibrobot_lerobot.training_checkpoints import TrainingCheckpoint
@@ -42,10 +42,7 @@ def train(options: TrainOptions, events: bool) -> None:
         _tell_end(newest, first, interrupted=code == INTERRUPTED, events=events)
         sys.exit(code or 1)
     trained = options.out / "checkpoints" / "last" / newest.policy.name
-    if events:
-        emit(TRAIN, Report(str(trained)))
-    else:
-        echo(f"trained: {trained}")
+    tell(f"trained: {trained}", Report(str(trained)), events=events)
 
 
 def _tell_end(newest: TrainingCheckpoint | None, first: int, *, interrupted: bool, events: bool) -> None:
@@ -55,10 +52,7 @@ def _tell_end(newest: TrainingCheckpoint | None, first: int, *, interrupted: boo
         text += f"; nothing is kept, since the first checkpoint would have been written at step {first}"
     else:
         text += f"; kept: {newest.folder} (step {newest.step}); the same command continues from there"
-    if events:
-        emit(TRAIN, Failed(text.replace("the same command", "the same training")))
-    else:
-        echo(text, err=True)
+    tell(text, Failed(text.replace("the same command", "the same training")), events=events, err=True)
 
 
 def _report(output: Iterable[str], begun: int, steps: int) -> None:
@@ -76,8 +70,7 @@ def _report(output: Iterable[str], begun: int, steps: int) -> None:
             continue
         reports += 1
         step, loss, rate = found
-        seconds = round(time.monotonic() - begin, 1)
-        left_s = None
+        seconds, left_s = round(time.monotonic() - begin, 1), None
         if first is None:
             first = step, seconds
         elif step > first[0]:
