@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping
 from typing import Any, override
@@ -224,14 +223,10 @@ class Ros2Control(Hardware):
             return None  # late: if no other comes, this is silence
         if not -_EARLIEST_NS <= age_ns <= _OLDEST_NS:
             self._fault = (
-                f"{self._options.states}: its stamps are {_seconds(age_ns)} off this machine's clock; if its clock is "
-                "another one, set stamp: receive"
+                f"{self._options.states}: its stamps are {age_ns / NS_PER_S:.3g} s off this machine's clock; if its "
+                "clock is another one, set stamp: receive"
             )
             return None
         if self._last is not None and message.header.stamp_ns <= self._last.stamp_ns:
             return None
         return min(message.header.stamp_ns, now_ns)
-
-
-def _seconds(duration_ns: int) -> str:
-    return f"{math.copysign(abs(duration_ns) / NS_PER_S, duration_ns):.3g} s"

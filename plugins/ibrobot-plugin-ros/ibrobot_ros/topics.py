@@ -16,7 +16,7 @@ from ibrobot_ros.wire import Frame, Wire
 
 CLOCK = "/clock"
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
-_CLOCK_CDR = struct.Struct("<4xiI")
+_CLOCK_CDR = struct.Struct("<4siI")
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 GLOBAL = ("/tf", "/tf_static", CLOCK)
 """Topics that have the same name in every namespace."""
@@ -179,6 +179,5 @@ class Topics:
         if CLOCK not in self._declared:
             self._declared[CLOCK] = _CLOCK_TYPE
             frames.append(({"op": "publisher", "topic": CLOCK, "type": _CLOCK_TYPE, "qos": "sensor_data"}, b""))
-        text = bytearray(_CLOCK_CDR.pack(*divmod(now_ns, NS_PER_S)))
-        text[:4] = _LITTLE_ENDIAN
-        return [*frames, ({"op": "message", "topic": CLOCK}, bytes(text))]
+        text = _CLOCK_CDR.pack(_LITTLE_ENDIAN, *divmod(now_ns, NS_PER_S))
+        return [*frames, ({"op": "message", "topic": CLOCK}, text)]

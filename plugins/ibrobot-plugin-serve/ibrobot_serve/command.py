@@ -9,7 +9,8 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ from ibrobot_serve.fleet import LARGEST_CANARY
 from ibrobot_serve.metrics import probes
 from ibrobot_serve.service import InferenceService, ServiceOptions
 
+_LOG = logging.getLogger("ibrobot")
 _PLAIN_PERIOD_S = 10.0
 _PANEL_PERIOD_S = 0.5
 _PORTS = {"openpi": 8000, "gr00t": 5555}
@@ -143,7 +145,7 @@ def serve(what: str, **options: Any) -> None:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
-    logging.getLogger("ibrobot").setLevel(logging.INFO)
+    _LOG.setLevel(logging.INFO)
     if options["protocol"] in _PORTS:
         _serve_clients(what, registry, options)
         return
@@ -151,53 +153,53 @@ def serve(what: str, **options: Any) -> None:
         name, policy, make_transport = (
             _from_folder(Path(what), registry, options) if options["type_"] else _from_config(what, registry, options)
         )
-    transport: Transport | None = None
     hung = threading.Event()
-    try:
-        begun_s = time.monotonic()
-        policy.load()
-        logging.getLogger("ibrobot").info("%s loaded in %.1f s", name, time.monotonic() - begun_s)
-        stopping = threading.Event()  # from here on; before, either signal ends the process at once
-        on_signals(stopping.set)
-        transport = make_transport()
-        limits = ServiceOptions(
-            options["batch"], options["queue"], options["patience"] / 1000, options["hang_timeout"],
-            canary=options["canary"],
-        )  # fmt: skip
+    with _loaded(policy, name) as stopping, ExitStack() as ending:
 
         def replace() -> None:
             hung.set()
             stopping.set()
 
+        ending.callback(lambda: _start_again() if hung.is_set() else None)  # closing the policy could hang as well
+        transport = make_transport()
+        ending.callback(transport.close)
+        limits = ServiceOptions(
+            options["batch"], options["queue"], options["patience"] / 1000, options["hang_timeout"],
+            canary=options["canary"],
+        )  # fmt: skip
         service = InferenceService(policy, transport, name, limits, policy.picture_codec(), replace)
-        metrics = None
-        try:
+        with ExitStack() as answering:
+            answering.callback(service.close)
             service.start()
             some = f" for {limits.canary:.0%} of the robots" if limits.canary else ""
-            logging.getLogger("ibrobot").info("server %s of %s%s", service.id, name, some)
+            _LOG.info("server %s of %s%s", service.id, name, some)
             if options["metrics_port"] is not None:
-                metrics = ProbeServer(options["metrics_port"], probes(service))
-                logging.getLogger("ibrobot").info("metrics on %s", metrics.url)
+                metrics = answering.enter_context(closing(ProbeServer(options["metrics_port"], probes(service))))
+                _LOG.info("metrics on %s", metrics.url)
             echo(f"serving {name} (policy {policy.fingerprint()}); Ctrl-C ends")
             _show(service, stopping)
             if not hung.is_set() and not service.drain(options["drain"]):
-                logging.getLogger("ibrobot").warning("pending requests were not answered in time")
-        finally:
-            service.close()
-            if metrics is not None:
-                metrics.close()
+                _LOG.warning("pending requests were not answered in time")
         echo(_line(service.statistics()))
+
+
+@contextmanager
+def _loaded(policy: Policy, name: str) -> Iterator[threading.Event]:
+    """A context with a loaded policy; a signal sets the event."""
+    try:
+        begun_s = time.monotonic()
+        policy.load()
+        _LOG.info("%s loaded in %.1f s", name, time.monotonic() - begun_s)
+        stopping = threading.Event()  # from here on; before, either signal ends the process at once
+        on_signals(stopping.set)
+        yield stopping
     finally:
-        if transport is not None:
-            transport.close()
-        if hung.is_set():  # closing the policy could hang as well
-            _start_again()
         policy.close()
 
 
 def _start_again() -> None:
     """Replace this process by one with the same command line: nothing else ends a hanging thread."""
-    logging.getLogger("ibrobot").error("the server restarts, with the same command line")
+    _LOG.error("the server restarts, with the same command line")
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
@@ -274,10 +276,7 @@ def _serve_clients(what: str, registry: Registry, options: dict[str, Any]) -> No
             path = find_config(what, registry)
             config = load_config(path, overrides=options["overrides"], sim=options["sim"], registry=registry)
             name, policy = _of_config(config, path, registry, options)
-    try:
-        policy.load()
-        stopping = threading.Event()
-        on_signals(stopping.set)
+    with _loaded(policy, name) as stopping:
         with wrong_input():
             try:
                 model = ClientModel(policy, name, protocol)
@@ -285,15 +284,11 @@ def _serve_clients(what: str, registry: Registry, options: dict[str, Any]) -> No
                 server: OpenpiServer | Gr00tServer = kind(model, host, port, key)
             except OSError as error:
                 raise click.UsageError(f"--listen: {host}:{port} cannot be used: {error.strerror}") from None
-        try:
+        with closing(server):
             scheme = "ws" if protocol == "openpi" else "tcp"
             echo(f"serving {name} to clients of {protocol} on {scheme}://{host}:{server.port}; Ctrl-C ends")
             stopping.wait()
-        finally:
-            server.close()
         echo(f"{model.answered} answered, {model.failed} failed")
-    finally:
-        policy.close()
 
 
 def _host_and_port(listen: Sequence[str], key: str | None, usual: int = 8000) -> tuple[str, int]:

@@ -41,17 +41,6 @@ _LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_ms
 """Types of large messages; smaller ones may overtake them."""
 
 
-class _Group:
-    """A group of declarations."""
-
-    def __init__(self, *declared: Declared) -> None:
-        self._declared = declared
-
-    def undeclare(self) -> None:
-        for each in self._declared:
-            each.undeclare()
-
-
 class _Publisher:
     """A published topic. If latched, its newest message is also sent to later subscribers, and after connecting."""
 
@@ -106,12 +95,12 @@ class _Publisher:
         token = self._transport.node(session).publisher_token(
             self._transport.next_number(), self._topic, self.type_name, hashed=hashed, latched=self.latched
         )
-        alive = session.liveliness().declare_token(token)
+        self._token = session.liveliness().declare_token(token)
         with self._lock:
             self._publisher = publisher
             if self._newest is not None:
                 self._put(publisher, self._newest)
-        return _Group(alive, publisher)
+        return publisher
 
 
 class RosTransport(TopicTransport):
