@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
 
 from ibrobot_core.api import (
     DecoderDescriptor,
@@ -17,63 +17,27 @@ from ibrobot_core.api import (
 from ibrobot_core.app import Command
 from ibrobot_mujoco.check import check_world
 from ibrobot_mujoco.experts import EXPERTS
-from ibrobot_mujoco.gl import check_asked, choose
+from ibrobot_mujoco.gl import choose, from_module
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions, picture_size
 from ibrobot_mujoco.scenes import SCENES
 
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import (
-        CompressedImage,
-        Context,
-        Hardware,
-        Image,
-        Robot,
-        SceneObject,
-        Sensor,
-        Viewer,
-    )
-
-
-def _hardware(options: Any, ctx: Context) -> Hardware:
-    check_asked()
-    from ibrobot_mujoco.hardware import MujocoHardware
-
-    return MujocoHardware(options, ctx)
-
-
-def _scene(options: Any, robot: Robot) -> Sequence[SceneObject]:
-    check_asked()
-    from ibrobot_mujoco.scene_objects import scene_objects
-
-    return scene_objects(options, robot)
-
-
-def _camera(options: Any, ctx: Context) -> Sensor:
-    check_asked()
-    from ibrobot_mujoco.camera import MujocoCamera
-
-    return MujocoCamera(options, ctx)
+    from ibrobot_core.api import CompressedImage, Image
 
 
 def _can_render() -> None:
     choose()
 
 
-def _viewer(options: Any, ctx: Context) -> Viewer:
-    check_asked()
-    from ibrobot_mujoco.viewer import MujocoViewer
-
-    return MujocoViewer(ctx)
-
-
 @hookimpl
 def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     """Physics."""
     yield HardwareDescriptor(
-        type="mujoco", options=MujocoOptions, make=_hardware, default=True, simulated=True,
-        sensors={"camera": "mujoco"}, check_options=check_world, scene=_scene,
+        type="mujoco", options=MujocoOptions, make=from_module("hardware", "MujocoHardware"), default=True,
+        simulated=True, sensors={"camera": "mujoco"}, check_options=check_world,
+        scene=from_module("scene_objects", "scene_objects"),
         film={"type": "mujoco", "camera": "front", "width": 320, "height": 240, "fps": 10},
         summary="the robot's MJCF in MuJoCo, with the objects of a scene",
     )  # fmt: skip
@@ -89,8 +53,8 @@ def ibrobot_scenes() -> Iterable[SceneDescriptor]:
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Cameras in the simulated scene."""
     yield SensorDescriptor(
-        type="mujoco", kind="camera", options=CameraOptions, make=_camera, check=_can_render, picture=picture_size,
-        summary="a camera in the simulated scene",
+        type="mujoco", kind="camera", options=CameraOptions, make=from_module("camera", "MujocoCamera"),
+        check=_can_render, picture=picture_size, summary="a camera in the simulated scene",
     )  # fmt: skip
 
 
@@ -128,5 +92,9 @@ def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
 def ibrobot_viewers() -> Iterable[ViewerDescriptor]:
     """A window on a desktop."""
     yield ViewerDescriptor(
-        type="mujoco", make=_viewer, default=True, flag="--window", summary="a desktop window on the simulated scene"
+        type="mujoco",
+        make=from_module("viewer", "MujocoViewer"),
+        default=True,
+        flag="--window",
+        summary="a desktop window on the simulated scene",
     )

@@ -5,7 +5,10 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from collections.abc import Callable
 from functools import cache
+from importlib import import_module
+from typing import Any
 
 from ibrobot_core.api import MissingDependency
 
@@ -97,3 +100,17 @@ def choose() -> str:
         missing = "no OpenGL that renders without a display, neither EGL with a driver nor OSMesa"
         raise MissingDependency(missing, apt=PACKAGES)
     return found[0]
+
+
+def from_module(module: str, name: str) -> Callable[..., Any]:
+    """A function or class of a module of this package that imports MuJoCo, which the first call does.
+
+    Raises:
+        MissingDependency: when it is called, if `MUJOCO_GL` names a backend that would break the import.
+    """
+
+    def made(*arguments: Any) -> Any:
+        check_asked()
+        return getattr(import_module(f"ibrobot_mujoco.{module}"), name)(*arguments)
+
+    return made

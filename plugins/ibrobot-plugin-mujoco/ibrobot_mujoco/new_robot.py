@@ -7,30 +7,17 @@ from pathlib import Path
 import click
 
 from ibrobot_core.api import HardwareError
-from ibrobot_core.app import (
-    echo,
-    install_command,
-    installed_plugins,
-    load_config,
-    official_plugins,
-    wrong_input,
-)
+from ibrobot_core.app import echo, install_command, installed_plugins, load_config, official_plugins, wrong_input
 from ibrobot_mujoco.mjcf_model import complete_model
 from ibrobot_mujoco.urdf_model import RobotModel, make_model
+
+_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.command("new")
 @click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
-@click.option(
-    "--urdf",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="URDF or xacro file of the arm.",
-)
-@click.option(
-    "--mjcf",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Instead of a URDF: an MJCF of the arm, whose drives stay.",
-)
+@click.option("--urdf", type=_FILE, help="URDF or xacro file of the arm.")
+@click.option("--mjcf", type=_FILE, help="Instead of a URDF: an MJCF of the arm, whose drives stay.")
 @click.option("--lerobot", metavar="ROBOT", help="Instead of a URDF: a robot of LeRobot's, e.g. koch_follower.")
 @click.option(
     "--tip", metavar="LINK", help="Link, body or site whose frame is the tool's.  [default: found by its name]"

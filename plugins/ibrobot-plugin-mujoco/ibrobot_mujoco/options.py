@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import attrs
 
 from ibrobot_core.api import SceneConfig, documented, option
 from ibrobot_mujoco.scenes import scene
-
-if TYPE_CHECKING:
-    pass
 
 Vec3 = tuple[float, float, float]
 

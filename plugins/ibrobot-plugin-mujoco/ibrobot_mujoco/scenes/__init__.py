@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 from ibrobot_core.api import SceneConfig, SceneDescriptor
-from ibrobot_mujoco.gl import check_asked
+from ibrobot_mujoco.gl import from_module
 from ibrobot_mujoco.scenes.options import (
     DrawerOptions,
     HandoverOptions,
@@ -18,21 +17,10 @@ from ibrobot_mujoco.scenes.options import (
     StackOptions,
 )
 
-if TYPE_CHECKING:
-    from ibrobot_core.api import Robot, Scene
-
-
-def _maker(module: str, name: str) -> Callable[[Any, Robot], Scene[Any, Any]]:
-    def make(options: Any, robot: Robot) -> Scene[Any, Any]:
-        check_asked()
-        made: Scene[Any, Any] = getattr(import_module(f"{__name__}.{module}"), name)(options, robot)
-        return made
-
-    return make
-
 
 def _descriptor(type_: str, name: str, options: type[Any], summary: str, module: str = "") -> SceneDescriptor:
-    return SceneDescriptor(type=type_, options=options, summary=summary, make=_maker(module or type_, name))
+    make = from_module(f"scenes.{module or type_}", name)
+    return SceneDescriptor(type=type_, options=options, summary=summary, make=make)
 
 
 SCENES: Mapping[str, SceneDescriptor] = {
