@@ -12,29 +12,18 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import IbrobotError, PlanningError, seconds
-from ibrobot_core.app import RESET, SET_MODE, TOGGLE_SMOOTHING, RunView, error_text, raise_thread_priority
-from ibrobot_core.app import Reset as ResetRun
-from ibrobot_core.app import SetMode as EnterMode
-from ibrobot_web.messages import (
-    BeginEpisode,
-    Cancel,
-    DiscardEpisode,
-    EndEpisode,
-    Finish,
-    GoTo,
-    Intervene,
-    Jog,
-    Motion,
-    Preview,
-    RedoEpisode,
-    Release,
+from ibrobot_core.app import (
+    RESET,
+    SET_MODE,
+    TOGGLE_SMOOTHING,
     Reset,
-    RunCommand,
-    Sent,
+    RunView,
     SetMode,
-    SetSmoothing,
-    clock_ns,
+    error_text,
+    raise_thread_priority,
 )
+from ibrobot_web import messages
+from ibrobot_web.messages import RunCommand, Sent, clock_ns
 from ibrobot_web.run_services import (
     CANCEL,
     DISCARD_EPISODE,
@@ -45,8 +34,7 @@ from ibrobot_web.run_services import (
     START_EPISODE,
     STOP_EPISODE,
 )
-from ibrobot_web.teleop import JOG, RELEASE, Released
-from ibrobot_web.teleop import Jog as JogRequest
+from ibrobot_web.teleop import JOG, RELEASE, Jog, Released
 
 Reply = Callable[[Mapping[str, Any]], None]
 Handler = Callable[[RunView, Any], Any]
@@ -54,12 +42,12 @@ _LATE_MS = 200
 """Age from which on messages of the deadman are refused [ms]."""
 _AHEAD_MS = 5
 """How far a page's estimate of the time may be ahead [ms]."""
-_ALWAYS = Finish | Reset | Preview
+_ALWAYS = messages.Finish | messages.Reset | messages.Preview
 """Commands that may be older than an emergency stop: a reset says which stops it clears, the others move nothing."""
 _STOPPED = "an emergency stop came after this command was sent, so it is not carried out; reset, then send it again"
 _PREVIEW_ROWS = 40
 _NS_PER_MS = 1_000_000
-_MOTION = tuple(attrs.fields_dict(Motion))
+_MOTION = tuple(attrs.fields_dict(messages.Motion))
 _log = logging.getLogger("ibrobot.web")
 
 
@@ -99,7 +87,7 @@ class Commands:
 
     def take(self, sent: Sent[RunCommand]) -> None:
         """Carry out a command, now or as soon as its turn comes."""
-        if isinstance(sent.command, Jog | Release):  # which only leave a note for the teleop
+        if isinstance(sent.command, messages.Jog | messages.Release):  # which only leave a note for the teleop
             self._carry_out(sent)
         else:
             self._others.put(sent)
@@ -143,7 +131,7 @@ class Commands:
             self._reply({"reply": sent.number, **reply})
 
     def _is_older_than_a_stop(self, sent: Sent[RunCommand]) -> bool:
-        if isinstance(sent.command, Jog | Release | _ALWAYS):
+        if isinstance(sent.command, messages.Jog | messages.Release | _ALWAYS):
             return False
         return sent.stops is None or sent.stops < self._session.stops
 
@@ -161,7 +149,7 @@ class Commands:
             return {"error": error_text(error)}
 
     def _execute(self, sent: Sent[RunCommand]) -> Any:
-        if isinstance(sent.command, Finish):
+        if isinstance(sent.command, messages.Finish):
             return self._finish()
         return _HANDLERS[type(sent.command)](self._session, sent)
 
@@ -176,7 +164,7 @@ def _waiting[T](waiting: queue.SimpleQueue[T]) -> list[T]:
             return found
 
 
-def _jog(session: RunView, sent: Sent[Jog]) -> None:
+def _jog(session: RunView, sent: Sent[messages.Jog]) -> None:
     if not session.bus.serves(JOG):
         raise IbrobotError("this mode does not jog from the page: enter a mode whose teleop is of type web")
     jog, now_ms = sent.command, clock_ns() / _NS_PER_MS
@@ -185,10 +173,10 @@ def _jog(session: RunView, sent: Sent[Jog]) -> None:
     if now_ms - jog.at > _LATE_MS:
         raise IbrobotError(f"the connection is too slow to jog: {(now_ms - jog.at) / 1e3:.1f} s")
     made_ns, began_ns = _run_times(session, jog.at, jog.press)
-    session.bus.call(JOG, JogRequest(made_ns, began_ns, **{name: getattr(jog, name) for name in _MOTION}))
+    session.bus.call(JOG, Jog(made_ns, began_ns, **{name: getattr(jog, name) for name in _MOTION}))
 
 
-def _release(session: RunView, sent: Sent[Release]) -> None:
+def _release(session: RunView, sent: Sent[messages.Release]) -> None:
     if session.bus.serves(RELEASE):
         at = sent.command.at
         session.bus.call(RELEASE, Released(None if at is None else _run_times(session, at)[0]))
@@ -200,10 +188,10 @@ def _run_times(session: RunView, *times_ms: int) -> list[int]:
     return [now_ns - max(0, page_ns - time_ms * _NS_PER_MS) for time_ms in times_ms]
 
 
-def _reset(session: RunView, sent: Sent[Reset]) -> Any:
+def _reset(session: RunView, sent: Sent[messages.Reset]) -> Any:
     if sent.stops is None:
         raise IbrobotError("this page has seen no state of the robot yet")
-    return session.bus.call(RESET, ResetRun(sent.stops))
+    return session.bus.call(RESET, Reset(sent.stops))
 
 
 def _joints_of(session: RunView, pose: str) -> dict[str, float]:
@@ -216,7 +204,7 @@ def _joints_of(session: RunView, pose: str) -> dict[str, float]:
     return {joint: values[joint] for each in executors if each.goals == "trajectory" for joint in each.joints}
 
 
-def _preview(session: RunView, sent: Sent[Preview]) -> Mapping[str, Any]:
+def _preview(session: RunView, sent: Sent[messages.Preview]) -> Mapping[str, Any]:
     """The path to a goal, planned and not executed: joints by index, and rows of positions [rad]."""
     goal = sent.command.goal
     joints = goal.joints if goal.pose is None else _joints_of(session, goal.pose)
@@ -234,21 +222,21 @@ def _preview(session: RunView, sent: Sent[Preview]) -> Mapping[str, Any]:
 
 
 _HANDLERS: Mapping[type[RunCommand], Handler] = {
-    Jog: _jog,
-    Release: _release,
-    Reset: _reset,
-    SetMode: lambda session, sent: session.bus.call(SET_MODE, EnterMode(sent.command.mode)),
-    BeginEpisode: lambda session, sent: session.bus.call(
+    messages.Jog: _jog,
+    messages.Release: _release,
+    messages.Reset: _reset,
+    messages.SetMode: lambda session, sent: session.bus.call(SET_MODE, SetMode(sent.command.mode)),
+    messages.BeginEpisode: lambda session, sent: session.bus.call(
         START_EPISODE, {"prompt": sent.command.prompt or None, "wait": True}
     ),
-    EndEpisode: lambda session, sent: session.bus.call(STOP_EPISODE, sent.command.outcome),
-    DiscardEpisode: lambda session, sent: session.bus.call(DISCARD_EPISODE),
-    RedoEpisode: lambda session, sent: session.bus.call(REDO_EPISODE),
-    SetSmoothing: lambda session, sent: session.bus.call(TOGGLE_SMOOTHING, sent.command.enabled),
-    Intervene: lambda session, sent: session.bus.call(INTERVENE, sent.command.take),
-    Preview: _preview,
-    GoTo: lambda session, sent: session.bus.call(GO_TO, sent.command.goal),
-    Cancel: lambda session, sent: session.bus.call(CANCEL),
+    messages.EndEpisode: lambda session, sent: session.bus.call(STOP_EPISODE, sent.command.outcome),
+    messages.DiscardEpisode: lambda session, sent: session.bus.call(DISCARD_EPISODE),
+    messages.RedoEpisode: lambda session, sent: session.bus.call(REDO_EPISODE),
+    messages.SetSmoothing: lambda session, sent: session.bus.call(TOGGLE_SMOOTHING, sent.command.enabled),
+    messages.Intervene: lambda session, sent: session.bus.call(INTERVENE, sent.command.take),
+    messages.Preview: _preview,
+    messages.GoTo: lambda session, sent: session.bus.call(GO_TO, sent.command.goal),
+    messages.Cancel: lambda session, sent: session.bus.call(CANCEL),
 }
 
 

@@ -16,22 +16,18 @@ import mujoco
 import numpy as np
 from ibrobot_kinematics.meshes import cluster
 from ibrobot_kinematics.rotations import from_quaternion, from_rpy, quaternion
+from ibrobot_kinematics.urdf import read_urdf
 from numpy.typing import NDArray
 
-from ibrobot_core.app import ModelError, read_xml
+from ibrobot_core.app import ModelError
 
 _GRID_M = 0.0035
 """Grid on which the vertices of meshes are merged, for robots of up to 1 m; larger ones have a larger one."""
 _SHOWN_GROUPS = 3
 """MuJoCo's viewers show geoms of the groups 0 to 2; files have collision shapes in group 3."""
 _SHAPES = {
-    int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
-    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid",
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
-    int(mujoco.mjtGeom.mjGEOM_BOX): "box",
-    int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name.upper()}")): name
+    for name in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 }
 _JOINTS = {int(mujoco.mjtJoint.mjJNT_HINGE): "hinge", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
 _FIELD_DEG = 45.0
@@ -105,21 +101,10 @@ def _mounted(model: Any, description: Mapping[str, Any]) -> Iterator[dict[str, A
 
 def _root_link(urdf: str | None) -> str | None:
     """The first link of a URDF that no joint carries: the base frame."""
-    if urdf is None:
-        return None
     try:
-        elements = read_xml(Path(urdf)).children
+        return read_urdf(Path(urdf)).root if urdf is not None else None
     except ModelError:
         return None
-    links = [each.attributes.get("name") for each in elements if each.tag == "link"]
-    children = {
-        inner.attributes.get("link")
-        for each in elements
-        if each.tag == "joint"
-        for inner in each.children
-        if inner.tag == "child"
-    }
-    return next((link for link in links if link not in children), None)
 
 
 def _compiled(description: Mapping[str, Any]) -> Any:

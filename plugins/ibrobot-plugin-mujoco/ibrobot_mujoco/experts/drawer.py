@@ -9,7 +9,6 @@ from ibrobot_kinematics import UnreachableError
 
 from ibrobot_core.api import Vector
 from ibrobot_mujoco.experts.task import Task
-from ibrobot_mujoco.experts.trajectory import Segment
 from ibrobot_mujoco.experts.way import GRASP_TURN_RAD, HOVER_TURN_RAD, SETTLE_S, UP, Way, down, is_at
 
 _OPENED_M = 0.095
@@ -23,8 +22,8 @@ class DrawerTask(Task):
     """For scene `drawer`."""
 
     @override
-    def plan(self, start: Vector, scene: Vector, home: Vector) -> list[Segment]:
-        way, opening = Way(start, self.limits), float(scene[5])
+    def plan(self, way: Way, scene: Vector, home: Vector) -> None:
+        opening = float(scene[5])
         if opening < _ENOUGH_M:
             along = float(np.arctan2(scene[4], scene[3])) + np.pi / 2
             try:
@@ -32,7 +31,6 @@ class DrawerTask(Task):
             except UnreachableError:
                 self._pull(way, scene, along + np.pi)
         way.to("return", home, clear=True, expects=lambda state, seen: bool(seen[5] >= _ENOUGH_M))
-        return way.segments
 
     def _pull(self, way: Way, scene: Vector, heading: float) -> None:
         hand, options, handle, opening = self.hand, self.options, scene[:3], float(scene[5])

@@ -91,7 +91,7 @@ class ScriptedExpert(Policy):
             hands = tuple(self._hand(side) for side in self._kind.sides)
         except KinematicsError as error:
             raise PolicyError(f"{self._name} cannot be loaded: {error}") from error
-        self._task = self._kind(hands, self._options, self._limits)
+        self._task = self._kind(hands, self._options)
 
     def _hand(self, side: str) -> Hand:
         robot = self._robot
@@ -157,11 +157,12 @@ class ScriptedExpert(Policy):
     def _extended(self, kept: list[Segment], scene: Vector, home: Vector) -> tuple[Trajectory, int]:
         """The trajectory of `kept` followed by a new plan, and the plan's first segment."""
         assert self._task is not None
+        way = Way(kept[-1].end, self._limits, list(kept))
         try:
-            plan = self._task.plan(kept[-1].end, scene, home)
+            self._task.plan(way, scene, home)
         except UnreachableError as error:
             raise PolicyError(f"{self._name} cannot plan its task: {error}") from error
-        return Trajectory([*kept, *plan]), len(kept)
+        return Trajectory(way.segments), len(kept)
 
     @staticmethod
     def _failed(episode: _Episode, now_s: float, state: Vector, scene: Vector) -> bool:

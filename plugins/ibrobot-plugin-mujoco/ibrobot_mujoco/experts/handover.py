@@ -8,7 +8,6 @@ import numpy as np
 
 from ibrobot_core.api import Vector
 from ibrobot_mujoco.experts.task import Task
-from ibrobot_mujoco.experts.trajectory import Segment
 from ibrobot_mujoco.experts.way import (
     GRASP_TURN_RAD,
     HOVER_TURN_RAD,
@@ -39,11 +38,9 @@ class HandoverTask(Task):
     sides: ClassVar[tuple[str, ...]] = ("left_", "right_")
 
     @override
-    def plan(self, start: Vector, scene: Vector, home: Vector) -> list[Segment]:
-        way = Way(start, self.limits)
-        held = is_held(0, self.hands[0], _HELD_M)(start, scene) and scene[2] > _LIFTED_M
+    def plan(self, way: Way, scene: Vector, home: Vector) -> None:
+        held = is_held(0, self.hands[0], _HELD_M)(way.at, scene) and scene[2] > _LIFTED_M
         (self._take if held else self._present)(way, scene)
-        return way.segments
 
     def _present(self, way: Way, scene: Vector) -> None:
         """The left arm holds the bar where the right one can reach it, and waits for another plan."""

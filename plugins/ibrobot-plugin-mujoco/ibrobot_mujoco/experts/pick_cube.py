@@ -8,7 +8,7 @@ import numpy as np
 
 from ibrobot_core.api import Vector
 from ibrobot_mujoco.experts.task import Task
-from ibrobot_mujoco.experts.trajectory import Expectation, Segment
+from ibrobot_mujoco.experts.trajectory import Expectation
 from ibrobot_mujoco.experts.way import (
     GRASP_TURN_RAD,
     HOVER_TURN_RAD,
@@ -29,11 +29,9 @@ class PickTask(Task):
     """For scene `pick_cube`; the base of the experts that put cubes into bins."""
 
     @override
-    def plan(self, start: Vector, scene: Vector, home: Vector) -> list[Segment]:
-        way = Way(start, self.limits)
+    def plan(self, way: Way, scene: Vector, home: Vector) -> None:
         self.deliver(way, 0, scene[:7], scene[7:10])
         way.to("return", home, clear=True, expects=is_delivered(0, scene[7:10]))
-        return way.segments
 
     def deliver(self, way: Way, first: int, cube: Vector, spot: Vector) -> None:
         """Put the cube whose pose begins at index `first` of the ground truth into a bin, at `spot`, shape (3,)."""

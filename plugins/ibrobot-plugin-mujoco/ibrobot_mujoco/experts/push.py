@@ -9,7 +9,6 @@ from ibrobot_kinematics import UnreachableError
 
 from ibrobot_core.api import Vector
 from ibrobot_mujoco.experts.task import Task
-from ibrobot_mujoco.experts.trajectory import Segment
 from ibrobot_mujoco.experts.way import GRASP_TURN_RAD, HOVER_TURN_RAD, UP, Way, down, is_at
 
 CLOSED_RAD = -0.17
@@ -32,8 +31,8 @@ class PushTask(Task):
     """For scene `push`."""
 
     @override
-    def plan(self, start: Vector, scene: Vector, home: Vector) -> list[Segment]:
-        way, block, goal = Way(start, self.limits), scene[:3], scene[7:10]
+    def plan(self, way: Way, scene: Vector, home: Vector) -> None:
+        block, goal = scene[:3], scene[7:10]
         if np.hypot(*(block - goal)[:2]) > _NEAR_M:
             reasons = []
             for face in _FACES:
@@ -46,7 +45,6 @@ class PushTask(Task):
                 raise reasons[0]
         near = lambda state, scene: bool(np.hypot(*(scene[:3] - goal)[:2]) <= 1.5 * _NEAR_M)  # noqa: E731
         way.to("return", home, clear=True, expects=near)
-        return way.segments
 
     def _push(self, way: Way, face: tuple[float, float, float], block: Vector, goal: Vector, half: float) -> None:
         hand, (turn, ahead, shift) = self.hand, face
@@ -66,14 +64,9 @@ class PushTask(Task):
         for done in np.linspace(0.0, distance, max(2, round(distance / _STEP_M) + 1))[1:]:
             at = hand.reach(behind + done * forward, tool, at, CLOSED_RAD, GRASP_TURN_RAD)
             line.append(at)
-        away = hand.reach(behind + (distance - _APPROACH_M) * forward, tool, at, CLOSED_RAD, GRASP_TURN_RAD)
-        up = hand.reach(
-            behind + (distance - _APPROACH_M) * forward + self.options.hover_height * UP,
-            tool,
-            away,
-            CLOSED_RAD,
-            HOVER_TURN_RAD,
-        )
+        back = behind + (distance - _APPROACH_M) * forward
+        away = hand.reach(back, tool, at, CLOSED_RAD, GRASP_TURN_RAD)
+        up = hand.reach(back + self.options.hover_height * UP, tool, away, CLOSED_RAD, HOVER_TURN_RAD)
         way.to("hover", above, clear=True, expects=is_at(0, block))
         way.to("descend", here, expects=is_at(0, block))
         for joints in line:

@@ -8,7 +8,6 @@ import numpy as np
 
 from ibrobot_core.api import Vector
 from ibrobot_mujoco.experts.pick_cube import PickTask, is_delivered
-from ibrobot_mujoco.experts.trajectory import Segment
 from ibrobot_mujoco.experts.way import Way
 
 _SPOTS = 0.026 * np.array([(-1, -1, 0), (1, 1, 0), (-1, 1, 0), (1, -1, 0)])
@@ -21,13 +20,11 @@ class SortTask(PickTask):
     """For scene `sort`."""
 
     @override
-    def plan(self, start: Vector, scene: Vector, home: Vector) -> list[Segment]:
-        way = Way(start, self.limits)
+    def plan(self, way: Way, scene: Vector, home: Vector) -> None:
         cubes = (len(scene) - _BINS) // 8  # a pose and the number of a bin for each
         numbers, centres = scene[7 * cubes : 8 * cubes], scene[8 * cubes :].reshape(2, 3)
         arrived = [is_delivered(7 * cube, centres[int(number)]) for cube, number in enumerate(numbers)]
         for cube, number in enumerate(numbers):
-            if not arrived[cube](start, scene):
+            if not arrived[cube](way.at, scene):
                 self.deliver(way, 7 * cube, scene[7 * cube : 7 * cube + 7], centres[int(number)] + _SPOTS[cube])
         way.to("return", home, clear=True, expects=lambda state, scene: all(each(state, scene) for each in arrived))
-        return way.segments

@@ -8,7 +8,6 @@ import numpy as np
 
 from ibrobot_core.api import Vector
 from ibrobot_mujoco.experts.task import Task
-from ibrobot_mujoco.experts.trajectory import Segment
 from ibrobot_mujoco.experts.way import (
     GRASP_TURN_RAD,
     HOVER_TURN_RAD,
@@ -33,13 +32,13 @@ class StackTask(Task):
     """For scene `stack`."""
 
     @override
-    def plan(self, start: Vector, scene: Vector, home: Vector) -> list[Segment]:
-        hand, options, way = self.hand, self.options, Way(start, self.limits)
+    def plan(self, way: Way, scene: Vector, home: Vector) -> None:
+        hand, options = self.hand, self.options
         opened, closed = options.gripper_open, options.gripper_closed
         cube, base = scene[:7], scene[7:14]
         tool = down(across(cube, hand.inward(cube)))
         lift = options.hover_height * UP
-        hover = hand.reach(cube[:3] + lift, tool, start, opened, HOVER_TURN_RAD)
+        hover = hand.reach(cube[:3] + lift, tool, way.at, opened, HOVER_TURN_RAD)
         grasp = hand.reach(cube[:3], tool, hover, opened, GRASP_TURN_RAD)
         size = 2 * cube[2]
         goal = np.array([*base[:2], 2 * base[2] + size / 2])
@@ -57,4 +56,3 @@ class StackTask(Task):
         way.to("loosen", loose)
         way.to("rise", hand.grip(above, opened), clear=True)
         way.to("return", home, clear=True, expects=is_at(0, goal))
-        return way.segments

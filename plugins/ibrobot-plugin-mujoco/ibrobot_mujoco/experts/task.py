@@ -9,8 +9,7 @@ import attrs
 
 from ibrobot_core.api import Vector
 from ibrobot_mujoco.experts.options import ExpertOptions
-from ibrobot_mujoco.experts.trajectory import Limits, Segment
-from ibrobot_mujoco.experts.way import Hand
+from ibrobot_mujoco.experts.way import Hand, Way
 
 
 @attrs.frozen(eq=False)
@@ -19,7 +18,6 @@ class Task(ABC):
 
     hands: tuple[Hand, ...]
     options: ExpertOptions
-    limits: Limits
 
     sides: ClassVar[tuple[str, ...]] = ("",)
     """Prefixes of the joint groups of the hands."""
@@ -30,8 +28,8 @@ class Task(ABC):
         return self.hands[0]
 
     @abstractmethod
-    def plan(self, start: Vector, scene: Vector, home: Vector) -> list[Segment]:
-        """Plan the task. Returns segments from `start` to `home`, both shape (J,) [rad].
+    def plan(self, way: Way, scene: Vector, home: Vector) -> None:
+        """Plan the task: extend a way to `home`, shape (J,) [rad].
 
         Raises:
             UnreachableError: if an object is out of reach.

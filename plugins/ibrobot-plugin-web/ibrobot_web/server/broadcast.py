@@ -101,10 +101,6 @@ class Broadcast:
                 while any(page.behind for page in self.pages):
                     await asyncio.sleep(_DRAIN_S)
 
-    def forget(self) -> None:
-        """Forget the newest frames, e.g. when a run has ended."""
-        self._newest.clear()
-
     @property
     def wanted(self) -> frozenset[int] | None:
         """Channels that any page shows; None for all."""
