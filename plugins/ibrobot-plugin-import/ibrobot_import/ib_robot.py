@@ -94,7 +94,6 @@ class _Robot:
     node: Node
     body: so101.Body
     executors: dict[str, tuple[str, str, str, int]] = attrs.field(factory=dict)
-    models: dict[str, Any] = attrs.field(factory=dict)
     devices: dict[str, Any] = attrs.field(factory=dict)
 
 
@@ -141,8 +140,7 @@ def _sections(part: _Robot) -> dict[str, Any]:
     _only_driven(modes, contract)
     streams = [name for name, (type_, *_) in part.executors.items() if type_ == "position"]
     modes |= so101.added_modes(streams, list(modes))
-    for name, reason in _SECTIONS.items():
-        robot[name].refuse(reason)
+    robot.refuse_all(_SECTIONS)
     for recording in (robot["recording"], robot["contract"]["recording"]):
         recording.refuse("`ibrobot record` records, and takes --root and --dataset; all topics of the contract")
     return {
@@ -232,16 +230,17 @@ def _hardware_section(part: _Robot) -> dict[str, Any]:
     node, body = part.node["ros2_control"], part.body
     arms = len(body.prefixes)
     port, calibration = node["port"].text(), node["calib_file"].text()
-    for key, reason in {
-        "urdf_path": "the model is that of the package so101-nexus",
-        "controllers_config": "executors are in this file",
-        "controllers": "each mode has its executors",
-        "joint_names": "servos have the names of their joints",
-        "velocity_joints": "there is no mobile base here",
-        "base_vel_max_rad": "there is no mobile base here",
-        "xacro_mappings": "the model is that of the package so101-nexus",
-    }.items():
-        node[key].refuse(reason)
+    node.refuse_all(
+        {
+            "urdf_path": "the model is that of the package so101-nexus",
+            "controllers_config": "executors are in this file",
+            "controllers": "each mode has its executors",
+            "joint_names": "servos have the names of their joints",
+            "velocity_joints": "there is no mobile base here",
+            "base_vel_max_rad": "there is no mobile base here",
+            "xacro_mappings": "the model is that of the package so101-nexus",
+        }
+    )
     rest: list[From | None] = [None] * (arms - 1)
     if arms > 1 and calibration is not None:
         node["calib_file"].drop("has the servos of two buses; each arm has its own calibration here")
@@ -266,8 +265,7 @@ def _peripherals(part: _Robot) -> dict[str, dict[str, Any]]:
         values |= {key: node[key].whole() for key in ("width", "height")} | {"fps": node["fps"].number()}
         optical = node["optical_frame_id"].text()
         values |= {"frame_id": optical, "transform": _transform(node, part.body)}
-        for key, reason in _CAMERA.items():
-            node[key].refuse(reason)
+        node.refuse_all(_CAMERA)
         values["sim"] = so101.simulated(str(values["name"].value), part.body)
         found[str(name.value)] = values
     return found
@@ -363,9 +361,9 @@ def _control_modes(part: _Robot) -> dict[str, Any]:
         titled = node.origin
         if isinstance(comment.value, str):
             titled += f"; {comment.taken(comment.value, 'is a comment').value}"
-        for reasons, place in ((_MODE, node), (_EXECUTOR, node["executor"]), (_INFERENCE, node["inference"])):
-            for key, reason in reasons.items():
-                place[key].refuse(reason)
+        node.refuse_all(_MODE)
+        node["executor"].refuse_all(_EXECUTOR)
+        node["inference"].refuse_all(_INFERENCE)
         modes[plain_name(name)] = Titled(values, titled, node.line)
     return modes
 
@@ -472,7 +470,6 @@ def _teleoperation(part: _Robot) -> dict[str, Any]:
             }
         else:
             values |= {"scale": device["phone_config"]["linear_scale"].number()}
-        for key, reason in _DEVICE[kind].items():
-            device[key].refuse(reason)
+        device.refuse_all(_DEVICE[kind])
         part.devices[plain_name(str(name.value))] = device.titles(values)
     return part.devices

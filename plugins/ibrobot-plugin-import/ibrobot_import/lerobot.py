@@ -177,9 +177,7 @@ def _cameras(nodes: list[Node]) -> dict[str, Any]:
                     "serial": camera["serial_number_or_name"].text(),
                 }
             values |= {key: camera[key].whole() for key in ("width", "height")} | {"fps": camera["fps"].number()}
-            for key, reason in _CAMERA.items():
-                if key not in values:
-                    camera[key].refuse(reason)
+            camera.refuse_all(_CAMERA)
             values["sim"] = so101.simulated(plain, so101.DOUBLE if prefix in so101.DOUBLE.prefixes else so101.SINGLE)
             found[plain] = values
     return found
@@ -223,9 +221,8 @@ def _record(root: Node, sections: dict[str, Any]) -> None:
     default = contract.pop("rate_hz")
     times = {"rate_hz": dataset["fps"].number() or default, "max_duration_s": dataset["episode_time_s"].number()}
     sections["contract"] = times | contract
-    for place, reasons in ((dataset, _DATASET), (root, _RECORD)):
-        for key, reason in reasons.items():
-            place[key].refuse(reason)
+    dataset.refuse_all(_DATASET)
+    root.refuse_all(_RECORD)
     dataset.refuse("an option of LeRobot's writer; `ibrobot convert` has its own")
     policy = root["policy"]
     path = policy["path"] if policy["path"].value is not None else policy["pretrained_path"]

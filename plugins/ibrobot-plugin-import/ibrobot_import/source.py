@@ -189,6 +189,11 @@ class Node:
         """Note that it, or all below it without a verdict, has no counterpart."""
         self.source.mark(self.key, Fate.REFUSED, reason, keeps=True)
 
+    def refuse_all(self, reasons: Mapping[str, str]) -> None:
+        """Note that values below it have no counterpart: key -> why."""
+        for key, reason in reasons.items():
+            self[key].refuse(reason)
+
     def drop(self, reason: str) -> None:
         """Note that it and all below it have no counterpart, whatever was taken of it before."""
         self.source.mark(self.key, Fate.REFUSED, reason)

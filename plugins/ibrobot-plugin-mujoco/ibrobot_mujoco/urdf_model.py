@@ -170,12 +170,8 @@ def _convert(source: Path, target: Path) -> None:
 
 def _links_with_joints(root: Element) -> dict[str, Element]:
     """Child link -> its joint."""
-    found = {}
-    for joint in root.findall("joint"):
-        child = joint.find("child")
-        if child is not None:
-            found[child.get("link", "")] = joint
-    return found
+    joints = ((joint.find("child"), joint) for joint in root.findall("joint"))
+    return {child.get("link", ""): joint for child, joint in joints if child is not None}
 
 
 def _load(root: Element, folder: Path) -> mujoco.MjSpec:

@@ -39,14 +39,13 @@ def modes_json(config: RobotConfig, registry: Registry, *, terminal: bool) -> li
     ]
 
 
-def devices_of(mode: ControlMode) -> dict[str, str]:
-    """Joint group -> the teleoperation device that moves it in a mode, also one that takes the robot from a policy."""
-    return {**mode.devices, **(mode.inference.devices if mode.inference is not None else {})}
-
-
 def page_devices(config: RobotConfig, mode: ControlMode) -> dict[str, str]:
-    """Joint group -> the page's own device that moves it in a mode; empty group: all joints."""
-    return {group: name for group, name in devices_of(mode).items() if config.teleoperation[name].type == _PAGE}
+    """Joint group -> the page's own device that moves it in a mode, also one that takes the robot from a policy.
+
+    An empty group stands for all joints.
+    """
+    devices = {**mode.devices, **(mode.inference.devices if mode.inference is not None else {})}
+    return {group: name for group, name in devices.items() if config.teleoperation[name].type == _PAGE}
 
 
 def _jogs(config: RobotConfig, mode: ControlMode) -> dict[str, list[str]]:

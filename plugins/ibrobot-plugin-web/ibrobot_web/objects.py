@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ibrobot_core.api import Float64MultiArray, HardwareDescriptor, IbrobotError, Pose, SceneObject, Vector
+from ibrobot_core.api import Float64MultiArray, HardwareDescriptor, IbrobotError, SceneObject, Vector
 from ibrobot_core.app import Registry, RobotConfig, RunView, Subscription
 from ibrobot_web.run_services import SHAPES
 
@@ -62,9 +62,11 @@ class SceneObjects:
 
 def place_of(thing: SceneObject) -> dict[str, Any]:
     """An object where it is at the beginning."""
-    pos, quat = _pose(thing.pose)
-    size = _half(thing.shape, thing.size)
-    return {"name": thing.name, "type": thing.shape, "size": size, "pos": pos, "quat": quat}
+    at, turn = thing.pose.position, thing.pose.orientation
+    return {
+        "name": thing.name, "type": thing.shape, "size": _half(thing.shape, thing.size), "pos": [at.x, at.y, at.z],
+        "quat": [turn.w, turn.x, turn.y, turn.z],
+    }  # fmt: skip
 
 
 def _half(kind: str, size: Sequence[float]) -> list[float]:
@@ -76,11 +78,6 @@ def _half(kind: str, size: Sequence[float]) -> list[float]:
             return [round(float(size[0]), 4)] * 3
         case _:
             return [round(float(size[0]), 4), round(float(size[1]) / 2, 4), 0.0]
-
-
-def _pose(pose: Pose) -> tuple[list[float], list[float]]:
-    at, turn = pose.position, pose.orientation
-    return [at.x, at.y, at.z], [turn.w, turn.x, turn.y, turn.z]
 
 
 def simulated_objects(config: RobotConfig, registry: Registry) -> list[SceneObject]:

@@ -205,7 +205,8 @@ class WebViewer(Viewer):
                 continue
             match message:
                 case Pages():
-                    self._set_pages(message)
+                    self._wanted, self.pages = message.wanted, message.count
+                    self._due = {}
                 case StopRun(number):
                     self._commands.stop(number)
                 case Sent():
@@ -214,10 +215,6 @@ class WebViewer(Viewer):
     def _fail(self, error: Exception) -> None:
         """End the run, whose page can no longer stop the robot."""
         self._dead = f"the page can no longer stop the robot: {error_text(error)}"
-
-    def _set_pages(self, pages: Pages) -> None:
-        self._wanted, self.pages = pages.wanted, pages.count
-        self._due = {}
 
     def _shows(self, channel: int) -> bool:
         return self.pages > 0 and (self._wanted is None or channel in self._wanted)

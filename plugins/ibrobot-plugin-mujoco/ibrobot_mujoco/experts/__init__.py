@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import PolicyDescriptor
-from ibrobot_mujoco.experts.options import ExpertOptions, SortExpertOptions, check_one_arm, check_two_arms
+from ibrobot_mujoco.experts.options import ExpertOptions, SortExpertOptions, check_arm, check_arms
 from ibrobot_mujoco.gl import check_asked
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def _expert(
         type=name,
         options=options,
         make=make,
-        check_options=check_two_arms if scene == "handover" else check_one_arm,
+        check_options=check_arms if scene == "handover" else check_arm,
         summary=f"{summary}, by inverse kinematics and the scene's ground truth",
     )
 

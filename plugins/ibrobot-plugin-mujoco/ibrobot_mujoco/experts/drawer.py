@@ -14,8 +14,6 @@ from ibrobot_mujoco.experts.way import GRASP_TURN_RAD, HOVER_TURN_RAD, SETTLE_S,
 _OPENED_M = 0.095
 """Opening to pull to: beyond the one that counts [m]."""
 _ENOUGH_M = 0.085
-_STEP_M = 0.02
-"""Distance between waypoints of the pull [m]."""
 
 
 class DrawerTask(Task):
@@ -38,16 +36,12 @@ class DrawerTask(Task):
         pull = np.array([scene[3], scene[4], 0.0])
         hover = hand.reach(handle + options.hover_height * UP, tool, way.at, opened, HOVER_TURN_RAD)
         grasp = hand.reach(handle, tool, hover, opened, GRASP_TURN_RAD)
-        at, line = grasp, []
-        distance = _OPENED_M - opening
-        for done in np.linspace(0.0, distance, max(2, round(distance / _STEP_M) + 1))[1:]:
-            at = hand.reach(handle + done * pull, tool, at, closed, GRASP_TURN_RAD)
-            line.append(at)
-        above = handle + distance * pull + options.hover_height * UP
-        up = hand.reach(above, tool, at, opened, HOVER_TURN_RAD)
+        motion = (_OPENED_M - opening) * pull
+        line = hand.line(grasp, handle, tool, motion, closed)
+        up = hand.reach(handle + motion + options.hover_height * UP, tool, line[-1], opened, HOVER_TURN_RAD)
         way.grasp(hand, hover, grasp, closed, is_at(0, handle))
         for joints in line:
             way.to("pull", joints)
-        way.to("open", hand.grip(at, opened))
+        way.to("open", hand.grip(line[-1], opened))
         way.rest("open", SETTLE_S)
         way.to("rise", up, clear=True)

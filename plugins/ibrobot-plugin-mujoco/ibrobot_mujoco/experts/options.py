@@ -36,19 +36,18 @@ class SortExpertOptions(ExpertOptions):
     gripper_open: float = option(0.4, unit="rad", help="position of the open gripper")
 
 
-def check_one_arm(options: ExpertOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+def check_arm(
+    options: ExpertOptions, robot: Robot, joints: tuple[str, ...], name: str = "gripper"
+) -> Iterator[OptionFault]:
     """Check that the robot has a gripper with one joint."""
-    gripper = robot.groups.get("gripper", ())
+    gripper = robot.groups.get(name, ())
     if len(gripper) != 1:
-        yield OptionFault((), f"the scripted expert needs one joint in robot.groups.gripper, got {list(gripper)}")
+        yield OptionFault((), f"the scripted expert needs one joint in robot.groups.{name}, got {list(gripper)}")
 
 
-def check_two_arms(options: ExpertOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+def check_arms(options: ExpertOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
     """Check that the robot has two arms, each with a gripper with one joint."""
-    for name in ("left_gripper", "right_gripper"):
-        gripper = robot.groups.get(name, ())
-        if len(gripper) != 1:
-            yield OptionFault((), f"the scripted expert needs one joint in robot.groups.{name}, got {list(gripper)}")
     for name in ("left", "right"):
+        yield from check_arm(options, robot, joints, f"{name}_gripper")
         if name not in robot.groups:
             yield OptionFault((), f"the scripted expert needs robot.groups.{name}, the joints of that arm")

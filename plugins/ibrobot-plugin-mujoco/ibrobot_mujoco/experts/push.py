@@ -16,8 +16,6 @@ _HEIGHT_M = 0.016
 """Height of the tip while it pushes; the jaws end 9 mm below [m]."""
 _APPROACH_M = 0.02
 """Distance between gripper and block when the gripper comes down [m]."""
-_STEP_M = 0.02
-"""Distance between waypoints of a straight line [m]."""
 _NEAR_M = 0.008
 """A block this near to the goal is left alone [m]."""
 _MIDDLE_M = 0.0145
@@ -60,12 +58,9 @@ class PushTask(Task):
         here = hand.reach(behind, tool, above, CLOSED_RAD, GRASP_TURN_RAD)
         contact = ground - (half + ahead) * forward
         distance = float(np.dot(contact + length * forward - behind, forward))
-        line, at = [], here
-        for done in np.linspace(0.0, distance, max(2, round(distance / _STEP_M) + 1))[1:]:
-            at = hand.reach(behind + done * forward, tool, at, CLOSED_RAD, GRASP_TURN_RAD)
-            line.append(at)
+        line = hand.line(here, behind, tool, distance * forward, CLOSED_RAD)
         back = behind + (distance - _APPROACH_M) * forward
-        away = hand.reach(back, tool, at, CLOSED_RAD, GRASP_TURN_RAD)
+        away = hand.reach(back, tool, line[-1], CLOSED_RAD, GRASP_TURN_RAD)
         up = hand.reach(back + self.options.hover_height * UP, tool, away, CLOSED_RAD, HOVER_TURN_RAD)
         way.to("hover", above, clear=True, expects=is_at(0, block))
         way.to("descend", here, expects=is_at(0, block))

@@ -21,6 +21,8 @@ MOVED_M = 0.01
 """An object further than this from its planned position has moved [m]."""
 LOST_M = 0.03
 """An object further than this from the tip is not held [m]."""
+_STEP_M = 0.02
+"""Distance between waypoints of a straight line [m]."""
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -51,6 +53,18 @@ class Hand:
         result = start.copy()
         result[self.columns] = solve(self.arm, target, start[self.columns], rotation_tolerance=turn)
         return self.grip(result, gripper)
+
+    def line(self, start: Vector, position: Vector, rotation: Vector, motion: Vector, gripper: float) -> list[Vector]:
+        """Joints along a straight line of the tip from `position` by `motion` [m], a waypoint at least every 2 cm.
+
+        Raises:
+            UnreachableError: if a part of it is out of reach.
+        """
+        found = [start]
+        steps = max(1, round(float(np.linalg.norm(motion)) / _STEP_M))
+        for done in np.linspace(0.0, 1.0, steps + 1)[1:]:
+            found.append(self.reach(position + done * motion, rotation, found[-1], gripper, GRASP_TURN_RAD))
+        return found[1:]
 
     def grip(self, joints: Vector, gripper: float) -> Vector:
         """Return the joints with another position of the gripper."""
