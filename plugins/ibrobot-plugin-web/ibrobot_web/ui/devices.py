@@ -13,7 +13,6 @@ from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import (
     Child,
     ComponentFailed,
-    GuideDescriptor,
     Question,
     install_command,
     installed_plugins,
@@ -37,6 +36,7 @@ class Work:
     title: str
     number: int
     child: Child = attrs.field(repr=False)
+    thread: threading.Thread = attrs.field(init=False, repr=False)
     items: list[dict[str, Any]] = attrs.field(factory=list)
     """What was shown: texts, tables and pictures."""
     pictures: list[bytes] = attrs.field(factory=list, repr=False)
@@ -48,90 +48,50 @@ class Work:
 
 
 class Devices:
-    """Runs guides."""
+    """The guide that runs, or has run last."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
-        self._starting = threading.Lock()
+        self.starting = threading.Lock()
         self.work: Work | None = None
-        self._thread: threading.Thread | None = None
-        self._count = 0
 
-    def start(self, guide: GuideDescriptor, answers: Mapping[str, str | bool]) -> int:
-        """Start a guide.
-
-        Raises:
-            IbrobotError: if another one runs.
-        """
-        with self._starting:
-            if self.work is not None and self.work.state == "running":
-                raise IbrobotError(f"{self.work.title} is running: end it first")
-            if self._thread is not None:
-                self._thread.join()
-            self._count += 1
-            child = Child(_MODULE, {"name": guide.name, "answers": dict(answers)})
-            self.work = Work(guide.name, guide.title, self._count, child)
-            self._thread = threading.Thread(target=self._follow, args=(self.work,), name="guide", daemon=True)
-            self._thread.start()
-            return self._count
-
-    def answer(self, number: int, ask: int, ok: bool) -> None:
-        """Answer the present question, or say that what was asked for is done.
-
-        Raises:
-            IbrobotError: if it was answered already.
-        """
-        with self.lock:
-            work = self._present(number)
-            if work.ask is None or work.ask["ask"] != ask:
-                raise IbrobotError("this question was answered already")
-            said = ("yes" if ok else "no") if work.ask["kind"] == "confirm" else "done"
-            work.items.append({"kind": "answered", "text": work.ask["text"], "answer": said, **_table(work.ask)})
-            work.ask = None
-            work.child.channel.send({"reply": ask, "ok": ok})
-
-    def cancel(self, number: int) -> None:
-        """End the guide where it waits for the operator; kill it if it does not end.
+    def running(self, number: int) -> Work:
+        """The guide with this number.
 
         Raises:
             IbrobotError: if it does not run.
         """
-        with self.lock:
-            work = self._present(number)
-            work.cancelled = True
+        if self.work is None or self.work.number != number or self.work.state != "running":
+            raise IbrobotError("this guide does not run")
+        return self.work
 
     def close(self) -> None:
         """End the guide."""
         if self.work is not None:
             self.work.cancelled = True
-        if self._thread is not None:
-            self._thread.join()
+            self.work.thread.join()
 
-    def _present(self, number: int) -> Work:
-        if self.work is None or self.work.number != number or self.work.state != "running":
-            raise IbrobotError("this guide does not run")
-        return self.work
 
-    def _follow(self, work: Work) -> None:
-        """Take the messages of a guide until it ends."""
-        child = work.child
-        done = False
-        while not work.cancelled and not done and child.failure is None:
-            try:
-                message = child.wait(_POLL_S)
-            except ComponentFailed:
-                break
-            if message is not None:
-                done = message["event"] == "done"
-                with self.lock:
-                    _take(work, message)
-        child.channel.close()
-        error = "" if done else "cancelled; nothing more is done" if work.cancelled else child.cause(_END_S)
-        child.end(_END_S)
-        with self.lock:
-            work.error = error
-            work.state = "done" if done else "failed"
-            work.ask = None
+def _follow(lock: threading.Lock, work: Work) -> None:
+    """Take the messages of a guide until it ends; kill it if it was cancelled and does not end by itself."""
+    child = work.child
+    done = False
+    while not work.cancelled and not done and child.failure is None:
+        try:
+            message = child.wait(_POLL_S)
+        except ComponentFailed:
+            break
+        if message is not None:
+            done = message["event"] == "done"
+            with lock:
+                _take(work, message)
+    child.channel.close()
+    error = "" if done else "cancelled; nothing more is done" if work.cancelled else child.cause(_END_S)
+    child.end(_END_S)
+    with lock:
+        work.error = error
+        work.state = "done" if done else "failed"
+        work.ask = None
 
 
 def _take(work: Work, message: Mapping[str, Any]) -> None:
@@ -174,7 +134,17 @@ def start(ui: Ui, name: str, answers: Mapping[str, str | bool] = option(factory=
     if guide is None:
         raise IbrobotError(f"no guide {name!r}")
     given = {each.name: _answer(each, answers) for each in guide.questions()}
-    return {"number": ui.keep(Devices).start(guide, given)}
+    devices = ui.keep(Devices)
+    with devices.starting:
+        before = devices.work
+        if before is not None and before.state == "running":
+            raise IbrobotError(f"{before.title} is running: end it first")
+        number = before.number + 1 if before is not None else 1
+        work = Work(guide.name, guide.title, number, Child(_MODULE, {"name": guide.name, "answers": given}))
+        work.thread = threading.Thread(target=_follow, args=(devices.lock, work), name="guide", daemon=True)
+        work.thread.start()
+        devices.work = work
+    return {"number": number}
 
 
 def _answer(question: Question, given: Mapping[str, Any]) -> str | bool:
@@ -214,12 +184,22 @@ def picture(ui: Ui, picture: int = option(ge=0), n: int = 0) -> Picture:
 
 def answer(ui: Ui, number: int, ask: int, ok: bool = True) -> None:
     """Answer what the guide asks: yes or no; yes for what is done."""
-    ui.keep(Devices).answer(number, ask, ok)
+    devices = ui.keep(Devices)
+    with devices.lock:
+        work = devices.running(number)
+        if work.ask is None or work.ask["ask"] != ask:
+            raise IbrobotError("this question was answered already")
+        said = ("yes" if ok else "no") if work.ask["kind"] == "confirm" else "done"
+        work.items.append({"kind": "answered", "text": work.ask["text"], "answer": said, **_table(work.ask)})
+        work.ask = None
+        work.child.channel.send({"reply": ask, "ok": ok})
 
 
 def cancel(ui: Ui, number: int) -> None:
-    """End the guide."""
-    ui.keep(Devices).cancel(number)
+    """End the guide where it waits for the operator; kill it if it does not end."""
+    devices = ui.keep(Devices)
+    with devices.lock:
+        devices.running(number).cancelled = True
 
 
 ROUTES: Routes = {

@@ -102,9 +102,8 @@ class Jobs:
         """Called after every change, in any thread."""
 
     def start(
-        self, kind: str, title: str, arguments: Sequence[str], *, facts: Mapping[str, Any] | None = None,
-        read: Reader | None = None, program: Sequence[str] = IBROBOT, done_codes: tuple[int, ...] = (0,),
-        asks: bool = False,
+        self, kind: str, title: str, arguments: Sequence[str], *, read: Reader | None = None,
+        program: Sequence[str] = IBROBOT, done_codes: tuple[int, ...] = (0,), asks: bool = False,
     ) -> Job:  # fmt: skip
         """Start a job.
 
@@ -112,7 +111,6 @@ class Jobs:
             kind: what the views look for.
             title: its name on the page.
             arguments: of the program, e.g. `["convert", …]`.
-            facts: what is known about it at the start.
             read: reads facts from each line of its output.
             program: the program; the command `ibrobot` by default.
             done_codes: exit codes of a job that did what it was started for.
@@ -134,7 +132,7 @@ class Jobs:
                 raise IbrobotError(f"{program[0]} cannot be started: {error.strerror}") from None
             name = "ibrobot" if tuple(program) == IBROBOT else Path(program[0]).name
             number = max(self._jobs, default=0) + 1
-            job = Job(number, kind, title, (name, *arguments), process, done_codes, dict(facts or {}))
+            job = Job(number, kind, title, (name, *arguments), process, done_codes)
             self._jobs[number] = job
             self._forget()
             thread = threading.Thread(target=self._follow, args=(job, read), name=f"job {number}", daemon=True)
