@@ -129,6 +129,11 @@ def called_by_name() -> Iterator[tuple[str, str]]:
             constants = dict(_constants(tree))
             for node in ast.walk(tree):
                 match node:
+                    case ast.Call(
+                        func=ast.Attribute(attr="call" | "serves" | "ask"),
+                        args=[ast.Attribute(value=ast.Name(id="run_services"), attr=constant), *_],
+                    ):
+                        yield getattr(run_services, constant), path.name
                     case ast.Call(func=ast.Attribute(attr="call" | "serves" | "ask"), args=[name, *_]):
                         found = constants.get(name.id) if isinstance(name, ast.Name) else getattr(name, "value", None)
                         if isinstance(found, str) and found.startswith("/"):

@@ -22,18 +22,8 @@ from ibrobot_core.app import (
     error_text,
     raise_thread_priority,
 )
-from ibrobot_web import messages
+from ibrobot_web import messages, run_services
 from ibrobot_web.messages import RunCommand, Sent, clock_ns
-from ibrobot_web.run_services import (
-    CANCEL,
-    DISCARD_EPISODE,
-    GO_TO,
-    INTERVENE,
-    PLAN,
-    REDO_EPISODE,
-    START_EPISODE,
-    STOP_EPISODE,
-)
 from ibrobot_web.teleop import JOG, RELEASE, Jog, Released
 
 Reply = Callable[[Mapping[str, Any]], None]
@@ -209,7 +199,7 @@ def _preview(session: RunView, sent: Sent[messages.Preview]) -> Mapping[str, Any
     goal = sent.command.goal
     joints = goal.joints if goal.pose is None else _joints_of(session, goal.pose)
     target = {"xyz": list(goal.xyz)} if goal.xyz is not None else {"joints": dict(joints or {})}
-    answer = session.bus.call(PLAN, {"goals": [target]})
+    answer = session.bus.call(run_services.PLAN, {"goals": [target]})
     if answer.trajectory is None:
         raise PlanningError(answer.message)
     points = answer.trajectory.points
@@ -227,16 +217,16 @@ _HANDLERS: Mapping[type[RunCommand], Handler] = {
     messages.Reset: _reset,
     messages.SetMode: lambda session, sent: session.bus.call(SET_MODE, SetMode(sent.command.mode)),
     messages.BeginEpisode: lambda session, sent: session.bus.call(
-        START_EPISODE, {"prompt": sent.command.prompt or None, "wait": True}
+        run_services.START_EPISODE, {"prompt": sent.command.prompt or None, "wait": True}
     ),
-    messages.EndEpisode: lambda session, sent: session.bus.call(STOP_EPISODE, sent.command.outcome),
-    messages.DiscardEpisode: lambda session, sent: session.bus.call(DISCARD_EPISODE),
-    messages.RedoEpisode: lambda session, sent: session.bus.call(REDO_EPISODE),
+    messages.EndEpisode: lambda session, sent: session.bus.call(run_services.STOP_EPISODE, sent.command.outcome),
+    messages.DiscardEpisode: lambda session, sent: session.bus.call(run_services.DISCARD_EPISODE),
+    messages.RedoEpisode: lambda session, sent: session.bus.call(run_services.REDO_EPISODE),
     messages.SetSmoothing: lambda session, sent: session.bus.call(TOGGLE_SMOOTHING, sent.command.enabled),
-    messages.Intervene: lambda session, sent: session.bus.call(INTERVENE, sent.command.take),
+    messages.Intervene: lambda session, sent: session.bus.call(run_services.INTERVENE, sent.command.take),
     messages.Preview: _preview,
-    messages.GoTo: lambda session, sent: session.bus.call(GO_TO, sent.command.goal),
-    messages.Cancel: lambda session, sent: session.bus.call(CANCEL),
+    messages.GoTo: lambda session, sent: session.bus.call(run_services.GO_TO, sent.command.goal),
+    messages.Cancel: lambda session, sent: session.bus.call(run_services.CANCEL),
 }
 
 
