@@ -36,7 +36,7 @@ class Draws(TorchFunctionMode):  # type: ignore[misc]  # torch has no types here
     def __init__(self, seeds: Sequence[int], device: torch.device, alone: Sequence[Draw] = ()) -> None:
         super().__init__()
         self.made: list[Draw] = []
-        self._device = device
+        self._generators = [torch, *([getattr(torch, device.type)] if device.type in ("cuda", "mps") else [])]
         self._alone = alone
         self._states = []
         for seed in seeds:
@@ -104,17 +104,8 @@ class Draws(TorchFunctionMode):  # type: ignore[misc]  # torch has no types here
         return result
 
     def _state(self) -> list[torch.Tensor]:
-        match self._device.type:
-            case "cuda":
-                return [torch.get_rng_state(), torch.cuda.get_rng_state(self._device)]
-            case "mps":
-                return [torch.get_rng_state(), torch.mps.get_rng_state()]
-            case _:
-                return [torch.get_rng_state()]
+        return [each.get_rng_state() for each in self._generators]
 
     def _set(self, states: Sequence[torch.Tensor]) -> None:
-        torch.set_rng_state(states[0])
-        if self._device.type == "cuda":
-            torch.cuda.set_rng_state(states[1], self._device)
-        elif self._device.type == "mps":
-            torch.mps.set_rng_state(states[1])
+        for each, state in zip(self._generators, states, strict=True):
+            each.set_rng_state(state)

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from queue import Full, Queue
+from queue import Queue
 from typing import Any
 
 import attrs
@@ -199,40 +199,34 @@ class VideoTrack:
     def abort(self) -> None:
         """Discard the file. Safe after `close`."""
         self._failure = self._failure or DatasetError("given up")
-        while self._thread.is_alive():
-            try:
-                self._queue.put(None, timeout=0.05)
-            except Full:
-                continue
-            self._thread.join(0.05)
+        if self._thread.is_alive():
+            self._queue.put(None)
+            self._thread.join()
 
     def _put(self, frame: Any) -> None:
-        while True:
-            if self._failure is not None:
-                raise self._failed()
-            try:
-                self._queue.put(frame, timeout=0.5)
-            except Full:
-                continue
-            return
+        if self._failure is not None:
+            raise self._failed()
+        self._queue.put(frame)
 
     def _failed(self) -> DatasetError:
         return DatasetError(f"{self._path}: image {self._count} could not be encoded or written: {self._failure}")
 
     def _run(self) -> None:
+        frames = iter(self._queue.get, None)
         try:
             with self._container:
                 with _same_priority():
                     self._stream.codec_context.open()
-                while (frame := self._queue.get()) is not None:
+                for frame in frames:
                     if self._failure is not None:
-                        self._stream.encode(None)  # without a flush, the encoder prints warnings to stderr
-                        return
+                        break
                     self._stats.add(frame.to_ndarray())
                     self._container.mux(self._stream.encode(frame))
-                self._container.mux(self._stream.encode(None))
+                self._container.mux(self._stream.encode(None))  # or the encoder prints warnings to stderr
         except Exception as error:  # noqa: BLE001 - the next `add` raises it
             self._failure = error
+        for _ in frames:  # so that `add` does not wait
+            pass
 
 
 @attrs.frozen

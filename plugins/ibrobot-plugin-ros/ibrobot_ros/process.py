@@ -31,7 +31,6 @@ class Hello:
     """What the node found."""
 
     python: str
-    version: str
     rclpy: str
     distro: str
     rmw: str

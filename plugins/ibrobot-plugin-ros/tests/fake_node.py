@@ -16,7 +16,6 @@ PACKAGE = Path(sys.modules["ibrobot_ros.wire"].__file__ or "").parent
 HELLO = {
     "op": "hello",
     "python": "python",
-    "version": "3.12",
     "rclpy": "rclpy",
     "distro": "jazzy",
     "rmw": "rmw_none",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import DecoderDescriptor, TransportDescriptor, hookimpl
@@ -70,48 +72,24 @@ def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
     yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
 
 
-def _certs() -> click.Command:
-    from ibrobot_zenoh.commands.certs import certs
-
-    return certs
-
-
-def _topic() -> click.Command:
-    from ibrobot_zenoh.commands.topic import topic
-
-    return topic
-
-
-def _service() -> click.Command:
-    from ibrobot_zenoh.commands.service import service
-
-    return service
+_COMMANDS = {
+    "action": "List actions on the network, and send goals to them.",
+    "param": "List, read and set parameters of nodes on the network.",
+    "bag": "Play recorded episodes to machines on the network.",
+    "topic": "List, show, measure and publish topics shared over the network.",
+    "service": "List, show and call services shared over the network.",
+    "certs": "Make certificates for a server and its robots.",
+}
+"""Commands, each in a module of its name."""
 
 
-def _action() -> click.Command:
-    from ibrobot_zenoh.commands.action import action
-
-    return action
-
-
-def _param() -> click.Command:
-    from ibrobot_zenoh.commands.param import param
-
-    return param
-
-
-def _bag() -> click.Command:
-    from ibrobot_zenoh.commands.bag import bag
-
-    return bag
+def _load(name: str) -> click.Command:
+    command: click.Command = getattr(import_module(f"ibrobot_zenoh.commands.{name}"), name)
+    return command
 
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """Commands for topics, services, bags and certificates."""
-    yield Command("action", "List actions on the network, and send goals to them.", _action)
-    yield Command("param", "List, read and set parameters of nodes on the network.", _param)
-    yield Command("bag", "Play recorded episodes to machines on the network.", _bag)
-    yield Command("topic", "List, show, measure and publish topics shared over the network.", _topic)
-    yield Command("service", "List, show and call services shared over the network.", _service)
-    yield Command("certs", "Make certificates for a server and its robots.", _certs)
+    for name, summary in _COMMANDS.items():
+        yield Command(name, summary, partial(_load, name))

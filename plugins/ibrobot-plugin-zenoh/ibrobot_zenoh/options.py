@@ -233,9 +233,8 @@ class ZenohOptions:
 def check_files(options: ZenohOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
     """Check that the files in the options exist."""
     files: dict[tuple[str, ...], Path | None] = {("settings",): options.settings, ("users",): options.users}
-    if (tls := options.tls) is not None:
-        files |= {("tls", "ca"): tls.ca, ("tls", "certificate"): tls.certificate, ("tls", "key"): tls.key}
-        files[("tls", "robots")] = tls.robots
+    if options.tls is not None:
+        files |= {("tls", name): path for name, path in attrs.asdict(options.tls).items()}
     for key, path in files.items():
         if path is not None and not path.is_file():
             yield OptionFault(key, f"no such file: {path}")

@@ -13,7 +13,7 @@ import attrs
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import RunView, Service
-from ibrobot_ros2.offers import with_ns
+from ibrobot_ros2.offers import answered, with_ns
 from ibrobot_ros2.services import plain
 
 _FEEDBACK_S = 0.5
@@ -131,16 +131,8 @@ class Calls:
         thread.start()
 
     def _call(self, goal: _Goal, request: Mapping[str, Any]) -> None:
-        state, name = "succeeded", goal.service.name
-        try:
-            values = plain(self._session.bus.call(name, request))
-            if not values.get("success", True):
-                state = "aborted"
-        except IbrobotError as error:
-            state, values = "aborted", {"success": False, "message": str(error)}
-        except Exception:
-            self._session.log.exception("%s failed", name)
-            state, values = "aborted", {"success": False, "message": "it failed; the robot's log has the cause"}
+        values = answered(self._session, goal.service.name, request)
+        state = "succeeded" if values.get("success", True) else "aborted"
         with self._lock:
             del self._goals[goal.wire, goal.number]
             goal.ended.set()

@@ -76,17 +76,23 @@ class Offers:
 
         Of std_srvs: `success` and `message`, which is the run's own answer.
         """
+        if offer.type not in (TRIGGER, SET_BOOL):
+            return answered(self._session, offer.service, with_ns(request))
         full = {**offer.request, **({offer.field: request["data"]} if offer.field else {})}
-        try:
-            if offer.type not in (TRIGGER, SET_BOOL):
-                answer: dict[str, Any] = plain(self._session.bus.call(offer.service, with_ns(request)))
-                return answer
-            return {"success": True, "message": _text(self._session.bus.call(offer.service, full))}
-        except IbrobotError as error:
-            return {"success": False, "message": str(error)}
-        except Exception:
-            self._session.log.exception("%s failed", offer.service)
-            return {"success": False, "message": "the service failed; the robot's log has the cause"}
+        return answered(self._session, offer.service, full, lambda said: {"success": True, "message": _text(said)})
+
+
+def answered(
+    session: RunView, service: str, request: Mapping[str, Any], shaped: Callable[[Any], dict[str, Any]] = plain
+) -> dict[str, Any]:
+    """The answer of a service of the bus, as `shaped` makes it; its error as `success` and `message`."""
+    try:
+        return shaped(session.bus.call(service, request))
+    except IbrobotError as error:
+        return {"success": False, "message": str(error)}
+    except Exception:
+        session.log.exception("%s failed", service)
+        return {"success": False, "message": "the service failed; the robot's log has the cause"}
 
 
 def time_of(stamp_ns: int) -> dict[str, int]:

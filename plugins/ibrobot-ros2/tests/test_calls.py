@@ -142,7 +142,7 @@ def test_a_cancel_that_the_service_refuses_leaves_the_goal(robot: Robot):
     [
         (Done(False, "discarded"), "discarded"),
         (RecorderError("the disk is full"), "the disk is full"),
-        (ValueError("a bug"), "it failed; the robot's log has the cause"),
+        (ValueError("a bug"), "the service failed; the robot's log has the cause"),
     ],
 )
 def test_errors_and_failures_abort_a_goal(robot: Robot, answer: Done | Exception, message: str):

@@ -61,7 +61,6 @@ def _order(wire: Wire) -> dict[str, Any] | None:
 def _found(rclpy: Any) -> dict[str, Any]:
     return {
         "python": sys.executable,
-        "version": sys.version.split()[0],
         "rclpy": str(rclpy.__file__),
         "distro": os.environ.get("ROS_DISTRO", ""),
         "rmw": rclpy.get_rmw_implementation_identifier(),

@@ -5,9 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, suppress
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import attrs
 import click
@@ -109,13 +107,13 @@ class Player:
 
     def play(self, messages: Iterator[Recorded], start_ns: int) -> None:
         """Publish messages, the first of which may be at `start_ns` [ns]; returns after the last one."""
-        began_ns = self.clock.now_ns()
+        began_ns, clock = self.clock.now_ns(), make_class(_CLOCK_TYPE, standard_types())
         step_ns = None if self.clock_hz is None else max(1, round(NS_PER_S * self.rate / self.clock_hz))
         ticks = 0
         for each in messages:
             while step_ns is not None and start_ns + ticks * step_ns <= each.received_ns:
                 self._wait(began_ns, ticks * step_ns)
-                self.publish(CLOCK, clock_message(start_ns + ticks * step_ns))
+                self.publish(CLOCK, clock(start_ns + ticks * step_ns))
                 ticks += 1
             self._wait(began_ns, each.received_ns - start_ns)
             self._send(self.names[each.topic], each.message)
@@ -132,17 +130,6 @@ class Player:
                 echo(f"{topic} is not played: {error}", err=True)
             return
         self.count += 1
-
-
-@cache
-def _clock_class() -> Any:
-    return make_class(_CLOCK_TYPE, standard_types())
-
-
-def clock_message(stamp_ns: int) -> Message:
-    """The message of /clock for a time [ns]."""
-    message: Message = _clock_class()(stamp_ns)
-    return message
 
 
 def commands(summary: EpisodeSummary) -> dict[str, str]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
 from typing import Any
 
 import attrs
 import numpy as np
 
-from ibrobot_core.api import MESSAGE_TYPES, Message, NotSupported
+from ibrobot_core.api import MESSAGE_TYPES, Message, NotSupported, did_you_mean
 from ibrobot_core.app import dump_yaml, single_options
 
 _SHOWN = 16
@@ -41,7 +40,6 @@ def message_from(type_name: str, text: str) -> Message:
     """
     kind = MESSAGE_TYPES.get(type_name)
     if kind is None:
-        close = get_close_matches(type_name, MESSAGE_TYPES, 1)
-        hint = f"did you mean {close[0]!r}?" if close else f"one of: {', '.join(sorted(MESSAGE_TYPES))}"
-        raise NotSupported(f"{type_name!r} is not a type that can be published, {hint}")
+        hint = did_you_mean(type_name, list(MESSAGE_TYPES), "the types are")
+        raise NotSupported(f"{type_name!r} is not a type that can be published{hint}")
     return single_options(kind, (), "MESSAGE", text=text)
