@@ -23,11 +23,17 @@ _AUTOMATIC = -1
 _TELEOP = {"leader_arm": "so101_leader", "xbox_controller": "gamepad", "phone": "webxr"}
 _SECTIONS = {
     "type": "selects nothing here; robot_type is what datasets have",
-    "gazebo_world_name": "the simulation is MuJoCo, with scenes of plugins",
-    "gazebo_gui": "the simulation is MuJoCo, with scenes of plugins",
+    "gazebo_world_name gazebo_gui": "the simulation is MuJoCo, with scenes of plugins",
     "controller_startup_timeout": "executors are there when the control loop starts",
     "voice_asr": "there is no speech recognition here",
     "navigation": "there is no mobile base here",
+}
+_HARDWARE = {
+    "urdf_path xacro_mappings": "the model is that of the package so101-nexus",
+    "controllers_config": "executors are in this file",
+    "controllers": "each mode has its executors",
+    "joint_names": "servos have the names of their joints",
+    "velocity_joints base_vel_max_rad": "there is no mobile base here",
 }
 _MODE = {
     "description_cn": "modes have no description; `description` is a comment here",
@@ -42,32 +48,22 @@ _EXECUTOR = {
 }
 _INFERENCE = {
     "enabled": "a mode with `inference` runs its model",
-    "model": "a mode without `inference` runs no model",
-    "execution_mode": "a mode without `inference` runs no model",
-    "force_disable": "a mode without `inference` runs no model",
+    "model execution_mode force_disable": "a mode without `inference` runs no model",
     "action_server": "the dispatcher calls the model itself",
-    "publish_attention": "attention is not published",
-    "attention_viz_topic": "attention is not published",
-    "attention_viz": "attention is not published",
+    "publish_attention attention_viz_topic attention_viz": "attention is not published",
 }
 _CAMERA = {
-    "pixel_format": "images are JPEG or raw; datasets have RGB",
-    "format": "images are JPEG or raw; datasets have RGB",
+    "pixel_format format": "images are JPEG or raw; datasets have RGB",
     "enable_pointcloud": "RealSense cameras give colour, or aligned depth",
     "enable_sync": "each stream is aligned by its stamps",
     "align_depth": "depth is always aligned to the colour images",
     "streams": "a further peripheral {type: realsense, stream: depth} gives depth",
-    "saturation": "this setting is not changed here",
-    "contrast": "this setting is not changed here",
-    "sharpness": "this setting is not changed here",
+    "saturation contrast sharpness": "this setting is not changed here",
     "autoexposure": "exposure is automatic unless it is set",
     "auto_white_balance": "white balance is automatic unless it is set",
     "fovy": "with --sim, the scene's model has the field of view",
-    "use_default_transform": "with --sim, the scene's model has the camera",
-    "simulation": "with --sim, the scene's model has the camera",
-    "depth_width": "depth is aligned to the colour images",
-    "depth_height": "depth is aligned to the colour images",
-    "depth_fps": "depth is aligned to the colour images",
+    "use_default_transform simulation": "with --sim, the scene's model has the camera",
+    "depth_width depth_height depth_fps": "depth is aligned to the colour images",
 }
 _DEVICE = {
     "leader_arm": {"control_frequency": "the robot follows at the rate of control"},
@@ -176,8 +172,8 @@ def _robot_section(part: _Robot) -> dict[str, Any]:
             groups[target] = node.changed(own, note)
         else:
             node.refuse("the groups are those of the executors")
-    for key in ("arm_group_name", "base_link", "ee_link", "shoulder_link"):
-        robot["moveit"][key].refuse("planners plan for the executors' groups, with robot.description.tip as the tool")
+    reason = "planners plan for the executors' groups, with robot.description.tip as the tool"
+    robot["moveit"].refuse_all({"arm_group_name base_link ee_link shoulder_link": reason})
     return so101.robot_section(
         body,
         name,
@@ -230,17 +226,7 @@ def _hardware_section(part: _Robot) -> dict[str, Any]:
     node, body = part.node["ros2_control"], part.body
     arms = len(body.prefixes)
     port, calibration = node["port"].text(), node["calib_file"].text()
-    node.refuse_all(
-        {
-            "urdf_path": "the model is that of the package so101-nexus",
-            "controllers_config": "executors are in this file",
-            "controllers": "each mode has its executors",
-            "joint_names": "servos have the names of their joints",
-            "velocity_joints": "there is no mobile base here",
-            "base_vel_max_rad": "there is no mobile base here",
-            "xacro_mappings": "the model is that of the package so101-nexus",
-        }
-    )
+    node.refuse_all(_HARDWARE)
     rest: list[From | None] = [None] * (arms - 1)
     if arms > 1 and calibration is not None:
         node["calib_file"].drop("has the servos of two buses; each arm has its own calibration here")
@@ -434,8 +420,7 @@ def _default_mode(node: Node, modes: Mapping[str, Any]) -> From:
 def _simulation(node: Node) -> dict[str, Any]:
     platform = node["platform"] if node["platform"].value is not None else node["active_platform"]
     type_ = platform.changed("mujoco", "the simulator here") if platform.value is not None else None
-    for key in ("platform", "active_platform", "sim_models_pkg"):
-        node[key].refuse("scenes are plugins here") if key == "sim_models_pkg" else None
+    node["sim_models_pkg"].refuse("scenes are plugins here")
     scene, given = node["scene"], None
     if "scene" in (node.value or {}):
         known = installed_plugins().types("scene")

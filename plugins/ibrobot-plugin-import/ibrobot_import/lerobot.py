@@ -18,11 +18,10 @@ _LEADERS = ("so100_leader", "so101_leader", "so_leader")
 _BI_LEADERS = ("bi_so100_leader", "bi_so101_leader", "bi_so_leader")
 _DEVICES = {"keyboard": "keyboard", "gamepad": "gamepad", "phone": "webxr"}
 _CAMERA = {
-    "color_mode": "datasets have RGB",
+    "color_mode color_format": "datasets have RGB",
     "warmup_s": "a camera is ready when its first image came",
     "backend": "cameras are opened by Video4Linux, streams and files by OpenCV",
     "use_depth": "a further peripheral {type: realsense, stream: depth} gives depth",
-    "color_format": "datasets have RGB",
     "rotation": "this camera is not turned here",
 }
 _DATASET = {
@@ -30,12 +29,9 @@ _DATASET = {
     "single_task": "`ibrobot record --prompt`",
     "num_episodes": "`ibrobot record --episodes`",
     "root": "`ibrobot convert --out`; recordings are bags below recording.root",
-    "push_to_hub": "`hf upload`, after `ibrobot convert`",
-    "private": "`hf upload`, after `ibrobot convert`",
-    "tags": "`hf upload`, after `ibrobot convert`",
+    "push_to_hub private tags": "`hf upload`, after `ibrobot convert`",
     "reset_time_s": "the operator begins each episode",
-    "video": "an option of `ibrobot convert`",
-    "vcodec": "an option of `ibrobot convert`",
+    "video vcodec": "an option of `ibrobot convert`",
 }
 _RECORD = {
     "display_data": "`ibrobot record --web`",

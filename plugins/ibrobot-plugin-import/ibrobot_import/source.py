@@ -190,9 +190,10 @@ class Node:
         self.source.mark(self.key, Fate.REFUSED, reason, keeps=True)
 
     def refuse_all(self, reasons: Mapping[str, str]) -> None:
-        """Note that values below it have no counterpart: key -> why."""
-        for key, reason in reasons.items():
-            self[key].refuse(reason)
+        """Note that values below it have no counterpart: keys, with spaces between them -> why."""
+        for keys, reason in reasons.items():
+            for key in keys.split():
+                self[key].refuse(reason)
 
     def drop(self, reason: str) -> None:
         """Note that it and all below it have no counterpart, whatever was taken of it before."""
