@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from ibrobot_core.api import HardwareError
-from ibrobot_core.app import echo, install_command, installed_plugins, load_config, official_plugins, wrong_input
+from ibrobot_core.app import echo, installed_plugins, load_config, wrong_input
 from ibrobot_mujoco.mjcf_model import complete_model
 from ibrobot_mujoco.urdf_model import RobotModel, make_model
 
@@ -75,13 +75,9 @@ def new(
 
 def _command_of_lerobot() -> click.Command:
     """`ibrobot lerobot new`, of another plugin."""
-    group = installed_plugins().commands.get("lerobot")
-    if group is None:
-        package = next(name for name, offers in official_plugins().items() if "lerobot" in offers.get("command", ()))
-        raise click.UsageError(f"--lerobot needs a plugin: {install_command([package])}")
-    commands = group.load()
-    assert isinstance(commands, click.Group)
-    return commands.commands["new"]
+    group = installed_plugins().command("lerobot").load()
+    assert isinstance(group, click.Group)
+    return group.commands["new"]
 
 
 def robot_yaml(model: RobotModel, source: Path, folder: str) -> str:

@@ -109,13 +109,9 @@ class ScriptedExpert(Policy):
     @override
     def preprocess(self, frame: Frame) -> Tensors:
         tensors: dict[str, NDArray[np.generic]] = {STAMP: np.array([frame.stamp_ns], dtype=np.int64)}
-        for key, shape in self.spec.observations.items():
-            if key not in frame.values:
-                raise PolicyError(f"{self._name} needs {key}, which the frame at {frame.stamp_ns} ns lacks")
-            value = np.asarray(frame.values[key], dtype=np.float64)
-            if value.shape != shape or not np.isfinite(value).all():
-                raise PolicyError(f"{self._name} needs {key} with {shape[0]} finite numbers, got {value.tolist()}")
-            tensors[key] = value
+        known = (key for key in self.spec.observations if key in frame.values)
+        tensors |= {key: np.asarray(frame.values[key], dtype=np.float64) for key in known}
+        self.check(tensors)
         return tensors
 
     @override
@@ -123,8 +119,8 @@ class ScriptedExpert(Policy):
         for name, shape in {STAMP: (1,), **self.spec.observations}.items():
             array = tensors.get(name)
             if array is None or array.shape != shape or not np.isfinite(array).all():
-                got = "nothing" if array is None else f"{array.dtype} {array.shape}"
-                raise PolicyError(f"{self._name} needs {name} with {shape[0]} finite numbers, got {got}")
+                got = "nothing" if array is None else array.tolist()
+                raise PolicyError(f"{self._name} needs {name} with {shape[0]} finite numbers, got {got!s:.200}")
 
     @override
     def infer(self, tensors: Tensors) -> Tensors:

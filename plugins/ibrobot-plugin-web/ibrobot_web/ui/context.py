@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import re
-import threading
+import json
 from collections.abc import Callable, Mapping
 from functools import cache
 from inspect import signature
 from pathlib import Path
-from typing import Any, Protocol, get_type_hints
+from typing import Any, get_type_hints
 
 import attrs
 
 from ibrobot_core.app import RequestError, RequestLimits, Service
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.job_runner import Jobs
-
-
-class Closes(Protocol):
-    """What ends with the server."""
-
-    def close(self) -> None:
-        """End it."""
 
 
 @attrs.frozen(eq=False)
@@ -33,14 +25,10 @@ class Ui:
     run_options: tuple[str, ...] = ()
     """Options of runs that the page launches, so that their pages are reachable from where this page is."""
     _kept: dict[type[Any], Any] = attrs.field(factory=dict, init=False)
-    _lock: threading.Lock = attrs.field(factory=threading.Lock, init=False)
 
-    def keep[T: Closes](self, kind: type[T]) -> T:
-        """The one object of a class that requests share until the server ends, made at the first call."""
-        with self._lock:
-            if kind not in self._kept:
-                self._kept[kind] = kind()
-            found: T = self._kept[kind]
+    def keep[T](self, kind: type[T]) -> T:
+        """The one object of a class that requests share until the server ends, which closes it. Thread-safe."""
+        found: T = self._kept.setdefault(kind, kind())
         return found
 
     def close(self) -> None:
@@ -67,7 +55,6 @@ Bounds and checks of a fact stand in the place of its default, as `option`. It r
 type Routes = dict[str, Handler]
 """Method and path below that of the view, e.g. `GET /list` -> what answers it."""
 _LIMITS = RequestLimits(values=10_000, text=4_500, depth=3)
-_WHOLE = re.compile(r"-?\d{1,18}")
 
 
 @cache
@@ -105,13 +92,7 @@ def read_query(handler: Handler, query: Mapping[str, str]) -> dict[str, Any]:
 
 def _typed(text: str, kind: Any) -> Any:
     """A text of a query as the type of its field; the text itself if it is not one."""
-    if kind is bool:
-        return {"true": True, "false": False}.get(text, text)
-    if kind is int and _WHOLE.fullmatch(text):
-        return int(text)
-    if kind is float:
-        try:
-            return float(text)
-        except ValueError:
-            return text
-    return text
+    try:
+        return json.loads(text) if kind in (bool, int, float) else text
+    except (ValueError, RecursionError):
+        return text
