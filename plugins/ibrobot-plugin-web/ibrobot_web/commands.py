@@ -131,7 +131,8 @@ class Commands:
 
     def _outcome_of(self, execute: Callable[[], Any]) -> dict[str, Any]:
         try:
-            return {"ok": _outcome(execute())}
+            value = execute()
+            return {"ok": value if isinstance(value, str | int | float | bool | Mapping) else None}
         except (IbrobotError, ValueError, TypeError) as error:
             return {"error": str(error) or type(error).__name__}
         except Exception as error:  # noqa: BLE001 - contained: a page must not end the run
@@ -228,7 +229,3 @@ _HANDLERS: Mapping[type[RunCommand], Handler] = {
     messages.GoTo: lambda session, sent: session.bus.call(run_services.GO_TO, sent.command.goal),
     messages.Cancel: lambda session, sent: session.bus.call(run_services.CANCEL),
 }
-
-
-def _outcome(value: Any) -> Any:
-    return value if isinstance(value, str | int | float | bool | Mapping) else None

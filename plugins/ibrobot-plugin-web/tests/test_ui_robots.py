@@ -129,7 +129,7 @@ def test_a_session_is_started_with_the_values_of_its_form(folder: Path) -> None:
     pytest.importorskip("ibrobot_data", reason="needs ibrobot-plugin-data")
 
     async def test(server: UiServer) -> None:
-        form = await server.get("record/form")
+        form = await server.get("jobs/form", command="record")
         assert [field["label"] for field in form["fields"]][:3] == ["Task", "Dataset", "Episodes"]
         for wrong in (0, 1.5, "x"):
             with pytest.raises(RuntimeError, match="Episodes: "):

@@ -13,7 +13,7 @@ from ibrobot_core.api import IbrobotError, option
 from ibrobot_web.pictures import Picture
 from ibrobot_web.ui.context import Routes, Ui
 from ibrobot_web.ui.forms import choices_of, run_command
-from ibrobot_web.ui.recordings import Episodes, existing, find_recordings, playback
+from ibrobot_web.ui.recordings import Episodes, find_recordings, playback
 
 _LONGEST_S = 1e6
 
@@ -77,7 +77,7 @@ def objects(ui: Ui, path: str) -> list[dict[str, Any]]:
 
 def mark(ui: Ui, outcome: str, paths: tuple[str, ...] = option(validator=_some)) -> None:
     """Judge episodes."""
-    run_command(ui, "episodes mark", episodes=existing(ui, paths), outcome=outcome)
+    run_command(ui, "episodes mark", episodes=list(paths), outcome=outcome)
 
 
 def trim(
@@ -91,9 +91,8 @@ def trim(
 
 def delete(ui: Ui, paths: tuple[str, ...] = option(validator=_some)) -> None:
     """Move episodes to the trash."""
-    found = existing(ui, paths)
     ui.keep(Episodes).close()
-    run_command(ui, "episodes delete", episodes=found, to_trash=True)
+    run_command(ui, "episodes delete", episodes=list(paths), to_trash=True)
 
 
 def restore(ui: Ui, path: str, id: str) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import installed_plugins
 from ibrobot_web.ui.context import Routes, Ui
-from ibrobot_web.ui.forms import arguments, form_of, read_form
+from ibrobot_web.ui.forms import arguments, read_form
 from ibrobot_web.ui.jobs import event_reader
 from ibrobot_web.ui.robots import RUN_DONE, read_address, run_arguments
 
@@ -19,11 +19,6 @@ _COMMAND = "record"
 _ROOT = "episodes"
 """Folder of all datasets that are recorded by the page, in the first folder."""
 _DATASET = re.compile(r"\w[\w .-]*(?:/\w[\w .-]*)*")
-
-
-def form(ui: Ui) -> dict[str, Any]:
-    """The form of a session, beside the choice of the robot."""
-    return form_of(ui, _COMMAND)
 
 
 def place(ui: Ui, dataset: str = "default") -> dict[str, Any]:
@@ -70,7 +65,6 @@ def _folder(ui: Ui, dataset: str) -> Path:
 
 
 ROUTES: Routes = {
-    "GET /form": form,
     "GET /place": place,
     "POST /start": start,
 }

@@ -138,19 +138,6 @@ def playback(ui: Ui, path: str) -> Playback:
     return ui.keep(Episodes).opened(ui.folders.find(path))
 
 
-def existing(ui: Ui, named: Sequence[str]) -> list[str]:
-    """The paths that a request names, all within the opened folders.
-
-    Raises:
-        IbrobotError: if one is outside, or does not exist.
-    """
-    paths = [ui.folders.find(each) for each in named]
-    for path in paths:
-        if not path.exists():
-            raise IbrobotError(f"{ui.folders.name(path)}: there is no such file or folder")
-    return [str(path) for path in paths]
-
-
 def _state_of(path: Path) -> Any:
     """Names, sizes and times of an episode's files, which show whether it has changed."""
     if not path.is_dir():

@@ -27,7 +27,7 @@ export class View {
   }
 
   async load() {
-    const form = await this.ui.attempt(() => this.ui.get("record/form"));
+    const form = await this.ui.attempt(() => this.ui.get("jobs/form", { command: "record" }));
     if (!form) return;
     this.missing = form.missing;
     this.form.show({ ...form, summary: "" }, this.ui.drives);
