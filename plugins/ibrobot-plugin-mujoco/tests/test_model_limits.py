@@ -8,9 +8,8 @@ import mujoco
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ibrobot_mujoco.so101 import MJCF
+from ibrobot_mujoco.so101 import so101
 
-from ibrobot_core.api import resolve_path
 from ibrobot_core.config.models import read_mjcf
 
 CLASSES = ("main", "servo", "small")
@@ -62,7 +61,8 @@ def test_they_are_mujocos(tmp_path_factory: pytest.TempPathFactory, text: str) -
 
 
 def test_so_are_those_of_the_so101() -> None:
-    path = resolve_path(MJCF, Path())
+    path = so101().description.mjcf
+    assert path is not None
     theirs = compiled(mujoco.MjModel.from_xml_path(str(path)))
     ours = read(path)
     assert len(ours) == 6

@@ -7,16 +7,15 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 from ibrobot_mujoco import gl
 from ibrobot_mujoco.experts.options import ExpertOptions
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.options import Fault, MujocoOptions, SceneCamera
 from ibrobot_mujoco.scenes import scene
-from ibrobot_mujoco.so101 import MJCF, so101
+from ibrobot_mujoco.so101 import so101
 from ibrobot_testing import control_context
 
-from ibrobot_core.api import Joint, MissingDependency
+from ibrobot_core.api import MissingDependency
 from ibrobot_core.app import installed_plugins
 
 
@@ -37,15 +36,6 @@ def test_stands_for_the_robot_and_its_cameras() -> None:
     assert descriptor.simulated  # type: ignore[attr-defined]
     assert descriptor.sensors == {"camera": "mujoco"}  # type: ignore[attr-defined]
     assert isinstance(descriptor.make(MujocoOptions(), control_context(robot=so101())), MujocoHardware)
-
-
-def test_the_so101_of_scripts_is_that_of_the_robot_yaml() -> None:
-    document = yaml.safe_load((Path(__file__).parents[3] / "configs" / "so101.yaml").read_text())["robot"]
-    robot = so101()
-    assert robot.joints == tuple(Joint(**joint) for joint in document["joints"])
-    assert {name: list(joints) for name, joints in robot.groups.items()} == document["groups"]
-    assert {name: list(pose) for name, pose in robot.description.poses.items()} == document["description"]["poses"]
-    assert document["description"]["mjcf"] == MJCF
 
 
 @pytest.mark.parametrize(

@@ -23,17 +23,9 @@ from ibrobot_web.server.app import STATIC
 from ibrobot_web.ui.context import File, Handler, Routes, Ui, read_facts, read_query
 from ibrobot_web.ui.forms import job_commands, takes, title_of
 
-VIEWS = {
-    "robots": "Robots",
-    "devices": "Devices",
-    "record": "Record",
-    "episodes": "Episodes",
-    "datasets": "Datasets",
-    "policies": "Policies",
-    "jobs": "Jobs",
-}
-"""Name -> title in the navigation. The module `ibrobot_web.ui.NAME` has the view's `ROUTES`; `static/ui/NAME.js` shows
-it. Each command that runs as a job has a view, too, all by `static/ui/command.js`; each kind of report has one, all by
+VIEWS = ("robots", "devices", "record", "episodes", "datasets", "policies", "jobs")
+"""The views. The module `ibrobot_web.ui.NAME` has the `ROUTES` of one, and `static/ui/NAME.js` shows it. Each command
+that runs as a job has a view, too, all by `static/ui/command.js`; each kind of report has one, all by
 `static/ui/reports.js`."""
 SHOWN = {"episodes": "episodes", "dataset": "datasets", "policy": "policies"}
 """What a command works on -> the view that shows it."""
@@ -61,7 +53,7 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
 
     async def session(request: web.Request) -> web.StreamResponse:
         folders = [str(path) for path in ui.folders.paths]
-        views: list[dict[str, Any]] = [{"name": name, "title": title, "module": name} for name, title in VIEWS.items()]
+        views: list[dict[str, Any]] = [{"name": name, "title": name.capitalize(), "module": name} for name in VIEWS]
         jobs = [
             {"name": f"job-{name}", "title": title_of(name), "module": "command", "command": name, "takes": takes(name)}
             for name in job_commands()
