@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, override
+from typing import Any, override
 
 import attrs
 import click
 
 from ibrobot_core.calibration import load_calibration
 from ibrobot_core.cli.options import run_options
+from ibrobot_core.config import RobotConfig, find_config, load_config
+from ibrobot_core.config.missing import absent_models, describe, unavailable_modes
+from ibrobot_core.config.schema import HardwareConfig, TeleopConfig
 from ibrobot_core.errors import CalibrationError, ConfigError, PluginError, Problem
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.safe_output import echo
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from ibrobot_core.config import RobotConfig
-    from ibrobot_core.config.schema import HardwareConfig, TeleopConfig
 
 _CONFIG = "config "
 config_options = run_options("config", "sim", "overrides", "mode")
@@ -58,8 +56,6 @@ def check(
     config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | None, as_json: bool, deep: bool
 ) -> None:
     """Report all faults of CONFIG; exit with 2 if there are any."""
-    from ibrobot_core.config import find_config, load_config
-    from ibrobot_core.config.missing import absent_models, unavailable_modes
     from ibrobot_core.launch.absence import absent_sensors, describe_absent
     from ibrobot_core.launch.models import check_models
 
@@ -83,9 +79,7 @@ def check(
     body = "simulation" if found.simulated else "hardware"
     echo(f"{path}: ok ({found.robot.name}, {len(found.robot.joints)} joints, {body})")
     echo(f"modes: {', '.join(found.control_modes)}; starts in {found.default_control_mode}")
-    for line in unavailable_modes(found.unavailable):
-        echo(f"note: {line}")
-    for line in absent_models(found.absent_models):
+    for line in (*unavailable_modes(found.unavailable), *absent_models(found.absent_models)):
         echo(f"note: {line}")
     if absent := describe_absent(absent_sensors(found, installed_plugins())):
         echo(f"note: runs start without {absent}")
@@ -118,8 +112,6 @@ def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | 
 
     All defaults are filled in, and the YAML loads again.
     """
-    from ibrobot_core.config import find_config, load_config
-    from ibrobot_core.config.missing import describe
     from ibrobot_core.config.show import to_yaml
 
     found = load_config(find_config(config, installed_plugins()), overrides=overrides, mode=mode, sim=sim)
@@ -144,7 +136,6 @@ def copy(context: click.Context, config: str, copy: Path, values: tuple[str, ...
     such as ${IBROBOT_FOLLOWER_PORT:/dev/ttyACM0}; the environment still overrides it. `ibrobot doctor` lists what is
     connected. The copy is checked at the end.
     """
-    from ibrobot_core.config import find_config
     from ibrobot_core.config.copying import variables_of, write_copy
 
     source = find_config(config, installed_plugins())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import resource
 import shutil
 import sys
@@ -16,7 +17,6 @@ from ibrobot_core.descriptors import Check
 from ibrobot_core.plugins import Registry, installed_plugins
 from ibrobot_core.safe_output import echo
 
-MINIMUM_PYTHON = (3, 12)
 LEAST_FREE_BYTES = 2_000_000_000
 _REMEDY = f"run this and log in again: {PERMIT}"
 MLOCK_BYTES = 512 * 1024 * 1024
@@ -42,17 +42,9 @@ def doctor(as_json: bool) -> None:
 
 def examine(registry: Registry) -> list[Check]:
     """Run all checks: Python, plugins and their checks, dependencies of types, real-time permissions, disk."""
-    return [
-        python_version(), *plugin_checks(registry), *registry.doctor(), *types(registry), realtime(), memory_lock(),
-        disk("."),
-    ]  # fmt: skip
-
-
-def python_version() -> Check:
-    """Check the version of Python."""
-    found = ".".join(str(part) for part in sys.version_info[:3])
-    wanted = ".".join(str(part) for part in MINIMUM_PYTHON)
-    return Check("python", sys.version_info >= MINIMUM_PYTHON, found, f"install Python {wanted} or newer")
+    python = Check("python", True, platform.python_version())  # an older one cannot import this file
+    devices = (realtime(), memory_lock(), disk("."))
+    return [python, *plugin_checks(registry), *registry.doctor(), *types(registry), *devices]
 
 
 def plugin_checks(registry: Registry) -> list[Check]:

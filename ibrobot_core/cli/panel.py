@@ -88,10 +88,9 @@ def _loop_text(session: Session, rates: RecentRates) -> str:
 
 
 def _sensor_texts(session: Session, rates: RecentRates) -> list[str]:
-    ages = {name: sensor.age_s for name, sensor in session.sensors.items()}
     return [
-        f"{name} {rates[name]}" + (f", {age_s * 1e3:.0f} ms old" if age_s is not None else "")
-        for name, age_s in ages.items()
+        f"{name} {rates[name]}" + (f", {age_s * 1e3:.0f} ms old" if (age_s := sensor.age_s) is not None else "")
+        for name, sensor in session.sensors.items()
     ]
 
 

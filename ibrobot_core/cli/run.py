@@ -185,17 +185,12 @@ class _Signals:
         if number == signal.SIGHUP:  # the terminal may be closed; writing to it must not fail
             discard(self._terminals)
         if session.finished.is_set() and number == signal.SIGTERM:
-            threading.Thread(target=self._brake, name="signal", daemon=True).start()
+            brake = session.emergency_stop
+            threading.Thread(target=_try, args=(session, brake), name="signal", daemon=True).start()
             return
         self.came = True
         session.finish()
         session.log.info("stopping; Ctrl-C again stops at once")
-
-    def _brake(self) -> None:
-        try:
-            self._session.emergency_stop()
-        except IbrobotError as error:
-            self._session.log.error("%s", error)
 
     def _suspend(self) -> None:
         session = self._session
@@ -225,13 +220,10 @@ def _listen(session: Session, take: Callable[[tuple[str, int]], None]) -> None:
                 key = keys.get(timeout=PULSE_S)
                 if key.startswith((REPEAT, RELEASE)):
                     continue
-                if key != "esc":
+                if key == "esc":
+                    _try(session, session.emergency_stop)
+                else:
                     take((key, session.stops))
-                    continue
-                try:
-                    session.emergency_stop()
-                except IbrobotError as error:
-                    session.log.error("%s", error)
 
     threading.Thread(target=work, name="runtime keys", daemon=True).start()
 
@@ -318,7 +310,7 @@ class _Panel:
     def _act(self, name: str, act: Callable[[], object]) -> None:
         """Do what may take seconds, e.g. set up a device again, in another thread, while the panel goes on."""
         if self._runtime.session.request.lockstep:
-            self._try(act)
+            _try(self._runtime.session, act)
         else:
             self._acts.put((name, act))
 
@@ -330,16 +322,18 @@ class _Panel:
         while (each := self._acts.get()) is not None:
             self._acting, act = each
             try:
-                self._try(act)
+                _try(self._runtime.session, act)
             except Exception as error:  # noqa: BLE001 - without this thread, the keys of the panel do nothing
                 self._runtime.session.fail(self._acting, error)
             self._acting = ""
 
-    def _try(self, act: Callable[[], object]) -> None:
-        try:
-            act()
-        except IbrobotError as error:
-            self._runtime.session.log.error("%s", error)
+
+def _try(session: Session, act: Callable[[], object]) -> None:
+    """Do what the run survives if it fails."""
+    try:
+        act()
+    except IbrobotError as error:
+        session.log.error("%s", error)
 
 
 def _log_to(handler: logging.Handler) -> None:

@@ -12,6 +12,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from ibrobot_core.errors import PolicyError
 from ibrobot_core.robot import Vector
 
 Tensors = Mapping[str, NDArray[np.generic]]
@@ -39,6 +40,21 @@ class Frame:
     history: tuple[Frame, ...] = ()
     """The frames of the preceding ticks, oldest first, each complete and without prompt, prefix and history; at most
     `PolicySpec.history` of them, fewer at the start of an episode or after a missing observation."""
+
+    def observation(self, key: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        """The value of an observation that a policy needs.
+
+        Raises:
+            PolicyError: if it is missing or has another shape, or if an image does not have 8-bit pixels.
+        """
+        value = self.values.get(key)
+        if value is None:
+            raise PolicyError(f"the policy needs {key}, which the frame at {self.stamp_ns} ns lacks")
+        if value.shape != shape:
+            raise PolicyError(f"the policy needs {key} of shape {shape}, got {value.shape}")
+        if len(shape) == 3 and value.dtype != np.uint8:
+            raise PolicyError(f"the policy needs {key} with 8-bit pixels, got {value.dtype}")
+        return value
 
 
 @attrs.frozen

@@ -83,7 +83,7 @@ def test_as_json(ibrobot: Ibrobot, site: Site) -> None:
 
 
 def test_a_sound_machine_passes(ibrobot: Ibrobot, site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "examine", lambda registry: [doctor.python_version()])
+    monkeypatch.setattr(doctor, "examine", lambda registry: [doctor.disk(".")])
 
     assert ibrobot("doctor").code == 0
 

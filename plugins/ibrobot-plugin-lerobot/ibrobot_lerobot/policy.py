@@ -186,14 +186,8 @@ class LeRobotPolicy(Policy):
         """A batch of one in LeRobot's layout: images (1, C, H, W) from 0 to 1."""
         batch: dict[str, NDArray[Any]] = {}
         for key, shape in self.spec.observations.items():
-            if key not in frame.values:
-                raise PolicyError(f"the policy needs {key}, which the frame at {frame.stamp_ns} ns lacks")
-            value = frame.values[key]
-            if value.shape != shape:
-                raise PolicyError(f"the policy needs {key} of shape {shape}, got {value.shape}")
+            value = frame.observation(key, shape)
             if len(shape) == 3:
-                if value.dtype != np.uint8:
-                    raise PolicyError(f"the policy needs {key} with 8-bit pixels, got {value.dtype}")
                 if key in self._pictures:
                     continue
                 value = np.ascontiguousarray(value.transpose(2, 0, 1)).astype(np.float32) / np.float32(255)

@@ -69,21 +69,15 @@ class OnnxPolicy(Policy):
             digest.update(graph)
             sessions.append(_session(self._options, self._options.path / name, graph))
         zeros = {key: np.zeros(shape, dtype) for key, (dtype, shape) in self._expected.items()}
-        self._sessions = sessions
-        try:
-            [chunk] = self._run([zeros])
-        except PolicyError:
-            self._sessions = []
-            raise
+        [chunk] = self._run(sessions, [zeros])
         manifest = self._manifest
         least = manifest.first + manifest.chunk_size
         if chunk.ndim != 2 or chunk.shape[0] < least or chunk.shape[1] != manifest.action_size:
-            self._sessions = []
             raise PolicyError(
                 f"{self._options.path}: the graph returns actions of shape {chunk.shape}; {manifest.path.name} states "
                 f"{manifest.action_size} values in at least {least} actions"
             )
-        self._weights = digest.hexdigest()[:32]
+        self._sessions, self._weights = sessions, digest.hexdigest()[:32]
         self._identity = f"onnxruntime {version('onnxruntime')}, {sessions[0].get_providers()[0]}"
         self._log.info("%s on %s", manifest.type, sessions[0].get_providers()[0])
 
@@ -115,8 +109,8 @@ class OnnxPolicy(Policy):
         # Repeat an episode's first frame to fill the history, as in training.
         frames = [frames[0]] * (history + 1 - len(frames)) + frames
         tensors: dict[str, NDArray[Any]] = {}
-        for key in self.spec.observations:
-            values = [self._observation(each, key) for each in frames]
+        for key, shape in self.spec.observations.items():
+            values = [each.observation(key, shape).astype(_dtype(key, self._manifest)) for each in frames]
             tensors[key] = np.stack(values) if history else values[0]
         if self._manifest.noise is not None:
             tensors[SEED] = np.array([self._seed % 2**64, frame.stamp_ns % 2**64], np.uint64)
@@ -132,7 +126,7 @@ class OnnxPolicy(Policy):
             raise PolicyError(f"{self._options.path} is not loaded: call load() first")
         for tensors in batch:
             self._check(tensors)
-        return [{ACTION: actions} for actions in self._run(batch)]
+        return [{ACTION: actions} for actions in self._run(self._sessions, batch)]
 
     @override
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
@@ -141,41 +135,28 @@ class OnnxPolicy(Policy):
         chunk = np.asarray(tensors[ACTION], np.float64)[first : first + self.spec.chunk_size]
         return chunk * manifest.scale + manifest.offset
 
-    def _observation(self, frame: Frame, key: str) -> NDArray[Any]:
-        shape = self.spec.observations[key]
-        if key not in frame.values:
-            raise PolicyError(f"the policy needs {key}, which the frame at {frame.stamp_ns} ns lacks")
-        value = frame.values[key]
-        if value.shape != shape:
-            raise PolicyError(f"the policy needs {key} of shape {shape}, got {value.shape}")
-        dtype = _dtype(key, self._manifest)
-        if dtype == np.uint8 and value.dtype != dtype:
-            raise PolicyError(f"the policy needs {key} with 8-bit pixels, got {value.dtype}")
-        return value.astype(dtype)
-
     def _check(self, tensors: Tensors) -> None:
         """Check that a request, which may be from an untrusted client, has the tensors that `preprocess` makes."""
         wrong = [f"{name} is unknown" for name in tensors if name not in self._expected]
         for name, (dtype, shape) in self._expected.items():
             array = tensors.get(name)
-            if array is None:
-                wrong.append(f"{name} is missing, must be {dtype} {shape}")
-            elif (array.dtype, array.shape) != (dtype, shape):
-                wrong.append(f"{name} is {array.dtype} {array.shape}, must be {dtype} {shape}")
+            if array is None or (array.dtype, array.shape) != (dtype, shape):
+                got = "is missing" if array is None else f"is {array.dtype} {array.shape}"
+                wrong.append(f"{name} {got}, must be {dtype} {shape}")
         if wrong:
             raise PolicyError(f"the request's tensors: {'; '.join(wrong)}")
 
-    def _run(self, batch: Sequence[Tensors]) -> list[NDArray[Any]]:
+    def _run(self, sessions: Sequence[Any], batch: Sequence[Tensors]) -> list[NDArray[Any]]:
         """Outputs of the network, each of shape (N, A), before they are unnormalised."""
         manifest = self._manifest
         inputs = {key: np.stack([tensors[key] for tensors in batch]) for key in manifest.observations}
         noise = manifest.noise
         if noise is None:
-            return list(_outputs(self._sessions[0], inputs))
+            return list(_outputs(sessions[0], inputs))
         draws = [np.random.default_rng(np.asarray(tensors[SEED])) for tensors in batch]
         if not manifest.steps:
-            return list(_outputs(self._sessions[0], {**inputs, NOISE: _drawn(noise, draws)}))
-        encode, denoise = self._sessions
+            return list(_outputs(sessions[0], {**inputs, NOISE: _drawn(noise, draws)}))
+        encode, denoise = sessions
         condition = _outputs(encode, inputs)
         x = _drawn(noise, draws)
         for step in manifest.steps:

@@ -18,11 +18,12 @@ def one_line(text: str) -> str:
 class Connection(ABC):
     """A connection to a server.
 
-    After any error it must be closed: what arrives later could be the answer to an earlier request.
+    After any error it must be closed: what arrives later could be the answer to an earlier request. Errors do not name
+    the server: `ServedPolicy` adds its address.
     """
 
     address: str
-    """For messages."""
+    """Of the server."""
 
     @abstractmethod
     def open(self, timeout_s: float) -> Mapping[str, Any]:

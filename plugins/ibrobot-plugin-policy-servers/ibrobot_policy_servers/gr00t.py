@@ -51,10 +51,10 @@ class Gr00tConnection(Connection):
         try:
             socket.connect(self.address)
         except zmq.ZMQError as error:
-            raise PolicyError(f"{self.address}: cannot be used: {error}") from None
+            raise PolicyError(f"cannot be used: {error}") from None
         described = self._call("get_modality_config", None, timeout_s)
         if not isinstance(described, dict):
-            raise PolicyError(f"{self.address}: described its model as {type(described).__name__}, not a dictionary")
+            raise PolicyError(f"described its model as {type(described).__name__}, not a dictionary")
         return described
 
     @override
@@ -64,7 +64,7 @@ class Gr00tConnection(Connection):
         if not self._flat and isinstance(answer, list) and answer:
             answer = answer[0]  # the rest is information
         if not isinstance(answer, dict):
-            raise PolicyError(f"{self.address}: answered with {type(answer).__name__}, must be a dictionary")
+            raise PolicyError(f"answered with {type(answer).__name__}, must be a dictionary")
         return {name: self._alone(value) for name, value in answer.items()}
 
     @override
@@ -90,7 +90,7 @@ class Gr00tConnection(Connection):
     def _call(self, endpoint: str, data: Mapping[str, Any] | None, timeout_s: float) -> Any:
         socket = self._socket
         if socket is None:
-            raise PolicyError(f"{self.address}: is not connected")
+            raise PolicyError("is not connected")
         message: dict[str, Any] = {"endpoint": endpoint}
         if data is not None:
             message["data"] = data
@@ -101,13 +101,11 @@ class Gr00tConnection(Connection):
             self._wait(socket, timeout_s)
             answer = unpack_npy(socket.recv())
         except zmq.Again:
-            raise PolicyError(f"{self.address}: {_GONE}") from None
+            raise PolicyError(_GONE) from None
         except zmq.ZMQError as error:
-            raise PolicyError(f"{self.address}: the connection failed: {error}") from None
-        except PolicyError as error:
-            raise PolicyError(f"{self.address}: {error}") from None
+            raise PolicyError(f"the connection failed: {error}") from None
         if isinstance(answer, dict) and "error" in answer:
-            raise PolicyError(f"{self.address}: the server's error: {one_line(str(answer['error']))}")
+            raise PolicyError(f"the server's error: {one_line(str(answer['error']))}")
         return answer
 
     def _wait(self, socket: zmq.Socket[bytes], timeout_s: float) -> None:

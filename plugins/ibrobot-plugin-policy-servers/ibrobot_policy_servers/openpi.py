@@ -51,11 +51,8 @@ class OpenpiConnection(WebsocketConnection):
     def _answer(self, timeout_s: float) -> Mapping[str, Any]:
         message = self.receive(timeout_s)
         if isinstance(message, str):
-            raise PolicyError(f"{self.address}: the server's error: {one_line(message)}")
-        try:
-            content = unpack(message)
-        except PolicyError as error:
-            raise PolicyError(f"{self.address}: {error}") from None
+            raise PolicyError(f"the server's error: {one_line(message)}")
+        content = unpack(message)
         if not isinstance(content, dict):
-            raise PolicyError(f"{self.address}: sent {type(content).__name__}, must be a dictionary")
+            raise PolicyError(f"sent {type(content).__name__}, must be a dictionary")
         return content

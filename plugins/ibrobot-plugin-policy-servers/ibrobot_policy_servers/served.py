@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, override
 
 import attrs
@@ -72,11 +73,8 @@ class ServedPolicy(Policy):
     def reset(self, seed: int) -> None:
         with self._turn:
             if self._connected:
-                try:
+                with self._exchange():
                     self._connection.reset(self._options.timeout)
-                except PolicyError:
-                    self._disconnect()
-                    raise
 
     @override
     def close(self) -> None:
@@ -105,7 +103,7 @@ class ServedPolicy(Policy):
             raise PolicyError("the server's model needs a prompt that describes the task")
         tensors: dict[str, NDArray[Any]] = {}
         for each in self._options.observations:
-            value = _observation(frame, each)
+            value = frame.observation(each.observation, each.shape)
             if each is self._reference:
                 positions = dict(zip(each.joints, value.astype(np.float64), strict=True))
                 tensors[REFERENCE] = np.array([positions.get(joint, 0.0) for joint in self._joints])
@@ -126,17 +124,13 @@ class ServedPolicy(Policy):
     @override
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
         values = np.asarray(tensors[ACTION], np.float64)
-        joints: list[str] = []
-        columns, start = [], 0
-        for each in self._options.actions:
-            part = values[:, start : start + len(each.joints)]
-            start += len(each.joints)
-            part = part * np.array(each.scale or 1.0) + np.array(each.offset or 0.0)
-            columns.append(part)
-            joints += each.joints
-        actions = np.concatenate(columns, axis=1)[:, np.array([joints.index(joint) for joint in self._joints])]
+        maps = self._options.actions
+        joints = [joint for each in maps for joint in each.joints]
+        scale = np.concatenate([np.broadcast_to(each.scale or 1.0, len(each.joints)) for each in maps])
+        offset = np.concatenate([np.broadcast_to(each.offset or 0.0, len(each.joints)) for each in maps])
+        actions = (values * scale + offset)[:, [joints.index(joint) for joint in self._joints]]
         if REFERENCE in tensors:
-            relative = {joint for each in self._options.actions for joint in each.relative}
+            relative = {joint for each in maps for joint in each.relative}
             moved = np.array([joint in relative for joint in self._joints], np.float64)
             actions = actions + moved * np.asarray(tensors[REFERENCE], np.float64)
         return actions[: self.spec.chunk_size]
@@ -148,12 +142,8 @@ class ServedPolicy(Policy):
             _put(request, each.key, _tensor(tensors, each))
         if self._options.prompt:
             _put(request, self._options.prompt, _task(tensors))
-        try:
-            answer = self._connection.ask(request, timeout_s)
-            outputs: dict[str, NDArray[Any]] = {ACTION: self._actions(answer)}
-        except PolicyError:
-            self._disconnect()
-            raise
+        with self._exchange():
+            outputs: dict[str, NDArray[Any]] = {ACTION: self._actions(self._connection.ask(request, timeout_s))}
         if REFERENCE in tensors:
             outputs[REFERENCE] = np.array(tensors[REFERENCE])
         return outputs
@@ -170,26 +160,21 @@ class ServedPolicy(Policy):
             value = _get(answer, each.key)
             expected = (self._options.horizon, size)
             if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf":
-                raise PolicyError(
-                    f"{self._connection.address}: the answer has no numbers under {name!r}; it has: {_names(answer)}"
-                )
+                raise PolicyError(f"the answer has no numbers under {name!r}; it has: {_names(answer)}")
             if value.shape != expected:
                 raise PolicyError(
-                    f"{self._connection.address}: the server's {name!r} has shape {value.shape}, the robot YAML states "
-                    f"{expected}: horizon, and the size of the action"
+                    f"the server's {name!r} has shape {value.shape}, the robot YAML states {expected}: horizon, and "
+                    "the size of the action"
                 )
             if not np.isfinite(value).all():
-                raise PolicyError(f"{self._connection.address}: the server's {name!r} has values that are not finite")
+                raise PolicyError(f"the server's {name!r} has values that are not finite")
             columns.append(value[:, : len(each.joints)].astype(np.float64))
         return np.concatenate(columns, axis=1)
 
     def _connect(self, timeout_s: float) -> None:
-        try:
+        with self._exchange():
             metadata = self._connection.open(timeout_s)
             self._check_metadata(metadata)
-        except PolicyError:
-            self._disconnect()
-            raise
         self._metadata, self._connected = metadata, True
         self._weights, self._identity = _hash(metadata), f"{self._connection.address[:500]} {_shown(metadata)}"
 
@@ -200,17 +185,24 @@ class ServedPolicy(Policy):
             if (stated := str(metadata.get(name, "nothing"))) != value:
                 wrong.append(f"  {name}\n      server: {stated}\n      robot: {value}")
         if wrong:
-            raise PolicyError(
-                "\n".join([f"{self._connection.address}: is not the server that the robot expects:", *wrong])
-            )
+            raise PolicyError("\n".join(["is not the server that the robot expects:", *wrong]))
         if self._metadata is not None and _hash(metadata) != self._weights:
             change = (
-                f"{self._connection.address}: the server restarted with another model: it states {_shown(metadata)}, "
-                f"previously {_shown(self._metadata)}"
+                f"the server restarted with another model: it states {_shown(metadata)}, previously "
+                f"{_shown(self._metadata)}"
             )
             if not self._options.accept_new_model:
                 raise PolicyError(f"{change}; start the run again, or set the model's accept_new_model: true")
-            self._log.warning("%s", change)
+            self._log.warning("%s: %s", self._connection.address, change)
+
+    @contextmanager
+    def _exchange(self) -> Iterator[None]:
+        """Any error closes the connection, and names the server."""
+        try:
+            yield
+        except PolicyError as error:
+            self._disconnect()
+            raise PolicyError(f"{self._connection.address}: {error}") from None
 
     def _disconnect(self) -> None:
         self._connected = False
@@ -278,18 +270,6 @@ def _reference(options: ServerOptions) -> ObservationMap | None:
         f"actions: {', '.join(sorted(relative))} are relative, but no observation names these joints: add joints to "
         "the observation with their positions"
     )
-
-
-def _observation(frame: Frame, each: ObservationMap) -> NDArray[Any]:
-    """An observation as the contract has it."""
-    value = frame.values.get(each.observation)
-    if value is None:
-        raise PolicyError(f"the policy needs {each.observation}, which the frame at {frame.stamp_ns} ns lacks")
-    if value.shape != each.shape:
-        raise PolicyError(f"the policy needs {each.observation} of shape {each.shape}, got {value.shape}")
-    if len(each.shape) == 3 and value.dtype != np.uint8:
-        raise PolicyError(f"the policy needs {each.observation} with 8-bit pixels, got {value.dtype}")
-    return value
 
 
 def _converted(value: NDArray[Any], each: ObservationMap) -> NDArray[Any]:

@@ -36,7 +36,7 @@ class VlaEvalConnection(WebsocketConnection):
         hello = self._call("hello", {"harness_version": "ibrobot", "protocol_version": VERSION}, "hello", timeout_s)
         if hello.get("protocol_version") != VERSION:
             raise PolicyError(
-                f"{self.address}: the server speaks version {hello.get('protocol_version')!r} of the protocol, "
+                f"the server speaks version {hello.get('protocol_version')!r} of the protocol, "
                 f"the robot version {VERSION}"
             )
         self._begin()
@@ -66,19 +66,16 @@ class VlaEvalConnection(WebsocketConnection):
         self._send(kind, payload)
         message = self.receive(timeout_s)
         if isinstance(message, str):
-            raise PolicyError(f"{self.address}: sent text, must be binary: {one_line(message)}")
-        try:
-            answer = unpack_named(message)
-        except PolicyError as error:
-            raise PolicyError(f"{self.address}: {error}") from None
+            raise PolicyError(f"sent text, must be binary: {one_line(message)}")
+        answer = unpack_named(message)
         content = answer.get("payload") if isinstance(answer, dict) else None
         if not isinstance(answer, dict) or not isinstance(content, dict):
-            raise PolicyError(f"{self.address}: sent a message without a payload")
+            raise PolicyError("sent a message without a payload")
         if answer.get("type") == "error":
-            raise PolicyError(f"{self.address}: the server's error: {one_line(str(content.get('error')))}")
+            raise PolicyError(f"the server's error: {one_line(str(content.get('error')))}")
         if answer.get("type") != wanted or answer.get("seq") != self._number:
             raise PolicyError(
-                f"{self.address}: answered message {self._number} with {str(answer.get('type'))[:40]!r} to message "
+                f"answered message {self._number} with {str(answer.get('type'))[:40]!r} to message "
                 f"{str(answer.get('seq'))[:40]}; expected {wanted!r}"
             )
         return content

@@ -52,11 +52,9 @@ class WebsocketConnection(Connection):
             self._socket = self._stack.enter_context(opening)
             return self.greet(timeout_s)
         except InvalidStatus as error:
-            status = error.response.status_code
-            raise PolicyError(f"{self.address}: refused the connection with status {status}") from None
+            raise PolicyError(f"refused the connection with status {error.response.status_code}") from None
         except (OSError, TimeoutError, InvalidHandshake, WebSocketException, EOFError) as error:
-            reason = error or type(error).__name__
-            raise PolicyError(f"{self.address}: no {self.project} server: {reason}") from None
+            raise PolicyError(f"no {self.project} server: {error or type(error).__name__}") from None
 
     @override
     def interrupt(self) -> None:
@@ -89,17 +87,17 @@ class WebsocketConnection(Connection):
         try:
             return self._connected().recv(timeout_s)
         except TimeoutError:
-            raise PolicyError(f"{self.address}: no answer within {timeout_s:g} s") from None
+            raise PolicyError(f"no answer within {timeout_s:g} s") from None
         except (OSError, WebSocketException, EOFError) as error:
             raise self._ended(error) from None
 
     def _connected(self) -> ClientConnection:
         if self._socket is None:
-            raise PolicyError(f"{self.address}: is not connected")
+            raise PolicyError("is not connected")
         return self._socket
 
     def _ended(self, error: Exception) -> PolicyError:
-        return PolicyError(f"{self.address}: the connection ended: {error or type(error).__name__}")
+        return PolicyError(f"the connection ended: {error or type(error).__name__}")
 
     def _tls(self) -> ssl.SSLContext | None:
         if not self.address.startswith("wss:"):

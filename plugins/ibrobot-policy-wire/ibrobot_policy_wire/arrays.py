@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import msgpack
@@ -21,51 +22,6 @@ _ARRAY, _SCALAR = b"__ndarray__", b"__npgeneric__"
 _DATA, _DTYPE, _SHAPE = b"data", b"dtype", b"shape"
 _KINDS = "biuf"
 """Booleans, integers and floats; others have no place on the wire."""
-
-
-def pack(value: Any) -> bytes:
-    """Pack a message of dictionaries, lists, texts, numbers and arrays for openpi."""
-    packed: bytes = msgpack.packb(value, default=_packed)
-    return packed
-
-
-def unpack(message: bytes) -> Any:
-    """Unpack a message of openpi; its arrays are read-only.
-
-    Raises:
-        PolicyError: if it is damaged.
-    """
-    return _unpack(message, _unpacked)
-
-
-def pack_npy(value: Any) -> bytes:
-    """Pack a message with arrays as .npy files, for GR00T."""
-    packed: bytes = msgpack.packb(value, default=_packed_npy)
-    return packed
-
-
-def unpack_npy(message: bytes) -> Any:
-    """Unpack a message of GR00T, with its descriptions of modalities as dictionaries.
-
-    Raises:
-        PolicyError: if it is damaged.
-    """
-    return _unpack(message, _unpacked_npy)
-
-
-def pack_named(value: Any) -> bytes:
-    """Pack a message with arrays under text keys, for vla-eval."""
-    packed: bytes = msgpack.packb(value, default=_packed_named)
-    return packed
-
-
-def unpack_named(message: bytes) -> Any:
-    """Unpack a message of vla-eval.
-
-    Raises:
-        PolicyError: if it is damaged.
-    """
-    return _unpack(message, _unpacked_named)
 
 
 def _unpack(message: bytes, hook: Callable[[dict[Any, Any]], Any]) -> Any:
@@ -164,3 +120,20 @@ def _npy(content: Any) -> NDArray[Any]:
     shape = [int(n) for n in header[3].split(b",") if n.strip()]
     array = _array(content[end:], dtype, shape[::-1] if is_fortran else shape)
     return array.T if is_fortran else array
+
+
+type Pack = Callable[[Any], bytes]
+"""Packs a message of dictionaries, lists, texts, numbers and arrays."""
+type Unpack = Callable[[bytes], Any]
+"""Unpacks a message; its arrays are read-only. Raises PolicyError if it is damaged."""
+
+pack: Pack = partial(msgpack.packb, default=_packed)
+"""For openpi."""
+unpack: Unpack = partial(_unpack, hook=_unpacked)
+pack_npy: Pack = partial(msgpack.packb, default=_packed_npy)
+"""With arrays as .npy files, for GR00T."""
+unpack_npy: Unpack = partial(_unpack, hook=_unpacked_npy)
+"""Descriptions of modalities become dictionaries."""
+pack_named: Pack = partial(msgpack.packb, default=_packed_named)
+"""With arrays under text keys, for vla-eval."""
+unpack_named: Unpack = partial(_unpack, hook=_unpacked_named)
