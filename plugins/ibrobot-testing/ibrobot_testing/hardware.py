@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import override
 
 import numpy as np
@@ -50,16 +50,9 @@ class HardwareSuite(Suite[Hardware]):
             if isinstance(hardware, SimulatedHardware):
                 hardware.advance(ctx.period_ns)
 
-    @contextmanager
-    def connected(self) -> Iterator[tuple[Hardware, Context]]:
-        """Connected hardware with its context."""
-        ctx = self.context()
-        hardware = self.make(ctx)
-        try:
-            hardware.connect()
-            yield hardware, ctx
-        finally:
-            hardware.disconnect()
+    def connected(self, *, again: bool = False) -> AbstractContextManager[tuple[Hardware, Context]]:
+        """Connected hardware with its context; for `again` see `in_use`."""
+        return self.in_use(lambda hardware: hardware.connect(), lambda hardware: hardware.disconnect(), again=again)
 
     def moved(self, hardware: Hardware, ctx: Context) -> Vector:
         """Move every joint towards the middle of its range and return the measured position [rad], shape (J,).
@@ -73,6 +66,18 @@ class HardwareSuite(Suite[Hardware]):
         reached = hardware.read().position.copy()
         assert (np.abs(reached - goal) < 0.5 * np.abs(start - goal)).all(), "the joints did not stay at the command"
         return reached
+
+    def _check_rest(self, hardware: Hardware, ctx: Context, position: Vector) -> None:
+        """Check that the joints stay at a position [rad], shape (J,), for `settle_s`."""
+        self.elapse(hardware, ctx, self.settle_s)
+        np.testing.assert_allclose(hardware.read().position, position, atol=self.tolerance_rad)
+
+    def _relax(self, hardware: Hardware) -> Torque:
+        """Skip the check for hardware that cannot relax."""
+        try:
+            return hardware.relax()
+        except NotSupported:
+            pytest.skip("has no torque control")
 
     def _target(self, hardware: Hardware, ctx: Context) -> Vector:
         position = hardware.read().position
@@ -112,9 +117,7 @@ class HardwareSuite(Suite[Hardware]):
     def test_holds_where_it_is(self) -> None:
         """Without further commands, joints stay where the last one moved them."""
         with self.connected() as (hardware, ctx):
-            before = self.moved(hardware, ctx)
-            self.elapse(hardware, ctx, self.settle_s)
-            np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
+            self._check_rest(hardware, ctx, self.moved(hardware, ctx))
 
     def test_connecting_moves_nothing(self) -> None:
         """After `connect` the joints hold their positions, even if these are not zero."""
@@ -122,9 +125,7 @@ class HardwareSuite(Suite[Hardware]):
             self.moved(hardware, ctx)
             hardware.disconnect()
             hardware.connect()
-            before = hardware.read().position.copy()
-            self.elapse(hardware, ctx, self.settle_s)
-            np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
+            self._check_rest(hardware, ctx, hardware.read().position.copy())
 
     def test_readings_are_new(self) -> None:
         """While joints move, no reading repeats an older one under a new stamp, and two at one time agree."""
@@ -171,8 +172,7 @@ class HardwareSuite(Suite[Hardware]):
                 if size != len(hardware.joints):
                     with pytest.raises((HardwareError, ValueError)):
                         hardware.write(np.zeros(size))
-            self.elapse(hardware, ctx, self.settle_s)
-            np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
+            self._check_rest(hardware, ctx, before)
 
     def test_keeps_no_hold_of_the_callers_arrays(self) -> None:
         """Later changes of the caller's array do not affect a command, and a reading does not change after `read`."""
@@ -191,16 +191,8 @@ class HardwareSuite(Suite[Hardware]):
 
     def test_disconnect_is_safe_at_any_time(self) -> None:
         """`disconnect` may be called before `connect` and twice; `connect` works again afterwards."""
-        hardware = self.make(self.context())
-        hardware.disconnect()
-        hardware.connect()
-        hardware.disconnect()
-        hardware.disconnect()
-        try:
-            hardware.connect()
+        with self.connected(again=True) as (hardware, _):
             assert np.isfinite(hardware.read().position).all()
-        finally:
-            hardware.disconnect()
 
     def test_refuses_use_while_disconnected(self) -> None:
         """`read` and `write` raise HardwareError after `disconnect`, instead of repeating old values."""
@@ -215,10 +207,7 @@ class HardwareSuite(Suite[Hardware]):
         """`relax` is not supported, or returns the torque state; `holding` agrees, with a place and a command."""
         with self.connected() as (hardware, ctx):
             before = hardware.holding()
-            try:
-                outcome = hardware.relax()
-            except NotSupported:
-                pytest.skip("has no torque control")
+            outcome = self._relax(hardware)
             assert isinstance(outcome, Torque), f"relax returned {outcome!r}, not a Torque"
             after = hardware.holding()
             assert after is None or outcome is not Torque.OFF, f"torque is off, but holding returns {after}"
@@ -264,10 +253,7 @@ class HardwareSuite(Suite[Hardware]):
     def test_relax_ends_with_the_next_write(self) -> None:
         """`relax` is not supported, or the next `write` switches the torque on again."""
         with self.connected() as (hardware, ctx):
-            try:
-                hardware.relax()
-            except NotSupported:
-                pytest.skip("has no torque control")
+            self._relax(hardware)
             self.elapse(hardware, ctx, 0.0)
             start = hardware.read().position.copy()
             goal = self._target(hardware, ctx)
@@ -279,10 +265,7 @@ class HardwareSuite(Suite[Hardware]):
         """`relax` is not supported, or torque comes back where the joints are: a command to stay moves nothing."""
         with self.connected() as (hardware, ctx):
             self.moved(hardware, ctx)
-            try:
-                hardware.relax()
-            except NotSupported:
-                pytest.skip("has no torque control")
+            self._relax(hardware)
             self.elapse(hardware, ctx, 0.0)
             before = hardware.read().position.copy()
             for _ in range(max(1, round(ns(self.settle_s) / ctx.period_ns))):
@@ -296,8 +279,7 @@ class HardwareSuite(Suite[Hardware]):
         with self.connected() as (hardware, ctx):
             before = self.moved(hardware, ctx)
             hardware.reset_faults()
-            self.elapse(hardware, ctx, self.settle_s)
-            np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
+            self._check_rest(hardware, ctx, before)
 
     def test_signals_fill_their_vectors(self) -> None:
         """Every declared signal has a unique topic and writes as many values as it declares."""
@@ -375,9 +357,7 @@ class SimulatedHardwareSuite(HardwareSuite):
         with self.simulated() as (hardware, ctx):
             self.moved(hardware, ctx)
             hardware.reset(EpisodeSetup(1))
-            before = hardware.read().position.copy()
-            self.elapse(hardware, ctx, self.settle_s)
-            np.testing.assert_allclose(hardware.read().position, before, atol=self.tolerance_rad)
+            self._check_rest(hardware, ctx, hardware.read().position.copy())
 
     def test_success_is_a_verdict(self) -> None:
         """`success` is True, False or None, and never True right after a reset."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import ClassVar
 
 import attrs
@@ -23,16 +22,9 @@ class PlannerSuite(Suite[Planner]):
     samples: ClassVar[int] = 20
     """Samples between two points, at which limits are checked."""
 
-    @contextmanager
-    def loaded(self) -> Iterator[tuple[Planner, Context]]:
+    def loaded(self) -> AbstractContextManager[tuple[Planner, Context]]:
         """A loaded planner with its context."""
-        ctx = self.context()
-        planner = self.make(ctx)
-        try:
-            planner.load()
-            yield planner, ctx
-        finally:
-            planner.close()
+        return self.in_use(lambda planner: planner.load(), lambda planner: planner.close())
 
     def request(self, ctx: Context, seed: int, joints: tuple[str, ...] | None = None) -> PlanRequest:
         """A request between random positions within limits; override it if these could collide."""

@@ -45,14 +45,9 @@ class PolicySuite(Suite[Policy]):
     @contextmanager
     def loaded(self) -> Iterator[tuple[Policy, Context]]:
         """A loaded policy with its context, at the beginning of an episode."""
-        ctx = self.context()
-        policy = self.make(ctx)
-        try:
-            policy.load()
+        with self.in_use(lambda policy: policy.load(), lambda policy: policy.close()) as (policy, ctx):
             policy.reset(0)
             yield policy, ctx
-        finally:
-            policy.close()
 
     def _run(self, policy: Policy, ctx: Context, seed: int) -> list[NDArray[np.float64]]:
         policy.reset(seed)

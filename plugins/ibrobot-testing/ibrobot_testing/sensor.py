@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,16 +29,9 @@ class SensorSuite(Suite[Sensor]):
     def silence(self, sensor: Sensor) -> None:
         """Make the device stop capturing; override it for a device that captures without `trigger`."""
 
-    @contextmanager
-    def opened(self) -> Iterator[tuple[Sensor, Context]]:
-        """An open sensor with its context."""
-        ctx = self.context()
-        sensor = self.make(ctx)
-        try:
-            sensor.open()
-            yield sensor, ctx
-        finally:
-            sensor.close()
+    def opened(self, *, again: bool = False) -> AbstractContextManager[tuple[Sensor, Context]]:
+        """An open sensor with its context; for `again` see `in_use`."""
+        return self.in_use(lambda sensor: sensor.open(), lambda sensor: sensor.close(), again=again)
 
     def _next(self, sensor: Sensor, ctx: Context) -> Any:
         self.trigger(sensor, ctx)
@@ -141,17 +133,8 @@ class SensorSuite(Suite[Sensor]):
 
     def test_close_is_safe_at_any_time(self) -> None:
         """`close` may be called before `open` and twice; `open` works again afterwards."""
-        ctx = self.context()
-        sensor = self.make(ctx)
-        sensor.close()
-        sensor.open()
-        sensor.close()
-        sensor.close()
-        try:
-            sensor.open()
+        with self.opened(again=True) as (sensor, ctx):
             self._next(sensor, ctx)
-        finally:
-            sensor.close()
 
     def test_refuses_reading_while_closed(self) -> None:
         """`read` raises SensorError after `close`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar
 
@@ -37,6 +38,27 @@ class Suite[T]:
     def context(self) -> Context:
         """The context for `make`; override for another robot, clock or options."""
         return host_context()
+
+    @contextmanager
+    def in_use(
+        self, begin: Callable[[T], object], end: Callable[[T], object], *, again: bool = False
+    ) -> Iterator[tuple[T, Context]]:
+        """A new object under test between `begin` and `end`, with its context.
+
+        Args:
+            begin: connects, opens or loads it.
+            end: disconnects or closes it, which is safe at any time.
+            again: whether it ended before it began, began, and ended twice.
+        """
+        ctx = self.context()
+        subject = self.make(ctx)
+        for step in (end, begin, end, end) if again else ():
+            step(subject)
+        try:
+            begin(subject)
+            yield subject, ctx
+        finally:
+            end(subject)
 
 
 def run_checks[T](suite: type[Suite[T]], directory: Path) -> dict[str, BaseException | None]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import ClassVar
 
 import numpy as np
@@ -66,16 +65,9 @@ class TeleopSuite(Suite[Teleop]):
         Does nothing for devices that report only when these are called.
         """
 
-    @contextmanager
-    def connected(self) -> Iterator[tuple[Teleop, Context]]:
-        """A connected device with its context."""
-        ctx = self.context()
-        teleop = self.make(ctx)
-        try:
-            teleop.connect()
-            yield teleop, ctx
-        finally:
-            teleop.disconnect()
+    def connected(self, *, again: bool = False) -> AbstractContextManager[tuple[Teleop, Context]]:
+        """A connected device with its context; for `again` see `in_use`."""
+        return self.in_use(lambda teleop: teleop.connect(), lambda teleop: teleop.disconnect(), again=again)
 
     def poses(self, ctx: Context) -> list[Vector]:
         """Initial measured positions of the checks [rad], each shape (J,): nonzero and within limits."""
@@ -103,11 +95,7 @@ class TeleopSuite(Suite[Teleop]):
             for pose in self.poses(ctx):
                 command = self._begin(teleop, ctx, pose)
                 assert command.positions, "no positions with the deadman pressed"
-                for joint, position in command.positions.items():
-                    measured = pose[ctx.robot.joint_names.index(joint)]
-                    assert abs(position - measured) <= self.tolerance_rad, (
-                        f"{joint} jumps from {measured} to {position}"
-                    )
+                _check_near(command, ctx, pose, self.tolerance_rad)
 
     def test_positions_are_of_known_joints(self) -> None:
         """Every position is finite and belongs to a joint of the robot."""
@@ -176,11 +164,9 @@ class TeleopSuite(Suite[Teleop]):
             self.hold(teleop)
             positions = operate(teleop, self._measure(ctx, pose)).positions
             assert positions is None, "it moves again by the same press of the deadman"
-        positions = self._press(teleop, ctx, pose).positions
-        assert positions, "a new press moves nothing"
-        for joint, position in positions.items():
-            measured = pose[ctx.robot.joint_names.index(joint)]
-            assert abs(position - measured) <= self.step_rad, f"{joint} jumps from {measured} to {position}"
+        command = self._press(teleop, ctx, pose)
+        assert command.positions, "a new press moves nothing"
+        _check_near(command, ctx, pose, self.step_rad)
 
     def test_a_held_deadman_does_not_survive_an_activation(self) -> None:
         """A deadman held over a stop, a reset, a mode switch or a change of control must be pressed again."""
@@ -240,8 +226,7 @@ class TeleopSuite(Suite[Teleop]):
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[1]
             assert any(teleop.approach(self._measure(ctx, pose)) for _ in range(1000)), "it never arrives"
-            for joint, position in (self._begin(teleop, ctx, pose).positions or {}).items():
-                assert abs(position - pose[ctx.robot.joint_names.index(joint)]) <= self.tolerance_rad
+            _check_near(self._begin(teleop, ctx, pose), ctx, pose, self.tolerance_rad)
 
     def test_leaves_the_measurement_alone(self) -> None:
         """`activate` and `read` do not change `measured`, and later changes of it do not affect the device."""
@@ -258,24 +243,14 @@ class TeleopSuite(Suite[Teleop]):
                 before.position[:] = 0.0
             self.engage(teleop)
             now = self._measure(ctx, pose)
-            positions = operate(teleop, now).positions or {}
+            command = operate(teleop, now)
             np.testing.assert_array_equal(now.position, pose)
-            for joint, position in positions.items():
-                assert abs(position - pose[ctx.robot.joint_names.index(joint)]) <= self.tolerance_rad
+            _check_near(command, ctx, pose, self.tolerance_rad)
 
     def test_disconnect_is_safe_at_any_time(self) -> None:
         """`disconnect` may be called before `connect` and twice; `connect` works again afterwards."""
-        ctx = self.context()
-        teleop = self.make(ctx)
-        teleop.disconnect()
-        teleop.connect()
-        teleop.disconnect()
-        teleop.disconnect()
-        try:
-            teleop.connect()
+        with self.connected(again=True) as (teleop, ctx):
             assert isinstance(self._begin(teleop, ctx, self.poses(ctx)[0]), TeleopCommand)
-        finally:
-            teleop.disconnect()
 
     def test_refuses_reading_while_disconnected(self) -> None:
         """`read` raises TeleopError after `disconnect`."""
@@ -283,3 +258,10 @@ class TeleopSuite(Suite[Teleop]):
             pass
         with pytest.raises(TeleopError):
             operate(teleop, self._measure(ctx, self.poses(ctx)[0]))
+
+
+def _check_near(command: TeleopCommand, ctx: Context, pose: Vector, most_rad: float) -> None:
+    """Check that no position is farther than `most_rad` [rad] from that of a pose [rad], shape (J,)."""
+    for joint, position in (command.positions or {}).items():
+        measured = pose[ctx.robot.joint_names.index(joint)]
+        assert abs(position - measured) <= most_rad, f"{joint} jumps from {measured} to {position}"

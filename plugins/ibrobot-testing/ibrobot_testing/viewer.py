@@ -32,16 +32,11 @@ class ViewerSuite(Suite[Viewer]):
         raise NotImplementedError(f"{type(self).__name__} must define shown(self, viewer)")
 
     @contextmanager
-    def opened(self) -> Iterator[tuple[Viewer, Context, Bus]]:
-        """An open viewer with its context and bus."""
-        ctx = self.context()
-        assert ctx.bus is not None
-        viewer = self.make(ctx)
-        try:
-            viewer.open()
+    def opened(self, *, again: bool = False) -> Iterator[tuple[Viewer, Context, Bus]]:
+        """An open viewer with its context and bus; for `again` see `in_use`."""
+        with self.in_use(lambda viewer: viewer.open(), lambda viewer: viewer.close(), again=again) as (viewer, ctx):
+            assert ctx.bus is not None
             yield viewer, ctx, ctx.bus
-        finally:
-            viewer.close()
 
     def test_stays_open_until_the_person_closes_it(self) -> None:
         """`update` is True until then and False from then on, with messages and without."""
@@ -84,13 +79,5 @@ class ViewerSuite(Suite[Viewer]):
 
     def test_close_is_safe_at_any_time(self) -> None:
         """`close` may come before `open` and twice; `open` works again afterwards."""
-        viewer = self.make(self.context())
-        viewer.close()
-        viewer.open()
-        viewer.close()
-        viewer.close()
-        try:
-            viewer.open()
+        with self.opened(again=True) as (viewer, _, _):
             assert viewer.update() is True
-        finally:
-            viewer.close()
