@@ -41,6 +41,10 @@ class DatasetSuite(Suite[DatasetWriter]):
         rng = np.random.default_rng(i)
         return {key: rng.normal(size=f.shape).astype(f.dtype) for key, f in self.features.items()}
 
+    def _add(self, writer: DatasetWriter, *numbers: int) -> None:
+        for i in numbers:
+            writer.add_frame(self.frame(i), "pick")
+
     def _check(self, root: Path, episodes: Sequence[Sequence[int]]) -> None:
         found = self.read_back(root)
         assert len(found) == len(episodes), f"{len(found)} episodes, not {len(episodes)}"
@@ -53,8 +57,7 @@ class DatasetSuite(Suite[DatasetWriter]):
         """Episodes are numbered from 0, and every value is reproduced bit by bit."""
         writer = self.created(tmp_path / "set")
         for episode, numbers in enumerate(((0, 1, 2), (3, 4))):
-            for i in numbers:
-                writer.add_frame(self.frame(i), "pick")
+            self._add(writer, *numbers)
             assert writer.save_episode() == episode
         writer.finalize()
         self._check(tmp_path / "set", [(0, 1, 2), (3, 4)])
@@ -101,9 +104,9 @@ class DatasetSuite(Suite[DatasetWriter]):
         """Saved episodes can be read before, and without, `finalize`."""
         writer = self.created(tmp_path / "set")
         try:
-            writer.add_frame(self.frame(0), "pick")
+            self._add(writer, 0)
             writer.save_episode()
-            writer.add_frame(self.frame(1), "pick")
+            self._add(writer, 1)
             self._check(tmp_path / "set", [(0,)])
         finally:
             writer.finalize()

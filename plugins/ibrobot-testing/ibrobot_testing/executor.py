@@ -240,7 +240,4 @@ def plan_towards(ctx: Context, start: Vector, target: Vector) -> Plan:
 
 def drain(executor: Executor) -> list[GoalStatus]:
     """Every status not yet reported."""
-    statuses = []
-    while (status := executor.pop_status()) is not None:
-        statuses.append(status)
-    return statuses
+    return list(iter(executor.pop_status, None))

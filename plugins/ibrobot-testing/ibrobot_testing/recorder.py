@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import attrs
 import numpy as np
@@ -66,12 +66,9 @@ class RecorderSuite(Suite[Recorder]):
     def recording(self, directory: Path) -> Iterator[tuple[Recorder, Context]]:
         """A recorder with an episode begun in `directory`, and its context."""
         ctx = self.context()
-        recorder = self.make(ctx)
-        try:
+        with closing(self.make(ctx)) as recorder:
             recorder.begin(self._start(ctx, directory))
             yield recorder, ctx
-        finally:
-            recorder.close()
 
     def _start(self, ctx: Context, directory: Path) -> EpisodeStart:
         topics = {self.topic: JointState.ros_type}
@@ -79,6 +76,11 @@ class RecorderSuite(Suite[Recorder]):
 
     def _end(self, ctx: Context, outcome: str) -> EpisodeEnd:
         return EpisodeEnd(ctx.clock.now_ns() + 60 * NS_PER_S, outcome)
+
+    def _saved(self, recorder: Recorder, end: EpisodeEnd) -> Path:
+        path = recorder.end(end)
+        assert path is not None
+        return path
 
     def _write(self, recorder: Recorder, records: Sequence[Record]) -> None:
         for received_ns, message in records:
@@ -88,8 +90,7 @@ class RecorderSuite(Suite[Recorder]):
         """Every message is reproduced bit by bit, in order, with its time of receipt."""
         with self.recording(tmp_path / "episode") as (recorder, ctx):
             self._write(recorder, self.records(ctx))
-            path = recorder.end(self._end(ctx, "success"))
-            assert path is not None
+            path = self._saved(recorder, self._end(ctx, "success"))
             assert path.is_relative_to(tmp_path / "episode")
             assert path.exists()
             assert list(self.read_back(path)[self.topic]) == self.records(ctx)
@@ -98,8 +99,7 @@ class RecorderSuite(Suite[Recorder]):
         """The recording contains the initial metadata and the outcome."""
         with self.recording(tmp_path / "episode") as (recorder, ctx):
             self._write(recorder, self.records(ctx))
-            path = recorder.end(self._end(ctx, "failure"))
-            assert path is not None
+            path = self._saved(recorder, self._end(ctx, "failure"))
             metadata = self.read_metadata(path)
             assert metadata["prompt"] == "pick: the “cube”,\n'now'"
             assert metadata["outcome"] == "failure"
@@ -109,8 +109,7 @@ class RecorderSuite(Suite[Recorder]):
         with self.recording(tmp_path / "episode") as (recorder, ctx):
             records = self.records(ctx, 2500)
             self._write(recorder, records)
-            path = recorder.end(self._end(ctx, "success"))
-            assert path is not None
+            path = self._saved(recorder, self._end(ctx, "success"))
             sent = [received_ns for received_ns, _ in records]
             kept = [received_ns for received_ns, _ in self.read_back(path)[self.topic]]
             wrong = next((i for i, (a, b) in enumerate(zip(sent, kept, strict=False)) if a != b), None)
@@ -118,44 +117,32 @@ class RecorderSuite(Suite[Recorder]):
 
     def test_records_other_types(self, tmp_path: Path) -> None:
         """Text and arrays on topics that were announced are reproduced."""
-        self._needs_other_types()
-        ctx = self.context()
-        others = _others(ctx)
-        topics = {topic: message.ros_type for topic, message in others.items()}
-        start = attrs.evolve(self._start(ctx, tmp_path / "episode"), topics={self.topic: JointState.ros_type, **topics})
-        assert self._recorded(ctx, start, others) == {topic: [(ctx.clock.now_ns(), m)] for topic, m in others.items()}
+        announced = {topic: message.ros_type for topic, message in _others(self.context()).items()}
+        self._check_others(tmp_path / "episode", topics={self.topic: JointState.ros_type, **announced})
 
     def test_records_any_topic_if_asked(self, tmp_path: Path) -> None:
         """With `any_topic`, messages of topics that appear later are reproduced."""
-        self._needs_other_types()
-        ctx = self.context()
-        others = _others(ctx)
-        start = attrs.evolve(self._start(ctx, tmp_path / "episode"), any_topic=True)
-        assert self._recorded(ctx, start, others) == {topic: [(ctx.clock.now_ns(), m)] for topic, m in others.items()}
+        self._check_others(tmp_path / "episode", any_topic=True)
 
-    def _needs_other_types(self) -> None:
+    def _check_others(self, directory: Path, **start: Any) -> None:
+        """Check that messages of other types are reproduced, with these fields of `EpisodeStart`."""
         if self.joint_states_only:
             pytest.skip("records joint states only")
-
-    def _recorded(self, ctx: Context, start: EpisodeStart, messages: Mapping[str, Message]) -> dict[str, list[Record]]:
-        """What an episode with a message on each topic gives back."""
-        recorder = self.make(ctx)
-        try:
-            recorder.begin(start)
-            for topic, message in messages.items():
+        ctx = self.context()
+        others = _others(ctx)
+        with closing(self.make(ctx)) as recorder:
+            recorder.begin(attrs.evolve(self._start(ctx, directory), **start))
+            for topic, message in others.items():
                 recorder.write(topic, message, ctx.clock.now_ns())
-            path = recorder.end(self._end(ctx, "success"))
-            assert path is not None
-            return {topic: list(kept) for topic, kept in self.read_back(path).items() if kept}
-        finally:
-            recorder.close()
+            path = self._saved(recorder, self._end(ctx, "success"))
+        found = {topic: list(kept) for topic, kept in self.read_back(path).items() if kept}
+        assert found == {topic: [(ctx.clock.now_ns(), message)] for topic, message in others.items()}
 
     def test_keeps_what_was_lost_before(self, tmp_path: Path) -> None:
         """The recording contains the counts of messages that did not reach the recorder."""
         with self.recording(tmp_path / "episode") as (recorder, ctx):
             self._write(recorder, self.records(ctx))
-            path = recorder.end(attrs.evolve(self._end(ctx, "success"), dropped={self.topic: 3}))
-            assert path is not None
+            path = self._saved(recorder, attrs.evolve(self._end(ctx, "success"), dropped={self.topic: 3}))
             assert {topic: count for topic, count in self.read_dropped(path).items() if count} == {self.topic: 3}
 
     def test_metadata_survives_a_crash(self, tmp_path: Path) -> None:
@@ -168,29 +155,21 @@ class RecorderSuite(Suite[Recorder]):
     def test_sizes_are_estimated(self, tmp_path: Path) -> None:
         """`size_of` works for every type, before and within an episode, and grows with the message."""
         ctx = self.context()
-        recorder = self.make(ctx)
         messages = [self.records(ctx, 1)[0][1], *_others(ctx).values()]
-        try:
+        with closing(self.make(ctx)) as recorder:
             assert all(recorder.size_of(message) > 0 for message in messages)
             recorder.begin(self._start(ctx, tmp_path / "episode"))
             assert all(recorder.size_of(message) > 0 for message in messages)
             small, large = (recorder.size_of(Float64MultiArray(np.ones(size))) for size in (10, 10_000))
             assert large > 100 * small
-        finally:
-            recorder.close()
 
     def test_never_writes_over_anything(self, tmp_path: Path) -> None:
         """An existing directory is refused and not changed."""
         old = tmp_path / "episode" / "old.txt"
         old.parent.mkdir()
         old.write_text("old")
-        ctx = self.context()
-        recorder = self.make(ctx)
-        try:
-            with pytest.raises(RecorderError):
-                recorder.begin(self._start(ctx, old.parent))
-        finally:
-            recorder.close()
+        with pytest.raises(RecorderError), self.recording(old.parent):
+            pass
         assert [p.name for p in old.parent.iterdir()] == ["old.txt"]
         assert old.read_text() == "old"
 
@@ -207,8 +186,7 @@ class RecorderSuite(Suite[Recorder]):
             records = self.records(ctx)
             recorder.write("/unannounced", String("hello"), records[0][0])
             self._write(recorder, records)
-            path = recorder.end(self._end(ctx, "success"))
-            assert path is not None
+            path = self._saved(recorder, self._end(ctx, "success"))
             assert {topic for topic, kept in self.read_back(path).items() if kept} == {self.topic}
 
     def test_episodes_follow_one_another(self, tmp_path: Path) -> None:
@@ -216,21 +194,18 @@ class RecorderSuite(Suite[Recorder]):
         with self.recording(tmp_path / "first") as (recorder, ctx):
             records = self.records(ctx)
             self._write(recorder, records[:20])
-            first = recorder.end(self._end(ctx, "success"))
+            first = self._saved(recorder, self._end(ctx, "success"))
             recorder.begin(self._start(ctx, tmp_path / "second"))
             self._write(recorder, records[20:])
-            second = recorder.end(self._end(ctx, "success"))
-            assert first is not None
-            assert second is not None
+            second = self._saved(recorder, self._end(ctx, "success"))
             assert list(self.read_back(first)[self.topic]) == records[:20]
             assert list(self.read_back(second)[self.topic]) == records[20:]
 
     def test_refuses_calls_out_of_turn(self, tmp_path: Path) -> None:
         """`write` and `end` need an episode, and a second episode cannot begin before the first has ended."""
         ctx = self.context()
-        recorder = self.make(ctx)
         received_ns, message = self.records(ctx, 1)[0]
-        try:
+        with closing(self.make(ctx)) as recorder:
             with pytest.raises(RecorderError):
                 recorder.write(self.topic, message, received_ns)
             with pytest.raises(RecorderError):
@@ -239,8 +214,6 @@ class RecorderSuite(Suite[Recorder]):
             with pytest.raises(RecorderError):
                 recorder.begin(self._start(ctx, tmp_path / "second"))
             assert not (tmp_path / "second").exists()
-        finally:
-            recorder.close()
 
     def test_close_ends_an_open_episode(self, tmp_path: Path) -> None:
         """`close` saves the open episode with outcome `unknown`; it is safe twice."""
@@ -269,8 +242,7 @@ class RecorderSuite(Suite[Recorder]):
             copy = attrs.evolve(message, position=message.position.copy())
             recorder.write(self.topic, message, received_ns)
             message.position[:] = 0.0
-            path = recorder.end(self._end(ctx, "success"))
-            assert path is not None
+            path = self._saved(recorder, self._end(ctx, "success"))
             assert list(self.read_back(path)[self.topic]) == [(received_ns, copy)]
 
 
