@@ -50,7 +50,7 @@ class HoldsZero(FakeExecutor):
 
 class FollowsTheSag(FakeExecutor):
     def update(self, measured):
-        if self._plan is None and self._goal is None:
+        if self._plan is None and self._goal_id is None:
             self._setpoint = measured.position.copy()
         return super().update(measured)
 
@@ -130,7 +130,7 @@ class DropsTheOldGoal(FakeExecutor):
         try:
             super().set_goal(goal_id, goal, measured)
         except GoalRejected:
-            self._goal = None
+            self._goal_id = None
             raise
 
 
@@ -144,14 +144,14 @@ class AcceptsAnything(FakeExecutor):
 
 class JumpsToANewGoal(FakeExecutor):
     def set_goal(self, goal_id, goal, measured):
-        if self._goal is not None:
+        if self._goal_id is not None:
             self._setpoint = self._goal
         super().set_goal(goal_id, goal, measured)
 
 
 class CancelGoesOn(FakeExecutor):
     def cancel(self, measured):
-        if self._goal is not None:
+        if self._goal_id is not None:
             self._statuses.append(GoalStatus(self._goal_id, GoalState.CANCELED))
 
 

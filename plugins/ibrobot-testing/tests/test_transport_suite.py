@@ -9,7 +9,6 @@ from typing import Any, override
 import pytest
 from ibrobot_testing import TransportSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeTransport
-from ibrobot_testing.fakes.transport import _Request
 
 from ibrobot_core.api import Payload, TransportError
 
@@ -102,7 +101,8 @@ class SharesAnswers(FakeTransport):
         server = self._servers.get(name)
         if self._closed or server is None:
             raise TransportError(f"nobody serves {name}")
-        server.put(_Request(payload, self.answers))
+        answer = server.threads.submit(server.handler, payload, None)
+        answer.add_done_callback(lambda done: self.answers.put(done.result()))
         try:
             return self.answers.get(timeout=timeout_s)
         except queue.Empty:

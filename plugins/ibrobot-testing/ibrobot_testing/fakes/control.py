@@ -135,17 +135,16 @@ class FakeRealHardware(Hardware):
         self._moved_ns = now_ns
 
 
-class FakeExecutor(Executor):
-    """Accepts plans, read at their nearest point, and goals `{"position": …}`, approached at constant speed."""
+class _HoldingExecutor(Executor):
+    """Holds the position at activation; a goal ends with the setpoint where the joints are.
 
-    accepts_plans = True
+    Subclasses override `deactivate`, which ends their motion, and call it from there.
+    """
 
     def __init__(self, ctx: Context) -> None:
         self.joints = ctx.joints
-        self._step = 0.5 * ctx.robot.max_velocity[ctx.robot.indices(ctx.joints)] * seconds(ctx.period_ns)
-        self._statuses: list[GoalStatus] = []
-        self._refused = 0
         self._setpoint: Vector = np.zeros(len(ctx.joints))
+        self._statuses: list[GoalStatus] = []
         self.deactivate()
 
     @override
@@ -154,9 +153,43 @@ class FakeExecutor(Executor):
 
     @override
     def deactivate(self) -> None:
+        self._goal_id: str | None = None
+
+    @override
+    def cancel(self, measured: JointReading) -> None:
+        if self._goal_id is not None:
+            self._end_goal(GoalState.CANCELED)
+            self._setpoint = measured.position.copy()
+
+    @override
+    def pop_status(self) -> GoalStatus | None:
+        return self._statuses.pop(0) if self._statuses else None
+
+    def _begin_goal(self, goal_id: str) -> None:
+        self._goal_id = goal_id
+        self._statuses.append(GoalStatus(goal_id, GoalState.EXECUTING))
+
+    def _end_goal(self, state: GoalState) -> None:
+        if self._goal_id is not None:
+            self._statuses.append(GoalStatus(self._goal_id, state))
+            self._goal_id = None
+
+
+class FakeExecutor(_HoldingExecutor):
+    """Accepts plans, read at their nearest point, and goals `{"position": …}`, approached at constant speed."""
+
+    accepts_plans = True
+
+    def __init__(self, ctx: Context) -> None:
+        super().__init__(ctx)
+        self._step = 0.5 * ctx.robot.max_velocity[ctx.robot.indices(ctx.joints)] * seconds(ctx.period_ns)
+        self._refused = 0
+        self._goal: Vector = self._setpoint
+
+    @override
+    def deactivate(self) -> None:
+        super().deactivate()
         self._plan: Plan | None = None
-        self._goal: Vector | None = None
-        self._goal_id = ""
 
     @override
     def update(self, measured: JointReading) -> Vector:
@@ -164,7 +197,7 @@ class FakeExecutor(Executor):
         if plan is not None and measured.stamp_ns >= plan.start_ns:
             index = min((measured.stamp_ns - plan.start_ns) // plan.step_ns, len(plan.positions) - 1)
             self._setpoint = plan.positions[index].copy()
-        if self._goal is not None:
+        if self._goal_id is not None:
             self._setpoint = self._setpoint + np.clip(self._goal - self._setpoint, -self._step, self._step)
             if np.array_equal(self._setpoint, self._goal):
                 self._end_goal(GoalState.SUCCEEDED)
@@ -182,49 +215,19 @@ class FakeExecutor(Executor):
         position = np.asarray(goal.get("position", ()), np.float64)
         if position.shape != self._setpoint.shape or not np.isfinite(position).all():
             raise GoalRejected(f"position must be {len(self.joints)} finite numbers, got {goal!r}")
-        self._goal, self._goal_id = position, goal_id
-        self._statuses.append(GoalStatus(goal_id, GoalState.EXECUTING))
-
-    @override
-    def cancel(self, measured: JointReading) -> None:
-        if self._goal is not None:
-            self._end_goal(GoalState.CANCELED)
-            self._setpoint = measured.position.copy()
-
-    @override
-    def pop_status(self) -> GoalStatus | None:
-        return self._statuses.pop(0) if self._statuses else None
+        self._goal = position
+        self._begin_goal(goal_id)
 
     @override
     def counters(self) -> Mapping[str, int]:
         return {"refused_plans": self._refused}
 
-    def _end_goal(self, state: GoalState) -> None:
-        self._statuses.append(GoalStatus(self._goal_id, state))
-        self._goal = None
 
-
-class FakeTrajectoryExecutor(Executor):
+class FakeTrajectoryExecutor(_HoldingExecutor):
     """Accepts goals made by `trajectory_goal`, and interpolates their positions linearly.
 
     A goal succeeds once the joints are within 0.02 rad of its end.
     """
-
-    def __init__(self, ctx: Context) -> None:
-        self.joints = ctx.joints
-        self._setpoint: Vector = np.zeros(len(ctx.joints))
-        self._statuses: list[GoalStatus] = []
-        self.deactivate()
-
-    @override
-    def activate(self, measured: JointReading) -> None:
-        self._setpoint = measured.position.copy()
-
-    @override
-    def deactivate(self) -> None:
-        self._goal_id = ""
-        self._times_ns: Vector = np.empty(0)
-        self._positions: Vector = np.empty((0, len(self.joints)))
 
     @override
     def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
@@ -236,14 +239,13 @@ class FakeTrajectoryExecutor(Executor):
         except (KeyError, ValueError, TypeError) as error:
             raise GoalRejected(f"not a trajectory of {', '.join(self.joints)}: {goal!r}") from error
         self._end_goal(GoalState.CANCELED)
-        self._times_ns = measured.stamp_ns + np.concatenate(([0.0], times_ns))
-        self._positions = np.vstack((self._setpoint, positions))
-        self._goal_id = goal_id
-        self._statuses.append(GoalStatus(goal_id, GoalState.EXECUTING))
+        self._times_ns: Vector = measured.stamp_ns + np.concatenate(([0.0], times_ns))
+        self._positions: Vector = np.vstack((self._setpoint, positions))
+        self._begin_goal(goal_id)
 
     @override
     def update(self, measured: JointReading) -> Vector:
-        if self._goal_id:
+        if self._goal_id is not None:
             self._setpoint = np.array(
                 [np.interp(measured.stamp_ns, self._times_ns, column) for column in self._positions.T]
             )
@@ -251,18 +253,3 @@ class FakeTrajectoryExecutor(Executor):
             if measured.stamp_ns >= self._times_ns[-1] and at_end:
                 self._end_goal(GoalState.SUCCEEDED)
         return self._setpoint.copy()
-
-    @override
-    def cancel(self, measured: JointReading) -> None:
-        if self._goal_id:
-            self._end_goal(GoalState.CANCELED)
-            self._setpoint = measured.position.copy()
-
-    @override
-    def pop_status(self) -> GoalStatus | None:
-        return self._statuses.pop(0) if self._statuses else None
-
-    def _end_goal(self, state: GoalState) -> None:
-        if self._goal_id:
-            self._statuses.append(GoalStatus(self._goal_id, state))
-            self._goal_id = ""

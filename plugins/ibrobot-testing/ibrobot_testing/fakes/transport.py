@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-import queue
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
+from itertools import chain
 from typing import override
 
 import attrs
@@ -17,22 +17,23 @@ from ibrobot_core.app import HANDLER_THREADS
 
 
 @attrs.frozen(eq=False)
-class _Request:
-    payload: bytes
-    answer: queue.SimpleQueue[Payload | Exception] = attrs.field(factory=queue.SimpleQueue)
+class _Server:
+    handler: Handler
+    threads: ThreadPoolExecutor
+    died: Future[None] = attrs.field(factory=Future)
+
+    def end(self) -> None:
+        """Begin no further request."""
+        self.threads.shutdown(wait=False, cancel_futures=True)
 
 
-class _GoneError(TransportError):
-    """The server died before it answered."""
+class _Listener[T]:
+    """Calls `act` with each item in a thread, in the order of arrival."""
 
-
-class _Threads[T]:
-    """Calls `act` with each item, in at most `count` threads; with one, in the order of arrival."""
-
-    def __init__(self, act: Callable[[T], object], name: str, count: int = 1) -> None:
+    def __init__(self, act: Callable[[T], object], name: str) -> None:
         self._act = act
         self._name = name
-        self._pool = ThreadPoolExecutor(count, thread_name_prefix=name)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix=name)
 
     def put(self, item: T) -> None:
         with suppress(RuntimeError):  # it has ended
@@ -57,11 +58,9 @@ class FakeTransport(Transport):
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._subscribers: dict[str, list[_Threads[bytes]]] = {}
-        self._servers: dict[str, _Threads[_Request]] = {}
-        self._watchers: dict[str, list[_Threads[bool]]] = {}
-        self._pending: dict[_Request, str] = {}
-        """Requests without an answer yet, and the names of their servers."""
+        self._subscribers: dict[str, list[_Listener[bytes]]] = {}
+        self._servers: dict[str, _Server] = {}
+        self._watchers: dict[str, list[_Listener[bool]]] = {}
         self._closed = False
 
     @override
@@ -74,23 +73,15 @@ class FakeTransport(Transport):
 
     @override
     def subscribe(self, topic: str, callback: Callable[[Payload], object]) -> Callable[[], None]:
-        subscriber = _Threads[bytes](callback, f"a subscriber of {topic}")
+        subscriber = _Listener[bytes](callback, f"a subscriber of {topic}")
         with self._lock:
             self._check_open()
             self._subscribers.setdefault(topic, []).append(subscriber)
-        return lambda: self._end(self._subscribers, topic, subscriber)
+        return lambda: self._leave(self._subscribers, topic, subscriber)
 
     @override
     def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
-        def answer(request: _Request) -> None:
-            try:
-                request.answer.put(handler(request.payload, None))
-            except Exception as error:  # noqa: BLE001 - the requester receives it
-                request.answer.put(error)
-            finally:
-                self._pending.pop(request, None)
-
-        server = _Threads(answer, f"the server of {name}", workers)
+        server = _Server(handler, ThreadPoolExecutor(workers, f"the server of {name}"))
         with self._lock:
             self._check_open()
             if name in self._servers:
@@ -114,18 +105,16 @@ class FakeTransport(Transport):
             server = self._servers.get(name)
             if server is None:
                 raise TransportError(f"nobody serves {name}")
-            request = _Request(bytes(payload))
-            self._pending[request] = name
-            server.put(request)
+            answer = server.threads.submit(server.handler, bytes(payload), None)
+        wait((answer, server.died), timeout_s, FIRST_COMPLETED)
+        if (server.died.done() and not answer.done()) or answer.cancelled():
+            raise TransportError(f"nobody serves {name}, or not any more")
+        if not answer.done():
+            raise TransportError(f"no answer from {name} within {timeout_s} s")
         try:
-            result = request.answer.get(timeout=timeout_s)
-        except queue.Empty:
-            raise TransportError(f"no answer from {name} within {timeout_s} s") from None
-        if isinstance(result, _GoneError):
-            raise result
-        if isinstance(result, Exception):
-            raise TransportError(f"{name} failed: {type(result).__name__}: {result}") from result
-        return result
+            return answer.result()
+        except Exception as error:
+            raise TransportError(f"{name} failed: {type(error).__name__}: {error}") from error
 
     @override
     def watch(self, name: str, changed: Callable[[bool], object]) -> Callable[[], None]:
@@ -135,14 +124,14 @@ class FakeTransport(Transport):
             with turn:
                 changed(served)
 
-        watcher = _Threads(tell, f"a watch of {name}")
+        watcher = _Listener(tell, f"a watch of {name}")
         with turn:
             with self._lock:
                 self._check_open()
                 served = name in self._servers
                 self._watchers.setdefault(name, []).append(watcher)
             changed(served)
-        return lambda: self._end(self._watchers, name, watcher)
+        return lambda: self._leave(self._watchers, name, watcher)
 
     @override
     def served(self, prefix: str) -> frozenset[str]:
@@ -154,32 +143,27 @@ class FakeTransport(Transport):
         """End the servers of these names as the death of their process would: pending requests fail at once."""
         with self._lock:
             for name in names:
-                self._servers.pop(name).end()
+                server = self._servers.pop(name)
+                server.end()
+                server.died.set_result(None)
                 self._tell(name, False)
-            for request in [request for request, name in self._pending.items() if name in names]:
-                name = self._pending.pop(request)
-                request.answer.put(_GoneError(f"nobody serves {name}, or not any more"))
 
     @override
     def close(self) -> None:
         with self._lock:
             self._closed = True
-            ended: list[_Threads[bytes] | _Threads[_Request] | _Threads[bool]] = [*self._servers.values()]
-            for subscribers in self._subscribers.values():
-                ended += subscribers
-            for watchers in self._watchers.values():
-                ended += watchers
+            for server in self._servers.values():
+                server.end()
+            for listener in chain(*self._subscribers.values(), *self._watchers.values()):
+                listener.end()
             self._subscribers.clear()
             self._servers.clear()
             self._watchers.clear()
-        for threads in ended:
-            threads.end()
 
-    def _end[T](self, of: dict[str, list[_Threads[T]]], key: str, threads: _Threads[T]) -> None:
-        with self._lock:
-            if threads in of.get(key, ()):
-                of[key].remove(threads)
-        threads.end()
+    def _leave[T](self, of: dict[str, list[_Listener[T]]], key: str, listener: _Listener[T]) -> None:
+        with self._lock, suppress(KeyError, ValueError):  # it has ended
+            of[key].remove(listener)
+        listener.end()
 
     def _tell(self, name: str, served: bool) -> None:
         for watcher in self._watchers.get(name, ()):
