@@ -128,7 +128,7 @@ class ServedPolicy(Policy):
         joints = [joint for each in maps for joint in each.joints]
         scale = np.concatenate([np.broadcast_to(each.scale or 1.0, len(each.joints)) for each in maps])
         offset = np.concatenate([np.broadcast_to(each.offset or 0.0, len(each.joints)) for each in maps])
-        actions = (values * scale + offset)[:, [joints.index(joint) for joint in self._joints]]
+        actions: NDArray[np.float64] = (values * scale + offset)[:, [joints.index(joint) for joint in self._joints]]
         if REFERENCE in tensors:
             relative = {joint for each in maps for joint in each.relative}
             moved = np.array([joint in relative for joint in self._joints], np.float64)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from itertools import chain
-from typing import override
+from typing import Any, override
 
 import attrs
 
@@ -20,7 +20,7 @@ from ibrobot_core.app import HANDLER_THREADS
 class _Server:
     handler: Handler
     threads: ThreadPoolExecutor
-    died: Future[None] = attrs.field(factory=Future)
+    died: Future[Any] = attrs.field(factory=Future)
 
     def end(self) -> None:
         """Begin no further request."""
@@ -58,9 +58,9 @@ class FakeTransport(Transport):
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._subscribers: dict[str, list[_Listener[bytes]]] = {}
+        self._subscribers: dict[str, list[_Listener[Any]]] = {}
         self._servers: dict[str, _Server] = {}
-        self._watchers: dict[str, list[_Listener[bool]]] = {}
+        self._watchers: dict[str, list[_Listener[Any]]] = {}
         self._closed = False
 
     @override
@@ -160,7 +160,7 @@ class FakeTransport(Transport):
             self._servers.clear()
             self._watchers.clear()
 
-    def _leave[T](self, of: dict[str, list[_Listener[T]]], key: str, listener: _Listener[T]) -> None:
+    def _leave(self, of: dict[str, list[_Listener[Any]]], key: str, listener: _Listener[Any]) -> None:
         with self._lock, suppress(KeyError, ValueError):  # it has ended
             of[key].remove(listener)
         listener.end()
