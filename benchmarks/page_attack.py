@@ -142,7 +142,7 @@ async def attack(address: str, count: int, seed: int) -> list[float]:
     times = []
     rng = random.Random(seed)
     async with client(address) as operator, client(address) as attacker:
-        await operator.until(lambda: operator.states and "jog" in operator.status.get("services", ()))
+        await operator.until(lambda: operator.states and operator.status.get("jogs"))
         attacks = Attack(attacker, rng)
         begun_s = time.monotonic()
         for number in range(1, count + 1):

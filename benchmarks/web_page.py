@@ -131,7 +131,7 @@ async def kills(count: int) -> bool:
     held: dict[str, list[float]] = {"closed": [], "killed": [], "cut off": []}
     with page_run(*SO101) as address:
         async with client(address) as watcher:
-            await watcher.until(lambda: "jog" in watcher.status.get("services", ()))
+            await watcher.until(lambda: watcher.status.get("jogs"))
             for how in itertools.islice(itertools.cycle(held), count):
                 async with client(address) as operator:
                     await operator.call("operate", take_over=True)
