@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 
 import attrs
 import numpy as np
-from ibrobot_kinematics import KinematicModel, KinematicsError, Target, TipPose, UnreachableError, solve, solve_all
+from ibrobot_kinematics import KinematicModel, Target, TipPose, UnreachableError, solve, solve_all
 from ibrobot_kinematics.poses import matrix
 from ibrobot_kinematics.rotations import between, cross, log
+from ibrobot_kinematics.search import search
 
 from ibrobot_core.api import Vector, Vector3
 from ibrobot_core.app import PoseGoal, PositionGoal
@@ -18,16 +20,12 @@ _PITCHES = np.linspace(-np.pi / 2, np.pi / 2, 7)
 """Directions of the tool that are tried if a goal has none: from straight down to straight up."""
 _SAME = 1e-3
 """Solutions that differ less [rad] count as one."""
-_SEEDS = 12
-"""Random configurations from which numerical searches begin, besides the start."""
-_BRANCHES = 8
-"""Most branches of a position with an axis."""
 _AS_NEAR = 0.02
 """Orientations whose errors differ less [rad] count as equally near."""
 _POSITION_WEIGHT = 100.0
 """A centimetre weighs as much as a radian."""
-_TURNS, _SETTLED = 40, 1e-6
-"""Steps of a search for the nearest orientation, and a step [rad] that ends it."""
+_TURNS = 40
+"""Most steps of a search for the nearest orientation."""
 _FAR = 10.0
 """Positions farther than this many times the arm's reach are refused at once."""
 _WIDEST = 100.0
@@ -198,10 +196,6 @@ class Tool:
                 error = error or failure
                 if direction is None:
                     break
-            except KinematicsError:  # no closed form
-                numerical, error = self._numerical(target, start, tolerances)
-                solutions += numerical
-                break
         distinct = _distinct(solutions)
         if not distinct:
             assert error is not None
@@ -220,22 +214,18 @@ class Tool:
 
     def _posed(self, position: Vector, rotation: Vector, start: Vector, tolerance: float) -> list[Candidate]:
         """Configurations at a position, with orientations near `rotation`, the nearest first."""
-        seeds: list[Vector] = []
-        for axis in (rotation[:, 2], self._in_plane(position, rotation[:, 2]), None, *self._pitched(position)):
-            try:
-                seeds += solve_all(self.model, Target(position, axis=axis), start, position_tolerance=tolerance)
-            except UnreachableError:
-                continue
-            except KinematicsError:  # no closed form
-                seeds += self._seeds(start)
+        target, seeds = Target(position, rotation), [np.clip(start, self.model.lower, self.model.upper)]
+        tool_axis, in_plane = rotation[:, 2], self._in_plane(position, rotation[:, 2])
+        # If a branch of the tool's axis has the orientation, no other is nearer.
+        for axes in ((tool_axis,), (in_plane, None, *self._pitched(position))):
+            for axis in axes:
+                with suppress(UnreachableError):
+                    seeds += solve_all(self.model, Target(position, axis=axis), start, position_tolerance=tolerance)
+            begin = np.array(_distinct(seeds))
+            found = search(self.model, target, begin, position_weight=_POSITION_WEIGHT, iterations=_TURNS)
+            if found.within(tolerance, _SAME).any():
                 break
-        candidates: list[Candidate] = []
-        for begin in (start, *_distinct(seeds)):
-            q = _turned_towards(self.model, position, rotation, begin)
-            candidates.append(self._compared(q, position, rotation))
-            # The branches of the tool's axis come first: if one of them has the orientation, no other is nearer.
-            if len(candidates) > _BRANCHES and min(each.orientation_error for each in candidates) < _SAME:
-                break
+        candidates = map(Candidate, found.joints, found.off.tolist(), found.turned.tolist())
         placed = sorted(
             (each for each in candidates if each.position_error <= tolerance), key=lambda each: each.orientation_error
         )
@@ -243,73 +233,9 @@ class Tool:
         kept = _distinct([each.joints for each in best])
         return [each for each in best if any(each.joints is q for q in kept)]
 
-    def _numerical(
-        self, target: Target, start: Vector, tolerances: Mapping[str, float]
-    ) -> tuple[list[Vector], UnreachableError | None]:
-        solutions: list[Vector] = []
-        for begin in (start, *self._seeds(start)):
-            try:
-                solutions.append(solve(self.model, target, begin, **tolerances))
-            except UnreachableError as failure:
-                # No retry: `solve` has searched from many configurations.
-                return solutions, failure
-        return solutions, None
-
-    def _seeds(self, start: Vector) -> Iterator[Vector]:
-        moving = self.model.moving
-        rng = np.random.default_rng(0)
-        for _ in range(_SEEDS):
-            begin = start.copy()
-            begin[moving] = rng.uniform(self.model.lower[moving], self.model.upper[moving])
-            yield begin
-
     def _compared(self, q: Vector, position: Vector, rotation: Vector | None, axis: Vector | None = None) -> Candidate:
         tip = self.model.forward(q)
         return Candidate(q, float(np.linalg.norm(tip.position - position)), turned(tip, rotation, axis))
-
-
-def _turned_towards(model: KinematicModel, position: Vector, rotation: Vector, start: Vector) -> Vector:
-    """Search from `start` for the configuration at a position with the orientation nearest to `rotation`.
-
-    Levenberg-Marquardt steps within the limits; the weight of the position keeps its error below 0.1 mm if it can be
-    reached.
-    """
-    moving = model.moving
-    lower, upper = model.lower[moving], model.upper[moving]
-
-    def errors(q: Vector) -> tuple[Vector, Vector]:
-        tip, jacobian = model.forward_and_jacobian(q)
-        error = np.concatenate([_POSITION_WEIGHT * (position - tip.position), log(rotation @ tip.rotation.T)])
-        return error, np.concatenate([_POSITION_WEIGHT * jacobian[:3, moving], jacobian[3:, moving]])
-
-    q, damping = np.clip(start, model.lower, model.upper), 1e-2
-    error, rows = errors(q)
-    for _ in range(_TURNS):
-        free = np.ones(len(moving), dtype=bool)
-        for _ in moving:
-            step = np.zeros(len(moving))
-            some = rows[:, free]
-            step[free] = np.linalg.solve(some.T @ some + damping * np.eye(int(free.sum())), some.T @ error)
-            # Joints that would leave their limits stay there; the step is solved again for the others.
-            out = free & (
-                (q[moving] + step < lower) & (q[moving] <= lower) | (q[moving] + step > upper) & (q[moving] >= upper)
-            )
-            if not out.any() or not (free & ~out).any():
-                break
-            free &= ~out
-        trial = q.copy()
-        trial[moving] = np.clip(q[moving] + np.clip(step, -0.5, 0.5), lower, upper)
-        error_there, rows_there = errors(trial)
-        if error_there @ error_there < error @ error:
-            done = np.abs(trial - q).max() < _SETTLED
-            q, error, rows, damping = trial, error_there, rows_there, max(damping / 5, 1e-6)
-            if done:
-                break
-        else:
-            damping *= 4
-            if damping > 1e6:
-                break
-    return q
 
 
 def turned(tip: TipPose, rotation: Vector | None, axis: Vector | None = None) -> float:

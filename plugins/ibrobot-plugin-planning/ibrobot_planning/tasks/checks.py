@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import attrs
 import numpy as np
@@ -25,14 +25,13 @@ from ibrobot_planning.execution.plans import tool_planners
 from ibrobot_planning.goals.grammar import GoalOptions
 from ibrobot_planning.goals.joints import named_pose, pose_names
 from ibrobot_planning.tasks.format import (
-    AlternativesStep,
+    Alternatives,
     GripperStep,
     LookStep,
     MoveStep,
     PolicyStep,
     RecordStep,
     Step,
-    WaitStep,
 )
 from ibrobot_planning.tasks.reading import TaskFile
 from ibrobot_planning.world.objects import World
@@ -118,24 +117,18 @@ class _Checks:
         return CheckedTask(self._file, mode, arm, grippers)
 
     def _step(self, key: Key, step: Step) -> None:
-        key = (*key, step.kind)
-        match step.action:
-            case MoveStep() as move:
-                self._move(key, move)
-            case GripperStep() as gripper:
-                self._gripper(key, gripper)
-            case PolicyStep() as policy:
-                self._policy(key, policy)
-            case LookStep() as look:
-                self._look(key, look)
-            case RecordStep() as record:
-                self._record(key, record)
-            case AlternativesStep() as alternatives:
-                self._alternatives(key, alternatives)
-            case WaitStep():
-                pass
+        kinds: dict[str, Callable[[Key, Any], None]] = {
+            "move": self._move,
+            "gripper": self._gripper,
+            "run_policy": self._policy,
+            "look": self._look,
+            "record": self._record,
+            "alternatives": self._alternatives,
+        }
+        if step.kind in kinds:
+            kinds[step.kind]((*key, step.kind), step.action)
 
-    def _alternatives(self, key: Key, step: AlternativesStep) -> None:
+    def _alternatives(self, key: Key, lists: Alternatives) -> None:
         """Check each list of steps from the same beginning; one of them must be within reach."""
         before, moved, held = self._moved, set(self._moved), self._held
         ends: set[str | None] = set()
@@ -143,7 +136,7 @@ class _Checks:
         if self._recording is not None:
             self._document.add(self._recording, "the step after it must be a run_policy, or in the same list")
             self._recording = None
-        for i, steps in enumerate(step.lists):
+        for i, steps in enumerate(lists):
             self._moved, self._held = set(before), held
             for j, each in enumerate(steps):
                 self._step((*key, i, j), each)

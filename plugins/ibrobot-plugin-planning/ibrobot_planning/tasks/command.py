@@ -24,11 +24,10 @@ from ibrobot_core.app import (
     run_overrides,
     run_robot,
 )
-from ibrobot_planning.execution.requests import Numbered
 from ibrobot_planning.tasks.checks import CheckedTask, Situation, check_task
 from ibrobot_planning.tasks.reading import TaskFile, find_task, read_task
 from ibrobot_planning.tasks.result import TaskResult
-from ibrobot_planning.tasks.runner import RESULT, TaskRunner
+from ibrobot_planning.tasks.runner import TaskRunner
 from ibrobot_planning.world.section import SECTION, first_world, scene_objects
 
 TASKS = "tasks"
@@ -121,7 +120,6 @@ class TaskHooks(RunHooks):
         self._number: int | None = None
         # Counts as failed until the task begins.
         self._session.outcome.goals_failed += 1
-        self._result: TaskResult | None = None
 
     @override
     def step(self) -> None:
@@ -134,8 +132,7 @@ class TaskHooks(RunHooks):
                 session.outcome.goals_failed -= 1
             except IbrobotError as error:
                 session.fail("task", error)
-        elif (result := session.bus.call(RESULT, Numbered(self._number))) is not None:
-            self._result = result
+        elif self._result() is not None:
             session.finish()
 
     @override
@@ -148,7 +145,7 @@ class TaskHooks(RunHooks):
 
     @override
     def summary_rows(self) -> list[tuple[str, str]]:
-        result = self._ended()
+        result = self._result()
         if result is None:
             return []
         rows = [("task", f"{result.name}: {result.outcome.lower()} after {result.duration_s:.1f} s")]
@@ -165,11 +162,9 @@ class TaskHooks(RunHooks):
 
     @override
     def facts(self) -> dict[str, Any]:
-        result = self._ended()
+        result = self._result()
         return {"task": result.as_json() if result is not None else None}
 
-    def _ended(self) -> TaskResult | None:
+    def _result(self) -> TaskResult | None:
         """The result, also of a task that the end of the run cancelled."""
-        if self._result is None and self._number is not None:
-            self._result = self._runner.result(self._number)
-        return self._result
+        return None if self._number is None else self._runner.result(self._number)

@@ -147,7 +147,9 @@ class RecordStep:
             raise ValueError("outcome belongs to the episode of a policy; that of a task is how the task ends")
 
 
-type Action = MoveStep | GripperStep | WaitStep | PolicyStep | LookStep | RecordStep | AlternativesStep
+type Alternatives = tuple[tuple[Step, ...], ...]
+"""Lists of steps."""
+type Action = MoveStep | GripperStep | WaitStep | PolicyStep | LookStep | RecordStep | Alternatives
 
 
 @documented
@@ -190,13 +192,6 @@ def _some_lists(instance: object, attribute: attrs.Attribute[Any], value: Sequen
         raise ValueError("alternatives are lists of steps, each with at least one step")
 
 
-@attrs.frozen
-class AlternativesStep:
-    """`alternatives`: the first list of steps that succeeds."""
-
-    lists: tuple[tuple[Step, ...], ...]
-
-
 @documented
 @attrs.frozen
 class TaskStep(Step):
@@ -205,11 +200,6 @@ class TaskStep(Step):
     alternatives: tuple[tuple[Step, ...], ...] | None = option(
         None, validator=_some_lists, help="lists of steps: the first one whose motions can be planned and that succeeds"
     )
-
-    @override
-    def _actions(self) -> dict[str, Action | None]:
-        lists = self.alternatives
-        return {**super()._actions(), "alternatives": None if lists is None else AlternativesStep(lists)}
 
 
 @documented

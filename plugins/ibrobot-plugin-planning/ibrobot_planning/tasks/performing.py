@@ -22,8 +22,7 @@ from ibrobot_planning.goals.grammar import object_pose
 from ibrobot_planning.goals.text import Target
 from ibrobot_planning.tasks.checks import CheckedTask
 from ibrobot_planning.tasks.format import (
-    Action,
-    AlternativesStep,
+    Alternatives,
     GripperStep,
     LookStep,
     MoveStep,
@@ -118,7 +117,7 @@ class Performance:
             try:
                 if self.cancelled:
                     raise Cancelled
-                facts = dict((yield from self._act(step.action)))
+                facts = dict((yield from self._act(step)))
             except Cancelled:
                 outcome, message = "CANCELLED", self.cancelled
             except (StepFailed, IbrobotError) as error:
@@ -136,23 +135,17 @@ class Performance:
         step = self.checked.file.task.steps[number]
         return StepResult(number + 1, step.kind, step.name, outcome, message)
 
-    def _act(self, action: Action) -> Steps:
-        match action:
-            case MoveStep():
-                acting = self._move(action)
-            case GripperStep():
-                acting = self._grip(action)
-            case WaitStep():
-                acting = self._wait(action)
-            case PolicyStep():
-                acting = self._policy(action)
-            case LookStep():
-                acting = self._look(action)
-            case RecordStep():
-                acting = self._record(action)
-            case AlternativesStep():
-                acting = self._alternatives(action)
-        return acting
+    def _act(self, step: Step) -> Steps:
+        kinds: dict[str, Callable[[Any], Steps]] = {
+            "move": self._move,
+            "gripper": self._grip,
+            "wait": self._wait,
+            "run_policy": self._policy,
+            "look": self._look,
+            "record": self._record,
+            "alternatives": self._alternatives,
+        }
+        return kinds[step.kind](step.action)
 
     def _tick(self) -> Generator[None, None, None]:
         yield
@@ -167,25 +160,25 @@ class Performance:
 
     # Steps.
 
-    def _alternatives(self, step: AlternativesStep) -> Steps:
+    def _alternatives(self, alternatives: Alternatives) -> Steps:
         """Perform the first list of steps that succeeds; lists whose first motions cannot be planned are skipped.
 
         All fail if the robot stops, or if a list fails after it has grasped or released something.
         """
         failures: list[StepFailed | IbrobotError] = []
         held = self._held
-        for number, steps in enumerate(step.lists, 1):
+        for number, steps in enumerate(alternatives, 1):
             self._enter(self.checked.mode.name)
             try:
                 self._check_ahead(steps)
                 for each in steps:
-                    yield from self._act(each.action)
+                    yield from self._act(each)
             except (StepFailed, IbrobotError) as error:
                 self._episode = None
                 if self._session.faults or self._held != held:
                     raise
                 failures.append(error)
-                self._session.log.info("alternative %d of %d: %s", number, len(step.lists), error)
+                self._session.log.info("alternative %d of %d: %s", number, len(alternatives), error)
             else:
                 return {"alternative": number}
         reasons = "; ".join(f"alternative {number}: {error}" for number, error in enumerate(failures, 1))
