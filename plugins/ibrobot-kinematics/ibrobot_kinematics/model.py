@@ -70,7 +70,7 @@ class KinematicModel:
         Returns:
             Position and rotation of shapes (…, 3) and (…, 3, 3).
         """
-        return self._frames(q)[0]
+        return self.screws(q)[0]
 
     def jacobian(self, q: Vector) -> Vector:
         """Jacobian of the tip.
@@ -101,23 +101,12 @@ class KinematicModel:
         Returns:
             The tip, the linear [m/s] and the angular velocities [rad/s], both shape (…, n, 3), all in the base frame.
         """
-        tip, origins, axes = self._frames(q)
+        tip, origins, axes = self.screws(q)
         linear = cross(axes, tip.position[..., None, :] - origins)
         if not self._slides.any():
             return tip, linear, axes
         slides = self._slides[:, None]
         return tip, np.where(slides, axes, linear), np.where(slides, 0.0, axes)
-
-    def screws(self, q: Vector) -> tuple[TipPose, Vector, Vector]:
-        """Pose of the tip, and a point on the axis [m] and the direction of each of the chain's joints.
-
-        Args:
-            q: joint positions, shape (…, J).
-
-        Returns:
-            The tip, the points and the directions, both shape (…, n, 3), all in the base frame.
-        """
-        return self._frames(q)
 
     @cached_property
     def moving(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
@@ -169,8 +158,15 @@ class KinematicModel:
         """The tip in the frame of the last joint of the chain, shape (4, 4)."""
         return homogeneous(self.tip_pose.rotation, self.tip_pose.position)
 
-    def _frames(self, q: Vector) -> tuple[TipPose, Vector, Vector]:
-        """The tip, and the origins and axes of the chain's joints in the base frame, both shape (…, n, 3)."""
+    def screws(self, q: Vector) -> tuple[TipPose, Vector, Vector]:
+        """Pose of the tip, and a point on the axis [m] and the direction of each of the chain's joints.
+
+        Args:
+            q: joint positions, shape (…, J).
+
+        Returns:
+            The tip, the points and the directions, both shape (…, n, 3), all in the base frame.
+        """
         way = (q.take(self.moving, axis=-1) - self._reference)[..., None, None]
         still, turning, turned, moved = self._terms
         steps = still + np.sin(way) * turning + (1 - np.cos(way)) * turned

@@ -45,26 +45,6 @@ class Srdf:
     may_touch: frozenset[tuple[str, str]]
     """Pairs of links whose collisions do not count, both names in alphabetical order."""
 
-    def state(self, name: str, group: str | None = None) -> GroupState:
-        """A named pose.
-
-        Args:
-            name: name of the pose.
-            group: its group; None if only one group has a pose of this name.
-
-        Raises:
-            KinematicsError: if there is none, or several groups have one.
-        """
-        states = [each for each in self.states if each.name == name and group in (None, each.group)]
-        if len(states) == 1:
-            return states[0]
-        if states:
-            groups = ", ".join(each.group for each in states)
-            raise KinematicsError(f"{self.path}: pose {name!r} exists for several groups: {groups}; name the group")
-        known = list(dict.fromkeys(each.name for each in self.states if group in (None, each.group)))
-        where = "" if group is None else f" for group {group!r}"
-        raise KinematicsError(f"{self.path}: no pose {name!r}{where}{did_you_mean(name, known, 'the poses are')}")
-
 
 def read_srdf(path: Path, urdf: Urdf) -> Srdf:
     """Read an SRDF.

@@ -9,7 +9,7 @@ from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.urdf import MOVING, read_urdf
 
 from ibrobot_core.api import JointState, String, TFMessage
-from ibrobot_core.app import CONTROL, RunView, SessionWorker, Subscription
+from ibrobot_core.app import CONTROL, RunView, SessionWorker
 from ibrobot_description.frames import mounted, transform
 
 
@@ -27,7 +27,6 @@ class DescriptionPublisher(SessionWorker):
         urdf = session.config.robot.description.urdf
         source = "the mounts of sensors" if urdf is None else urdf.name
         super().__init__(session, "description", f"/tf, /tf_static and /robot_description from {source}", (CONTROL,))
-        self._states: Subscription | None = None
 
     @override
     def setup(self) -> None:
@@ -50,10 +49,10 @@ class DescriptionPublisher(SessionWorker):
             if path is not None:
                 session.bus.publish(topic, String(_text(path)), latched=True)
         self._states = session.bus.subscribe("/joint_states", 1)
+        self.on_end.callback(self._states.close)
 
     @override
     def work(self, timeout_s: float) -> None:
-        assert self._states is not None
         received = self._states.get(timeout_s)
         if received is None or not self._moving or not self.session.bus.has_subscribers("/tf"):
             return
@@ -63,8 +62,3 @@ class DescriptionPublisher(SessionWorker):
         stamp_ns = state.header.stamp_ns
         transforms = tuple(transform(joint, positions[i], stamp_ns) for joint, i in self._moving)
         self.session.bus.publish("/tf", TFMessage(transforms))
-
-    @override
-    def teardown(self) -> None:
-        if self._states is not None:
-            self._states.close()

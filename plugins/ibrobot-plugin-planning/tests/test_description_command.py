@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
-from ibrobot_kinematics.srdf import Srdf, read_srdf
+from ibrobot_kinematics.srdf import GroupState, Srdf, read_srdf
 from ibrobot_kinematics.urdf import read_urdf
 from ibrobot_planning.commands.description import description
 from ibrobot_planning.goals.text import target
@@ -67,7 +67,7 @@ def test_groups_poses_and_pairs_are_written_under_the_names_of_the_urdf(yaml: Pa
     assert {(state.name, state.group) for state in srdf.states} == {
         (name, group) for name in ("up", "left", "right") for group in ("arm", "gripper")
     }
-    assert srdf.state("left", "arm").positions == {"pan": 1.0, "lift": 0.8, "elbow": 0.8, "flex": 0.5, "roll": 0.0}
+    assert GroupState("left", "arm", {"pan": 1.0, "lift": 0.8, "elbow": 0.8, "flex": 0.5, "roll": 0.0}) in srdf.states
     assert ("base_link", "turret_link") in srdf.may_touch, "one joint connects them"
     assert ("base_link", "upper_link") in srdf.may_touch, "they never touch"
     assert ("base_link", "hand_link") not in srdf.may_touch, "the hand reaches the base"

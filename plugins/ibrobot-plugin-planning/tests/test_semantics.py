@@ -7,7 +7,7 @@ import logging
 import attrs
 import numpy as np
 import pytest
-from ibrobot_kinematics.srdf import read_srdf
+from ibrobot_kinematics.srdf import GroupState, read_srdf
 from ibrobot_kinematics.urdf import read_urdf
 from ibrobot_planning.commands.description import srdf_of as srdf
 from ibrobot_planning.goals.joints import named_pose, pose_names
@@ -72,7 +72,7 @@ def test_a_written_srdf_is_read_with_groups_poses_and_pairs(described, tmp_path)
     path.write_text(srdf(described, pairs, urdf_names(arm, urdf)))
     found = read_srdf(path, urdf)
     assert found.groups["arm"] == ARM
-    assert found.state("left", "arm").positions == {"pan": 1.0, "lift": 0.8, "elbow": 0.8, "flex": 0.5, "roll": 0.0}
+    assert GroupState("left", "arm", {"pan": 1.0, "lift": 0.8, "elbow": 0.8, "flex": 0.5, "roll": 0.0}) in found.states
     assert ("foot_link", "turret_link") in found.may_touch
     assert len(found.may_touch) == len(pairs)
     assert "Never" in path.read_text()

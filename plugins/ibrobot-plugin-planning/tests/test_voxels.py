@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ibrobot_kinematics.poses import pose_at
 from ibrobot_planning.world.voxels import depth_points, voxels
-
-from ibrobot_core.api import Pose
 
 K = np.array([[100.0, 0, 20], [0, 100, 15], [0, 0, 1]])
 
@@ -31,21 +28,9 @@ def test_outliers_can_be_dropped():
 def test_depth_images_become_points_of_the_cameras_frame():
     depth = np.zeros((30, 40))
     depth[15, 20], depth[15, 30], depth[0, 0], depth[1, 1] = 0.5, 1.0, np.nan, 9.0
-    # The optical axis looks along the world's x, the picture's right is the world's -y.
-    camera = pose_at((0, 0, 0.2), (-np.pi / 2, 0, -np.pi / 2))
-    np.testing.assert_allclose(depth_points(depth, K, camera), [[0.5, 0, 0.2], [1.0, -0.1, 0.2]], atol=1e-12)
+    np.testing.assert_allclose(depth_points(depth, K, 2.0), [[0, 0, 0.5], [0.1, 0, 1.0]], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: voxels(np.zeros((3, 2)), 0.01), r"points have shape \(3, 2\)"),
-        (lambda: voxels(np.zeros((3, 3)), 0.0), "size is 0.0 m, must be above 0"),
-        (lambda: voxels(np.zeros((3, 3)), 0.01, least_points=0), "least_points is 0, must be at least 1"),
-        (lambda: depth_points(np.zeros(3), K, Pose()), r"depth has shape \(3,\)"),
-        (lambda: depth_points(np.zeros((3, 3)), np.zeros((3, 3)), Pose()), "focal lengths above 0"),
-    ],
-)
-def test_arrays_of_other_shapes_are_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+def test_focal_lengths_must_be_above_0():
+    with pytest.raises(ValueError, match="focal lengths above 0"):
+        depth_points(np.zeros((3, 3)), np.zeros((3, 3)), 2.0)

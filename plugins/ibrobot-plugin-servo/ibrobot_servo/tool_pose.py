@@ -8,7 +8,7 @@ from ibrobot_kinematics import KinematicModel, KinematicsError, robot_model
 from ibrobot_kinematics.poses import orientation
 
 from ibrobot_core.api import NS_PER_S, Header, JointState, Pose, PoseStamped, Vector3
-from ibrobot_core.app import CONTROL, RunView, SessionWorker, Subscription
+from ibrobot_core.app import CONTROL, RunView, SessionWorker
 from ibrobot_servo.options import ToolPoseOptions
 
 
@@ -23,7 +23,6 @@ class ToolPose(SessionWorker):
         self._period_ns = round(NS_PER_S / options.rate_hz)
         self._next_ns: int | None = None
         self._model: KinematicModel | None = None
-        self._states: Subscription | None = None
 
     @override
     def setup(self) -> None:
@@ -34,10 +33,11 @@ class ToolPose(SessionWorker):
             return
         self._next_ns = None
         self._states = self.session.bus.subscribe("/joint_states", 1)
+        self.on_end.callback(self._states.close)
 
     @override
     def work(self, timeout_s: float) -> None:
-        if self._states is None or self._model is None:
+        if self._model is None:
             self.pause(timeout_s)
             return
         received = self._states.get(timeout_s)
@@ -55,9 +55,3 @@ class ToolPose(SessionWorker):
         tip = self._model.forward(state.position)
         pose = Pose(Vector3(*tip.position.tolist()), orientation(tip.rotation))
         self.session.bus.publish(self._options.topic, PoseStamped(Header(stamp_ns, self._options.frame), pose))
-
-    @override
-    def teardown(self) -> None:
-        if self._states is not None:
-            self._states.close()
-            self._states = None

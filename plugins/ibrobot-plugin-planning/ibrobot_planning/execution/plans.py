@@ -91,20 +91,16 @@ class GoalPlans:
         Raises:
             PlanningError: if the planner does not take such goals, or no executor of the mode can reach it.
         """
-        if target.tool is not None and not isinstance(target.tool, JointGoal):
-            self._check_planner(target)
-        self.divided(target)
-
-    def _check_planner(self, target: Target) -> None:
-        """Refuse a goal of the tool, or alternatives, where the planner takes joint positions only."""
         takes = tool_planners(self._session.registry)
         assert self._mode.planner is not None
-        if self._mode.planner.type not in takes:
+        of_tool = target.tool is not None and not isinstance(target.tool, JointGoal)
+        if of_tool and self._mode.planner.type not in takes:
             raise PlanningError(
                 f"goal {target.text!r}: planner type {self._mode.planner.type!r} of mode {self._mode.name} takes joint"
                 f" positions only; types that take other goals: {', '.join(takes) or 'none is installed'}",
                 PlanCode.UNRECOGNIZED_GOAL_TYPE,
             )
+        self.divided(target)
 
     def divided(self, target: Target) -> dict[str, Goal | float | JointTrajectory]:
         """Executor -> its part of a goal: a goal to plan for, a position [rad], or a trajectory to follow.

@@ -149,7 +149,7 @@ class PlannerSource(SourceWorker):
         self._over = False
         self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
             GO_TO: lambda request: self._submit(request.goal).number,
-            RESULT: self._result,
+            RESULT: lambda request: self._results.of(request.number),
             CANCEL: lambda _: self._inbox.put(None),
             MOVE_ACTION: self._move_action,
             EXECUTE: self._execute,
@@ -231,7 +231,8 @@ class PlannerSource(SourceWorker):
             if self.session.request.lockstep:
                 self._watch()
             if self._move is not None:
-                self._go_on(self._move)
+                self._following(self._move, self._execution.step)
+                self._end_at_rest(self._move)
             if self._move is None and self._queue and self._at_rest():
                 self._begin(self._queue.popleft())
             if self._move is not None and self.session.clock.now_ns() - self._status_ns >= _STATUS_NS:
@@ -255,13 +256,20 @@ class PlannerSource(SourceWorker):
         return {"goals": goals} if self._goals else {}
 
     def _new(self, goal: str | Goal | Target, velocity_scaling: float = 1.0, *, asked: bool = False) -> _Move:
+        """A goal that was checked.
+
+        Raises:
+            PlanningError: for an invalid goal, or while the robot is stopped, since a goal must not wait for the reset.
+        """
         parsed = target(goal, self.session.config.robot, velocity_scaling)
         self._plans.check(parsed)
-        return _Move(self._results.number(), parsed, asked)
+        if self.session.faults:
+            raise PlanningError(f"refused before a reset: {self.session.faults[-1]}", PlanCode.CONTROL_FAILED)
+        return _Move(self._results.number(), parsed, asked, self.session.stops)
 
     def _submit(self, goal: str | Goal | Target, velocity_scaling: float = 1.0) -> _Move:
         """Replace all goals by this one."""
-        move = self._accepted(self._new(goal, velocity_scaling))
+        move = self._new(goal, velocity_scaling)
         self._inbox.put(move)
         return move
 
@@ -272,20 +280,6 @@ class PlannerSource(SourceWorker):
 
     def _execute(self, request: Execute) -> int:
         return self._submit(Target("trajectory", trajectory=request.trajectory())).number
-
-    def _accepted(self, move: _Move) -> _Move:
-        """Accept a goal.
-
-        Raises:
-            PlanningError: while the robot is stopped, since a goal must not wait for the reset.
-        """
-        if self.session.faults:
-            raise PlanningError(f"refused before a reset: {self.session.faults[-1]}", PlanCode.CONTROL_FAILED)
-        move.stops = self.session.stops
-        return move
-
-    def _result(self, request: Numbered) -> MoveResult | None:
-        return self._results.of(request.number)
 
     def _move_to_pose(self, wanted: MoveToPose) -> MoveResult:
         try:
@@ -326,7 +320,7 @@ class PlannerSource(SourceWorker):
                     f"takes geometry_msgs/msg/PoseStamped or Pose, got {message.ros_type}",
                     PlanCode.UNRECOGNIZED_GOAL_TYPE,
                 )
-            self._replace(self._accepted(self._new(_nearest(message))))
+            self._replace(self._new(_nearest(message)))
         except PlanningError as error:
             self.session.log.error("%s: %s: %s", CMD_POSE, error.code.name, error)
             self._show("failed")
@@ -368,11 +362,6 @@ class PlannerSource(SourceWorker):
         if not new.blocked:
             self._following(new, lambda: self._execution.follow(goals))
         return True
-
-    def _go_on(self, move: _Move) -> None:
-        self._following(move, self._execution.step)
-        if not self._execution.under_way:
-            self._end_move(move)
 
     def _following(self, move: _Move, step: Callable[[], None]) -> None:
         """Go on with a move; if that fails, slow down."""
@@ -433,11 +422,12 @@ class PlannerSource(SourceWorker):
         if failed and not move.dropped:
             move.failures.append(failed)
             self._execution.stop(move.number)
-        if not self._execution.under_way:
-            self._end_move(move)
+        self._end_at_rest(move)
 
-    def _end_move(self, move: _Move) -> None:
-        """Report the outcome of a move whose executors have ended."""
+    def _end_at_rest(self, move: _Move) -> None:
+        """Report the outcome of a move if its executors have ended."""
+        if self._execution.under_way:
+            return
         if move.blocked:
             code = PlanCode.MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE
             self._finish(move, "EXECUTION_FAILED", code, self._stopped(move))

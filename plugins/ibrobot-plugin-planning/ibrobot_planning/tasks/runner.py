@@ -71,15 +71,10 @@ class TaskRunner(SessionWorker):
 
     @override
     def setup(self) -> None:
+        self.on_end.callback(self._end_early)
         for service, handler in self._services.items():
             self.session.bus.serve(service, handler)
-
-    @override
-    def teardown(self) -> None:
-        for service in self._services:
-            self.session.bus.unserve(service)
-        self._end_early()
-        super().teardown()
+            self.on_end.callback(self.session.bus.unserve, service)
 
     def run(self, file: TaskFile) -> int:
         """Check a task and begin it; returns its number.

@@ -7,7 +7,7 @@ from types import NoneType
 from typing import Any, override
 
 import numpy as np
-from ibrobot_kinematics.poses import matrix, pose
+from ibrobot_kinematics.poses import matrix
 
 from ibrobot_core.api import (
     CameraInfo,
@@ -170,7 +170,7 @@ class _Cloud:
         depth = pixels(message)[:, :, 0].astype(float) / (1000.0 if message.encoding == "16UC1" else 1.0)
         step = max(1, int(options.cell * k[0, 0] / (_PIXELS * options.furthest)))
         k[:2] /= step
-        return depth_points(depth[::step, ::step], k, pose(np.eye(4)), furthest=options.furthest)
+        return depth_points(depth[::step, ::step], k, options.furthest)
 
     def kept(self, cells: Voxels | None, now_ns: int) -> Voxels | None:
         """These cells and earlier ones that are still kept, at most `most_cells`."""

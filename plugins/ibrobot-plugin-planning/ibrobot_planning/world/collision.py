@@ -198,15 +198,6 @@ class Collisions:
                 closest[first, second] = contact
         return sorted(closest.values(), key=lambda contact: contact.distance)
 
-    def distances(self, q: Vector) -> dict[Pair, float]:
-        """Distance [m] of each checked pair of names at `q`, shape (J,); negative if they overlap."""
-        shapes, results, native = self.geometry, self.results, self.native(q[None])[0]
-        pinocchio.computeDistances(self.arm.model, self.data, shapes, results, native)
-        distances: dict[Pair, float] = {}
-        for names, result in zip(self.pairs, results.distanceResults, strict=True):
-            distances[names] = min(float(result.min_distance), distances.get(names, np.inf))
-        return distances
-
     def native(self, configurations: Vector) -> Vector:
         """Configurations of the planned joints, shape (N, J), completed with all other joints for Pinocchio."""
         whole = np.empty((len(configurations), len(self._still)))
@@ -230,17 +221,21 @@ class Clearance:
     def __init__(self, arm: Arm, world: World) -> None:
         self._checks = Collisions(arm, world, arm.joint_names)
         standing = {name for name, thing in world.objects.items() if thing.link is None}
-        self._pairs = [number for number, names in enumerate(self._checks.pairs) if standing.intersection(names)]
+        pairs = enumerate(self._checks.pairs)
+        self._pairs = [(number, names) for number, names in pairs if standing.intersection(names)]
 
-    def __call__(self, q: Vector) -> float:
-        """Distance from the nearest object [m] at `q`, shape (J,): negative in contact, infinite without objects."""
+    def __call__(self, q: Vector) -> tuple[float, Pair]:
+        """Distance from the nearest object [m] at `q`, shape (J,): negative in contact, infinite without objects.
+
+        With the names of the nearest pair.
+        """
         checks = self._checks
         native = checks.native(q[None])[0]
         pinocchio.updateGeometryPlacements(checks.arm.model, checks.data, checks.geometry, checks.results, native)
         distance = pinocchio.computeDistance
         return min(
-            (float(distance(checks.geometry, checks.results, number).min_distance) for number in self._pairs),
-            default=math.inf,
+            ((distance(checks.geometry, checks.results, number).min_distance, names) for number, names in self._pairs),
+            default=(math.inf, ("", "")),
         )
 
 

@@ -325,4 +325,4 @@ class WorldKeeper(Component):
         with self._measuring:
             if self._clearance is None or self._clearance[0] != world:
                 self._clearance = world, Clearance(self._robot(), world)
-            return self._clearance[1](q)
+            return self._clearance[1](q)[0]
