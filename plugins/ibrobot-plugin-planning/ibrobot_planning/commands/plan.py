@@ -181,8 +181,7 @@ def _planned(
             raise PlanningError(f"goal {aim.text!r} moves no joint of the arm: {', '.join(joints)}")
         trajectory = next(each for each in goals.values() if isinstance(each, JointTrajectory))
         sampled = _sampled(trajectory, robot, start)
-        others = dict(zip(robot.joint_names, start.tolist(), strict=True))
-        clearance = _clearance(session, joints, others, sampled)
+        clearance = _clearance(session, joints, start, sampled)
     limits = robot.max_velocity[robot.indices(joints)]
     peaks = np.abs(sampled.velocities).max(axis=0)
     report |= {
@@ -233,25 +232,19 @@ def _sampled(trajectory: JointTrajectory, robot: Robot, start: Vector) -> Plan:
     return Plan(trajectory, times, positions, velocities, tool)
 
 
-def _clearance(
-    session: Session, joints: tuple[str, ...], others: dict[str, float], sampled: Plan
-) -> dict[str, Any] | None:
+def _clearance(session: Session, joints: tuple[str, ...], start: Vector, sampled: Plan) -> dict[str, Any] | None:
     """The least distance of the arm, and of what it carries, from objects; None without objects."""
-    world = world_of(session.bus)
-    if not world.objects:
+    world, robot = world_of(session.bus), session.config.robot
+    if all(thing.link is not None for thing in world.objects.values()):
         return None
-    from ibrobot_planning.world.checked_arm import checked_arm
-    from ibrobot_planning.world.collision import Collisions
+    from ibrobot_planning.world.arm import robot_arm
+    from ibrobot_planning.world.collision import Clearance
 
-    checked = checked_arm(session.config.robot, session.log)
-    checks = Collisions(checked.arm, world, joints, others, unchecked=checked.unchecked)
-    nearest: dict[str, Any] | None = None
-    for moment, q in zip(sampled.times.tolist(), sampled.positions, strict=True):
-        for (first, second), distance in checks.distances(q).items():
-            standing = any(name in world.objects and world.objects[name].link is None for name in (first, second))
-            if standing and (nearest is None or distance < nearest["distance_m"]):
-                nearest = {"distance_m": distance, "between": [first, second], "at_s": moment}
-    return nearest
+    clearance = Clearance(robot_arm(robot), world)
+    whole = np.repeat(start[None], len(sampled.times), axis=0)
+    whole[:, robot.indices(joints)] = sampled.positions
+    (distance, between), moment = min(zip(map(clearance, whole), sampled.times.tolist(), strict=True))
+    return {"distance_m": distance, "between": list(between), "at_s": moment}
 
 
 def _text(report: dict[str, Any]) -> str:
