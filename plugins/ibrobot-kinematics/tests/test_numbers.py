@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from ibrobot_kinematics.quadratic import bounded_minimum
+from ibrobot_kinematics.servo import bounded_minimum
 
 from ibrobot_core.api import Vector
 

@@ -58,13 +58,10 @@ class _Next:
     """A goal that waits for the braking motion."""
 
     goal: ExecutorGoal
+    motion: Motion | None
+    """The goal as a motion, if it is one."""
     refused: str = ""
     """Why the executor last refused it; often because it came too late."""
-
-    @cached_property
-    def motion(self) -> Motion | None:
-        """The goal as a motion, if it is one."""
-        return None if isinstance(self.goal, float) else motion_of(self.goal)
 
 
 class Execution:
@@ -157,7 +154,9 @@ class Execution:
     def follow(self, goals: Mapping[str, ExecutorGoal]) -> None:
         """Add the next motion to the braking one."""
         with self._lock:
-            self._ahead = {name: _Next(goal) for name, goal in goals.items()}
+            self._ahead = {
+                name: _Next(goal, None if isinstance(goal, float) else motion_of(goal)) for name, goal in goals.items()
+            }
         self.step()
 
     def step(self) -> None:

@@ -53,10 +53,10 @@ def linear_path(tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start:
     """
     if not waypoints:
         raise invalid_goal("a straight path needs at least one waypoint")
-    targets, lengths = _targets(tool, waypoints, start)
-    total = sum(lengths)
+    targets = _targets(tool, waypoints, start)
+    total = sum(length for *_, length in targets)
     joints, fractions, errors, reason, covered = [start], [0.0], [0.0], "", 0.0
-    for (target, tolerance, axis_tolerance), length in zip(targets, lengths, strict=True):
+    for target, tolerance, axis_tolerance, length in targets:
         q = _followed(tool.model, target, joints[-1], tolerance, axis_tolerance)
         if q is None:
             try:
@@ -106,11 +106,11 @@ def _followed(
 
 def _targets(
     tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start: Vector
-) -> tuple[list[tuple[Target, float, float]], list[float]]:
-    """Targets along the lines with their tolerances, and the length of the path to each from the previous one."""
+) -> list[tuple[Target, float, float, float]]:
+    """Targets along the lines, each with its tolerances and the length of the path from the previous one."""
     tip = tool.model.forward(start)
     position, rotation = tip.position, tip.rotation
-    targets, lengths = [], []
+    targets = []
     for waypoint in waypoints:
         end, end_rotation, axis, angle_tolerance = _end(waypoint)
         tool.check_reach(end, start)
@@ -123,21 +123,16 @@ def _targets(
         angle = float(np.linalg.norm(turn))
         number = max(int(np.ceil(away / _STEP_M)), int(np.ceil(angle / _STEP_RAD)), 1)
         for share in np.arange(1, number + 1) / number:
-            place = position + share * (end - position)
-            if end_rotation is not None:
-                target = Target(place, rotation @ exp(share * turn))
-            elif axis is not None:
-                target = Target(place, axis=exp(share * turn) @ rotation[:, 2])
-            else:
-                target = Target(place)
-            targets.append((target, waypoint.position_tolerance, angle_tolerance))
-            lengths.append(away / number)
+            rotated = None if end_rotation is None else rotation @ exp(share * turn)
+            pointed = None if axis is None else exp(share * turn) @ rotation[:, 2]
+            target = Target(position + share * (end - position), rotated, pointed)
+            targets.append((target, waypoint.position_tolerance, angle_tolerance, away / number))
         position = end
         if end_rotation is not None:
             rotation = end_rotation
         elif axis is not None:
             rotation = exp(turn) @ rotation
-    return targets, lengths
+    return targets
 
 
 def _end(waypoint: PositionGoal | PoseGoal) -> tuple[Vector, Vector | None, Vector | None, float]:

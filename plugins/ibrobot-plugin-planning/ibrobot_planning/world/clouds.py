@@ -97,7 +97,7 @@ class CloudKeeper(SessionWorker):
 
     def _clear(self, request: NoRequest) -> None:
         for name, cloud in self._clouds.items():
-            cloud.forget()
+            cloud.seen.clear()
             self._keeper.put(name, None)
 
 
@@ -110,7 +110,7 @@ class _Cloud:
         self._session = session
         self._info: CameraInfo | None = None
         self._due_ns: int | None = None
-        self._seen: deque[tuple[int, Voxels]] = deque()
+        self.seen: deque[tuple[int, Voxels]] = deque()
         """Time of receipt [ns] and cells of updates, oldest first."""
         self._reported = ""
 
@@ -176,22 +176,18 @@ class _Cloud:
         """These cells and earlier ones that are still kept, at most `most_cells`."""
         options = self.options
         if options.keep == 0:
-            self._seen.clear()
-        while self._seen and now_ns - self._seen[0][0] > ns(options.keep):
-            self._seen.popleft()
+            self.seen.clear()
+        while self.seen and now_ns - self.seen[0][0] > ns(options.keep):
+            self.seen.popleft()
         if cells is not None:
-            self._seen.append((now_ns, cells))
-        if not self._seen:
+            self.seen.append((now_ns, cells))
+        if not self.seen:
             return None
-        occupied = np.unique(np.concatenate([each.cells for _, each in self._seen]), axis=0)
+        occupied = np.unique(np.concatenate([each.cells for _, each in self.seen]), axis=0)
         if len(occupied) > options.most_cells:
             self.report(f"{len(occupied)} occupied cells, only the nearest {options.most_cells} are kept (most_cells)")
             occupied = occupied[np.argsort(np.linalg.norm(occupied, axis=1), kind="stable")[: options.most_cells]]
         return Voxels(options.cell, occupied)
-
-    def forget(self) -> None:
-        """Drop all cells."""
-        self._seen.clear()
 
     def report(self, message: str) -> None:
         """Log a warning, unless it is the same as before."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import attrs
 import numpy as np
@@ -152,6 +153,10 @@ class Voxels:
 
 
 type Shape = Box | Sphere | Cylinder | Capsule | Plane | Mesh | Voxels
+SIMPLE: Mapping[Literal["box", "sphere", "cylinder", "capsule", "plane"], type[Any]] = {
+    "box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Capsule, "plane": Plane,
+}  # fmt: skip
+"""The shapes of a simulated scene."""
 
 
 @attrs.frozen

@@ -76,19 +76,14 @@ class ObjectOptions:
         """
         from ibrobot_kinematics.poses import pose_at
 
-        from ibrobot_planning.world.objects import Box, Capsule, Cylinder, Plane, Shape, Sphere, WorldObject, read_mesh
+        from ibrobot_planning.world.objects import SIMPLE, Shape, WorldObject, read_mesh
 
         shape: Shape
-        if self.size is not None:
-            shape = Box(self.size)
-        elif self.file is not None:
+        if self.shape == "mesh":
+            assert self.file is not None
             shape = read_mesh(self.file, self.scale, convex=self.convex)
-        elif self.radius is not None and self.height is not None:
-            shape = (Cylinder if self.shape == "cylinder" else Capsule)(self.radius, self.height)
-        elif self.radius is not None:
-            shape = Sphere(self.radius)
         else:
-            shape = Plane()
+            shape = SIMPLE[self.shape](*(getattr(self, key) for key in _KEYS[self.shape]))
         return WorldObject(shape, pose_at(self.position, self.rpy), self.link, self.may_touch)
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, override
+from typing import TYPE_CHECKING, Any, override
 
 import attrs
 import numpy as np
@@ -27,14 +27,11 @@ from ibrobot_core.api import (
 from ibrobot_core.app import Component, NoRequest, PlanCode, Registry, RobotConfig, RunView, Service, Subscription
 from ibrobot_planning.world.objects import (
     FLOOR,
+    SIMPLE,
     SNAPSHOT,
     Box,
-    Capsule,
-    Cylinder,
     Mesh,
-    Plane,
     Shape,
-    Sphere,
     World,
     WorldObject,
 )
@@ -63,10 +60,6 @@ ALLOW = Service("/world/allow", Allowed, list, "State what an object may touch."
 SHAPES: Service[NoRequest, Sequence[SceneObject]] = Service(
     "/world/shapes", NoRequest, Sequence, "The objects in the base frame that have simple shapes."
 )
-_SIMPLE: Mapping[Literal["box", "sphere", "cylinder", "capsule", "plane"], type[Any]] = {
-    "box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Capsule, "plane": Plane,
-}  # fmt: skip
-"""The shapes of a simulated scene."""
 _STILL = 1e-4
 """Smaller changes of an object's position [m] and axes do not count as motion."""
 
@@ -99,7 +92,7 @@ def first_world(options: WorldOptions, scene: Sequence[SceneObject]) -> World:
 
 
 def _shape(thing: SceneObject) -> Shape:
-    return Box(thing.size) if thing.shape == "box" else _SIMPLE[thing.shape](*thing.size)
+    return Box(thing.size) if thing.shape == "box" else SIMPLE[thing.shape](*thing.size)
 
 
 def _size(shape: Shape) -> tuple[float, ...]:
@@ -108,7 +101,7 @@ def _size(shape: Shape) -> tuple[float, ...]:
 
 def simple_objects(world: World) -> list[SceneObject]:
     """The objects of a world that stand in the base frame and have a simple shape, e.g. to draw them."""
-    kinds = {kind: name for name, kind in _SIMPLE.items()}
+    kinds = {kind: name for name, kind in SIMPLE.items()}
     return [
         SceneObject(name, kinds[type(shape)], _size(shape), thing.pose)
         for name, thing in world.objects.items()
