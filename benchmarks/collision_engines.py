@@ -39,7 +39,7 @@ def timed(check: Callable[[Vector], bool], configurations: Vector) -> tuple[floa
 
 def main() -> None:
     maker, robot = Maker(), so101()
-    hulls = with_hulls(maker.arm, maker.unchecked)
+    hulls = with_hulls(maker.arm)
     samples = np.random.default_rng(0).uniform(robot.lower[:5], robot.upper[:5], (CONFIGURATIONS, 5))
     print(
         f"{'':12s} {'objects':>8s} {'free':>6s} "
@@ -58,7 +58,7 @@ def main() -> None:
             took, answers = timed(partial(native_check, (model, data, manager)), native)
             differ = sum(a != b for a, b in zip(answers, expected, strict=True))
             columns.append(f"{took:.1f} µs" + (f" ({differ} differ)" if differ else ""))
-        quick = Collisions(hulls, world, ARM_JOINTS, padding=PADDING_M, unchecked=maker.unchecked)
+        quick = Collisions(hulls, world, ARM_JOINTS, padding=PADDING_M)
         took, answers = timed(quick.touches, native)
         differ = sum(a != b for a, b in zip(answers, expected, strict=True))
         columns.append(f"{took:.1f} µs" + (f" ({differ} differ)" if differ else ""))

@@ -184,13 +184,13 @@ class Maker:
     """Makes problems; holds what all of them share."""
 
     def __init__(self) -> None:
-        self.arm = arm()
-        self.unchecked = unchecked_pairs(self.arm)
+        made = arm()
+        self.arm = attrs.evolve(made, unchecked=unchecked_pairs(made))
         self._model = read_mjcf(MJCF, "gripperframe", ARM_JOINTS)
 
     def checks(self, world: World, padding: float = PADDING_M) -> Collisions:
         """The planner's own checks."""
-        return Collisions(self.arm, world, ARM_JOINTS, padding=padding, unchecked=self.unchecked)
+        return Collisions(self.arm, world, ARM_JOINTS, padding=padding)
 
     def problem(self, kind: str, seed: int) -> Problem:
         """Problem number `seed` of a kind."""

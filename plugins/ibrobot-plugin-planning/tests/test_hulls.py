@@ -39,7 +39,7 @@ def make(tmp_path_factory, mjcf: str) -> Arm:
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory) -> Arm:
     arm = make(tmp_path_factory, FORKED)
-    return with_hulls(arm, unchecked_pairs(arm))
+    return with_hulls(attrs.evolve(arm, unchecked=unchecked_pairs(arm)))
 
 
 @pytest.fixture(scope="module")
@@ -47,10 +47,7 @@ def both(arm) -> tuple[Collisions, Collisions]:
     """Checks with and without hulls, among objects."""
     can = WorldObject(Cylinder(0.03, 0.2), Pose(Vector3(-0.15, 0.1, 0.15)))
     world = World({"wall": box(0.2, 0, 0.15, 0.3, 0.02, 0.3), "can": can, "lid": box(0, 0, 0.45, 0.05, 0.05, 0.02)})
-    unchecked = unchecked_pairs(arm)
-    quick, exact = (
-        Collisions(each, world, ARM, padding=0.005, unchecked=unchecked) for each in (arm, attrs.evolve(arm, hulls=()))
-    )
+    quick, exact = (Collisions(each, world, ARM, padding=0.005) for each in (arm, attrs.evolve(arm, hulls=())))
     return quick, exact
 
 
@@ -62,7 +59,7 @@ def test_links_of_several_shapes_have_one_hull(arm):
 def test_what_is_between_the_prongs_does_not_touch(arm):
     place = arm.link_pose("hand", np.zeros(6)) @ [0.042, 0, 0.05, 1]
     ball = World({"ball": WorldObject(Sphere(0.005), Pose(Vector3(*place[:3])))})
-    checks = Collisions(arm, ball, ARM, padding=0.002, unchecked=unchecked_pairs(arm))
+    checks = Collisions(arm, ball, ARM, padding=0.002)
     assert checks.free(np.zeros(5))
     moved = Collisions(arm, ball.move("ball", Pose(Vector3(place[0] + 0.008, *place[1:3]))), ARM, padding=0.002)
     assert ("hand", "ball") in {(each.first, each.second) for each in moved.contacts(np.zeros(5))}
@@ -86,7 +83,7 @@ def test_answers_are_those_of_the_exact_shapes(both):
 
 def test_link_keeps_shapes_where_its_hull_contains_the_arm(tmp_path_factory):
     arm = make(tmp_path_factory, POSTS)
-    arm = with_hulls(arm, unchecked_pairs(arm))
+    arm = with_hulls(attrs.evolve(arm, unchecked=unchecked_pairs(arm)))
     links = [shape.link for shape in arm.hulls]
     assert links.count("base") == 3
     assert links.count("hand") == 1
@@ -94,4 +91,4 @@ def test_link_keeps_shapes_where_its_hull_contains_the_arm(tmp_path_factory):
 
 def test_arm_with_one_shape_per_link_needs_no_hulls(tmp_path_factory):
     arm = make(tmp_path_factory, MJCF)
-    assert with_hulls(arm, unchecked_pairs(arm)) is arm
+    assert with_hulls(arm) is arm

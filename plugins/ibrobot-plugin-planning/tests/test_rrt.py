@@ -13,7 +13,7 @@ from ibrobot_kinematics import robot_model
 from ibrobot_planning.goals.tool import Tool
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.planners.timing import Motion
-from ibrobot_planning.world.collision import Collisions, unchecked_pairs
+from ibrobot_planning.world.collision import Collisions
 from ibrobot_planning.world.objects import Sphere, World, WorldObject
 
 from ibrobot_core.api import PlanningError, Pose, Quaternion, Robot, Vector3
@@ -219,8 +219,7 @@ def test_a_start_in_contact_leaves_outwards(tmp_path):
     beside = hand[:3, 3] + hand[:3, :3] @ [-0.016 - 0.015 + 0.003, 0, 0.03]
     ball = WorldObject(Sphere(0.015), Pose(Vector3(*beside)))
     planner.world = World({"ball": ball})
-    unchecked = unchecked_pairs(planner.arm)
-    checks = Collisions(planner.arm, planner.world, ARM, padding=0.005, unchecked=unchecked)
+    checks = Collisions(planner.arm, planner.world, ARM, padding=0.005)
     positions = motion(planner.plan(ask(NamedGoal("up")))).sampled(0.001)[0]
     depth = [checks.contacts(q)[0].distance if not checks.free(q) else 0.005 for q in positions[:200]]
     assert depth[0] == pytest.approx(-0.003, abs=2e-4)

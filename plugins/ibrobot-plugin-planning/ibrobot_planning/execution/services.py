@@ -34,7 +34,7 @@ from ibrobot_planning.world.engines import find_engines
 from ibrobot_planning.world.objects import world_of
 
 if TYPE_CHECKING:
-    from ibrobot_planning.world.checked_arm import CheckedArm
+    from ibrobot_planning.world.arm import Arm
 
 COMPUTE_IK = Service("/compute_ik", IkQuery, IkAnswer, "Joint positions for a position or pose of the tool.")
 COMPUTE_FK = Service("/compute_fk", FkQuery, FkAnswer, "Poses of links.")
@@ -77,7 +77,7 @@ class PlanningServices:
         }
 
     @cached_property
-    def _checked(self) -> CheckedArm:
+    def _arm(self) -> Arm:
         find_engines()
         from ibrobot_planning.world.checked_arm import checked_arm
 
@@ -147,18 +147,10 @@ class PlanningServices:
         """
         from ibrobot_planning.world.collision import Collisions
 
-        planner, padding, self_padding = self._mode.planner, 0.0, 0.0
+        planner, paddings = self._mode.planner, {}
         if planner is not None and isinstance(planner.options, RrtConnectOptions):
-            padding, self_padding = planner.options.padding, planner.options.self_padding
-        checked = self._checked
-        checks = Collisions(
-            checked.arm,
-            world_of(self._session.bus),
-            self._robot.joint_names,
-            padding=padding,
-            self_padding=self_padding,
-            unchecked=checked.unchecked,
-        )
+            paddings = {"padding": planner.options.padding, "self_padding": planner.options.self_padding}
+        checks = Collisions(self._arm, world_of(self._session.bus), self._robot.joint_names, **paddings)
         free = [each for each in candidates if checks.free(each.joints)]
         if not free:
             contacts = checks.contacts(candidates[0].joints)
@@ -183,8 +175,7 @@ class PlanningServices:
         if link == self._plans.tool.model.tip:
             tip = self._plans.tool.model.forward(q)
             return pose(homogeneous(tip.rotation, tip.position))
-        checked = self._checked
-        return pose(checked.arm.link_pose(checked.names.get(link, link), q))
+        return pose(self._arm.link_pose(self._arm.urdf_links.get(link, link), q))
 
     def _links(self) -> tuple[str, ...]:
         from ibrobot_planning.world.arm import robot_arm

@@ -32,7 +32,7 @@ from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.search import Pace, Space, connect, shortened
 from ibrobot_planning.planners.timing import Motion, motion_of, resting, timed, trajectory_of
-from ibrobot_planning.world.arm import Arm, Pair
+from ibrobot_planning.world.arm import Arm
 from ibrobot_planning.world.checked_arm import checked_arm
 from ibrobot_planning.world.collision import Collisions, Contact
 from ibrobot_planning.world.objects import FLOOR, SNAPSHOT, Plane, World, WorldObject
@@ -72,14 +72,12 @@ class RrtConnectPlanner(Planner):
         self._ctx = ctx
         self._arm: Arm | None = None
         self._tool: Tool | None = None
-        self._unchecked: Mapping[Pair, str] = {}
         self._checked: deque[tuple[JointTrajectory, World]] = deque(maxlen=8)
         """Free trajectories, each with the world in which it is free."""
 
     @override
     def load(self) -> None:
-        checked = checked_arm(self._ctx.robot, self._ctx.log)
-        self._arm, self._unchecked = checked.arm, checked.unchecked
+        self._arm = checked_arm(self._ctx.robot, self._ctx.log)
         self._tool = Tool(robot_model(self._ctx.robot))
 
     @property
@@ -122,10 +120,8 @@ class RrtConnectPlanner(Planner):
 
     def _collisions(self, world: World, joints: Sequence[str], others: Mapping[str, float]) -> Collisions:
         options = self._options
-        return Collisions(
-            self.arm, world, joints, others,
-            padding=options.padding, self_padding=options.self_padding, unchecked=self._unchecked,
-        )  # fmt: skip
+        paddings = {"padding": options.padding, "self_padding": options.self_padding}
+        return Collisions(self.arm, world, joints, others, **paddings)
 
     def _snapshot(self) -> World:
         bus = self._ctx.bus

@@ -5,7 +5,7 @@ MuJoCo reads the file, Pinocchio places the links, Coal finds contacts (ADR 31).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
@@ -68,6 +68,10 @@ class Arm:
     """Which joints are prismatic, shape (J,)."""
     hulls: tuple[LinkShape, ...] = ()
     """Fewer shapes that contain `shapes`, for quick checks; may be empty. See `with_hulls`."""
+    unchecked: Mapping[Pair, str] = attrs.field(factory=dict)
+    """Pairs of links that may touch, with the reason; see `unchecked_pairs`."""
+    urdf_links: Mapping[str, str] = attrs.field(factory=dict)
+    """Link of the URDF -> link of the MJCF; empty without a URDF."""
 
     def native(self, q: Vector) -> Vector:
         """Joint positions, shape (..., J), in Pinocchio's order and zero."""
@@ -81,20 +85,21 @@ class Arm:
         Raises:
             PlanningError: for an unknown link.
         """
-        import pinocchio
-
         joint, frame = self.frame(link)
-        data = self.model.createData()
-        pinocchio.forwardKinematics(self.model, data, self.native(np.asarray(q, dtype=float)))
-        return np.asarray(data.oMi[joint].homogeneous @ frame)
+        return np.asarray(self._joints(q)[joint].homogeneous @ frame)
 
     def placed_shapes(self, q: Vector) -> list[tuple[Any, Vector]]:
         """The shapes of all links with their poses in the base frame, shape (4, 4), at joint positions, shape (J,)."""
+        joints = self._joints(q)
+        return [(each.geometry, joints[each.joint].homogeneous @ each.placement) for each in self.shapes]
+
+    def _joints(self, q: Vector) -> Any:
+        """The pose of each of Pinocchio's joints at joint positions, shape (J,)."""
         import pinocchio
 
         data = self.model.createData()
         pinocchio.forwardKinematics(self.model, data, self.native(np.asarray(q, dtype=float)))
-        return [(each.geometry, data.oMi[each.joint].homogeneous @ each.placement) for each in self.shapes]
+        return data.oMi
 
     def frame(self, link: str) -> tuple[int, Vector]:
         """The joint that moves a link, and the link's frame in that of the joint.

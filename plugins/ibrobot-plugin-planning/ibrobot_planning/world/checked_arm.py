@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 
 import attrs
 import numpy as np
@@ -15,7 +15,7 @@ from ibrobot_kinematics.srdf import read_srdf
 from ibrobot_kinematics.urdf import Urdf, read_urdf
 
 from ibrobot_core.api import Robot
-from ibrobot_planning.world.arm import SRDF, Arm, LinkShape, Pair, robot_arm, sorted_pair
+from ibrobot_planning.world.arm import SRDF, Arm, LinkShape, robot_arm, sorted_pair
 from ibrobot_planning.world.coal_shapes import enclosing, hull
 from ibrobot_planning.world.collision import Collisions, unchecked_pairs
 from ibrobot_planning.world.objects import World
@@ -26,18 +26,7 @@ _VAIN_SHARE = 0.05
 """A link keeps its shapes if its hull touches another link in more of the free configurations."""
 
 
-@attrs.frozen(eq=False)
-class CheckedArm:
-    """A collision model of a robot's arm."""
-
-    arm: Arm
-    unchecked: Mapping[Pair, str]
-    """Pairs of links that need no check, with the reason."""
-    names: Mapping[str, str]
-    """Link of the URDF -> link of the MJCF; empty without a URDF."""
-
-
-def checked_arm(robot: Robot, log: logging.Logger) -> CheckedArm:
+def checked_arm(robot: Robot, log: logging.Logger) -> Arm:
     """The collision model of a robot, from its MJCF, URDF and SRDF.
 
     Raises:
@@ -45,23 +34,21 @@ def checked_arm(robot: Robot, log: logging.Logger) -> CheckedArm:
         KinematicsError: for a URDF or SRDF that cannot be read.
     """
     arm = robot_arm(robot)
-    unchecked = unchecked_pairs(arm)
-    arm = with_hulls(arm, unchecked)
+    arm = with_hulls(attrs.evolve(arm, unchecked=unchecked_pairs(arm)))
     if robot.description.urdf is None:
-        return CheckedArm(arm, unchecked, {})
+        return arm
     urdf = read_urdf(robot.description.urdf)
     links = {name: link for link, name in urdf_names(arm, urdf).items()}
-    if robot.description.srdf is None:
-        return CheckedArm(arm, unchecked, links)
-    srdf = read_srdf(robot.description.srdf, urdf)
-    for pair in srdf.may_touch:
+    unchecked = dict(arm.unchecked)
+    srdf = read_srdf(robot.description.srdf, urdf) if robot.description.srdf is not None else None
+    for pair in srdf.may_touch if srdf is not None else ():
         unknown = [name for name in pair if name not in links]
         if unknown:
             message = "%s: %s and %s are checked nevertheless: no joint of the MJCF carries %s"
-            log.warning(message, srdf.path, *pair, unknown[0])
+            log.warning(message, robot.description.srdf, *pair, unknown[0])
         else:
             unchecked[sorted_pair(links[pair[0]], links[pair[1]])] = SRDF
-    return CheckedArm(arm, unchecked, links)
+    return attrs.evolve(arm, unchecked=unchecked, urdf_links=links)
 
 
 def urdf_names(arm: Arm, urdf: Urdf) -> dict[str, str]:
@@ -82,14 +69,9 @@ def urdf_names(arm: Arm, urdf: Urdf) -> dict[str, str]:
     return names
 
 
-def with_hulls(arm: Arm, unchecked: Collection[Pair]) -> Arm:
-    """The arm with one hull in place of the shapes of each link, if that makes checks faster.
-
-    Args:
-        arm: the arm.
-        unchecked: pairs of links that may touch.
-    """
-    checks = Collisions(arm, World(), arm.joint_names, unchecked=unchecked)
+def with_hulls(arm: Arm) -> Arm:
+    """The arm with one hull in place of the shapes of each link, if that makes checks faster."""
+    checks = Collisions(arm, World(), arm.joint_names)
     samples = np.random.default_rng(0).uniform(arm.lower, arm.upper, (_SAMPLES, len(arm.joint_names)))
     free = [q for q in samples if checks.free(q)]
     of_links: dict[str, list[LinkShape]] = {}
@@ -100,7 +82,7 @@ def with_hulls(arm: Arm, unchecked: Collection[Pair]) -> Arm:
         few = tuple(shape for shapes in hulls.values() for shape in shapes)
         if len(few) == len(arm.shapes):
             return arm
-        coarse = Collisions(attrs.evolve(arm, shapes=few), World(), arm.joint_names, unchecked=unchecked)
+        coarse = Collisions(attrs.evolve(arm, shapes=few), World(), arm.joint_names)
         touching = Counter(
             link for q in free for link in {name for each in coarse.contacts(q) for name in (each.first, each.second)}
         )

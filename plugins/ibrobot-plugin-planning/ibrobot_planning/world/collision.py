@@ -61,7 +61,6 @@ class Collisions:
         others: positions of other joints [rad]; joints in neither are at 0.
         padding: least distance [m] of the arm, and of what it carries, from objects that stand in the world.
         self_padding: least distance [m] between links, and between links and what other links carry.
-        unchecked: pairs of links that may touch; see `unchecked_pairs`.
 
     Raises:
         PlanningError: for a joint or link that the arm does not have, or as `World.check`.
@@ -69,7 +68,7 @@ class Collisions:
 
     def __init__(
         self, arm: Arm, world: World, joints: Sequence[str], others: Mapping[str, float] | None = None, *,
-        padding: float = 0.0, self_padding: float = 0.0, unchecked: Collection[Pair] = (),
+        padding: float = 0.0, self_padding: float = 0.0,
     ) -> None:  # fmt: skip
         for name in (*joints, *(others or {})):
             if name not in arm.joint_names:
@@ -89,7 +88,7 @@ class Collisions:
 
         def engine(links: Sequence[LinkShape]) -> _Engine:
             shapes = [*links, *objects]
-            return _Engine(arm.model, self.data, shapes, *_pairs(world, shapes, padding, self_padding, unchecked))
+            return _Engine(arm.model, self.data, shapes, *_pairs(world, shapes, padding, self_padding, arm.unchecked))
 
         self._exact = engine(arm.shapes)
         self._coarse = engine(arm.hulls) if arm.hulls else self._exact
@@ -320,7 +319,7 @@ def unchecked_pairs(arm: Arm, *, samples: int = _SAMPLES, seed: int = 0, never: 
             contacts.
     """
     reasons = dict.fromkeys(arm.adjacent(), ADJACENT)
-    checks = Collisions(arm, World(), arm.joint_names, unchecked=reasons)
+    checks = Collisions(attrs.evolve(arm, unchecked=reasons), World(), arm.joint_names)
     touching: dict[Pair, int] = {}
     for q in np.random.default_rng(seed).uniform(arm.lower, arm.upper, (samples, len(arm.joint_names))):
         for contact in checks.contacts(q) if not checks.free(q) else ():
