@@ -144,8 +144,6 @@ class PlannerSource(SourceWorker):
                 raise
         self._goals = tuple(self._queue)
         """The goals of the request."""
-        self._asked = len(self._queue)
-        self._ends = bool(self._queue)
         self._over = False
         self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
             GO_TO: lambda request: self._submit(request.goal).number,
@@ -242,7 +240,7 @@ class PlannerSource(SourceWorker):
     def summary_rows(self) -> list[tuple[str, str]]:
         if not self._goals:
             return []
-        ended = [(move.target.text, move.result) for move in self._goals if move.result is not None]
+        ended = self._ended()
         reached = sum(result.success for _, result in ended)
         failures = [
             ("", f"{text}: {result.code.name}: {result.message}") for text, result in ended if not result.success
@@ -251,9 +249,12 @@ class PlannerSource(SourceWorker):
 
     @override
     def facts(self) -> dict[str, Any]:
-        ended = [(move.target.text, move.result) for move in self._goals if move.result is not None]
-        goals = [{"goal": text, **attrs.asdict(result), "code": result.code.name} for text, result in ended]
+        goals = [{"goal": text, **attrs.asdict(result), "code": result.code.name} for text, result in self._ended()]
         return {"goals": goals} if self._goals else {}
+
+    def _ended(self) -> list[tuple[str, MoveResult]]:
+        """The goals of the request that have ended, with their results."""
+        return [(move.target.text, move.result) for move in self._goals if move.result is not None]
 
     def _new(self, goal: str | Goal | Target, velocity_scaling: float = 1.0, *, asked: bool = False) -> _Move:
         """A goal that was checked.
@@ -470,8 +471,8 @@ class PlannerSource(SourceWorker):
         if not success and (move.asked or outcome != "CANCELLED"):
             session.outcome.goals_failed += 1
         self._show("succeeded" if success else "failed")
-        self._asked -= move.asked
-        if self._ends and not self._asked and not self._queue and self._move is None:
+        all_ended = len(self._ended()) == len(self._goals)
+        if self._goals and all_ended and not self._queue and self._move is None:
             session.finish()
 
     def _show(self, status: str) -> None:
