@@ -147,10 +147,11 @@ class PlanningServices:
         """
         from ibrobot_planning.world.collision import Collisions
 
-        planner, paddings = self._mode.planner, {}
+        planner, world, padding, self_padding = self._mode.planner, world_of(self._session.bus), 0.0, 0.0
         if planner is not None and isinstance(planner.options, RrtConnectOptions):
-            paddings = {"padding": planner.options.padding, "self_padding": planner.options.self_padding}
-        checks = Collisions(self._arm, world_of(self._session.bus), self._robot.joint_names, **paddings)
+            padding, self_padding = planner.options.padding, planner.options.self_padding
+        joints = self._robot.joint_names
+        checks = Collisions(self._arm, world, joints, padding=padding, self_padding=self_padding)
         free = [each for each in candidates if checks.free(each.joints)]
         if not free:
             contacts = checks.contacts(candidates[0].joints)

@@ -120,8 +120,7 @@ class RrtConnectPlanner(Planner):
 
     def _collisions(self, world: World, joints: Sequence[str], others: Mapping[str, float]) -> Collisions:
         options = self._options
-        paddings = {"padding": options.padding, "self_padding": options.self_padding}
-        return Collisions(self.arm, world, joints, others, **paddings)
+        return Collisions(self.arm, world, joints, others, padding=options.padding, self_padding=options.self_padding)
 
     def _snapshot(self) -> World:
         bus = self._ctx.bus

@@ -83,7 +83,8 @@ class ObjectOptions:
             assert self.file is not None
             shape = read_mesh(self.file, self.scale, convex=self.convex)
         else:
-            shape = SIMPLE[self.shape](*(getattr(self, key) for key in _KEYS[self.shape]))
+            sizes = attrs.asdict(self, filter=lambda field, _: field.name in _KEYS[self.shape])
+            shape = SIMPLE[self.shape](**sizes)
         return WorldObject(shape, pose_at(self.position, self.rpy), self.link, self.may_touch)
 
 
