@@ -60,7 +60,7 @@ class PageServer:
     Args:
         options: the address, the certificate, the cameras.
         clock: the clock of the run.
-        bus: the bus of the run, for images, status and the emergency stop; None without one.
+        bus: the bus of the run, for images, status and the emergency stop.
         log: where the server reports.
 
     Attributes:
@@ -71,15 +71,15 @@ class PageServer:
         TeleopError: if the certificate cannot be used or the address is not available.
     """
 
-    def __init__(self, options: WebxrOptions, clock: Clock, bus: Bus | None, log: logging.Logger) -> None:
+    def __init__(self, options: WebxrOptions, clock: Clock, bus: Bus, log: logging.Logger) -> None:
         listener = open_port(options)
         # A scanned code counts as a link from another site on some phones.
         self._guard = Guard(listener, roles=("drive",), other_sites_link=True, permissions=_PERMISSIONS)
         self._options = options
         self._bus = bus
         self._log = log
-        self._images = CameraImages(bus, options.cameras, log) if bus is not None else None
-        self._status = bus.subscribe("/robot_status", 1) if bus is not None else None
+        self._images = CameraImages(bus, options.cameras, log)
+        self._status = bus.subscribe("/robot_status", 1)
         self._robot: RobotStatus | None = None
         self._pages: list[_Page] = []
         self._control: _Page | None = None
@@ -101,10 +101,8 @@ class PageServer:
     def close(self) -> None:
         """Stop the server. Safe to call twice."""
         self._server.close()
-        if self._images is not None:
-            self._images.close()
-        if self._status is not None:
-            self._status.close()
+        self._images.close()
+        self._status.close()
 
     async def _close_pages(self, app: web.Application) -> None:
         for page in tuple(self._pages):
@@ -172,15 +170,14 @@ class PageServer:
     async def _stop(self) -> None:
         """Stop the robot, in any mode."""
         self.exchange.stop()
-        bus = self._bus
-        if bus is not None and bus.serves(ESTOP):
+        if self._bus.serves(ESTOP):
             try:
-                await asyncio.to_thread(bus.call, ESTOP)
+                await asyncio.to_thread(self._bus.call, ESTOP)
             except Exception as error:  # noqa: BLE001 - contained: the device in `read` stops the robot, too
                 self._log.error("webxr: the emergency stop failed: %s", error_text(error))
 
     def _next_image(self, page: _Page, camera: int) -> None:
-        names = self._images.names if self._images is not None else []
+        names = self._images.names
         if camera >= len(names):
             self._refuse(page, f"camera: must be below {len(names)}")
             return
@@ -214,9 +211,9 @@ class PageServer:
                 self._control.heard_s += max(0.0, now_s - began_s - _STATE_S)
                 if now_s - self._control.heard_s > _SILENT_S:
                     self._release(self._control)
-            if self._images is not None and not self._pages:
+            if not self._pages:
                 self._images.refresh()  # so that a page does not open with an old image
-            if self._status is not None and (received := self._status.get()) is not None:
+            if (received := self._status.get()) is not None:
                 assert isinstance(received.message, RobotStatus)
                 self._robot = received.message
             await asyncio.gather(*(self._send_state(page) for page in self._pages if not page.socket.closed))
@@ -237,7 +234,7 @@ class PageServer:
                 for hand in HANDS
                 if (report := reports.get(hand)) is not None
             },
-            "cameras": self._images.names if self._images is not None else [],
+            "cameras": self._images.names,
             "error": page.error,
             "robot": None
             if robot is None
@@ -247,7 +244,7 @@ class PageServer:
     async def _send_images(self, page: _Page) -> None:
         """Send each camera's newest image, after the page acknowledges the previous one."""
         images = self._images
-        while images is not None and not page.socket.closed:
+        while not page.socket.closed:
             await asyncio.sleep(1 / self._options.image_rate)
             images.refresh()
             for index, name in enumerate(images.names):

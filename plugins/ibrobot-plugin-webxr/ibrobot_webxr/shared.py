@@ -43,6 +43,7 @@ def open_page(options: WebxrOptions, ctx: Context) -> PageServer:
     with _lock:
         shared = _open.get(_key(options, ctx))
         if shared is None:
+            assert ctx.bus is not None  # devices run in the host
             server = PageServer(options, ctx.clock, ctx.bus, ctx.log)
             shared = _open[_key(options, ctx)] = _Shared(server, options, ctx.name)
             # Not logged: the address contains the token.

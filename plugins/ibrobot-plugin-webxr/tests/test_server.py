@@ -34,7 +34,7 @@ from ibrobot_core.api import (
     TeleopError,
     ns,
 )
-from ibrobot_core.app import ESTOP, NoRequest, operate
+from ibrobot_core.app import ESTOP, Bus, NoRequest, operate
 
 from .browser import Browser, hand, hands
 from .rig import ANY_PORT, BENT, page_of, robot_of
@@ -84,7 +84,7 @@ class TestAttacks(HttpSuite):
     @contextlib.contextmanager
     def serve(self, request_s: float) -> Iterator[Served]:
         with patch("ibrobot_http.guard.REQUEST_S", request_s):
-            page = PageServer(ANY_PORT, RealClock(), None, logging.getLogger("ibrobot.test"))
+            page = PageServer(ANY_PORT, RealClock(), Bus(RealClock()), logging.getLogger("ibrobot.test"))
             with contextlib.closing(page):
                 url, _, token = page.address.partition("/?")
                 yield Served(
@@ -116,13 +116,13 @@ def test_the_page_offers_its_own_certificate_for_phones_to_install(
     assert text == (own_folder() / "certificate.pem").read_text()
     certificate, key = own_certificate(tmp_path, ["localhost", "127.0.0.1"])
     given = attrs.evolve(ANY_PORT, certificate=certificate, key=key)
-    other = PageServer(given, ctx.clock, None, logging.getLogger("ibrobot.test"))
+    other = PageServer(given, ctx.clock, Bus(ctx.clock), logging.getLogger("ibrobot.test"))
     with contextlib.closing(other), Browser(other.address) as second:
         assert "ca.pem" in second.log_in().get("/certificate.pem")[1]
 
 
 def test_each_launch_has_another_token(page: PageServer, browser: Browser):
-    other = PageServer(ANY_PORT, RealClock(), None, logging.getLogger("ibrobot.test"))
+    other = PageServer(ANY_PORT, RealClock(), Bus(RealClock()), logging.getLogger("ibrobot.test"))
     other.close()
     assert other.address.partition("token=")[2] != page.address.partition("token=")[2]
 

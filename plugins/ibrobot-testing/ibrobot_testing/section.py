@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any, cast
 
-import attrs
 import numpy as np
 
 from ibrobot_core.api import Header, JointState
 from ibrobot_core.app import Component, LaunchRequest, Registry, RobotConfig, Session
 from ibrobot_testing.contexts import make_robot
 from ibrobot_testing.suite import Suite
-
-
-@attrs.define
-class FakeControl:
-    """The host's side of control in a run without hardware."""
-
-    report: Mapping[str, Any] = attrs.field(factory=lambda: {"loop": {}, "counters": {}})
 
 
 def make_session(**changes: Any) -> Session:
@@ -30,7 +23,7 @@ def make_session(**changes: Any) -> Session:
     """
     fields = {"robot": make_robot(), "executors": {}, "control_modes": {}, "default_control_mode": "idle"}
     session = Session(RobotConfig(**{**fields, **changes}), Registry(), LaunchRequest(lockstep=True))
-    session.control = cast("Any", FakeControl())
+    session.control = cast("Any", SimpleNamespace(report={"loop": {}, "counters": {}}))
     return session
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from typing import ClassVar
 
 import numpy as np
@@ -149,14 +150,18 @@ class TeleopSuite(Suite[Teleop]):
                 self.operate(teleop)
                 assert operate(teleop, self._measure(ctx, pose)).positions, "no positions once the operator acted"
 
-    def _moving(self, teleop: Teleop, ctx: Context) -> Vector:
-        """A robot that the device moves; returns its pose."""
-        pose = self.poses(ctx)[0]
-        self._begin(teleop, ctx, pose)
-        for _ in range(5):
-            self.hold(teleop)
-            assert operate(teleop, self._measure(ctx, pose)).positions, "no positions with the deadman pressed"
-        return pose
+    @contextmanager
+    def _moving(self) -> Iterator[tuple[Teleop, Context, Vector]]:
+        """A connected device that moves a robot by its deadman, with the robot's pose."""
+        if not (self.has_deadman and self.has_operator):
+            pytest.skip("has no deadman")
+        with self.connected() as (teleop, ctx):
+            pose = self.poses(ctx)[0]
+            self._begin(teleop, ctx, pose)
+            for _ in range(5):
+                self.hold(teleop)
+                assert operate(teleop, self._measure(ctx, pose)).positions, "no positions with the deadman pressed"
+            yield teleop, ctx, pose
 
     def _needs_a_new_press(self, teleop: Teleop, ctx: Context, pose: Vector) -> None:
         """Check that the held deadman moves nothing, and a new press does."""
@@ -170,19 +175,13 @@ class TeleopSuite(Suite[Teleop]):
 
     def test_a_held_deadman_does_not_survive_an_activation(self) -> None:
         """A deadman held over a stop, a reset, a mode switch or a change of control must be pressed again."""
-        if not (self.has_deadman and self.has_operator):
-            pytest.skip("has no deadman")
-        with self.connected() as (teleop, ctx):
-            pose = self._moving(teleop, ctx)
+        with self._moving() as (teleop, ctx, pose):
             begin_operation(teleop, self._measure(ctx, pose))
             self._needs_a_new_press(teleop, ctx, pose)
 
     def test_silence_ends_motion(self) -> None:
         """Without reports motion ends within `HOLD_S`, and needs a new press of the deadman when they come again."""
-        if not (self.has_deadman and self.has_operator):
-            pytest.skip("has no deadman")
-        with self.connected() as (teleop, ctx):
-            pose = self._moving(teleop, ctx)
+        with self._moving() as (teleop, ctx, pose):
             begun_ns = ctx.clock.now_ns()
             self.freeze(teleop)
             try:
@@ -196,10 +195,7 @@ class TeleopSuite(Suite[Teleop]):
 
     def test_a_pause_of_the_host_ends_motion(self) -> None:
         """After two seconds in which nobody read the device, it needs a new press of the deadman."""
-        if not (self.has_deadman and self.has_operator):
-            pytest.skip("has no deadman")
-        with self.connected() as (teleop, ctx):
-            pose = self._moving(teleop, ctx)
+        with self._moving() as (teleop, ctx, pose):
             self.hold(teleop)
             ctx.clock.sleep_until(ctx.clock.now_ns() + ns(2.0))
             try:

@@ -335,15 +335,14 @@ class TransportSuite(Suite[Transport]):
         with self.ends() as (near, _):
             near.close()
             near.close()
-            with pytest.raises(TransportError):
-                near.publish("topic", b"")
-            with pytest.raises(TransportError):
-                near.subscribe("topic", lambda payload: None)
-            with pytest.raises(TransportError):
-                near.serve("name", lambda payload, _: payload)
-            with pytest.raises(TransportError):
-                near.request("name", b"", self.short_s)
-            with pytest.raises(TransportError):
-                near.watch("name", lambda served: None)
-            with pytest.raises(TransportError):
-                near.served("name")
+            calls: tuple[Callable[[], object], ...] = (
+                lambda: near.publish("topic", b""),
+                lambda: near.subscribe("topic", lambda payload: None),
+                lambda: near.serve("name", lambda payload, _: payload),
+                lambda: near.request("name", b"", self.short_s),
+                lambda: near.watch("name", lambda served: None),
+                lambda: near.served("name"),
+            )
+            for call in calls:
+                with pytest.raises(TransportError):
+                    call()
