@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,19 +11,8 @@ from typing import Any, ClassVar
 import pytest
 
 from ibrobot_core.app import Job, Pool
-from ibrobot_testing.pool_jobs import (
-    Order,
-    die_if_odd,
-    die_once,
-    divide,
-    fail_if_odd,
-    process,
-    square,
-    wait,
-)
-from ibrobot_testing.suite import Suite
-
-_POLL_S = 0.02
+from ibrobot_testing.pool_jobs import Order, die_if_odd, die_once, divide, fail_if_odd, process, square, wait
+from ibrobot_testing.suite import Suite, wait_until
 
 
 class PoolSuite(Suite[Pool]):
@@ -125,12 +113,6 @@ class PoolSuite(Suite[Pool]):
         with self.opened(2) as pool:
             with closing(pool.run([Job(wait, Order(0, str(tmp_path))), Job(square, Order(2))])) as running:
                 assert next(running).result() == 4
-                self._await(began.exists)
+                wait_until(began.exists, self.patience_s)
             process = Path("/proc") / began.read_text()
-            self._await(lambda: not process.exists())
-
-    def _await(self, condition: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + self.patience_s
-        while not condition():
-            assert time.monotonic() < deadline
-            time.sleep(_POLL_S)
+            wait_until(lambda: not process.exists(), self.patience_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,8 @@ import pytest
 from ibrobot_core.api import Context
 from ibrobot_testing.contexts import host_context
 from ibrobot_testing.leaks import LeakCheck
+
+_POLL_S = 0.002
 
 
 class Suite[T]:
@@ -59,6 +62,18 @@ class Suite[T]:
             yield subject, ctx
         finally:
             end(subject)
+
+
+def wait_until(condition: Callable[[], bool], patience_s: float) -> None:
+    """Wait until `condition` holds.
+
+    Raises:
+        AssertionError: if it does not within `patience_s` [s].
+    """
+    deadline_s = time.monotonic() + patience_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "it did not happen in time"
+        time.sleep(_POLL_S)
 
 
 def run_checks[T](suite: type[Suite[T]], directory: Path) -> dict[str, BaseException | None]:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import queue
 import threading
-import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import ClassVar
 
 import pytest
 
 from ibrobot_core.api import Context, Payload, Transport, TransportError
-from ibrobot_testing.suite import Suite
+from ibrobot_testing.suite import Suite, wait_until
 
 _HELD_S = 120.0
 """Maximum time for which a callback is blocked [s]; longer than all waits, so that no callback continues by itself."""
@@ -93,7 +93,7 @@ class TransportSuite(Suite[Transport]):
 
     def test_a_slow_subscriber_blocks_nobody(self) -> None:
         """`publish` returns and others are served while one callback blocks."""
-        with self.ends() as (near, far), self.held() as release:
+        with self.ends() as (near, far), ThreadPoolExecutor() as pool, self.held() as release:
             arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
             def slow(payload: Payload) -> None:
@@ -102,16 +102,11 @@ class TransportSuite(Suite[Transport]):
             far.subscribe("topic", slow)
             far.subscribe("topic", arrived.put)
             self.settle(near, far)
-            publisher = threading.Thread(target=lambda: [near.publish("topic", b"x") for _ in range(3)], daemon=True)
-            publisher.start()
-            try:
-                publisher.join(self.wait_s / 2)
-                assert not publisher.is_alive(), "publish waits for a slow subscriber"
-                for _ in range(3):
-                    assert arrived.get(timeout=self.wait_s / 2) == b"x"
-            finally:
-                release.set()
-                publisher.join()
+            publishing = pool.submit(lambda: [near.publish("topic", b"x") for _ in range(3)])
+            done, _ = wait([publishing], self.wait_s / 2)
+            assert done, "publish waits for a slow subscriber"
+            for _ in range(3):
+                assert arrived.get(timeout=self.wait_s / 2) == b"x"
 
     def test_a_failing_subscriber_harms_nobody(self) -> None:
         """An exception in a callback does not affect the publisher or other subscribers; it is called again."""
@@ -133,20 +128,11 @@ class TransportSuite(Suite[Transport]):
 
     def test_each_request_gets_its_own_answer(self) -> None:
         """Concurrent requests each get their own answer."""
-        with self.ends() as (near, far):
+        with self.ends() as (near, far), ThreadPoolExecutor(20) as pool:
             far.serve("echo", lambda payload, _: bytes(payload) + b"!")
             self.settle(near, far)
-            answers: dict[int, Payload] = {}
-
-            def ask(i: int) -> None:
-                answers[i] = near.request("echo", str(i).encode(), self.wait_s)
-
-            threads = [threading.Thread(target=ask, args=(i,)) for i in range(20)]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join(self.wait_s)
-            assert answers == {i: f"{i}!".encode() for i in range(20)}
+            answers = pool.map(lambda i: near.request("echo", str(i).encode(), self.wait_s), range(20))
+            assert list(answers) == [f"{i}!".encode() for i in range(20)]
 
     def test_sent_buffers_are_free_again(self) -> None:
         """A bytearray or a view of one can be sent, and modified after the call has returned."""
@@ -182,7 +168,7 @@ class TransportSuite(Suite[Transport]):
 
     def test_a_slow_answer_delays_no_other(self) -> None:
         """Requests are answered concurrently, with at most one per worker."""
-        with self.ends() as (near, far), self.held() as release:
+        with self.ends() as (near, far), ThreadPoolExecutor() as pool, self.held() as release:
             begun: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
             def answer(payload: Payload, _: str | None) -> Payload:
@@ -193,23 +179,14 @@ class TransportSuite(Suite[Transport]):
 
             far.serve("echo", answer, workers=2)
             self.settle(near, far)
-            threads = [
-                threading.Thread(target=near.request, args=("echo", name, self.wait_s)) for name in (b"slow", b"slower")
-            ]
-            threads[0].start()
-            try:
-                assert begun.get(timeout=self.wait_s) == b"slow"
-                assert near.request("echo", b"quick", self.wait_s / 2) == begun.get() == b"quick"
-                threads[1].start()
-                assert begun.get(timeout=self.wait_s) == b"slower"
-                with pytest.raises(TransportError):
-                    near.request("echo", b"quick", self.short_s)
-                assert begun.empty()
-            finally:
-                release.set()
-                for thread in threads:
-                    if thread.ident is not None:
-                        thread.join()
+            pool.submit(near.request, "echo", b"slow", self.wait_s)
+            assert begun.get(timeout=self.wait_s) == b"slow"
+            assert near.request("echo", b"quick", self.wait_s / 2) == begun.get() == b"quick"
+            pool.submit(near.request, "echo", b"slower", self.wait_s)
+            assert begun.get(timeout=self.wait_s) == b"slower"
+            with pytest.raises(TransportError):
+                near.request("echo", b"quick", self.short_s)
+            assert begun.empty()
 
     def test_a_late_answer_is_dropped(self) -> None:
         """A request with a late answer fails, and its answer is not delivered to the next one."""
@@ -303,17 +280,10 @@ class TransportSuite(Suite[Transport]):
         with self.ends() as (near, far):
             ends = [far.serve(name, lambda payload, _: payload) for name in ("echo/1", "echo/2", "other")]
             self.settle(near, far)
-            self.until(lambda: near.served("echo/") == far.served("echo/") == {"echo/1", "echo/2"})
+            wait_until(lambda: near.served("echo/") == far.served("echo/") == {"echo/1", "echo/2"}, self.wait_s)
             assert near.served("echo/2") == {"echo/2"}
             ends[0]()
-            self.until(lambda: near.served("echo/") == far.served("echo/") == {"echo/2"})
-
-    def until(self, condition: Callable[[], bool]) -> None:
-        """Wait until `condition` holds."""
-        deadline_s, pause = time.monotonic() + self.wait_s, threading.Event()
-        while not condition():
-            assert time.monotonic() < deadline_s, "it did not happen in time"
-            pause.wait(0.002)
+            wait_until(lambda: near.served("echo/") == far.served("echo/") == {"echo/2"}, self.wait_s)
 
     def test_a_server_may_use_the_transport(self) -> None:
         """Callbacks and servers may publish and send requests."""
