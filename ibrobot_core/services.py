@@ -90,7 +90,9 @@ class Service[Q, A]:
             if self.alone and not isinstance(found, Mapping):
                 found = {self.alone: found}
             if not isinstance(found, Mapping):
-                raise RequestError(f"{self.name}: expected {self._keys()}, got {shown(found)}")
+                keys = ", ".join(fields(self.request))
+                expected = f"a mapping with {keys}" if keys else "nothing"
+                raise RequestError(f"{self.name}: expected {expected}, got {shown(found)}")
             try:
                 return Converter(files, MOST + 1).structure(found, self.request)  # type: ignore[no-any-return]
             except Faults as error:
@@ -98,10 +100,6 @@ class Service[Q, A]:
             except (ValueError, TypeError, ArithmeticError) as error:  # values that exclude each other
                 faults = [((), error_message(error))]
         raise RequestError(f"{self.name}: {Faults(faults)}")
-
-    def _keys(self) -> str:
-        known = fields(self.request)
-        return f"a mapping with {', '.join(known)}" if known else "nothing"
 
 
 def _too_much(request: object, limits: RequestLimits) -> list[tuple[Key, str]]:

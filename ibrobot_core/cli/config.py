@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, override
+from typing import override
 
 import attrs
 import click
@@ -70,8 +70,7 @@ def check(
     except ConfigError as error:
         if not as_json:
             raise
-        faults: list[dict[str, Any]] = [{**attrs.asdict(p), "file": str(p.file)} for p in error.problems]
-        echo(json.dumps(faults, indent=2))
+        echo(json.dumps([{**attrs.asdict(p), "file": str(p.file)} for p in error.problems], indent=2))
         sys.exit(error.exit_code)
     if as_json:
         echo("[]")

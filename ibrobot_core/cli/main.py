@@ -16,6 +16,7 @@ from ibrobot_core import __version__
 from ibrobot_core.bug_reports import DEBUG, describe_bug
 from ibrobot_core.cli.command import let_interrupts_raise
 from ibrobot_core.errors import IbrobotError
+from ibrobot_core.plugins import CORE, installed_plugins, official_plugins
 from ibrobot_core.safe_output import echo
 
 _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
@@ -30,16 +31,12 @@ class LazyGroup(click.Group):
 
     @override
     def list_commands(self, ctx: click.Context) -> list[str]:
-        from ibrobot_core.plugins import CORE, installed_plugins
-
         packages = installed_plugins().command_packages
         own = [name for name, package in packages.items() if package == CORE]
         return [*own, *sorted(name for name in set(packages) - set(own) if " " not in name)]
 
     @override
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        from ibrobot_core.plugins import CORE, installed_plugins, official_plugins
-
         registry = installed_plugins()
         found = registry.commands.get(cmd_name)
         if found is None:
@@ -53,8 +50,6 @@ class LazyGroup(click.Group):
 
     @override
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        from ibrobot_core.plugins import installed_plugins
-
         commands = installed_plugins().commands
         with formatter.section("Commands"):
             formatter.write_dl([(name, commands[name].summary) for name in self.list_commands(ctx)])

@@ -26,9 +26,6 @@ def _viewer_flags() -> dict[str, str]:
 class EpisodePath(click.Path):
     """A recorded episode or a folder of them: a path, or a short name such as `pick:1`; see `find_episode`."""
 
-    def __init__(self) -> None:
-        super().__init__(path_type=Path)
-
     @override
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         from ibrobot_core.interfaces.reader import find_episode

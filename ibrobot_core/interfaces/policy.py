@@ -91,6 +91,35 @@ def copied_tensors(tensors: Tensors) -> dict[str, NDArray[np.generic]]:
     return {name: np.array(array) for name, array in tensors.items()}
 
 
+def check_tensors(
+    tensors: Tensors, expected: Mapping[str, tuple[np.dtype[Any], tuple[int, ...]]], *, others: bool = False
+) -> None:
+    """Check that a request, which may be from an untrusted client, has the tensors that `preprocess` makes.
+
+    Args:
+        tensors: the request.
+        expected: name -> dtype and shape; -1 in a shape means any size except 0.
+        others: whether it may have tensors of other names.
+
+    Raises:
+        PolicyError: names all tensors that do not fit.
+    """
+    wrong = []
+    for name, (dtype, shape) in expected.items():
+        array = tensors.get(name)
+        if array is None or array.dtype != dtype or not _fits(array.shape, shape):
+            got = "is missing" if array is None else f"is {array.dtype} {array.shape}"
+            wrong.append(f"{name} {got}, must be {dtype} {shape}")
+    if not others:
+        wrong += [f"{name} is unknown" for name in tensors if name not in expected]
+    if wrong:
+        raise PolicyError(f"the request's tensors: {'; '.join(wrong)}")
+
+
+def _fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
+    return len(shape) == len(wanted) and all(n == m or (m == -1 and n > 0) for n, m in zip(shape, wanted, strict=True))
+
+
 class PictureCodec(ABC):
     """JPEG for tensors that are camera images: `uint8`, shape (H, W, 3) or (H, W, 1)."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, PictureCodec, Policy, PolicyError, PolicySpec, Tensors
+from ibrobot_core.app import check_tensors
 from ibrobot_lerobot.checkpoint import ACTION, POSTPROCESSOR, PREPROCESSOR, check_weights, hash_weights, read_checkpoint
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.steps import read_steps
@@ -165,22 +166,14 @@ class LeRobotPolicy(Policy):
         if self.spec.prefix and tensors.keys() & {PREFIX, DELAY}:
             expected[PREFIX] = (np.dtype(np.float32), (1, -1, self._checkpoint.action_size))
             expected[DELAY] = (np.dtype(np.int64), (1,))
-        wrong = []
-        for name, (dtype, shape) in expected.items():
-            array = tensors.get(name)
-            if array is None or array.dtype != dtype or not _fits(array.shape, shape):
-                got = "is missing" if array is None else f"is {array.dtype} {array.shape}"
-                wrong.append(f"{name} {got}, must be {dtype} {shape}")
-        if not self._pre.others:
-            wrong += [f"{name} is unknown" for name in tensors if name not in expected]
-        if not wrong and PREFIX in expected:
+        check_tensors(tensors, expected, others=bool(self._pre.others))
+        if PREFIX in expected:
             delay, length, most = int(tensors[DELAY][0]), tensors[PREFIX].shape[1], self._checkpoint.chunk_size
             if not 0 <= delay <= length <= most:
-                wrong.append(
-                    f"{DELAY} {delay} and a {PREFIX} of {length}: 0 <= {DELAY} <= {length} <= {most} must hold"
+                raise PolicyError(
+                    f"the request's tensors: {DELAY} {delay} and a {PREFIX} of {length}: 0 <= {DELAY} <= {length} <= "
+                    f"{most} must hold"
                 )
-        if wrong:
-            raise PolicyError(f"the request's tensors: {'; '.join(wrong)}")
 
     def _batch(self, frame: Frame, prefix: NDArray[Any] | None = None) -> dict[str, NDArray[Any]]:
         """A batch of one in LeRobot's layout: images (1, C, H, W) from 0 to 1."""
@@ -212,11 +205,6 @@ class LeRobotPolicy(Policy):
 
 def _pictures(spec: PolicySpec) -> tuple[str, ...]:
     return tuple(key for key, shape in spec.observations.items() if len(shape) == 3)
-
-
-def _fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
-    """Whether a shape matches `wanted`, in which -1 means any size except 0."""
-    return len(shape) == len(wanted) and all(n == m or (m == -1 and n > 0) for n, m in zip(shape, wanted, strict=True))
 
 
 def _seed(episode: int, stamp_ns: int) -> NDArray[np.int64]:

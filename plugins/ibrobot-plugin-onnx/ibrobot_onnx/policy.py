@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, Policy, PolicyError, PolicySpec, Tensors
+from ibrobot_core.app import check_tensors
 from ibrobot_onnx.manifest import NOISE, Manifest, Noise, read_manifest, stacked_shape
 from ibrobot_onnx.options import PROVIDERS, OnnxPolicyOptions
 
@@ -125,7 +126,7 @@ class OnnxPolicy(Policy):
         if not self._sessions:
             raise PolicyError(f"{self._options.path} is not loaded: call load() first")
         for tensors in batch:
-            self._check(tensors)
+            check_tensors(tensors, self._expected)
         return [{ACTION: actions} for actions in self._run(self._sessions, batch)]
 
     @override
@@ -134,17 +135,6 @@ class OnnxPolicy(Policy):
         first = manifest.first
         chunk = np.asarray(tensors[ACTION], np.float64)[first : first + self.spec.chunk_size]
         return chunk * manifest.scale + manifest.offset
-
-    def _check(self, tensors: Tensors) -> None:
-        """Check that a request, which may be from an untrusted client, has the tensors that `preprocess` makes."""
-        wrong = [f"{name} is unknown" for name in tensors if name not in self._expected]
-        for name, (dtype, shape) in self._expected.items():
-            array = tensors.get(name)
-            if array is None or (array.dtype, array.shape) != (dtype, shape):
-                got = "is missing" if array is None else f"is {array.dtype} {array.shape}"
-                wrong.append(f"{name} {got}, must be {dtype} {shape}")
-        if wrong:
-            raise PolicyError(f"the request's tensors: {'; '.join(wrong)}")
 
     def _run(self, sessions: Sequence[Any], batch: Sequence[Tensors]) -> list[NDArray[Any]]:
         """Outputs of the network, each of shape (N, A), before they are unnormalised."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, Policy, PolicyError, PolicySpec, Tensors, did_you_mean
+from ibrobot_core.app import check_tensors
 from ibrobot_policy_servers.connection import Connection
 from ibrobot_policy_servers.options import ActionMap, ObservationMap, ServerOptions
 
@@ -53,6 +54,10 @@ class ServedPolicy(Policy):
             prompt=bool(options.prompt),
             stateful=stateful,
         )
+        self._expected = {each.observation: _tensor(each) for each in options.observations}
+        """Tensors of a request: dtypes and shapes."""
+        if self.spec.prompt:
+            self._expected[TASK] = (np.dtype(np.uint8), (-1,))
         self._turn = threading.Lock()
         """Held during a request."""
         self._connected = False
@@ -137,11 +142,12 @@ class ServedPolicy(Policy):
 
     def _request(self, tensors: Tensors, timeout_s: float) -> Tensors:
         """One request; any error closes the connection."""
+        check_tensors(tensors, self._expected, others=True)
         request: dict[str, Any] = {}
         for each in self._options.observations:
-            _put(request, each.key, _tensor(tensors, each))
+            _put(request, each.key, tensors[each.observation])
         if self._options.prompt:
-            _put(request, self._options.prompt, _task(tensors))
+            _put(request, self._options.prompt, tensors[TASK].tobytes().decode(errors="replace"))
         with self._exchange():
             outputs: dict[str, NDArray[Any]] = {ACTION: self._actions(self._connection.ask(request, timeout_s))}
         if REFERENCE in tensors:
@@ -280,24 +286,12 @@ def _converted(value: NDArray[Any], each: ObservationMap) -> NDArray[Any]:
     return scaled.astype(np.float32)
 
 
-def _tensor(tensors: Tensors, each: ObservationMap) -> NDArray[Any]:
-    """A tensor of a request, which may be from another machine."""
-    shape = each.shape
-    if len(shape) == 3 and each.layout == "chw":
-        shape = (shape[2], shape[0], shape[1])
-    dtype = np.dtype(np.uint8 if len(shape) == 3 else np.float32)
-    array = tensors.get(each.observation)
-    if array is None or (array.dtype, array.shape) != (dtype, shape):
-        got = "is missing" if array is None else f"is {array.dtype} {array.shape}"
-        raise PolicyError(f"the request's tensors: {each.observation} {got}, must be {dtype} {shape}")
-    return array
-
-
-def _task(tensors: Tensors) -> str:
-    array = tensors.get(TASK)
-    if array is None or array.dtype != np.uint8:
-        raise PolicyError(f"the request's tensors: {TASK} must be UTF-8 text")
-    return array.tobytes().decode(errors="replace")
+def _tensor(each: ObservationMap) -> tuple[np.dtype[Any], tuple[int, ...]]:
+    """Dtype and shape of an observation in a request."""
+    if len(each.shape) != 3:
+        return np.dtype(np.float32), each.shape
+    height, width, channels = each.shape
+    return np.dtype(np.uint8), (channels, height, width) if each.layout == "chw" else each.shape
 
 
 def _put(request: dict[str, Any], key: Sequence[str], value: Any) -> None:
