@@ -18,6 +18,7 @@ from ibrobot_core.descriptors import (
     DatasetDescriptor as DatasetDescriptor,
     ViewerDescriptor as ViewerDescriptor,
     Check as Check,
+    Late as Late,
 )
 
 # Options

@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.descriptors import Command, EngineDescriptor, ExecutorDescriptor, StreamOptions, TransportDescriptor
+from ibrobot_core.descriptors import (
+    Command,
+    EngineDescriptor,
+    ExecutorDescriptor,
+    Late,
+    StreamOptions,
+    TransportDescriptor,
+)
 from ibrobot_core.errors import NotSupported
 from ibrobot_core.hookspecs import hookimpl
 
 if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.interfaces import Context, Engine, Executor, Transport
-
-
-def _position(options: Any, ctx: Context) -> Executor:
-    from ibrobot_core.control.position import PositionExecutor
-
-    return PositionExecutor(options, ctx)
+    from ibrobot_core.interfaces import Context, Engine, Transport
 
 
 def _monolithic(options: Any, ctx: Context) -> Engine:
@@ -38,7 +37,7 @@ def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
     yield ExecutorDescriptor(
         type="position",
         options=StreamOptions,
-        make=_position,
+        make=Late("ibrobot_core.control.position:PositionExecutor"),
         streams=True,
         summary="follows a stream of setpoints; holds when they go stale",
     )
@@ -56,34 +55,12 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
     yield TransportDescriptor(type="local", make=_local, summary="none: everything stays in this process")
 
 
-def _launch() -> click.Command:
-    from ibrobot_core.cli.launch import launch
-
-    return launch
-
-
-def _config() -> click.Command:
-    from ibrobot_core.cli.config import config
-
-    return config
-
-
-def _plugins() -> click.Command:
-    from ibrobot_core.cli.plugins import plugins
-
-    return plugins
-
-
-def _doctor() -> click.Command:
-    from ibrobot_core.cli.doctor import doctor
-
-    return doctor
-
-
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """Commands that need no other plugin."""
-    yield Command("launch", "Run a robot, real or simulated.", _launch)
-    yield Command("config", "Check and show robot YAMLs.", _config)
-    yield Command("plugins", "List what the installed plugins offer.", _plugins)
-    yield Command("doctor", "Check this machine, and print a remedy for each fault.", _doctor)
+    yield Command("launch", "Run a robot, real or simulated.", Late("ibrobot_core.cli.launch:launch").load)
+    yield Command("config", "Check and show robot YAMLs.", Late("ibrobot_core.cli.config:config").load)
+    yield Command("plugins", "List what the installed plugins offer.", Late("ibrobot_core.cli.plugins:plugins").load)
+    yield Command(
+        "doctor", "Check this machine, and print a remedy for each fault.", Late("ibrobot_core.cli.doctor:doctor").load
+    )

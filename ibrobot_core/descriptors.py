@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
@@ -24,6 +25,25 @@ if TYPE_CHECKING:
     from ibrobot_core.messages import CompressedImage, Image
     from ibrobot_core.reports import ReportSection
     from ibrobot_core.robot import Robot
+
+
+@attrs.frozen
+class Late:
+    """A function or class of a module that is imported when it is first needed, not with the descriptor.
+
+    HardwareDescriptor("my_arm", make=Late("my_package.arm:MyArm"), summary="...")
+    """
+
+    place: str
+    """`MODULE:NAME`."""
+
+    def load(self) -> Any:
+        """Import it, and return it; for `Command.load`."""
+        return resolve_name(self.place)
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        """Import it, and call it."""
+        return self.load()(*arguments, **options)
 
 
 @attrs.frozen

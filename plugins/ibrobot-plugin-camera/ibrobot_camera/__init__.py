@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_camera.device import realsense_stream, require_device, video_device
 from ibrobot_camera.options import OpenCvOptions, RealSenseOptions, picture_size
-from ibrobot_core.api import Check, DecoderDescriptor, OptionFault, SensorDescriptor, SensorError, hookimpl
+from ibrobot_core.api import Check, DecoderDescriptor, Late, OptionFault, SensorDescriptor, SensorError, hookimpl
 from ibrobot_core.app import Command, GuideDescriptor
 
 if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.api import CompressedImage, Context, Image, Robot, Sensor
-    from ibrobot_core.app import Guide, Question
-
-
-def _opencv(options: Any, ctx: Context) -> Sensor:
-    from ibrobot_camera.camera import OpenCvCamera
-
-    return OpenCvCamera(options, ctx)
-
-
-def _realsense(options: Any, ctx: Context) -> Sensor:
-    from ibrobot_camera.realsense import RealSenseCamera
-
-    return RealSenseCamera(options, ctx)
+    from ibrobot_core.api import Robot
+    from ibrobot_core.app import Guide
 
 
 def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
@@ -50,13 +36,19 @@ def _find_librealsense() -> None:
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Cameras."""
     yield SensorDescriptor(
-        type="opencv", options=OpenCvOptions, make=_opencv, devices=video_device, picture=picture_size,
-        check_options=_check, find=require_device, summary="V4L2 device, RTSP or HTTP stream, or video file",
-    )  # fmt: skip
+        type="opencv",
+        options=OpenCvOptions,
+        make=Late("ibrobot_camera.camera:OpenCvCamera"),
+        devices=video_device,
+        picture=picture_size,
+        check_options=_check,
+        find=require_device,
+        summary="V4L2 device, RTSP or HTTP stream, or video file",
+    )
     yield SensorDescriptor(
         type="realsense",
         options=RealSenseOptions,
-        make=_realsense,
+        make=Late("ibrobot_camera.realsense:RealSenseCamera"),
         check=_find_librealsense,
         devices=realsense_stream,
         picture=picture_size,
@@ -64,34 +56,18 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     )
 
 
-def _decoder() -> Callable[[CompressedImage], Image | None]:
-    from ibrobot_ros2.pictures import decode_picture
-
-    return decode_picture
-
-
 @hookimpl
 def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
     """The decoder of JPEG images."""
-    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
-
-
-def _commands() -> click.Command:
-    from ibrobot_camera.commands import camera
-
-    return camera
+    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), Late("ibrobot_ros2.pictures:decode_picture").load)
 
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot camera …`."""
-    yield Command("camera", "List and preview cameras, and save snapshots.", _commands)
-
-
-def _camera_questions() -> Sequence[Question]:
-    from ibrobot_camera.guides import camera_questions
-
-    return camera_questions()
+    yield Command(
+        "camera", "List and preview cameras, and save snapshots.", Late("ibrobot_camera.commands:camera").load
+    )
 
 
 def _show(answers: Mapping[str, str | bool], guide: Guide) -> None:
@@ -104,7 +80,7 @@ def _show(answers: Mapping[str, str | bool], guide: Guide) -> None:
 def ibrobot_guides() -> Iterable[GuideDescriptor]:
     """The cameras, with pictures."""
     summary = "List the cameras, with their formats and a picture of each."
-    yield GuideDescriptor("cameras", "Cameras", summary, _show, _camera_questions)
+    yield GuideDescriptor("cameras", "Cameras", summary, _show, Late("ibrobot_camera.guides:camera_questions"))
 
 
 @hookimpl

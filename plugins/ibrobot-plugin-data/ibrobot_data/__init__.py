@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import hookimpl
+from ibrobot_core.api import Late, hookimpl
 from ibrobot_core.app import Command, SectionDescriptor, SourceDescriptor
 from ibrobot_data.conversion import EVENTS, ConvertOptions
 from ibrobot_data.options import EpisodesOptions, check_keys
@@ -13,32 +13,24 @@ from ibrobot_data.recording_session import RecordOptions
 from ibrobot_data.recording_session import Session as SessionEvent
 
 if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.app import Component, ControlMode, PolicySource, RobotConfig, RunAccess, SourceWorker
+    from ibrobot_core.app import Component, RobotConfig, RunAccess
 
 
-def _convert() -> click.Command:
-    from ibrobot_data.command import convert
+CONVERT = Command(
+    "convert",
+    "Make a dataset for training from episodes.",
+    Late("ibrobot_data.command:convert").load,
+    ConvertOptions,
+    EVENTS,
+)
 
-    return convert
-
-
-def _record() -> click.Command:
-    from ibrobot_data.record import record
-
-    return record
-
-
-def _replay() -> click.Command:
-    from ibrobot_data.replay import replay
-
-    return replay
-
-
-CONVERT = Command("convert", "Make a dataset for training from episodes.", _convert, ConvertOptions, EVENTS)
-
-RECORD = Command("record", "Run a robot and record its episodes.", _record, RecordOptions, (SessionEvent,))
+RECORD = Command(
+    "record",
+    "Run a robot and record its episodes.",
+    Late("ibrobot_data.record:record").load,
+    RecordOptions,
+    (SessionEvent,),
+)
 
 
 @hookimpl
@@ -46,20 +38,16 @@ def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot convert`, `ibrobot record` and `ibrobot replay`."""
     yield CONVERT
     yield RECORD
-    yield Command("replay", "Play a recorded episode on a robot, and compare.", _replay)
-
-
-def _corrections(session: RunAccess, mode: ControlMode, policy: PolicySource) -> SourceWorker:
-    from ibrobot_data.corrections import Corrections
-
-    return Corrections(session, mode, policy)
+    yield Command("replay", "Play a recorded episode on a robot, and compare.", Late("ibrobot_data.replay:replay").load)
 
 
 @hookimpl
 def ibrobot_sources() -> Iterable[SourceDescriptor]:
     """The command source of modes with `inference: {intervene: …}`."""
     yield SourceDescriptor(
-        type="intervene", make=_corrections, summary="lets an operator take the robot from a policy, and give it back"
+        type="intervene",
+        make=Late("ibrobot_data.corrections:Corrections"),
+        summary="lets an operator take the robot from a policy, and give it back",
     )
 
 

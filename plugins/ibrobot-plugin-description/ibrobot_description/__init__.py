@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import hookimpl
+from ibrobot_core.api import Late, hookimpl
 from ibrobot_core.app import SectionDescriptor
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import NoOptions, OptionFault
+    from ibrobot_core.api import NoOptions
     from ibrobot_core.app import Component, RobotConfig, RunView
 
 
@@ -24,12 +24,6 @@ def _has_frames(config: RobotConfig) -> bool:
     return mounted or config.robot.description.urdf is not None
 
 
-def _check(config: RobotConfig) -> Iterable[OptionFault]:
-    from ibrobot_description.check import faults
-
-    return faults(config)
-
-
 @hookimpl
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """The section `description`, the counterpart of robot_state_publisher."""
@@ -37,6 +31,6 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         type="description",
         make=_publisher,
         without_section=_has_frames,
-        check_config=_check,
+        check_config=Late("ibrobot_description.check:faults"),
         summary="/tf, /tf_static and /robot_description from the URDF and the mounts of sensors; has no keys",
     )

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from ibrobot_core.api import hookimpl
+from ibrobot_core.api import Late, hookimpl
 from ibrobot_core.app import Command, ReportDescriptor
 from ibrobot_eval.options import EVENTS, KIND, SETTINGS, EvalOptions
 
-if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.app import ReportSection
-
-
-def _evaluate() -> click.Command:
-    from ibrobot_eval.command import evaluate
-
-    return evaluate
-
-
-EVAL = Command("eval", "Count the successes of policies, and compare them.", _evaluate, EvalOptions, EVENTS)
+EVAL = Command(
+    "eval",
+    "Count the successes of policies, and compare them.",
+    Late("ibrobot_eval.command:evaluate").load,
+    EvalOptions,
+    EVENTS,
+)
 
 
 @hookimpl
@@ -35,19 +28,13 @@ def _is_evaluation(folder: Path) -> bool:
     return (folder / SETTINGS).is_file()
 
 
-def _lines(folder: Path) -> Sequence[str]:
-    from ibrobot_eval.contents import lines_of
-
-    return lines_of(folder)
-
-
-def _report(folder: Path) -> Sequence[ReportSection]:
-    from ibrobot_eval.contents import read_contents
-
-    return read_contents(folder)
-
-
 @hookimpl
 def ibrobot_reports() -> Iterable[ReportDescriptor]:
     """Evaluations."""
-    yield ReportDescriptor(KIND, "Evaluations", _is_evaluation, _lines, _report)
+    yield ReportDescriptor(
+        KIND,
+        "Evaluations",
+        _is_evaluation,
+        Late("ibrobot_eval.contents:lines_of"),
+        Late("ibrobot_eval.contents:read_contents"),
+    )

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
 
-from ibrobot_core.api import Check, HardwareDescriptor, SensorDescriptor, TeleopDescriptor, hookimpl
+from ibrobot_core.api import Check, HardwareDescriptor, Late, SensorDescriptor, TeleopDescriptor, hookimpl
 from ibrobot_core.app import Command, GuideDescriptor, PanelDescriptor
 from ibrobot_feetech.options import (
     EmulatedSignalOptions,
@@ -18,86 +16,67 @@ from ibrobot_feetech.options import (
     serial_port,
 )
 
-if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.api import Context, Hardware, Sensor, Teleop
-    from ibrobot_core.app import Guide, Question, RunView
-
-
-def _follower(options: Any, ctx: Context) -> Hardware:
-    from ibrobot_feetech.follower import FeetechFollower
-
-    return FeetechFollower(options, ctx)
-
-
-def _signal(options: Any, ctx: Context) -> Sensor:
-    from ibrobot_feetech.emulator.signals import EmulatedSignal
-
-    return EmulatedSignal(options, ctx)
-
-
-def _leader(options: Any, ctx: Context) -> Teleop:
-    from ibrobot_feetech.leader import LeaderTeleop
-
-    return LeaderTeleop(options, ctx)
-
-
-def _servos(session: RunView) -> list[tuple[str, ...]]:
-    from ibrobot_feetech.panel import servo_rows
-
-    return servo_rows(session)
-
 
 @hookimpl
 def ibrobot_panels() -> Iterable[PanelDescriptor]:
     """State of the servos."""
-    yield PanelDescriptor("Servos", ("servo", "temperature", "voltage", "current", "load"), _servos)
-
-
-def _guide(name: str, title: str, summary: str, run: str, questions: str = "") -> GuideDescriptor:
-    """A guide whose functions are in `ibrobot_feetech.guides`."""
-
-    def start(answers: Mapping[str, str | bool], guide: Guide) -> None:
-        getattr(import_module("ibrobot_feetech.guides"), run)(answers, guide)
-
-    def ask() -> Sequence[Question]:
-        found: Sequence[Question] = getattr(import_module("ibrobot_feetech.guides"), questions)() if questions else ()
-        return found
-
-    return GuideDescriptor(name, title, summary, start, ask)
+    yield PanelDescriptor(
+        "Servos", ("servo", "temperature", "voltage", "current", "load"), Late("ibrobot_feetech.panel:servo_rows")
+    )
 
 
 @hookimpl
 def ibrobot_guides() -> Iterable[GuideDescriptor]:
     """Ports, motors and calibration."""
-    yield _guide("ports", "Serial ports", "List the USB serial ports, and which are adapters of an SO-101.", "list_all")
-    yield _guide("port", "Find an arm's port", "Unplug the arm and plug it in again to find its port.", "find")
-    yield _guide(
+    yield GuideDescriptor(
+        "ports",
+        "Serial ports",
+        "List the USB serial ports, and which are adapters of an SO-101.",
+        Late("ibrobot_feetech.guides:list_all"),
+    )
+    yield GuideDescriptor(
+        "port",
+        "Find an arm's port",
+        "Unplug the arm and plug it in again to find its port.",
+        Late("ibrobot_feetech.guides:find"),
+    )
+    yield GuideDescriptor(
         "motors",
         "Set up motors",
         "Give each servo its id and 1 Mbaud, with one servo connected at a time.",
-        "set_up",
-        "setup_questions",
+        Late("ibrobot_feetech.guides:set_up"),
+        Late("ibrobot_feetech.guides:setup_questions"),
     )
-    yield _guide(
+    yield GuideDescriptor(
         "calibration",
         "Calibrate an arm",
         "Measure the middle pose and the range of each joint, moved by hand.",
-        "calibrate",
-        "calibration_questions",
+        Late("ibrobot_feetech.guides:calibrate"),
+        Late("ibrobot_feetech.guides:calibration_questions"),
     )
-    yield _guide("servos", "Check an arm", "Compare the servos with their calibration.", "check", "check_questions")
+    yield GuideDescriptor(
+        "servos",
+        "Check an arm",
+        "Compare the servos with their calibration.",
+        Late("ibrobot_feetech.guides:check"),
+        Late("ibrobot_feetech.guides:check_questions"),
+    )
 
 
 @hookimpl
 def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     """The SO-101 on its servo bus."""
     yield HardwareDescriptor(
-        type="feetech_so101", options=FollowerOptions, make=_follower, torque_off="ibrobot feetech torque off",
-        summary="SO-101 arm: STS3215 servos on one bus", check_options=check_follower, devices=serial_port,
-        calibration=lambda options: options.calibration, anchored=lambda options: options.anchored,
-    )  # fmt: skip
+        type="feetech_so101",
+        options=FollowerOptions,
+        make=Late("ibrobot_feetech.follower:FeetechFollower"),
+        torque_off="ibrobot feetech torque off",
+        summary="SO-101 arm: STS3215 servos on one bus",
+        check_options=check_follower,
+        devices=serial_port,
+        calibration=lambda options: options.calibration,
+        anchored=lambda options: options.anchored,
+    )
 
 
 @hookimpl
@@ -107,7 +86,7 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         type="feetech_emulator",
         kind="simulation",
         options=EmulatedSignalOptions,
-        make=_signal,
+        make=Late("ibrobot_feetech.emulator.signals:EmulatedSignal"),
         summary="a signal of the simulation that moves an emulated arm",
     )
 
@@ -116,22 +95,27 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """The SO-101 leader arm."""
     yield TeleopDescriptor(
-        type="so101_leader", options=LeaderOptions, make=_leader, summary="SO-101 leader arm, moved by hand",
-        check_options=check_leader, devices=serial_port, calibration=lambda options: options.calibration,
-        keys=leader_keys, label="follow the leader arm", needs_terminal=lambda options: options.deadman != "none",
-    )  # fmt: skip
-
-
-def _commands() -> click.Command:
-    from ibrobot_feetech.commands import feetech
-
-    return feetech
+        type="so101_leader",
+        options=LeaderOptions,
+        make=Late("ibrobot_feetech.leader:LeaderTeleop"),
+        summary="SO-101 leader arm, moved by hand",
+        check_options=check_leader,
+        devices=serial_port,
+        calibration=lambda options: options.calibration,
+        keys=leader_keys,
+        label="follow the leader arm",
+        needs_terminal=lambda options: options.deadman != "none",
+    )
 
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot feetech …`."""
-    yield Command("feetech", "Set up, calibrate, monitor and emulate the servos of an SO-101.", _commands)
+    yield Command(
+        "feetech",
+        "Set up, calibrate, monitor and emulate the servos of an SO-101.",
+        Late("ibrobot_feetech.commands:feetech").load,
+    )
 
 
 @hookimpl

@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import Check, TeleopDescriptor, hookimpl
+from ibrobot_core.api import Check, Late, TeleopDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
 
 if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.api import Context, OperatorEvent, OptionFault, Robot, Teleop
-
-
-def _jog(options: Any, ctx: Context) -> Teleop:
-    from ibrobot_gamepad.teleop import JogTeleop
-
-    return JogTeleop(options, ctx)
+    from ibrobot_core.api import OptionFault, Robot
 
 
 def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
@@ -27,45 +19,35 @@ def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[Opti
     return check_mapping(options, robot)
 
 
-def _events(options: Any) -> Collection[OperatorEvent]:
-    from ibrobot_gamepad.mapping import events
-
-    return events(options)
-
-
 @hookimpl
 def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     """Jog with the hands on a device."""
     yield TeleopDescriptor(
         type="gamepad",
         options=GamepadOptions,
-        make=_jog,
+        make=Late("ibrobot_gamepad.teleop:JogTeleop"),
         check_options=_check,
-        events=_events,
+        events=Late("ibrobot_gamepad.mapping:events"),
         label="drive with a gamepad",
         summary="joint and tool jog with an Xbox, PlayStation, Switch, 8BitDo or other pad",
     )
     yield TeleopDescriptor(
         type="spacemouse",
         options=SpaceMouseOptions,
-        make=_jog,
+        make=Late("ibrobot_gamepad.teleop:JogTeleop"),
         check_options=_check,
-        events=_events,
+        events=Late("ibrobot_gamepad.mapping:events"),
         label="drive with a SpaceMouse",
         summary="joint and tool jog with a SpaceMouse",
     )
 
 
-def _commands() -> click.Command:
-    from ibrobot_gamepad.commands import gamepad
-
-    return gamepad
-
-
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot gamepad …`."""
-    yield Command("gamepad", "List, test and map gamepads and SpaceMice.", _commands)
+    yield Command(
+        "gamepad", "List, test and map gamepads and SpaceMice.", Late("ibrobot_gamepad.commands:gamepad").load
+    )
 
 
 @hookimpl

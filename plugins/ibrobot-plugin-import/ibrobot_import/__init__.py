@@ -3,20 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ibrobot_core.api import hookimpl
+from ibrobot_core.api import Late, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_import.formats import FORMATS
-
-if TYPE_CHECKING:
-    import click
-
-
-def _import() -> click.Command:
-    from ibrobot_import.command import import_
-
-    return import_
 
 
 def _takes(values: Mapping[str, Any]) -> str:
@@ -27,4 +18,4 @@ def _takes(values: Mapping[str, Any]) -> str:
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot config import`."""
     summary = "Make a robot YAML from a config of IB-Robot, Rosetta or LeRobot."
-    yield Command("config import", summary, _import, takes=_takes)
+    yield Command("config import", summary, Late("ibrobot_import.command:import_").load, takes=_takes)

@@ -3,19 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
-from ibrobot_core.api import Check, TeleopDescriptor, hookimpl
+from ibrobot_core.api import Check, Late, TeleopDescriptor, hookimpl
 from ibrobot_imu.options import ImuOptions, check_imu, imu_keys, serial_port
-
-if TYPE_CHECKING:
-    from ibrobot_core.api import Context, Teleop
-
-
-def _imu(options: ImuOptions, ctx: Context) -> Teleop:
-    from ibrobot_imu.teleop import ImuTeleop
-
-    return ImuTeleop(options, ctx)
 
 
 @hookimpl
@@ -24,7 +14,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     yield TeleopDescriptor(
         type="imu",
         options=ImuOptions,
-        make=_imu,
+        make=Late("ibrobot_imu.teleop:ImuTeleop"),
         check_options=check_imu,
         devices=serial_port,
         keys=imu_keys,

@@ -3,25 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import DatasetDescriptor, ReaderDescriptor, RecorderDescriptor, hookimpl
+from ibrobot_core.api import DatasetDescriptor, Late, ReaderDescriptor, RecorderDescriptor, hookimpl
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Context, DatasetWriter, EpisodeAddress, EpisodeReader, Recorder
-
-
-def _reads(path: Path) -> bool:
-    from ibrobot_jointlog.reader import is_joint_log
-
-    return is_joint_log(path)
-
-
-def _read(address: EpisodeAddress) -> EpisodeReader:
-    from ibrobot_jointlog.reader import JointLogReader
-
-    return JointLogReader(address)
+    from ibrobot_core.api import Context, DatasetWriter, Recorder
 
 
 def _joint_log(options: Any, ctx: Context) -> Recorder:
@@ -39,7 +26,12 @@ def _npz(options: Any, ctx: Context) -> DatasetWriter:
 @hookimpl
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
     """The reader of joint logs."""
-    yield ReaderDescriptor("joint_log", "joint logs: CSV", _reads, _read)
+    yield ReaderDescriptor(
+        "joint_log",
+        "joint logs: CSV",
+        Late("ibrobot_jointlog.reader:is_joint_log"),
+        Late("ibrobot_jointlog.reader:JointLogReader"),
+    )
 
 
 @hookimpl

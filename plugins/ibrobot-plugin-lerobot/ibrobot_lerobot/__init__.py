@@ -6,16 +6,14 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import DatasetDescriptor, PolicyDescriptor, ReaderDescriptor, hookimpl
+from ibrobot_core.api import DatasetDescriptor, Late, PolicyDescriptor, ReaderDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_lerobot.contents import Contents, InfoOptions
 from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions
 from ibrobot_lerobot.training import EVENTS, TrainOptions, check_trainer
 
 if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.api import Context, DatasetWriter, EpisodeAddress, EpisodeReader, Policy
+    from ibrobot_core.api import Context, DatasetWriter
 
 
 def _write(options: Any, ctx: Context) -> DatasetWriter:
@@ -26,18 +24,6 @@ def _write(options: Any, ctx: Context) -> DatasetWriter:
 
 def _reads(path: Path) -> bool:
     return (path / "meta" / "info.json").is_file()
-
-
-def _read(address: EpisodeAddress) -> EpisodeReader:
-    from ibrobot_lerobot.reader import LeRobotReader
-
-    return LeRobotReader(address)
-
-
-def _policy(options: Any, ctx: Context) -> Policy:
-    from ibrobot_lerobot.policy import LeRobotPolicy
-
-    return LeRobotPolicy(options, ctx)
 
 
 def _is_checkpoint(path: Path) -> bool:
@@ -60,7 +46,13 @@ def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
 @hookimpl
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
     """The reader of LeRobot datasets."""
-    yield ReaderDescriptor("lerobot", "LeRobot v3.0 datasets, as DATASET:N", _reads, _read, numbered=True)
+    yield ReaderDescriptor(
+        "lerobot",
+        "LeRobot v3.0 datasets, as DATASET:N",
+        _reads,
+        Late("ibrobot_lerobot.reader:LeRobotReader"),
+        numbered=True,
+    )
 
 
 @hookimpl
@@ -69,37 +61,32 @@ def ibrobot_policies() -> Iterable[PolicyDescriptor]:
     yield PolicyDescriptor(
         type="lerobot",
         options=LeRobotPolicyOptions,
-        make=_policy,
+        make=Late("ibrobot_lerobot.policy:LeRobotPolicy"),
         reads=_is_checkpoint,
         summary="a LeRobot checkpoint: ACT, Diffusion, VQ-BeT, SmolVLA, pi0, …",
     )
 
 
-def _datasets() -> click.Command:
-    from ibrobot_lerobot.commands import datasets
-
-    return datasets
-
-
-def _train() -> click.Command:
-    from ibrobot_lerobot.train import train
-
-    return train
-
-
-def _export() -> click.Command:
-    from ibrobot_lerobot.commands import export
-
-    return export
-
-
-INFO = Command("datasets info", "Show what a dataset contains.", _datasets, InfoOptions, (Contents,))
-TRAIN = Command("train", "Train a policy with LeRobot.", _train, TrainOptions, EVENTS, check=check_trainer)
+_DATASETS = Late("ibrobot_lerobot.commands:datasets").load
+INFO = Command("datasets info", "Show what a dataset contains.", _DATASETS, InfoOptions, (Contents,))
+TRAIN = Command(
+    "train",
+    "Train a policy with LeRobot.",
+    Late("ibrobot_lerobot.train:train").load,
+    TrainOptions,
+    EVENTS,
+    check=check_trainer,
+)
 
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot datasets info`, `ibrobot export` and `ibrobot train`."""
-    yield Command("datasets", "Show, join, upload and download LeRobot datasets.", _datasets, commands=(INFO,))
-    yield Command("export", "Convert a checkpoint to run without torch.", _export)
+    yield Command(
+        "datasets",
+        "Show, join, upload and download LeRobot datasets.",
+        _DATASETS,
+        commands=(INFO,),
+    )
+    yield Command("export", "Convert a checkpoint to run without torch.", Late("ibrobot_lerobot.commands:export").load)
     yield TRAIN

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-from ibrobot_core.api import DecoderDescriptor, ReaderDescriptor, RecorderDescriptor, hookimpl
+from ibrobot_core.api import DecoderDescriptor, Late, ReaderDescriptor, RecorderDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_mcap.changes import (
     Changed,
@@ -20,21 +19,7 @@ from ibrobot_mcap.changes import (
 from ibrobot_mcap.options import McapOptions
 
 if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.api import CompressedImage, Context, EpisodeAddress, EpisodeReader, Image, Recorder
-
-
-def _record(options: Any, ctx: Context) -> Recorder:
-    from ibrobot_mcap.recorder import McapRecorder
-
-    return McapRecorder(options, ctx)
-
-
-def _reads(path: Path) -> bool:
-    from ibrobot_mcap.reader import is_rosbag2
-
-    return is_rosbag2(path)
+    from ibrobot_core.api import EpisodeAddress, EpisodeReader
 
 
 def _read(address: EpisodeAddress) -> EpisodeReader:
@@ -49,7 +34,7 @@ def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
     yield RecorderDescriptor(
         type="mcap",
         options=McapOptions,
-        make=_record,
+        make=Late("ibrobot_mcap.recorder:McapRecorder"),
         default=True,
         summary="ROS 2 bags: MCAP in a rosbag2 directory",
     )
@@ -58,40 +43,25 @@ def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
 @hookimpl
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
     """The reader of bags, including foreign ones."""
-    yield ReaderDescriptor("rosbag2", "ROS 2 bags: MCAP, also unfinished, and sqlite3", _reads, _read)
-
-
-def _decoder() -> Callable[[CompressedImage], Image | None]:
-    from ibrobot_ros2.pictures import decode_picture
-
-    return decode_picture
+    yield ReaderDescriptor(
+        "rosbag2", "ROS 2 bags: MCAP, also unfinished, and sqlite3", Late("ibrobot_mcap.reader:is_rosbag2"), _read
+    )
 
 
 @hookimpl
 def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
     """The decoder of compressed images in bags."""
-    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
+    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), Late("ibrobot_ros2.pictures:decode_picture").load)
 
 
-def _commands() -> click.Command:
-    from ibrobot_mcap.commands import episodes
-
-    return episodes
-
-
-def _contract() -> click.Command:
-    from ibrobot_mcap.commands.contract import contract
-
-    return contract
-
-
-MARK = Command("episodes mark", "Judge episodes.", _commands, MarkOptions, (Changed,))
-TRIM = Command("episodes trim", "Keep a part of an episode.", _commands, TrimOptions, (Changed,))
-DELETE = Command("episodes delete", "Delete episodes.", _commands, DeleteOptions, (Changed,))
+_EPISODES = Late("ibrobot_mcap.commands:episodes").load
+MARK = Command("episodes mark", "Judge episodes.", _EPISODES, MarkOptions, (Changed,))
+TRIM = Command("episodes trim", "Keep a part of an episode.", _EPISODES, TrimOptions, (Changed,))
+DELETE = Command("episodes delete", "Delete episodes.", _EPISODES, DeleteOptions, (Changed,))
 LIST_TRASH = Command(
-    "episodes trash", "List, restore or delete what is in a trash.", _commands, TrashOptions, (Changed, InTrash)
+    "episodes trash", "List, restore or delete what is in a trash.", _EPISODES, TrashOptions, (Changed, InTrash)
 )
-REPAIR = Command("episodes repair", "Make unfinished episodes whole.", _commands, RepairOptions, (Changed,))
+REPAIR = Command("episodes repair", "Make unfinished episodes whole.", _EPISODES, RepairOptions, (Changed,))
 _CHANGES = (MARK, TRIM, DELETE, LIST_TRASH, REPAIR)
 
 
@@ -99,5 +69,7 @@ _CHANGES = (MARK, TRIM, DELETE, LIST_TRASH, REPAIR)
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot episodes …` and `ibrobot contract init`."""
     summary = "List, check, repair, trim, plot and export recorded episodes."
-    yield Command("episodes", summary, _commands, commands=_CHANGES)
-    yield Command("contract", "Draft a contract for foreign bags.", _contract)
+    yield Command("episodes", summary, _EPISODES, commands=_CHANGES)
+    yield Command(
+        "contract", "Draft a contract for foreign bags.", Late("ibrobot_mcap.commands.contract:contract").load
+    )

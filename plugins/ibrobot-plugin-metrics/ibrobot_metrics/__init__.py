@@ -3,20 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
-from ibrobot_core.api import hookimpl
+from ibrobot_core.api import Late, hookimpl
 from ibrobot_core.app import SectionDescriptor
 from ibrobot_metrics.options import MetricsOptions
-
-if TYPE_CHECKING:
-    from ibrobot_core.app import Component, RunView
-
-
-def _port(options: MetricsOptions, session: RunView) -> Component:
-    from ibrobot_metrics.component import MetricsPort
-
-    return MetricsPort(options, session)
 
 
 @hookimpl
@@ -25,6 +15,6 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
     yield SectionDescriptor(
         type="metrics",
         options=MetricsOptions,
-        make=_port,
+        make=Late("ibrobot_metrics.component:MetricsPort"),
         summary="counts in Prometheus' text format, over HTTP on this machine",
     )

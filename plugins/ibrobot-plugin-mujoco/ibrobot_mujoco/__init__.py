@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 from ibrobot_core.api import (
     DecoderDescriptor,
     HardwareDescriptor,
+    Late,
     PolicyDescriptor,
     SceneDescriptor,
     SensorDescriptor,
@@ -21,11 +21,6 @@ from ibrobot_mujoco.gl import choose, from_module
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions, picture_size
 from ibrobot_mujoco.scenes import SCENES
 
-if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.api import CompressedImage, Image
-
 
 def _can_render() -> None:
     choose()
@@ -35,12 +30,17 @@ def _can_render() -> None:
 def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
     """Physics."""
     yield HardwareDescriptor(
-        type="mujoco", options=MujocoOptions, make=from_module("hardware", "MujocoHardware"), default=True,
-        simulated=True, sensors={"camera": "mujoco"}, check_options=check_world,
+        type="mujoco",
+        options=MujocoOptions,
+        make=from_module("hardware", "MujocoHardware"),
+        default=True,
+        simulated=True,
+        sensors={"camera": "mujoco"},
+        check_options=check_world,
         scene=from_module("scene_objects", "scene_objects"),
         film={"type": "mujoco", "camera": "front", "width": 320, "height": 240, "fps": 10},
         summary="the robot's MJCF in MuJoCo, with the objects of a scene",
-    )  # fmt: skip
+    )
 
 
 @hookimpl
@@ -53,21 +53,22 @@ def ibrobot_scenes() -> Iterable[SceneDescriptor]:
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
     """Cameras in the simulated scene."""
     yield SensorDescriptor(
-        type="mujoco", kind="camera", options=CameraOptions, make=from_module("camera", "MujocoCamera"),
-        check=_can_render, picture=picture_size, summary="a camera in the simulated scene",
-    )  # fmt: skip
-
-
-def _new() -> click.Command:
-    from ibrobot_mujoco.new_robot import new
-
-    return new
+        type="mujoco",
+        kind="camera",
+        options=CameraOptions,
+        make=from_module("camera", "MujocoCamera"),
+        check=_can_render,
+        picture=picture_size,
+        summary="a camera in the simulated scene",
+    )
 
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot config new`."""
-    yield Command("config new", "Write a robot YAML for the arm in a URDF or MJCF.", _new)
+    yield Command(
+        "config new", "Write a robot YAML for the arm in a URDF or MJCF.", Late("ibrobot_mujoco.new_robot:new").load
+    )
 
 
 @hookimpl
@@ -76,16 +77,10 @@ def ibrobot_policies() -> Iterable[PolicyDescriptor]:
     yield from EXPERTS
 
 
-def _decoder() -> Callable[[CompressedImage], Image | None]:
-    from ibrobot_ros2.pictures import decode_picture
-
-    return decode_picture
-
-
 @hookimpl
 def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
     """The decoder of images from simulated cameras."""
-    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
+    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), Late("ibrobot_ros2.pictures:decode_picture").load)
 
 
 @hookimpl

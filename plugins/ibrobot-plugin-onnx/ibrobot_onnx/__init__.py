@@ -4,19 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import PolicyDescriptor, hookimpl
+from ibrobot_core.api import Late, PolicyDescriptor, hookimpl
 from ibrobot_onnx.options import MANIFEST, OnnxPolicyOptions
-
-if TYPE_CHECKING:
-    from ibrobot_core.api import Context, Policy
-
-
-def _policy(options: Any, ctx: Context) -> Policy:
-    from ibrobot_onnx.policy import OnnxPolicy
-
-    return OnnxPolicy(options, ctx)
 
 
 def _is_exported(path: Path) -> bool:
@@ -29,7 +19,7 @@ def ibrobot_policies() -> Iterable[PolicyDescriptor]:
     yield PolicyDescriptor(
         type="onnx",
         options=OnnxPolicyOptions,
-        make=_policy,
+        make=Late("ibrobot_onnx.policy:OnnxPolicy"),
         reads=_is_exported,
         summary="a folder of `ibrobot export --to onnx`, on ONNX Runtime, without torch",
     )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from ibrobot_core.api import ExecutorDescriptor, NoOptions, OptionFault, did_you_mean, hookimpl
+from ibrobot_core.api import ExecutorDescriptor, Late, NoOptions, OptionFault, did_you_mean, hookimpl
 from ibrobot_core.app import Command, PlannerDescriptor, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.planners.options import JointPlannerOptions, RrtConnectOptions
@@ -15,20 +15,8 @@ from ibrobot_planning.world.options import WorldOptions
 if TYPE_CHECKING:
     import click
 
-    from ibrobot_core.api import Context, Executor, Robot
-    from ibrobot_core.app import Component, ControlMode, Planner, RunAccess, RunView, SourceWorker
-
-
-def _joint(options: Any, ctx: Context) -> Planner:
-    from ibrobot_planning.planners.joint import JointPlanner
-
-    return JointPlanner(options, ctx)
-
-
-def _rrt_connect(options: Any, ctx: Context) -> Planner:
-    from ibrobot_planning.planners.rrt import RrtConnectPlanner
-
-    return RrtConnectPlanner(options, ctx)
+    from ibrobot_core.api import Robot
+    from ibrobot_core.app import Component, RunView
 
 
 @hookimpl
@@ -37,14 +25,14 @@ def ibrobot_planners() -> Iterable[PlannerDescriptor]:
     yield PlannerDescriptor(
         type="joint",
         options=JointPlannerOptions,
-        make=_joint,
+        make=Late("ibrobot_planning.planners.joint:JointPlanner"),
         tool_goals=False,
         summary="straight line in joint space, time-optimal within velocity, acceleration and jerk limits",
     )
     yield PlannerDescriptor(
         type="rrt_connect",
         options=RrtConnectOptions,
-        make=_rrt_connect,
+        make=Late("ibrobot_planning.planners.rrt:RrtConnectPlanner"),
         check=find_engines,
         check_options=_needs_model,
         summary="around obstacles, to joint positions or poses of the tool, checked against padding after timing",
@@ -56,30 +44,15 @@ def _needs_model(options: RrtConnectOptions, robot: Robot, joints: tuple[str, ..
         yield OptionFault((), "planning around obstacles needs robot.description.mjcf: set it", "mjcf")
 
 
-def _source(session: RunAccess, mode: ControlMode) -> SourceWorker:
-    from ibrobot_planning.execution.source import PlannerSource
-
-    return PlannerSource(session, mode)
-
-
 @hookimpl
 def ibrobot_sources() -> Iterable[SourceDescriptor]:
     """The command source of modes with `planner:`."""
     yield SourceDescriptor(
-        type="planner", make=_source, label="plan motions", summary="moves to goals that a planner of any plugin plans"
+        type="planner",
+        make=Late("ibrobot_planning.execution.source:PlannerSource"),
+        label="plan motions",
+        summary="moves to goals that a planner of any plugin plans",
     )
-
-
-def _trajectory(options: Any, ctx: Context) -> Executor:
-    from ibrobot_planning.executors.trajectory import TrajectoryExecutor
-
-    return TrajectoryExecutor(options, ctx)
-
-
-def _gripper(options: Any, ctx: Context) -> Executor:
-    from ibrobot_planning.executors.gripper import GripperExecutor
-
-    return GripperExecutor(options, ctx)
 
 
 @hookimpl
@@ -88,13 +61,13 @@ def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
     yield ExecutorDescriptor(
         type="trajectory",
         options=TrajectoryOptions,
-        make=_trajectory,
+        make=Late("ibrobot_planning.executors.trajectory:TrajectoryExecutor"),
         summary="follows joint trajectories, with path and goal tolerances",
     )
     yield ExecutorDescriptor(
         type="gripper",
         options=GripperOptions,
-        make=_gripper,
+        make=Late("ibrobot_planning.executors.gripper:GripperExecutor"),
         goals="position",
         summary="opens or closes a gripper; a stall counts as grasped",
     )
@@ -180,21 +153,15 @@ def _description() -> click.Command:
     return description
 
 
-def _plan() -> click.Command:
-    from ibrobot_planning.commands.plan import plan
-
-    return plan
-
-
-def _task() -> click.Command:
-    from ibrobot_planning.tasks.command import task
-
-    return task
-
-
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot plan`, `ibrobot description …` and `ibrobot task …`."""
-    yield Command("plan", "Plan a motion without moving, and print or plot it.", _plan)
+    yield Command(
+        "plan", "Plan a motion without moving, and print or plot it.", Late("ibrobot_planning.commands.plan:plan").load
+    )
     yield Command("description", "Make files that describe a robot, e.g. an SRDF.", _description)
-    yield Command("task", "Perform tasks: files of motions, grasps, policies and other steps.", _task)
+    yield Command(
+        "task",
+        "Perform tasks: files of motions, grasps, policies and other steps.",
+        Late("ibrobot_planning.tasks.command:task").load,
+    )

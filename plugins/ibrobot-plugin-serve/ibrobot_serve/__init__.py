@@ -3,43 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import EngineDescriptor, hookimpl
+from ibrobot_core.api import EngineDescriptor, Late, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_serve.options import DistributedOptions, ProcessOptions
-
-if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.api import Context, Engine
-
-
-def _process(options: Any, ctx: Context) -> Engine:
-    from ibrobot_serve.process import ProcessEngine
-
-    return ProcessEngine.from_context(options, ctx)
-
-
-def _distributed(options: Any, ctx: Context) -> Engine:
-    from ibrobot_serve.remote import RemoteEngine
-
-    return RemoteEngine.from_context(options, ctx)
-
-
-def _serve() -> click.Command:
-    from ibrobot_serve.command import serve
-
-    return serve
 
 
 @hookimpl
 def ibrobot_engines() -> Iterable[EngineDescriptor]:
     """Engines that run the model in another process or on a server."""
-    yield EngineDescriptor(type="process", make=_process, summary="in a process of its own", options=ProcessOptions)
+    yield EngineDescriptor(
+        type="process",
+        make=Late("ibrobot_serve.process:ProcessEngine.from_context"),
+        summary="in a process of its own",
+        options=ProcessOptions,
+    )
     yield EngineDescriptor(
         type="distributed",
-        make=_distributed,
+        make=Late("ibrobot_serve.remote:RemoteEngine.from_context"),
         summary="on a server",
         options=DistributedOptions,
         uses_transport=True,
@@ -50,4 +31,4 @@ def ibrobot_engines() -> Iterable[EngineDescriptor]:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot serve`."""
-    yield Command("serve", "Run a model for robots on other machines.", _serve)
+    yield Command("serve", "Run a model for robots on other machines.", Late("ibrobot_serve.command:serve").load)

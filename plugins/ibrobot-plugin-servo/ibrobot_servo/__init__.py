@@ -5,19 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import OptionFault, TeleopDescriptor, hookimpl
+from ibrobot_core.api import Late, OptionFault, TeleopDescriptor, hookimpl
 from ibrobot_core.app import SectionDescriptor
 from ibrobot_servo.options import ToolPoseOptions, TwistOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Context, Robot, Teleop
+    from ibrobot_core.api import Robot
     from ibrobot_core.app import Component, RobotConfig, RunView
-
-
-def _twist(options: TwistOptions, ctx: Context) -> Teleop:
-    from ibrobot_servo.teleop import TwistTeleop
-
-    return TwistTeleop(options, ctx)
 
 
 def _pose(options: ToolPoseOptions | None, session: RunView) -> Component:
@@ -53,7 +47,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     yield TeleopDescriptor(
         type="twist",
         options=TwistOptions,
-        make=_twist,
+        make=Late("ibrobot_servo.teleop:TwistTeleop"),
         check_options=_check_twist,
         label="follow twists on a topic",
         summary="moves the tool along a topic of twists, as MoveIt Servo does",

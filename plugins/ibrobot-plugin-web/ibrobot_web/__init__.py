@@ -5,26 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import OptionFault, TeleopDescriptor, ViewerDescriptor, hookimpl
+from ibrobot_core.api import Late, OptionFault, TeleopDescriptor, ViewerDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_web.options import WebOptions, WebTeleopOptions
 
 if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.api import Context, Robot, Teleop, Viewer
-
-
-def _viewer(options: WebOptions, ctx: Context) -> Viewer:
-    from ibrobot_web.viewer import WebViewer
-
-    return WebViewer(options, ctx)
-
-
-def _teleop(options: WebTeleopOptions, ctx: Context) -> Teleop:
-    from ibrobot_web.teleop import WebTeleop
-
-    return WebTeleop(options, ctx)
+    from ibrobot_core.api import Robot
 
 
 def _check_viewer(options: WebOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
@@ -37,9 +23,14 @@ def _check_viewer(options: WebOptions, robot: Robot, joints: tuple[str, ...]) ->
 def ibrobot_viewers() -> Iterable[ViewerDescriptor]:
     """A page in the browser."""
     yield ViewerDescriptor(
-        type="web", options=WebOptions, make=_viewer, check_options=_check_viewer, flag="--web", begins_episodes=True,
+        type="web",
+        options=WebOptions,
+        make=Late("ibrobot_web.viewer:WebViewer"),
+        check_options=_check_viewer,
+        flag="--web",
+        begins_episodes=True,
         summary="a page in the browser, which shows and drives the robot",
-    )  # fmt: skip
+    )
 
 
 @hookimpl
@@ -48,19 +39,13 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     yield TeleopDescriptor(
         type="web",
         options=WebTeleopOptions,
-        make=_teleop,
+        make=Late("ibrobot_web.teleop:WebTeleop"),
         label="drive from the page",
         summary="joint and tool jog from the page of the viewer web, while a button is held",
     )
 
 
-def _ui() -> click.Command:
-    from ibrobot_web.ui.command import ui
-
-    return ui
-
-
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot ui`."""
-    yield Command("ui", "Set up, launch and record robots in the browser.", _ui)
+    yield Command("ui", "Set up, launch and record robots in the browser.", Late("ibrobot_web.ui.command:ui").load)

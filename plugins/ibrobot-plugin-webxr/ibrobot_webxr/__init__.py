@@ -5,17 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import Check, TeleopDescriptor, hookimpl
+from ibrobot_core.api import Check, Late, TeleopDescriptor, hookimpl
 from ibrobot_webxr.options import WebxrOptions, check_robot
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Context, OperatorEvent, OptionFault, Robot, Teleop
-
-
-def _make(options: WebxrOptions, ctx: Context) -> Teleop:
-    from ibrobot_webxr.teleop import WebxrTeleop
-
-    return WebxrTeleop(options, ctx)
+    from ibrobot_core.api import OperatorEvent, OptionFault, Robot
 
 
 def _check(options: WebxrOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
@@ -32,7 +26,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
     yield TeleopDescriptor(
         type="webxr",
         options=WebxrOptions,
-        make=_make,
+        make=Late("ibrobot_webxr.teleop:WebxrTeleop"),
         check_options=_check,
         events=_events,
         peripherals=lambda options: [(("cameras", i), name) for i, name in enumerate(options.cameras)],

@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
-from ibrobot_core.api import DecoderDescriptor, TransportDescriptor, hookimpl
+from ibrobot_core.api import DecoderDescriptor, Late, TransportDescriptor, hookimpl
 from ibrobot_core.app import Command, PanelDescriptor
 from ibrobot_zenoh.options import Share, ZenohOptions, check_files, server_options
 
 if TYPE_CHECKING:
-    import click
-
-    from ibrobot_core.api import CompressedImage, Context, Image, Transport
-    from ibrobot_core.app import Component, RunAccess, RunView, TransportLink
-
-
-def _zenoh(options: Any, ctx: Context) -> Transport:
-    from ibrobot_zenoh.transport import ZenohTransport
-
-    return ZenohTransport(options, ctx)
+    from ibrobot_core.app import Component, RunAccess, TransportLink
 
 
 def _components(options: ZenohOptions, session: RunAccess, link: TransportLink) -> list[Component]:
@@ -34,11 +23,18 @@ def _components(options: ZenohOptions, session: RunAccess, link: TransportLink) 
 def ibrobot_transports() -> Iterable[TransportDescriptor]:
     """Between machines."""
     yield TransportDescriptor(
-        type="zenoh", options=ZenohOptions, make=_zenoh, default=True, listen=server_options, components=_components,
-        used=lambda options: options.share != Share(), check_options=check_files,
-        publishes=_subscribed, offers=lambda options, service: options.share.offers(service),
+        type="zenoh",
+        options=ZenohOptions,
+        make=Late("ibrobot_zenoh.transport:ZenohTransport"),
+        default=True,
+        listen=server_options,
+        components=_components,
+        used=lambda options: options.share != Share(),
+        check_options=check_files,
+        publishes=_subscribed,
+        offers=lambda options, service: options.share.offers(service),
         summary="between machines, including ROS 2 nodes with rmw_zenoh",
-    )  # fmt: skip
+    )
 
 
 def _subscribed(options: ZenohOptions) -> list[tuple[tuple[str | int, ...], str]]:
@@ -48,28 +44,18 @@ def _subscribed(options: ZenohOptions) -> list[tuple[tuple[str | int, ...], str]
     return [(("share", "subscribe", key), topic) for key, topic in zip(keys, topics, strict=True)]
 
 
-def _peers(session: RunView) -> list[tuple[str, ...]]:
-    from ibrobot_zenoh.panel import peer_rows
-
-    return peer_rows(session)
-
-
 @hookimpl
 def ibrobot_panels() -> Iterable[PanelDescriptor]:
     """The machines that a run is connected to."""
-    yield PanelDescriptor("Zenoh peers", ("peer", "kind", "address", "certificate"), _peers)
-
-
-def _decoder() -> Callable[[CompressedImage], Image | None]:
-    from ibrobot_ros2.pictures import decode_picture
-
-    return decode_picture
+    yield PanelDescriptor(
+        "Zenoh peers", ("peer", "kind", "address", "certificate"), Late("ibrobot_zenoh.panel:peer_rows")
+    )
 
 
 @hookimpl
 def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
     """The decoder of compressed images from ROS 2 nodes."""
-    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), _decoder)
+    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), Late("ibrobot_ros2.pictures:decode_picture").load)
 
 
 _COMMANDS = {
@@ -83,13 +69,8 @@ _COMMANDS = {
 """Commands, each in a module of its name."""
 
 
-def _load(name: str) -> click.Command:
-    command: click.Command = getattr(import_module(f"ibrobot_zenoh.commands.{name}"), name)
-    return command
-
-
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """Commands for topics, services, bags and certificates."""
     for name, summary in _COMMANDS.items():
-        yield Command(name, summary, partial(_load, name))
+        yield Command(name, summary, Late(f"ibrobot_zenoh.commands.{name}:{name}").load)
