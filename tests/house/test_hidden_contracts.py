@@ -34,7 +34,7 @@ ALLOWED = {
     # Functions with pluggy's mark on them.
     "hasattr(getattr(plugin, name), 'ibrobot_impl')",
     # LeRobot's own policies, and torch's functions: some have these.
-    "getattr(self._policy, '_queues', {})",
+    "getattr(self.network, '_queues', {})",
     "getattr(func, '__name__', '')",
     "hasattr(config, 'pretrained_backbone_weights')",
     "hasattr(config, 'rtc_config')",
