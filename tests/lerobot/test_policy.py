@@ -163,7 +163,7 @@ TOLERANCE = 1e-5
 
 def network(policy: LeRobotPolicy) -> torch.nn.Module:
     """What a run of the policy calls once, or once for each step of denoising."""
-    model = policy._model._policy  # type: ignore[union-attr]
+    model = policy._model.network  # type: ignore[union-attr]
     return {"act": lambda: model.model, "diffusion": lambda: model.diffusion.unet, "vqbet": lambda: model.vqbet.policy}[
         model.config.type
     ]()
@@ -200,7 +200,7 @@ def test_a_batch_that_draws_in_unknown_ways_is_run_one_by_one(
     folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     policy = loaded(folders["act"])
-    model = policy._model._policy  # type: ignore[union-attr]
+    model = policy._model.network  # type: ignore[union-attr]
     predict = model.predict_action_chunk
     monkeypatch.setattr(model, "predict_action_chunk", lambda inputs: predict(inputs) + torch.empty(1).log_normal_())
     batch = [policy.preprocess(frame) for frame in frames(policy, 3)]

@@ -93,7 +93,7 @@ class NodeProcess:
     def _await_hello(self, interpreter: Interpreter, given_up: Any) -> Hello:
         deadline_s = time.monotonic() + _START_S
         while not self.wire.closed and time.monotonic() < deadline_s and not given_up():
-            for head, _ in self.wire.wait(_GLANCE_S):  # one, since the node says no more before it is told to
+            for head, _ in self.wire.wait(_GLANCE_S):  # one, since the node then waits for an order
                 if head.pop("op") == "hello":
                     return Hello(**head)
                 raise MissingDependency(
