@@ -131,10 +131,10 @@ class MoveIt2(CollisionObjects):
             PlanningError: for an invalid goal.
         """
         self.set_pose_goal(pose, position, quat_xyzw, frame_id, target_link, tolerance_position, tolerance_orientation)
-        if cartesian:
-            self._follow(self._straight(cartesian_fraction_threshold, {}))
-        else:
+        if not cartesian:
             self._motions.ask("/move_action", {"goals": self._taken_goals(), **self._scalings()})
+        elif (trajectory := self._straight(cartesian_fraction_threshold, {})) is not None:
+            self.execute(trajectory)
 
     def move_to_configuration(
         self,
@@ -400,10 +400,6 @@ class MoveIt2(CollisionObjects):
 
     def _trajectory(self, answer: Mapping[str, Any]) -> JointTrajectory | None:
         return None if self._failed(answer) else EXECUTE.read(answer["trajectory"]).trajectory()
-
-    def _follow(self, trajectory: JointTrajectory | None) -> None:
-        if trajectory is not None:
-            self.execute(trajectory)
 
     def _failed(self, answer: Mapping[str, Any]) -> bool:
         code = PlanCode[answer["code"]]

@@ -169,20 +169,13 @@ class GoalPlans:
             others = dict(zip(robot.joint_names, start.tolist(), strict=True))
             if isinstance(goal, JointTrajectory):
                 check_size(goal)
-                goals[name] = self._checked(goal, start, others)
-                continue
-            joints = self._session.config.executors[name].joints
-            planned = self.planned(
-                PlanRequest(
-                    joints,
-                    start[robot.indices(joints)],
-                    goal,
-                    target.velocity_scaling,
-                    target.acceleration_scaling,
-                    others,
-                )
-            )
-            goals[name] = self._checked(planned.trajectory, start, others)
+                trajectory = goal
+            else:
+                joints = self._session.config.executors[name].joints
+                first, scalings = start[robot.indices(joints)], (target.velocity_scaling, target.acceleration_scaling)
+                planned = self.planned(PlanRequest(joints, first, goal, *scalings, others))
+                trajectory = planned.trajectory
+            goals[name] = self._checked(trajectory, start, others)
         return goals, planned
 
     def _checked(self, trajectory: JointTrajectory, start: Vector, others: Mapping[str, float]) -> JointTrajectory:

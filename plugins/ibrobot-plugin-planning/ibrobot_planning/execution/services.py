@@ -178,19 +178,16 @@ class PlanningServices:
             return pose(homogeneous(tip.rotation, tip.position))
         return pose(self._arm.link_pose(self._arm.urdf_links.get(link, link), q))
 
-    def _links(self) -> tuple[str, ...]:
+    def _scene(self, request: NoRequest) -> PlanningScene:
         from ibrobot_planning.world.arm import robot_arm
 
-        return tuple(robot_arm(self._robot).frames)
-
-    def _scene(self, request: NoRequest) -> PlanningScene:
         robot, reading = self._robot, self._session.measured()
         objects = {
             name: ObjectSummary(type(each.shape).__name__.lower(), each.pose, each.link, tuple(sorted(each.may_touch)))
             for name, each in world_of(self._session.bus).objects.items()
         }
         try:
-            tip, links = self._plans.tool.model.tip, self._links()
+            tip, links = self._plans.tool.model.tip, tuple(robot_arm(robot).frames)
         except IbrobotError:  # a robot without a model can still move its joints
             tip, links = "", ()
         state = JointState(Header(reading.stamp_ns), robot.joint_names, reading.position, reading.velocity)

@@ -47,10 +47,6 @@ class Limits:
     acceleration: Vector
     """[rad/s^2]."""
 
-    def hold(self, motion: Motion) -> bool:
-        """Whether a motion, as executors interpolate it, is within the limits."""
-        return self.hold_at(motion.sampled(_SAMPLE_S))
-
     def hold_at(self, samples: Vector) -> bool:
         """Whether samples of a motion, shape (3, N, J), are within the limits; it may begin outside the positions."""
         positions, velocities, accelerations = samples
@@ -118,7 +114,7 @@ def joined(old: Motion, new: Motion, begin_s: float, limits: Limits) -> Iterator
         rows[1:, -1] = 0.0
         if limits.hold_at(rows[:, ::_GLANCE]):
             candidate = _every(rows.transpose(1, 0, 2), STEP_S)
-            if limits.hold(candidate):
+            if limits.hold_at(candidate.sampled(_SAMPLE_S)):
                 yield candidate
 
 

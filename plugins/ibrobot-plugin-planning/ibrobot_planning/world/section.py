@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, override
 
@@ -124,7 +125,6 @@ class WorldKeeper(Component):
         self._meshes = options.meshes
         self._lock = threading.RLock()
         self._measuring = threading.Lock()
-        self._arm: Arm | None = None
         self._moving = {thing.name: thing for thing in scene if thing.topic}
         """Objects of the scene that may move."""
         self._poses: dict[str, Subscription] = {}
@@ -150,7 +150,7 @@ class WorldKeeper(Component):
         for topic in {thing.topic for thing in self._moving.values()}:
             self._poses[topic] = self._session.bus.subscribe(topic, 1, Float64MultiArray)
         if self._session.config.robot.description.mjcf is not None:
-            self._robot()  # slow, so not in the first service call
+            _ = self._arm  # slow, so not in the first service call
         self._check(self._world)
         for service, handler in self._services.items():
             self._session.bus.serve(service, handler, self._mesh_file)
@@ -171,7 +171,7 @@ class WorldKeeper(Component):
         """
         carried = any(thing.link is not None for thing in world.objects.values())
         if carried or self._session.config.robot.description.mjcf is not None:
-            links = self._robot().frames
+            links = self._arm.frames
             world.check(links, self._temporary)
             if named := sorted(self._temporary & set(links)):
                 raise PlanningError(f"a cloud has the name of link {named[0]!r}")
@@ -285,23 +285,22 @@ class WorldKeeper(Component):
         self._touched = it.objects
         return world
 
-    def _robot(self) -> Arm:
+    @cached_property
+    def _arm(self) -> Arm:
         from ibrobot_planning.world.arm import robot_arm
 
-        if self._arm is None:
-            self._arm = robot_arm(self._session.config.robot)
-        return self._arm
+        return robot_arm(self._session.config.robot)
 
     def _hand(self) -> tuple[str, ...]:
         """The links that the last joint of the tool carries."""
         from ibrobot_kinematics import robot_model
 
         model = robot_model(self._session.config.robot)
-        return self._robot().hand(model.joint_names[model.chain[-1].index])
+        return self._arm.hand(model.joint_names[model.chain[-1].index])
 
     def _link(self, link: str) -> Vector:
         """Present pose of a link, shape (4, 4)."""
-        return self._robot().link_pose(link, self._session.measured().position)
+        return self._arm.link_pose(link, self._session.measured().position)
 
     def _distance(self, request: Configuration) -> float:
         """Distance of the arm from the nearest object [m]; missing joints are at their measured positions."""
@@ -317,5 +316,5 @@ class WorldKeeper(Component):
         world = self._snapshot()
         with self._measuring:
             if self._clearance is None or self._clearance[0] != world:
-                self._clearance = world, Clearance(self._robot(), world)
+                self._clearance = world, Clearance(self._arm, world)
             return self._clearance[1](q)[0]
