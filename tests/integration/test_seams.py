@@ -302,7 +302,7 @@ def check_flags(declared: Mapping[str, Command]) -> None:
         named = {
             flag_of(name, field)
             for command in declared.values()
-            if command.events and command.load.__module__ == module
+            if command.events and str(command.load().callback.__module__).startswith(f"{module}.")
             for name, field in fields(command.options).items()
             if field.metadata["label"] is not None
         }
