@@ -145,13 +145,13 @@ class TwistTeleop(Teleop):
     def _take(self, servo: Servo, received: Received, now_ns: int, here: Vector) -> None:
         """Follow a twist, or refuse it."""
         self._quiet_since_ns = now_ns
-        fault = self._fault(received.message, received.received_ns) or self._held(received.message, now_ns)
+        message = received.message
+        fault = self._fault(message, received.received_ns, now_ns)
         if fault is None:
-            assert isinstance(received.message, TwistStamped)
+            assert isinstance(message, TwistStamped)
             if servo.at_rest and (self._fresh or np.abs(servo.position - here).max() > _FOLLOW_RAD):
                 servo.reset(here)
-            twist = received.message.twist
-            in_tool = received.message.header.frame_id == self._ctx.robot.description.tip
+            twist, in_tool = message.twist, message.header.frame_id == self._ctx.robot.description.tip
             fault = servo.command(_array(twist.linear), _array(twist.angular), now_ns, in_tool=in_tool)
             self._fresh &= fault is not None
         else:
@@ -159,16 +159,8 @@ class TwistTeleop(Teleop):
         if fault is not None:
             self._report(servo, fault, now_ns)
 
-    def _held(self, message: Message, now_ns: int) -> str | None:
-        """Report a twist to the deadman; returns the fault if it may not move the tool."""
-        assert isinstance(message, TwistStamped)
-        moves = _array(message.twist.linear).any() or _array(message.twist.angular).any()
-        self.deadman.report(bool(moves), now_ns)
-        if not moves or self.deadman.allows(now_ns):
-            return None
-        return "the stream went on over a reset, a mode switch or a gap: send a zero twist, or pause for 0.5 s"
-
-    def _fault(self, message: Message, received_ns: int) -> str | None:
+    def _fault(self, message: Message, received_ns: int, now_ns: int) -> str | None:
+        """Why a twist may not move the tool; reports a valid one to the deadman."""
         if not isinstance(message, TwistStamped):
             return f"not a {TwistStamped.ros_type}"
         frames = (self._options.frame, self._ctx.robot.description.tip)
@@ -179,7 +171,11 @@ class TwistTeleop(Teleop):
         stamp_ns = message.header.stamp_ns
         if stamp_ns and abs(stamp_ns - received_ns) > _OFF_NS:
             return "the time in its header is more than 0.5 s off: set the clocks, or leave the time 0"
-        return None
+        moves = _array(message.twist.linear).any() or _array(message.twist.angular).any()
+        self.deadman.report(bool(moves), now_ns)
+        if not moves or self.deadman.allows(now_ns):
+            return None
+        return "the stream went on over a reset, a mode switch or a gap: send a zero twist, or pause for 0.5 s"
 
     def _report(self, servo: Servo, fault: str, now_ns: int) -> None:
         """Log the first refused twist for each reason, and publish the counts."""

@@ -283,24 +283,20 @@ class PlannerSource(SourceWorker):
         return self._submit(Target("trajectory", trajectory=request.trajectory())).number
 
     def _move_to_pose(self, wanted: MoveToPose) -> MoveResult:
-        try:
-            goal = _nearest(wanted.target_pose)
-        except PlanningError as error:
-            return MoveResult(False, str(error), 0.0, "REJECTED", error.code)
-        return self._wait(goal, wanted.velocity_scaling)
+        return self._wait(lambda: _nearest(wanted.target_pose), wanted.velocity_scaling)
 
     def _move_to_configuration(self, wanted: MoveToConfiguration) -> MoveResult:
         state = wanted.target_joint_state
-        return self._wait(JointGoal(state.name, state.position), wanted.velocity_scaling)
+        return self._wait(lambda: JointGoal(state.name, state.position), wanted.velocity_scaling)
 
-    def _wait(self, goal: Goal, velocity_scaling: float) -> MoveResult:
+    def _wait(self, goal: Callable[[], Goal], velocity_scaling: float) -> MoveResult:
         """Submit a goal and wait for its end; an invalid goal is REJECTED."""
         if self.session.request.lockstep and threading.get_ident() == self._worker:
             raise NotSupported(
                 f"this service waits for the motion: in lockstep call it from another thread, or {GO_TO.name}"
             )
         try:
-            move = self._submit(goal, velocity_scaling or 1.0)
+            move = self._submit(goal(), velocity_scaling or 1.0)
         except PlanningError as error:
             return MoveResult(False, str(error), 0.0, "REJECTED", error.code)
         while not move.ended.wait(_GLANCE_S) and not self._over:

@@ -10,11 +10,12 @@ from typing import override
 
 import attrs
 import numpy as np
-from ibrobot_kinematics import KinematicModel, robot_model
+from ibrobot_kinematics import robot_model
 
 from ibrobot_core.api import Context, JointTrajectory, PlanningError, Pose, Vector, Vector3, seconds
 from ibrobot_core.app import (
     AnyGoal,
+    Goal,
     JointGoal,
     LinearGoal,
     NamedGoal,
@@ -94,9 +95,8 @@ class RrtConnectPlanner(Planner):
         world = self._snapshot()
         checks = self._collisions(world, request.joints, request.others)
         deadline = begun + self._options.planning_time
-        plan = _Plan(self._ctx, self._options, request, start, checks, deadline)
         assert self._tool is not None
-        result = plan.solve(self._tool)
+        result = _Plan(self._ctx, self._options, self._tool, request, start, checks, deadline).solve()
         self._checked.append((result.trajectory, world))
         return result
 
@@ -151,15 +151,16 @@ class _Plan:
 
     ctx: Context
     options: RrtConnectOptions
+    tool: Tool
     request: PlanRequest
     start: Vector
     checks: Collisions
     deadline: float
 
-    def solve(self, tool: Tool) -> PlanResult:
+    def solve(self) -> PlanResult:
         goal = self.request.goal
         if isinstance(goal, LinearGoal):
-            return self._linear(tool, goal)
+            return self._linear(goal)
         way_out = self._way_out()
         alternatives = goal.goals if isinstance(goal, AnyGoal) else (goal,)
         if not alternatives:
@@ -169,7 +170,7 @@ class _Plan:
             try:
                 # Divide the remaining time, so that a hard alternative leaves some for the next.
                 share = (self.deadline - time.monotonic()) / (len(alternatives) - number)
-                return self._reach(tool, alternative, number, way_out, time.monotonic() + share)
+                return self._reach(alternative, number, way_out, time.monotonic() + share)
             except PlanningError as failure:
                 failures.append(failure)
         if len(failures) == 1:
@@ -192,15 +193,8 @@ class _Plan:
         whole[self._order] = self.start
         return whole
 
-    def _reach(
-        self,
-        tool: Tool,
-        goal: JointGoal | NamedGoal | PositionGoal | PoseGoal,
-        number: int,
-        way_out: list[Vector],
-        deadline: float,
-    ) -> PlanResult:
-        candidates = self._free_goals(self._candidates(tool, goal), goal)
+    def _reach(self, goal: Goal, number: int, way_out: list[Vector], deadline: float) -> PlanResult:
+        candidates = self._free_goals(self._candidates(goal), goal)
         if np.abs(candidates[0].joints[self._order] - self.start).max() < _ROUNDING and len(way_out) == 1:
             return self._result(resting(self.start, self.options.step), candidates[0], number)
         goals = [candidate.joints[self._order] for candidate in candidates]
@@ -222,22 +216,23 @@ class _Plan:
             for closely in _RESOLUTIONS_M[1:]:
                 yield shortened(Space(self.checks, *self._limits, closely), path, rng, self._pace)
 
-    def _candidates(self, tool: Tool, goal: object) -> list[Candidate]:
+    def _candidates(self, goal: Goal) -> list[Candidate]:
         robot = self.ctx.robot
         if isinstance(goal, JointGoal | NamedGoal):
             whole = self._whole()
             whole[self._order] = joint_target(goal, robot, self.request.joints, self.start)
             return [Candidate(whole)]
         if isinstance(goal, PositionGoal | PoseGoal):
-            self._check_chain(tool.model)
-            return tool.candidates(goal, self._whole())
+            self._check_chain()
+            return self.tool.candidates(goal, self._whole())
         raise PlanningError(
             f"a goal of type {type(goal).__name__} is not known; known are JointGoal, NamedGoal, PositionGoal,"
             " PoseGoal, AnyGoal and LinearGoal",
             PlanCode.UNRECOGNIZED_GOAL_TYPE,
         )
 
-    def _check_chain(self, model: KinematicModel) -> None:
+    def _check_chain(self) -> None:
+        model = self.tool.model
         missing = [model.joint_names[i] for i in model.moving if model.joint_names[i] not in self.request.joints]
         if missing:
             raise PlanningError(
@@ -245,7 +240,7 @@ class _Plan:
                 PlanCode.INVALID_GROUP_NAME,
             )
 
-    def _free_goals(self, candidates: list[Candidate], goal: object) -> list[Candidate]:
+    def _free_goals(self, candidates: list[Candidate], goal: Goal) -> list[Candidate]:
         """The configurations without contacts.
 
         Raises:
@@ -308,14 +303,14 @@ class _Plan:
         line = Space(self.checks, *self._limits, _FINEST_M).line(start, end)
         return _outwards(self.checks, np.concatenate([start[None], line])) is not None
 
-    def _linear(self, tool: Tool, goal: LinearGoal) -> PlanResult:
-        self._check_chain(tool.model)
+    def _linear(self, goal: LinearGoal) -> PlanResult:
+        self._check_chain()
         if not 0 < goal.least_fraction <= 1:
             raise invalid_goal(f"least_fraction is {goal.least_fraction}, must be above 0 and at most 1")
         touching = self.checks.contacts(self.start)
         if touching:
             raise PlanningError(f"the start is in collision: {_sentence(touching)}", PlanCode.START_STATE_IN_COLLISION)
-        line = linear_path(tool, goal.waypoints, self._whole())
+        line = linear_path(self.tool, goal.waypoints, self._whole())
         path = line.joints[:, self._order]
         space = Space(self.checks, *self._limits, _FINEST_M)
         possible, reason = len(path), line.reason

@@ -23,7 +23,7 @@ from ibrobot_core.api import (
     pixels,
 )
 from ibrobot_core.app import CONTROL, Bus, NoRequest, Received, RunView, Service, SessionWorker
-from ibrobot_planning.world.arm import Arm, robot_arm
+from ibrobot_planning.world.arm import robot_arm
 from ibrobot_planning.world.coal_shapes import geometry
 from ibrobot_planning.world.objects import Voxels, WorldObject, world_of
 from ibrobot_planning.world.options import CloudOptions, WorldOptions
@@ -46,8 +46,7 @@ class CloudKeeper(SessionWorker):
         self._keeper = WorldKeeper(options, session)
         topics = ", ".join(cloud.topic for cloud in options.clouds.values())
         super().__init__(session, "world", f"{self._keeper.summary}, and cells from {topics}", (CONTROL,))
-        self._clouds = {name: _Cloud(name, cloud, session) for name, cloud in options.clouds.items()}
-        self._arm: Arm | None = None
+        self._options = options.clouds
 
     @override
     def setup(self) -> None:
@@ -56,8 +55,8 @@ class CloudKeeper(SessionWorker):
         self.on_end.callback(self._keeper.stop)
         self._frames = _Frames(self.session.bus)
         self.on_end.callback(self._frames.close)
+        self._clouds = {name: _Cloud(name, cloud, self.session) for name, cloud in self._options.items()}
         for cloud in self._clouds.values():
-            cloud.open()
             self.on_end.callback(cloud.close)
         self.session.bus.serve(CLEAR, self._clear)
         self.on_end.callback(self.session.bus.unserve, CLEAR)
@@ -80,9 +79,7 @@ class CloudKeeper(SessionWorker):
 
     def _unknown(self, cells: Voxels, margin: float) -> Voxels | None:
         """The cells that neither the arm nor an object occupies."""
-        arm = self._arm
-        assert arm is not None
-        world = world_of(self.session.bus)
+        arm, world = self._arm, world_of(self.session.bus)
         q = self.session.measured().position
         arm_shapes = arm.placed_shapes(q)
         others: list[tuple[Any, Vector]] = []
@@ -113,9 +110,7 @@ class _Cloud:
         self.seen: deque[tuple[int, Voxels]] = deque()
         """Time of receipt [ns] and cells of updates, oldest first."""
         self._reported = ""
-
-    def open(self) -> None:
-        bus, options = self._session.bus, self.options
+        bus = session.bus
         self._messages = bus.subscribe(options.topic, 1, PointCloud2, Image)
         self._infos = bus.subscribe(options.info or f"{options.topic.rpartition('/')[0]}/camera_info", 1, CameraInfo)
 
