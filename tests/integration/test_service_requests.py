@@ -64,8 +64,8 @@ def test_what_ends_motion_waits_for_no_other_request(run_offers: Offered):
 
 
 def test_an_orientation_that_cannot_be_kept_is_refused(runtime: Runtime):
-    goal = {"xyz": [0, 0, 0], "quaternion": [0, 0, 0, 1], "beyond_reach": "current"}
-    answer = runtime.session.bus.call("/plan_kinematic_path", {"goals": [goal]})
+    goal = {"xyz": [0.08, 0.03, -0.01], "quaternion": [0, 1, 0, 0], "position_tolerance": 1e-4}
+    answer = runtime.session.bus.call("/plan_kinematic_path", {"goals": [{**goal, "beyond_reach": "current"}]})
     assert "cannot keep its orientation at" in answer.message
 
 
