@@ -20,7 +20,7 @@ from ibrobot_lerobot.arrow import table_of, to_array, to_numpy
 from ibrobot_lerobot.episode import counter_stats, stats_columns, write_meta
 from ibrobot_lerobot.layout import OnDisk
 from ibrobot_lerobot.stats import PictureStats, Stats, picture_stats, vector_stats
-from ibrobot_lerobot.video import VideoFile, join_videos
+from ibrobot_lerobot.video import join_videos
 
 _MERGING = ".merging"
 """Folder of a merge in progress; discarded after an interruption."""
@@ -146,7 +146,7 @@ class _Merge:
         self._table: pq.ParquetWriter | None = None
         self._data = _Place(_next(old, layout.DATA, "parquet"))
         self._videos: dict[str, _Place] = {}
-        self._joining: dict[str, list[VideoFile]] = {}
+        self._joining: dict[str, list[tuple[Path, int]]] = {}
         self._rows: list[dict[str, Any]] = []
         self._rows_table: pq.ParquetWriter | None = None
         self._rows_number = _next(old, layout.EPISODES, "parquet")
@@ -270,7 +270,7 @@ class _Merge:
                 self._join(key)
                 place = self._videos[key] = _Place(place.number + 1)
             placed.append((place.number, place.frames / self._info["fps"]))
-            self._joining.setdefault(key, []).append(VideoFile(path, frames[number]))
+            self._joining.setdefault(key, []).append((path, frames[number]))
             place.bytes, place.frames = place.bytes + size, place.frames + frames[number]
         return placed
 

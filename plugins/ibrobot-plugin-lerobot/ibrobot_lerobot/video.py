@@ -229,15 +229,7 @@ class VideoTrack:
             pass
 
 
-@attrs.frozen
-class VideoFile:
-    """A part of a joined video."""
-
-    path: Path
-    frames: int
-
-
-def join_videos(parts: Sequence[VideoFile], path: Path, fps: int) -> None:
+def join_videos(parts: Sequence[tuple[Path, int]], path: Path, fps: int) -> None:
     """Join videos without re-encoding.
 
     Args:
@@ -252,8 +244,8 @@ def join_videos(parts: Sequence[VideoFile], path: Path, fps: int) -> None:
     stream: Any = None
     try:
         with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as joined:
-            for part in parts:
-                with av.open(str(part.path)) as container:
+            for part, frames in parts:
+                with av.open(str(part)) as container:
                     source: Any = container.streams.video[0]
                     if stream is None:
                         stream = joined.add_stream_from_template(source, opaque=True)
@@ -267,9 +259,9 @@ def join_videos(parts: Sequence[VideoFile], path: Path, fps: int) -> None:
                         packet.stream = stream
                         joined.mux(packet)
                         count += 1
-                if count != part.frames:
-                    raise DatasetError(f"{part.path}: has {count} images, its table {part.frames} rows")
-                begin += part.frames
+                if count != frames:
+                    raise DatasetError(f"{part}: has {count} images, its table {frames} rows")
+                begin += frames
     except (av.error.FFmpegError, OSError) as error:
         raise DatasetError(f"{path}: cannot be joined: {error}") from error
 

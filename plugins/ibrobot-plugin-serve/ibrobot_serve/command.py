@@ -9,7 +9,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -20,10 +20,8 @@ from ibrobot_http.probes import ProbeServer
 
 from ibrobot_core.api import Context, Policy, RealClock, Robot, Transport, TransportDescriptor
 from ibrobot_core.app import (
-    ConfigError,
     LogFormatter,
     Override,
-    Problem,
     Registry,
     RobotConfig,
     apply_overrides,
@@ -34,7 +32,7 @@ from ibrobot_core.app import (
     installed_plugins,
     load_config,
     on_signals,
-    parse_yaml,
+    read_document,
     single_options,
     wrong_input,
 )
@@ -311,16 +309,9 @@ def _host_and_port(listen: Sequence[str], key: str | None, usual: int = 8000) ->
 
 def _transport_type(path: Path, overrides: Sequence[str]) -> str:
     """The type in the `transport` section, read before any checks; empty if there is none."""
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise ConfigError([Problem(str(path), 0, "", f"cannot be read: {error.strerror}")]) from None
-    document = parse_yaml(text, str(path))
-    if not isinstance(document.root, Mapping):
-        return ""
+    document = read_document(path)
     apply_overrides(document, overrides)
-    section = document.root.get("transport")
-    found = str(section.get("type", "")) if isinstance(section, Mapping) else ""
+    found = str(document.get("transport", "type") or "")
     return "" if found == "local" else found
 
 

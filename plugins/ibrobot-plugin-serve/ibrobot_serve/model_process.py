@@ -13,8 +13,6 @@ import threading
 import time
 from pathlib import Path
 
-import attrs
-
 from ibrobot_core.api import Policy
 from ibrobot_core.app import (
     Channel,
@@ -34,44 +32,32 @@ _NICE = 5
 """Below the priority of the host, which reads cameras and sends plans while the model computes."""
 
 
-@attrs.define
-class ModelLoop:
-    """Answers requests one after the other."""
-
-    policy: Policy
-    channel: Channel
-    request: memoryview
-    answer: memoryview
+def answer_requests(policy: Policy, channel: Channel, request: memoryview, answer: memoryview) -> None:
+    """Answer requests one after the other, until the host hangs up."""
+    encoder, decoder = WireEncoder(), WireDecoder()
     episode: int | None = None
-    encoder: WireEncoder = attrs.field(factory=WireEncoder)
-    decoder: WireDecoder = attrs.field(factory=WireDecoder)
 
-    def run(self) -> None:
-        """Answer until the host hangs up."""
-        while True:
-            try:
-                order = self.channel.wait(None)[-1]  # the host gave up the earlier ones
-            except ComponentFailed:
-                return
-            size = self._answered(order["id"], order["size"])
-            self.channel.send({"event": "answer", "id": order["id"], "size": size, "identity": self.policy.identity()})
+    def encoded(message: WireMessage) -> int:
+        """Put a message into memory; returns the size of its frame."""
+        return len(encoder.encode(message, lambda size: answer[:size]))
 
-    def _answered(self, request_id: int, size: int) -> int:
-        """Answer the request in memory; returns the size of the answer's frame."""
+    while True:
+        try:
+            order = channel.wait(None)[-1]  # the host gave up the earlier ones
+        except ComponentFailed:
+            return
         begun_ns = time.monotonic_ns()
         try:
-            message = self.decoder.decode(self.request[:size])
-            if message.episode != self.episode:
-                self.policy.reset(message.seed)
-                self.episode = message.episode
-            outputs = self.policy.infer(message.tensors)
+            message = decoder.decode(request[: order["size"]])
+            if message.episode != episode:
+                policy.reset(message.seed)
+                episode = message.episode
+            outputs = policy.infer(message.tensors)
             latency_ms = (time.monotonic_ns() - begun_ns) / 1e6
-            return self._put(WireMessage(WireKind.ANSWER, request_id, outputs, latency_ms=latency_ms))
+            size = encoded(WireMessage(WireKind.ANSWER, order["id"], outputs, latency_ms=latency_ms))
         except Exception as error:  # noqa: BLE001 - contained: the answer has the error
-            return self._put(WireMessage(WireKind.FAILURE, request_id, text=error_text(error)))
-
-    def _put(self, message: WireMessage) -> int:
-        return len(self.encoder.encode(message, lambda size: self.answer[:size]))
+            size = encoded(WireMessage(WireKind.FAILURE, order["id"], text=error_text(error)))
+        channel.send({"event": "answer", "id": order["id"], "size": size, "identity": policy.identity()})
 
 
 def _end_with(host: int) -> None:
@@ -97,7 +83,7 @@ def main(parent: int, request: int, answer: int) -> int:
             "identity": policy.identity(),
         })  # fmt: skip
         frames = [memoryview(mmap.mmap(descriptor, WIRE_LIMITS.size)) for descriptor in (request, answer)]
-        ModelLoop(policy, channel, frames[0], frames[1]).run()
+        answer_requests(policy, channel, *frames)
     except Exception as error:  # noqa: BLE001 - the host reports it
         channel.report(Failure(error_text(error)))
         return 1

@@ -77,7 +77,7 @@ def _end(query: zenoh.Query) -> None:
 def call(
     session: zenoh.Session, key: str, name: str, kind: ServiceType, request: Mapping[str, Any], timeout_s: float
 ) -> dict[str, Any]:
-    """Call a service; see `TopicTransport.call_ros`."""
+    """Call a service; see `ZenohTransport.call_ros`."""
     try:
         replies = session.get(
             key,

@@ -11,7 +11,7 @@ import attrs
 from ibrobot_ros2.interfaces import ActionType, from_cdr
 
 from ibrobot_core.api import TransportError
-from ibrobot_zenoh.sharing import TopicTransport
+from ibrobot_zenoh.transport import ZenohTransport
 
 _ANSWER_S = 10.0
 """Longest wait for the answer to a goal or a cancel [s]."""
@@ -53,7 +53,7 @@ class SentGoal:
     """
 
     def __init__(
-        self, transport: TopicTransport, name: str, kind: ActionType, goal: Mapping[str, Any],
+        self, transport: ZenohTransport, name: str, kind: ActionType, goal: Mapping[str, Any],
         take_feedback: Callable[[dict[str, Any]], object] | None = None,
     ) -> None:  # fmt: skip
         self._transport = transport

@@ -23,12 +23,9 @@ from ibrobot_core.app import (
     type_name,
 )
 from ibrobot_zenoh.options import Share
-from ibrobot_zenoh.ros2 import SharedService, SharedTopic
 
 type Reply = Callable[[Mapping[str, Any]], None]
 type RosHandler = Callable[[dict[str, Any], Reply], object]
-LIST_S = 2.0
-"""How long to wait for the names on a network, unless the caller says [s]."""
 _DEPTH = 10
 """Queue size of a topic for the network; when it is full, the bus drops and counts the oldest message."""
 
@@ -88,10 +85,6 @@ class TopicTransport(Transport):
         """As `publish_message`, with the bytes of a message of any type, under its full name."""
 
     @abstractmethod
-    def subscribe_cdr(self, name: str, callback: Callable[[str, bytes], object]) -> Callable[[], None]:
-        """As `subscribe_messages`, with the type and the bytes of each message, under its full name."""
-
-    @abstractmethod
     def serve_ros(
         self, name: str, kind: ServiceType, handler: RosHandler, *, urgent: bool = False
     ) -> Callable[[], None]:
@@ -106,31 +99,6 @@ class TopicTransport(Transport):
 
         Raises:
             TransportError: if closed, or there is a server of this name.
-        """
-
-    @abstractmethod
-    def call_ros(self, name: str, kind: ServiceType, request: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
-        """Call a service of a ROS 2 node, under its full name; its response as plain data.
-
-        Raises:
-            TransportError: if there is none, or it does not answer within `timeout_s` [s].
-            CodecError: if the request does not fit the type.
-        """
-
-    @abstractmethod
-    def shared_services(self, timeout_s: float = LIST_S) -> list[SharedService]:
-        """The services of ROS 2 nodes, by name; waits up to `timeout_s` [s] for the answer.
-
-        Raises:
-            TransportError: if closed or not connected.
-        """
-
-    @abstractmethod
-    def shared_topics(self, timeout_s: float = LIST_S) -> list[SharedTopic]:
-        """All shared topics, by name; waits up to `timeout_s` [s] for the answer.
-
-        Raises:
-            TransportError: if closed or not connected.
         """
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 import threading
 import time
@@ -31,11 +30,13 @@ from ibrobot_zenoh.ros2 import (
     topics_of_tokens,
     type_of_key,
 )
-from ibrobot_zenoh.sharing import LIST_S, TopicTransport
+from ibrobot_zenoh.sharing import TopicTransport
 from ibrobot_zenoh.workers import Workers
 
 DEPTH = 100
 """Queue size of a subscriber; when it is full, the oldest message is dropped."""
+_LIST_S = 2.0
+"""How long to wait for the names on a network, unless the caller says [s]."""
 _AGAIN_S = 0.02
 _LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
 """Types of large messages; smaller ones may overtake them."""
@@ -198,21 +199,26 @@ class RosTransport(TopicTransport):
         name = absolute(topic, self.namespace)
         return self.subscribe_cdr(name, lambda type_name, data: callback(decode(type_name, data)))
 
-    @override
     def subscribe_cdr(self, name: str, callback: Callable[[str, bytes], object]) -> Callable[[], None]:
-        warn_once = _Once(self._log)
+        """As `subscribe_messages`, with the type and the bytes of each message, under its full name."""
+        warned: set[str] = set()
+
+        def warn_once(text: str, *arguments: object) -> None:
+            if text not in warned:
+                warned.add(text)
+                self._log.warning(text, *arguments)
 
         def deliver(sample: zenoh.Sample) -> None:
             try:
                 callback(type_of_key(str(sample.key_expr)), sample.payload.to_bytes())
             except IbrobotError as error:
-                warn_once.warning("a message on %s was skipped: %s", name, error)
+                warn_once("a message on %s was skipped: %s", name, error)
 
         subscriber = Workers(deliver, f"a subscriber of {name}", depth=DEPTH)
 
         def take(sample: zenoh.Sample) -> None:
             if subscriber.put(sample) is not None:
-                warn_once.warning("a subscriber of %s is too slow: messages are dropped", name)
+                warn_once("a subscriber of %s is too slow: messages are dropped", name)
 
         key = f"{self.options.domain}{name}/*/*"
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
@@ -221,12 +227,20 @@ class RosTransport(TopicTransport):
         )
         return self._keep(end, subscriber)
 
-    @override
-    def shared_topics(self, timeout_s: float = LIST_S) -> list[SharedTopic]:
+    def shared_topics(self, timeout_s: float = _LIST_S) -> list[SharedTopic]:
+        """All shared topics, by name; waits up to `timeout_s` [s] for the answer.
+
+        Raises:
+            TransportError: if closed or not connected.
+        """
         return topics_of_tokens(self._settled_tokens(timeout_s))
 
-    @override
-    def shared_services(self, timeout_s: float = LIST_S) -> list[SharedService]:
+    def shared_services(self, timeout_s: float = _LIST_S) -> list[SharedService]:
+        """The services of ROS 2 nodes, by name; waits up to `timeout_s` [s] for the answer.
+
+        Raises:
+            TransportError: if closed or not connected.
+        """
         return services_of_tokens(self._settled_tokens(timeout_s))
 
     def _settled_tokens(self, timeout_s: float) -> set[str]:
@@ -271,16 +285,3 @@ class RosTransport(TopicTransport):
                 self._workers.discard(workers)
 
         return end
-
-
-class _Once:
-    """Logs each kind of warning once."""
-
-    def __init__(self, log: logging.Logger) -> None:
-        self._log = log
-        self._once: set[str] = set()
-
-    def warning(self, text: str, *arguments: object) -> None:
-        if text not in self._once:
-            self._once.add(text)
-            self._log.warning(text, *arguments)

@@ -209,8 +209,13 @@ class ZenohTransport(RosTransport):
         end = self._declare_server(name, key, server.take, lambda: self._announce(name, kind))
         return self._keep(end, server.workers)
 
-    @override
     def call_ros(self, name: str, kind: ServiceType, request: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
+        """Call a service of a ROS 2 node, under its full name; its response as plain data.
+
+        Raises:
+            TransportError: if there is none, or it does not answer within `timeout_s` [s].
+            CodecError: if the request does not fit the type.
+        """
         key = service_key(self.options.domain, name, kind, hashed=self.options.type_hashes)
         return call(self.connection.session(), key, name, kind, request, timeout_s)
 

@@ -7,7 +7,7 @@ import threading
 import attrs
 from ibrobot_testing.fakes import FakeTransport
 from ibrobot_zenoh.options import Share
-from ibrobot_zenoh.sharing import LIST_S, TopicTransport, components
+from ibrobot_zenoh.sharing import TopicTransport, components
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import TransportDescriptor
@@ -41,23 +41,11 @@ class Network(FakeTransport, TopicTransport):
         self.is_urgent = is_urgent
         return self.serve(name, handler)
 
-    def shared_topics(self, timeout_s=LIST_S):
-        return []
-
     def publish_cdr(self, name, type_name, payload, *, latched=False):
         self.sent.append((name, type_name, latched))
 
-    def subscribe_cdr(self, name, callback):
-        return lambda: None
-
     def serve_ros(self, name, kind, handler, *, urgent=False):
         return lambda: None
-
-    def call_ros(self, name, kind, request, timeout_s):
-        raise TransportError("nobody")
-
-    def shared_services(self, timeout_s=LIST_S):
-        return []
 
     def close(self):
         super().close()
