@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_camera.device import realsense_stream, require_device, video_device
@@ -12,7 +12,6 @@ from ibrobot_core.app import Command, GuideDescriptor
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
-    from ibrobot_core.app import Guide
 
 
 def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
@@ -24,12 +23,6 @@ def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[Opti
             load_info(options.info)
         except SensorError as error:
             yield OptionFault(("info",), str(error))
-
-
-def _find_librealsense() -> None:
-    from ibrobot_camera.librealsense import load_library
-
-    load_library()
 
 
 @hookimpl
@@ -49,7 +42,7 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         type="realsense",
         options=RealSenseOptions,
         make=Late("ibrobot_camera.realsense:RealSenseCamera"),
-        check=_find_librealsense,
+        check=Late("ibrobot_camera.librealsense:load_library"),
         devices=realsense_stream,
         picture=picture_size,
         summary="Intel RealSense: colour, or aligned depth",
@@ -70,17 +63,17 @@ def ibrobot_commands() -> Iterable[Command]:
     )
 
 
-def _show(answers: Mapping[str, str | bool], guide: Guide) -> None:
-    from ibrobot_camera.guides import show_cameras
-
-    show_cameras(answers, guide)
-
-
 @hookimpl
 def ibrobot_guides() -> Iterable[GuideDescriptor]:
     """The cameras, with pictures."""
     summary = "List the cameras, with their formats and a picture of each."
-    yield GuideDescriptor("cameras", "Cameras", summary, _show, Late("ibrobot_camera.guides:camera_questions"))
+    yield GuideDescriptor(
+        "cameras",
+        "Cameras",
+        summary,
+        Late("ibrobot_camera.guides:show_cameras"),
+        Late("ibrobot_camera.guides:camera_questions"),
+    )
 
 
 @hookimpl

@@ -9,14 +9,7 @@ from ibrobot_core.api import Late, hookimpl
 from ibrobot_core.app import SectionDescriptor
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import NoOptions
-    from ibrobot_core.app import Component, RobotConfig, RunView
-
-
-def _publisher(options: NoOptions | None, session: RunView) -> Component:
-    from ibrobot_description.component import DescriptionPublisher
-
-    return DescriptionPublisher(session)
+    from ibrobot_core.app import RobotConfig
 
 
 def _has_frames(config: RobotConfig) -> bool:
@@ -29,7 +22,7 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """The section `description`, the counterpart of robot_state_publisher."""
     yield SectionDescriptor(
         type="description",
-        make=_publisher,
+        make=lambda options, session: Late("ibrobot_description.component:DescriptionPublisher")(session),
         without_section=_has_frames,
         check_config=Late("ibrobot_description.check:faults"),
         summary="/tf, /tf_static and /robot_description from the URDF and the mounts of sensors; has no keys",

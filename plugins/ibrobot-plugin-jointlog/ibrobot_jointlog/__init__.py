@@ -3,24 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import DatasetDescriptor, Late, ReaderDescriptor, RecorderDescriptor, hookimpl
-
-if TYPE_CHECKING:
-    from ibrobot_core.api import Context, DatasetWriter, Recorder
-
-
-def _joint_log(options: Any, ctx: Context) -> Recorder:
-    from ibrobot_jointlog.recorder import JointLogRecorder
-
-    return JointLogRecorder(ctx)
-
-
-def _npz(options: Any, ctx: Context) -> DatasetWriter:
-    from ibrobot_jointlog.npz import NpzDatasetWriter
-
-    return NpzDatasetWriter()
 
 
 @hookimpl
@@ -38,11 +22,17 @@ def ibrobot_readers() -> Iterable[ReaderDescriptor]:
 def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
     """The recorder of joint logs."""
     yield RecorderDescriptor(
-        type="joint_log", make=_joint_log, summary="joint positions of an episode as CSV, for replay"
+        type="joint_log",
+        make=lambda options, ctx: Late("ibrobot_jointlog.recorder:JointLogRecorder")(ctx),
+        summary="joint positions of an episode as CSV, for replay",
     )
 
 
 @hookimpl
 def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
     """The writer of NumPy datasets."""
-    yield DatasetDescriptor(type="npz", make=_npz, summary="one NumPy .npz file per episode")
+    yield DatasetDescriptor(
+        type="npz",
+        make=lambda options, ctx: Late("ibrobot_jointlog.npz:NpzDatasetWriter")(),
+        summary="one NumPy .npz file per episode",
+    )

@@ -4,22 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import DatasetDescriptor, Late, PolicyDescriptor, ReaderDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_lerobot.contents import Contents, InfoOptions
 from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions
 from ibrobot_lerobot.training import EVENTS, TrainOptions, check_trainer
-
-if TYPE_CHECKING:
-    from ibrobot_core.api import Context, DatasetWriter
-
-
-def _write(options: Any, ctx: Context) -> DatasetWriter:
-    from ibrobot_lerobot.writer import LeRobotDatasetWriter
-
-    return LeRobotDatasetWriter(options)
 
 
 def _reads(path: Path) -> bool:
@@ -36,7 +26,7 @@ def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
     yield DatasetDescriptor(
         type="lerobot",
         options=LeRobotOptions,
-        make=_write,
+        make=lambda options, ctx: Late("ibrobot_lerobot.writer:LeRobotDatasetWriter")(options),
         default=True,
         summary="LeRobot v3.0: videos and tables",
         flags=("codec", "crf", "videos"),

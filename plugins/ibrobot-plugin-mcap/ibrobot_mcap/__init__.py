@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 from ibrobot_core.api import DecoderDescriptor, Late, ReaderDescriptor, RecorderDescriptor, hookimpl
 from ibrobot_core.app import Command
@@ -17,15 +16,6 @@ from ibrobot_mcap.changes import (
     TrimOptions,
 )
 from ibrobot_mcap.options import McapOptions
-
-if TYPE_CHECKING:
-    from ibrobot_core.api import EpisodeAddress, EpisodeReader
-
-
-def _read(address: EpisodeAddress) -> EpisodeReader:
-    from ibrobot_mcap.reader import Rosbag2Reader
-
-    return Rosbag2Reader(address.path)
 
 
 @hookimpl
@@ -44,7 +34,10 @@ def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
 def ibrobot_readers() -> Iterable[ReaderDescriptor]:
     """The reader of bags, including foreign ones."""
     yield ReaderDescriptor(
-        "rosbag2", "ROS 2 bags: MCAP, also unfinished, and sqlite3", Late("ibrobot_mcap.reader:is_rosbag2"), _read
+        "rosbag2",
+        "ROS 2 bags: MCAP, also unfinished, and sqlite3",
+        Late("ibrobot_mcap.reader:is_rosbag2"),
+        lambda address: Late("ibrobot_mcap.reader:Rosbag2Reader")(address.path),
     )
 
 

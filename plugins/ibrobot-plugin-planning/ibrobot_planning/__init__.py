@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import ExecutorDescriptor, Late, NoOptions, OptionFault, did_you_mean, hookimpl
+from ibrobot_core.api import ExecutorDescriptor, Late, OptionFault, did_you_mean, hookimpl
 from ibrobot_core.app import Command, PlannerDescriptor, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.planners.options import JointPlannerOptions, RrtConnectOptions
@@ -83,12 +83,6 @@ def _world(options: WorldOptions, session: RunView) -> Component:
     return WorldKeeper(options, session)
 
 
-def _tasks(options: NoOptions, session: RunView) -> Component:
-    from ibrobot_planning.tasks.runner import TaskRunner
-
-    return TaskRunner(session)
-
-
 def _unknown_names(options: WorldOptions, robot: Robot) -> Iterable[OptionFault]:
     """Faults of names that are neither a link of the robot's model nor an object."""
     from ibrobot_core.app import ModelError, read_mjcf
@@ -142,7 +136,9 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         summary="what planners avoid: boxes, spheres, cylinders, meshes, planes, point clouds; services change it",
     )
     yield SectionDescriptor(
-        type="tasks", make=_tasks, summary="services of a run that perform tasks, with a mode with a planner"
+        type="tasks",
+        make=lambda options, session: Late("ibrobot_planning.tasks.runner:TaskRunner")(session),
+        summary="services of a run that perform tasks, with a mode with a planner",
     )
 
 

@@ -11,13 +11,7 @@ from ibrobot_servo.options import ToolPoseOptions, TwistOptions
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
-    from ibrobot_core.app import Component, RobotConfig, RunView
-
-
-def _pose(options: ToolPoseOptions | None, session: RunView) -> Component:
-    from ibrobot_servo.tool_pose import ToolPose
-
-    return ToolPose(options or ToolPoseOptions(), session)
+    from ibrobot_core.app import RobotConfig
 
 
 def _check_twist(options: TwistOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
@@ -60,7 +54,7 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
     yield SectionDescriptor(
         type="tool_pose",
         options=ToolPoseOptions,
-        make=_pose,
+        make=lambda options, session: Late("ibrobot_servo.tool_pose:ToolPose")(options or ToolPoseOptions(), session),
         check_options=_check_pose,
         without_section=_has_model,
         publishes=lambda options: [(("topic",), options.topic)],

@@ -349,12 +349,14 @@ def test_the_page_shows_the_robots_mode_and_faults(ctx: Context, browser: Browse
 
 
 def test_a_port_in_use_is_an_error(ctx: Context, page: PageServer):
+    assert ctx.bus is not None
     taken = attrs.evolve(ANY_PORT, port=page.port)
     with pytest.raises(TeleopError, match=rf"port {page.port} of 127\.0\.0\.1 is not available: .*; choose another"):
         PageServer(taken, ctx.clock, ctx.bus, ctx.log)
 
 
 def test_a_certificate_that_does_not_fit_is_an_error(tmp_path: Path, ctx: Context):
+    assert ctx.bus is not None
     (tmp_path / "a.pem").write_text("no certificate")
     options = WebxrOptions(port=0, certificate=tmp_path / "a.pem", key=tmp_path / "a.pem")
     with pytest.raises(TeleopError, match=r"certificate .*a\.pem and key .*a\.pem cannot be used"):

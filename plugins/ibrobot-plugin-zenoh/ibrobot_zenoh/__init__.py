@@ -3,20 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
 
 from ibrobot_core.api import DecoderDescriptor, Late, TransportDescriptor, hookimpl
 from ibrobot_core.app import Command, PanelDescriptor
 from ibrobot_zenoh.options import Share, ZenohOptions, check_files, server_options
-
-if TYPE_CHECKING:
-    from ibrobot_core.app import Component, RunAccess, TransportLink
-
-
-def _components(options: ZenohOptions, session: RunAccess, link: TransportLink) -> list[Component]:
-    from ibrobot_zenoh.sharing import components
-
-    return components(options.share, session, link)
 
 
 @hookimpl
@@ -28,7 +18,9 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
         make=Late("ibrobot_zenoh.transport:ZenohTransport"),
         default=True,
         listen=server_options,
-        components=_components,
+        components=lambda options, session, link: Late("ibrobot_zenoh.sharing:components")(
+            options.share, session, link
+        ),
         used=lambda options: options.share != Share(),
         check_options=check_files,
         publishes=_subscribed,
