@@ -245,8 +245,10 @@ class Corrections(SourceWorker):
             elif command.positions and (self._arm.at_rest or not self._arm.holds):
                 self._set(OPERATOR)
                 self._arm.follow(command.positions)
-            else:
-                self._release()
+            elif self._arm.holds:
+                self._arm.hold()
+            else:  # the deadman is released
+                self._arm.brake()
         elif self._commander == HANDOVER:
             self._give_back()
 
@@ -259,13 +261,6 @@ class Corrections(SourceWorker):
             self._devices.activate(self.session.measured())
             return False
         return self._aligned
-
-    def _release(self) -> None:
-        """Hold while the deadman is released."""
-        if self._arm.holds:
-            self._arm.hold()
-        else:
-            self._arm.brake()
 
     def _give_back(self) -> None:
         """Ask the policy for a plan once the arm holds. The policy commands from the plan's arrival."""

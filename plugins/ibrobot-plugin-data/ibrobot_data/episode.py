@@ -175,13 +175,10 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
                 return attrs.evolve(report, passed_over=_NOTHING[job.request.only])
             _sync(making)
             _put(making, job.unit, key)
-    except (IbrobotError, OSError) as error:
-        shutil.rmtree(making, ignore_errors=True)
-        stop_if_full(error, job.source)
-        return attrs.evolve(report, error=str(error))
     except Exception as error:  # noqa: BLE001 - a fault in a plugin must not cost the other episodes
         shutil.rmtree(making, ignore_errors=True)
-        return attrs.evolve(report, error=unexpected(error))
+        stop_if_full(error, job.source)
+        return attrs.evolve(report, error=error_text(error))
     return unit.report
 
 
@@ -218,8 +215,10 @@ def stop_if_full(error: BaseException, source: str) -> None:
         cause = cause.__cause__ or cause.__context__
 
 
-def unexpected(error: Exception) -> str:
-    """Message for an error that no interface documents, with the line that raised it."""
+def error_text(error: Exception) -> str:
+    """Message for an error; one that no interface documents is shown with the line that raised it."""
+    if isinstance(error, IbrobotError | OSError):
+        return str(error)
     place = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(place.filename).name}:{place.lineno}"
     return f"{type(error).__name__}: {error} (at {where}): a fault in ibrobot or a plugin; please report it"
@@ -268,7 +267,8 @@ def _write(
 
     try:
         number = -1
-        for row, number, begins in stretches(rows(), _KEEPS[request.only], _context(request, contract)):
+        context = round(request.context * contract.rate_hz) if request.only == "interventions" else 0
+        for row, number, begins in stretches(rows(), _KEEPS[request.only], context):
             if waiting is None:
                 features = _features(contract, row.values, request)
                 folder.mkdir(parents=True)
@@ -310,11 +310,6 @@ def _labelled(
     number = signals.pop(TASK_KEY, None)
     rest = {key: value for key, value in values.items() if key != TASK_KEY}
     return rest | signals, prompt if number is None else tasks[int(number[0])]
-
-
-def _context(request: ConversionRequest, contract: Contract) -> int:
-    """Rows to keep before and after each stretch of wanted rows."""
-    return round(request.context * contract.rate_hz) if request.only == "interventions" else 0
 
 
 def _add(

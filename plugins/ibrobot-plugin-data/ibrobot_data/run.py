@@ -25,9 +25,9 @@ from ibrobot_data.episode import (
     Job,
     Unit,
     convert_episode,
+    error_text,
     make_writer,
     read_unit,
-    unexpected,
     unit_key,
     unwanted_outcome,
 )
@@ -213,12 +213,10 @@ class _Plan:
         """Source -> number of frames, estimated from its length."""
         self._copies: dict[str, str] = {}
         """Source -> the source of which it is a copy; not converted unless that one fails."""
-        self._alike: dict[Any, list[Job]] = {}
-        """Properties in which the summaries of copies agree -> new episodes with them."""
+        self._alike: dict[Any, list[tuple[Job, str]]] = {}
+        """Properties in which the summaries of copies agree -> new episodes, with identity if a summary tells it."""
         self.resumed = 0
         self.sources: dict[str, None] = {}
-        self._identities: dict[str, str] = {}
-        """Source -> identity, where the summary tells it."""
         self._labelled = False
         known = KnownEpisodes(old.metadata["episodes"] if old is not None else ())
         for path in episodes:
@@ -238,19 +236,16 @@ class _Plan:
                 summary = reader.summary()
                 self._labelled = self._labelled or is_labelled(summary)
                 there = known.find(source, reader, summary)
-        except (IbrobotError, OSError) as error:
-            self._reports[source] = attrs.evolve(report, error=str(error))
-            return
         except Exception as error:  # noqa: BLE001 - a fault in a plugin must not cost the other episodes
-            self._reports[source] = attrs.evolve(report, error=unexpected(error))
+            self._reports[source] = attrs.evolve(report, error=error_text(error))
             return
         report = attrs.evolve(report, outcome=summary.outcome, start_ns=summary.start_ns)
         if there:
             self._reports[source] = attrs.evolve(report, passed_over=there)
             return
-        self._identities[source] = identity_by_uuid(summary)
         counts = tuple((topic, each.count) for topic, each in sorted(summary.topics.items()))
-        self._alike.setdefault((summary.start_ns, summary.end_ns, counts), []).append(job)
+        alike = self._alike.setdefault((summary.start_ns, summary.end_ns, counts), [])
+        alike.append((job, identity_by_uuid(summary)))
         if unwanted := unwanted_outcome(summary, self.request):
             self._reports[source] = attrs.evolve(report, passed_over=unwanted)
         else:
@@ -274,12 +269,12 @@ class _Plan:
     def _find_copies(self) -> None:
         """Find copies before they are converted; only episodes that look alike are compared by their content."""
         for alike in self._alike.values():
-            equal: dict[str, list[Job]] = {}
-            for job in alike if len(alike) > 1 else ():
+            equal: dict[str, list[str]] = {}
+            for job, known in alike if len(alike) > 1 else ():
                 with suppress(IbrobotError, OSError):  # its conversion will report it
-                    equal.setdefault(self._identities[job.source] or _identity(job.episode), []).append(job)
-            for jobs in equal.values():
-                self._note_copies([job.source for job in jobs])
+                    equal.setdefault(known or _identity(job.episode), []).append(job.source)
+            for sources in equal.values():
+                self._note_copies(sources)
 
     def _note_copies(self, sources: Sequence[str]) -> None:
         """Keep the first of equal episodes; none of them if their outcomes contradict each other."""
@@ -397,7 +392,7 @@ def _refuse_misfits(
             each = ", ".join(f"{key} is {unit.features.get(key)}, not {features.get(key)}" for key in keys)
             wrong = f"its features differ from those of {first}: {each}"
         elif not request.any_robot and (
-            difference := robot.difference(Identity.of_unit(unit.recorded, unit.robot_type, unit.calibration), first)
+            difference := robot.difference(Identity.of_unit(unit), first)
         ):
             wrong = f"{difference}; --any-robot merges them regardless"
         if wrong:

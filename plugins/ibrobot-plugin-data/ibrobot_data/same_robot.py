@@ -36,17 +36,9 @@ class Identity:
         return cls(metadata.get("robot", ""), metadata.get("robot_type", ""), calibration)
 
     @classmethod
-    def of_unit(
-        cls, recorded: Mapping[str, Any], robot_type: str, calibration: Mapping[str, Mapping[str, Any]]
-    ) -> Self:
-        """The identity of a converted episode.
-
-        Args:
-            recorded: the episode's metadata.
-            robot_type: the type in the dataset.
-            calibration: joint -> fields of `JointCalibration`, as used.
-        """
-        return cls(recorded.get("robot", ""), robot_type, calibration)
+    def of_unit(cls, unit: Unit) -> Self:
+        """The identity of a converted episode, with the calibration that was used."""
+        return cls(unit.recorded.get("robot", ""), unit.robot_type, unit.calibration)
 
     @classmethod
     def of_dataset(cls, metadata: Mapping[str, Any], units: Sequence[Unit]) -> Self:
@@ -58,10 +50,10 @@ class Identity:
         """
         kept, type_ = metadata.get("calibrations", {}), metadata.get("robot_type", "")
         known = [
-            cls.of_unit(each.get("recorded", {}), type_, kept.get(each.get("calibration", ""), {}))
+            cls(each.get("recorded", {}).get("robot", ""), type_, kept.get(each.get("calibration", ""), {}))
             for each in metadata.get("episodes", ())
         ]
-        known += [cls.of_unit(unit.recorded, unit.robot_type, unit.calibration) for unit in units]
+        known += map(cls.of_unit, units)
         return cls(
             next((each.name for each in known if each.name), ""),
             next((each.robot_type for each in known if each.robot_type), ""),

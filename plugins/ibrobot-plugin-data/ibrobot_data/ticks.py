@@ -107,6 +107,10 @@ class _Following:
             before_ns = item.received_ns
         self.end_ns = before_ns
 
+    def is_over(self, t_ns: int) -> bool:
+        """Whether no message follows tick `t_ns` [ns]."""
+        return self.end_ns is not None and t_ns >= self.end_ns
+
     def is_silent(self, t_ns: int) -> bool:
         """Whether the message after tick `t_ns` [ns] is too far from it; ticks must not decrease."""
         while self._silences and self._silences[0][1] <= t_ns:
@@ -139,7 +143,8 @@ class _Source:
             for part in aligned
             if part.align == "next"
         }
-        self._following = list(shifted.values())
+        self.following = list(shifted.values())
+        """The streams whose messages belong to the ticks before them."""
         direct = {part.topic for part in contract.observation_parts}
         direct |= {part.topic for part in aligned if _source_of(part) == part.topic}
         streams: dict[str, Iterable[Recorded]] = {"": reader.messages(direct), **shifted}
@@ -152,18 +157,6 @@ class _Source:
         """Read ahead, to know whether there is a message at or after a tick."""
         self._newest_ns = self.first_ns = self._read[0].received_ns if self._read else 0
 
-    def is_over(self, t_ns: int) -> bool:
-        """Whether no command or signal follows tick `t_ns` [ns] where one has to."""
-        return any(each.end_ns is not None and t_ns >= each.end_ns for each in self._following)
-
-    def misses_action(self, t_ns: int) -> bool:
-        """Whether the command after tick `t_ns` [ns], where it is the action, is too far from it."""
-        return any(each.is_silent(t_ns) for each in self._following)
-
-    def action_ended(self, t_ns: int) -> bool:
-        """Whether the commands after the ticks, where these are the actions, ended long before tick `t_ns` [ns]."""
-        return any(each.ends_early(t_ns) for each in self._following)
-
     def __iter__(self) -> Iterator[tuple[str, Message, int]]:
         while self._read or self._read_on():
             recorded = self._read.popleft()
@@ -172,15 +165,10 @@ class _Source:
     def ticks(self, step_ns: int) -> Iterator[int]:
         """From the first message to the last."""
         t_ns = self.first_ns
-        while self._newest_ns >= t_ns or self._reaches(t_ns):
-            yield t_ns
-            t_ns += step_ns
-
-    def _reaches(self, t_ns: int) -> bool:
-        while self._read_on():
+        while self._newest_ns >= t_ns or self._read_on():
             if self._newest_ns >= t_ns:
-                return True
-        return False
+                yield t_ns
+                t_ns += step_ns
 
     def _read_on(self) -> bool:
         recorded = next(self._messages, None)
@@ -284,10 +272,11 @@ class Ticks:
         leading: list[_Incomplete] = []
         over: list[int] = []
         for frame in frames(self._assembler, source, source.ticks(self._contract.step_ns)):
-            if source.is_over(frame.stamp_ns):
+            if any(each.is_over(frame.stamp_ns) for each in source.following):
                 over.append(frame.stamp_ns)
                 continue
-            missing = frame.missing | ({ACTION} if source.misses_action(frame.stamp_ns) else set())
+            far = any(each.is_silent(frame.stamp_ns) for each in source.following)
+            missing = frame.missing | ({ACTION} if far else set())
             if not last:
                 if missing:
                     leading.append((frame.stamp_ns, missing))
@@ -304,7 +293,7 @@ class Ticks:
             yield last
         if not last:
             raise RecorderError(f"no tick has every observation and action: {self._never(leading)}")
-        if over and source.action_ended(over[-1]):
+        if over and any(each.ends_early(over[-1]) for each in source.following):
             self._leave_out([ACTION], over[0], len(over))
 
     def _begin_late(self, leading: Sequence[_Incomplete], t_ns: int) -> None:
