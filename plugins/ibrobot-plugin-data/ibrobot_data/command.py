@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 _Progress = Callable[[int], AbstractContextManager[Any]]
 """Receives the number of episodes, and yields the function that shows the progress."""
 _MIB = 1 << 20
-_ONLY_TO_BAG = ("numbers",)
 _ONLY_TO_DATASET = (
     "append", "type_", "force_contract", "any_robot", "missing", "outcome", "success", "jobs", "on", "shard",
     "only", "context",
@@ -62,13 +61,6 @@ def _writer_flags() -> dict[str, click.Option]:
     return found
 
 
-def _with_writer_flags(command: click.Command) -> click.Command:
-    """Add the flags of the installed dataset writers."""
-    command.params += _writer_flags().values()
-    return command
-
-
-@_with_writer_flags
 @click.command()
 @declared(CONVERT)
 @click.option("--to", type=click.Choice(("dataset", "bag")), default="dataset", show_default=True, help="What to make.")
@@ -87,40 +79,41 @@ def convert(
     After an interruption, run the same command again to continue. An episode that cannot be converted is reported and
     left out; the command then exits with 1.
     """
-    given = [each for each in context.command.params if _given(context, each)]
-    only_other = _ONLY_TO_BAG if to == "dataset" else (*_ONLY_TO_DATASET, *_writer_flags())
-    if wrong := [each for each in given if each.name in only_other]:
-        raise click.UsageError(f"{wrong[0].opts[0]} does not apply to --to {to}")
+    given = {
+        each.name: each.opts[0]
+        for each in context.command.params
+        if context.get_parameter_source(each.name or "") is ParameterSource.COMMANDLINE
+    }
+    only_other = ("numbers",) if to == "dataset" else (*_ONLY_TO_DATASET, *_writer_flags())
+    if wrong := [flag for name, flag in given.items() if name in only_other]:
+        raise click.UsageError(f"{wrong[0]} does not apply to --to {to}")
     try:
         with wrong_input():
             check_prompt(options.prompt)
             progress = _events if events else partial(_progress, quiet=as_json)
             if to == "bag":
-                unit = options.norm_mode if "norm_mode" in [each.name for each in given] else None
+                unit = options.norm_mode if "norm_mode" in given else None
                 report = _to_bags(options, numbers, unit, sets, progress)
             else:
                 report = _to_dataset(options, type_, (*_overrides(flags), *sets), progress)
     except KeyboardInterrupt:
         if events:
-            emit(
-                CONVERT,
-                Failed("interrupted; finished episodes are kept: the same conversion continues with the others"),
-            )
+            why = "interrupted; finished episodes are kept: the same conversion continues with the others"
+            emit(CONVERT, Failed(why))
         else:
             echo("interrupted; finished episodes are kept: run the same command again to continue", err=True)
         sys.exit(130)
     if events:
-        emit(CONVERT, conversion.Report.of(report.summary()))  # each episode had its event
+        emit(CONVERT, conversion.Report(**report.summary()))  # each episode had its event
     elif as_json:
-        echo(json.dumps(report.summary()))
+        echo(json.dumps({**report.summary(), "reports": [attrs.asdict(each) for each in report.episodes]}))
     else:
         _print_report(report)
     if report.failed or not (report.converted or all(each.passed_over for each in report.episodes)):
         sys.exit(1)
 
 
-def _given(context: click.Context, parameter: click.Parameter) -> bool:
-    return context.get_parameter_source(parameter.name or "") is ParameterSource.COMMANDLINE
+convert.params += _writer_flags().values()
 
 
 def _to_dataset(options: ConvertOptions, type_: str | None, overrides: Sequence[str], progress: _Progress) -> Report:
@@ -129,11 +122,17 @@ def _to_dataset(options: ConvertOptions, type_: str | None, overrides: Sequence[
 
     installed_plugins().check_pool(options.on)
     type_ = type_ or installed_plugins().default("dataset")
+    writer_options = _options("dataset", type_, overrides)
+    robot, calibration = _stated(options)
+    if robot is not None and calibration is not None:
+        calibration = with_closed_ends(calibration, robot)
     request = ConversionRequest(
-        options.out, _options("dataset", type_, overrides), type_, append=options.append, outcomes=options.outcome,
+        options.out, writer_options, type_, append=options.append, outcomes=options.outcome,
         jobs=options.jobs, on=options.on, norm_mode=options.norm_mode, missing=options.missing, prompt=options.prompt,
         success=options.success, only=options.only, context=options.context, any_robot=options.any_robot,
-        force_contract=options.force_contract, **_stated(options.config, options.calibration),
+        force_contract=options.force_contract, calibration=calibration,
+        contract=Contract.from_config(robot) if robot is not None else None,
+        document=json.loads(json.dumps(robot.document, default=str)) if robot is not None else None,
     )  # fmt: skip
     found = find_episodes(options.episodes)
     found = [found[number] for number in shard_of(options.shard, len(found))]
@@ -157,8 +156,7 @@ def _to_bags(
     if (summary := writer.summary(address.path)) is None:
         raise DatasetError(f"{address.path}: not a dataset of type {dataset}")
     chosen = (address.number,) if address.number is not None else _numbers(numbers, summary.episodes)
-    robot = _robot(options.config) if options.config is not None else None
-    calibration = _calibration(options.calibration)
+    robot, calibration = _stated(options)
     request = BagRequest(
         address.path, chosen, options.out, _options("recorder", recorder, sets), recorder, prompt=options.prompt,
         contract=Contract.from_config(robot) if robot is not None else None,
@@ -209,32 +207,15 @@ def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:
     return single_options(installed_plugins().find(kind, type_).options, overrides, type_)
 
 
-def _robot(config: str) -> RobotConfig:
+def _stated(options: ConvertOptions) -> tuple[RobotConfig | None, Mapping[str, Mapping[str, Any]] | None]:
+    """The robot YAML and the calibration that the options name."""
+    from ibrobot_core.api import load_calibration
     from ibrobot_core.app import find_config
     from ibrobot_data.config_metadata import load_contract
 
-    return load_contract(find_config(config, installed_plugins()))
-
-
-def _stated(config: str | None, calibration: str | None) -> dict[str, Any]:
-    """Fields of the request that come from a robot YAML and a calibration."""
-    numbers = _calibration(calibration)
-    if config is None:
-        return {"calibration": numbers}
-    robot = _robot(config)
-    return {
-        "calibration": numbers and with_closed_ends(numbers, robot),
-        "contract": Contract.from_config(robot),
-        "document": json.loads(json.dumps(robot.document, default=str)),
-    }
-
-
-def _calibration(name: str | None) -> Mapping[str, Mapping[str, Any]] | None:
-    if name is None:
-        return None
-    from ibrobot_core.api import load_calibration
-
-    return load_calibration(name).snapshot()
+    calibration = load_calibration(options.calibration).snapshot() if options.calibration is not None else None
+    robot = load_contract(find_config(options.config, installed_plugins())) if options.config is not None else None
+    return robot, calibration
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import json
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from operator import itemgetter
 
 from ibrobot_core.api import EpisodeReader, EpisodeSummary, RecorderError, String
 from ibrobot_data.options import COMMANDER, OPERATOR, PLANNER, POLICY
@@ -27,20 +28,19 @@ class Commanders:
     """
 
     def __init__(self, reader: EpisodeReader, summary: EpisodeSummary) -> None:
-        self._times: list[int] = []
-        self._names: list[str] = []
+        self._changes: list[tuple[int, str]] = []
+        """Times [ns] from which somebody else commands, and who."""
         if is_labelled(summary):
             for item in reader.messages({COMMANDER}):
                 assert isinstance(item.message, String)
-                if not self._names or item.message.data != self._names[-1]:
-                    self._times.append(item.received_ns)
-                    self._names.append(item.message.data)
+                if not self._changes or item.message.data != self._changes[-1][1]:
+                    self._changes.append((item.received_ns, item.message.data))
         else:
-            self._times, self._names = [0], [_of_mode(summary)]
+            self._changes = [(0, _of_mode(summary))]
 
     def at(self, t_ns: int) -> str:
         """Who commanded at `t_ns` [ns], by the newest message up to then."""
-        return self._names[max(0, bisect_right(self._times, t_ns) - 1)]
+        return self._changes[max(0, bisect_right(self._changes, t_ns, key=itemgetter(0)) - 1)][1]
 
 
 def _of_mode(summary: EpisodeSummary) -> str:

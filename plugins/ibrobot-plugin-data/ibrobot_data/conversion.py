@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, override
+from typing import override
 
 import attrs
 
@@ -135,11 +134,6 @@ class Report(Event):
     without_prompt: int = option(help="episodes without a task")
     size_bytes: int = option(unit="bytes", help="size of the whole dataset")
     seconds: float = option(unit="s", help="duration")
-
-    @classmethod
-    def of(cls, summary: Mapping[str, Any]) -> Report:
-        """The event for the summary of a conversion."""
-        return cls(**{name: value for name, value in summary.items() if name != "reports"})
 
     @override
     def shown(self) -> Shown:

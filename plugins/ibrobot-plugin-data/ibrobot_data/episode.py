@@ -291,7 +291,7 @@ def _write(
         writer.finalize()
     report = attrs.evolve(
         report, frames=sum(count for _, count in pieces), stretches=pieces, skipped=ticks.skipped,
-        cuts=tuple(ticks.cuts), held=ticks.held, gaps=ticks.gaps, resets=dict(ticks.resets), prompt="; ".join(tasks),
+        cuts=tuple(ticks.cuts), held=ticks.held, gaps=dict(ticks.gaps), resets=ticks.resets, prompt="; ".join(tasks),
     )  # fmt: skip
     unit = Unit(
         job.unit, key, report, contract.rate_hz, features, contract.canonical(), robot_type, calibration, document,

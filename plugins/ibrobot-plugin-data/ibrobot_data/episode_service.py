@@ -369,9 +369,7 @@ class EpisodeService(Episodes):
 
     def elapsed_s(self) -> float:
         """Time since the episode began [s]; 0 without an episode."""
-        if not self.running:
-            return 0.0
-        return seconds(self._session.clock.now_ns() - self.begun_ns)
+        return seconds(self._session.clock.now_ns() - self.begun_ns) if self.running else 0.0
 
     def free_bytes(self) -> int:
         """Free space on the dataset's disk [bytes]."""
@@ -389,7 +387,7 @@ class EpisodeService(Episodes):
             elapsed_s=round(self.elapsed_s(), 2), max_duration_s=self._session.config.contract.max_duration_s,
             rates_hz={topic: round(rate, 1) for topic, rate in recording.rates().items()},
             silent=tuple(recording.silent()), lost=recording.lost(), free_bytes=self.free_bytes(),
-            bytes_per_s=round(recording.flow()), waiting_bytes=recording.waiting(),
+            bytes_per_s=round(recording.flow()), waiting_bytes=recording.recorder.waiting(),
             failure=str(failure) if failure is not None else "",
         )  # fmt: skip
 
@@ -421,7 +419,7 @@ class EpisodeService(Episodes):
 
     def _check_space(self) -> None:
         longest_s, flow = self._session.config.contract.max_duration_s, self._recording.flow()
-        free, kept = self.free_bytes(), self._recording.min_free
+        free, kept = self.free_bytes(), self._recording.recorder.min_free
         takes = longest_s * flow
         if free < takes + kept:
             raise DiskFull(

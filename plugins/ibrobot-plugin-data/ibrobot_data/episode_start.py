@@ -31,7 +31,8 @@ def take_next_folder(recording: RecordingConfig) -> Ownership:
     root = recording.folder / "episodes"
     try:
         root.mkdir(parents=True, exist_ok=True)
-        number = _next_number(root)
+        numbers = [path.name.removeprefix(_PREFIX) for path in root.glob(f"{_PREFIX}*")]
+        number = max((int(each) for each in numbers if each.isdigit()), default=0) + 1
         while True:
             with suppress(InUse):  # another run records into this dataset, too
                 taken = Ownership(episode_folder(root.parent, number), "is being recorded", wait_s=0.0)
@@ -100,8 +101,3 @@ def model_topics(config: RobotConfig, policy: Mapping[str, str] | None) -> dict[
         return {}
     observed = Contract.from_config(config, config.models[policy["model"]].extra_observations)
     return {**observed.topics, MODEL_ANSWERS: ModelAnswer.ros_type}
-
-
-def _next_number(root: Path) -> int:
-    numbers = [path.name.removeprefix(_PREFIX) for path in root.glob(f"{_PREFIX}*")]
-    return max((int(number) for number in numbers if number.isdigit()), default=0) + 1

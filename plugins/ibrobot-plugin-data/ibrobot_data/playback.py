@@ -118,7 +118,8 @@ def read_playback(reader: EpisodeReader, contract: Contract, period_ns: int) -> 
     first = np.concatenate([track.positions[0] for track in sent])
     held = np.where(np.isnan(held), first, held)
     commands = Track(np.arange(count) * (period_ns / NS_PER_S), held)
-    return Playback(joints, commands, measured, summary.outcome, _seed(summary.metadata))
+    seed = summary.metadata.get("seed", "")
+    return Playback(joints, commands, measured, summary.outcome, int(seed) if seed.isdigit() else None)
 
 
 def _read(
@@ -129,7 +130,8 @@ def _read(
     for item in reader.messages({*sizes, *([states] if states is not None else ())}):
         message: Any = item.message
         if isinstance(message, JointState):
-            values = _positions(message, joints)
+            known = dict(zip(message.name, message.position.tolist(), strict=False))
+            values = np.array([known.get(joint, np.nan) for joint in joints])
         elif isinstance(message, Float64MultiArray) and message.data.shape == (sizes[item.topic],):
             values = message.data
         else:
@@ -157,16 +159,6 @@ def _at_ticks(track: Track, count: int, period_ns: int, *, sampled: bool) -> Vec
     return np.where((newest < 0)[:, None], np.nan, track.positions[newest])
 
 
-def _positions(message: JointState, joints: tuple[str, ...]) -> Vector:
-    known = dict(zip(message.name, message.position.tolist(), strict=False))
-    return np.array([known.get(joint, np.nan) for joint in joints])
-
-
 def _track(samples: list[tuple[int, Vector]], first_ns: int) -> Track:
     stamps: NDArray[np.int64] = np.array([stamp for stamp, _ in samples])
     return Track((stamps - first_ns) / NS_PER_S, np.stack([values for _, values in samples]))
-
-
-def _seed(metadata: Mapping[str, str]) -> int | None:
-    text = metadata.get("seed", "")
-    return int(text) if text.isdigit() else None

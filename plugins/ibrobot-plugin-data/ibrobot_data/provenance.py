@@ -19,16 +19,14 @@ _KEPT_ONCE = ("contract", "fingerprint", "config", "calibration", "prompt")
 
 def conversion(request: ConversionRequest) -> dict[str, Any]:
     """The settings that must be equal for all episodes of a dataset."""
-    options = attrs.asdict(request.options)
-    labels = {"labels": True} if request.labels else {}
     settings = {
         "writer": request.type,
-        "options": options,
+        "options": attrs.asdict(request.options),
         "norm_mode": request.norm_mode,
         "success": request.success,
         "missing": request.missing,
     }
-    return settings | labels
+    return settings | ({"labels": True} if request.labels else {})
 
 
 def provenance(

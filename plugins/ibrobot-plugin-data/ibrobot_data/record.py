@@ -91,14 +91,8 @@ def record(options: RecordOptions, config: str | None, events: bool, **run: Any)
         run["lockstep"], run["seed"], run["duration"], options.episodes and options.episodes - earlier, run["goals"],
         prompt=prompt or "", by_operator=True,
     )  # fmt: skip
-    run_robot(
-        robot,
-        request,
-        headless=run["headless"],
-        dry_run=run["dry_run"],
-        as_json=run["as_json"],
-        make_hooks=operator,
-    )
+    shown = {name: run[name] for name in ("headless", "dry_run", "as_json")}
+    run_robot(robot, request, **shown, make_hooks=operator)
 
 
 def _recorded(config: str | None, dataset: str | None, root: Path | None, options: dict[str, Any]) -> RobotConfig:

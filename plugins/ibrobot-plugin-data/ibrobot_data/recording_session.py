@@ -16,18 +16,13 @@ CUES = ("beep", "speech", "none")
 """Kinds of cues; see `Cues`."""
 
 
-def _check_prompt(instance: object, attribute: object, prompt: str | None) -> None:
-    if prompt is not None:
-        check_prompt(prompt)
-
-
 @attrs.frozen(kw_only=True)
 class RecordOptions:
     """Which episodes are recorded, and where."""
 
     prompt: str | None = option(
         None,
-        validator=_check_prompt,
+        validator=attrs.validators.optional(lambda _, __, prompt: check_prompt(prompt)),
         label="Task",
         help="description of the task, e.g. pick the cube; keys ask for it if left out",
     )

@@ -100,13 +100,13 @@ class RecordingWorker(SessionWorker):
     @override
     def setup(self) -> None:
         session = self.session
-        self._recorder: Recorder = session.make("recorder", self._config, "recording")
+        self.recorder: Recorder = session.make("recorder", self._config, "recording")
         self._incoming = session.bus.subscribe(None, _DEPTH)
         self.on_end.callback(self._incoming.close)
         self.episodes.serve()
         self.on_end.callback(self.episodes.unserve)
         self.on_end.callback(self._give_up)
-        self.on_end.callback(self._did, self._recorder.close)
+        self.on_end.callback(self._did, self.recorder.close)
         self.on_end.callback(self.work, 0.0)
 
     def begin(self, number: int, prompt: str, *, again: bool = False) -> None:
@@ -198,18 +198,9 @@ class RecordingWorker(SessionWorker):
         """Disk space that an episode takes per second, from present rates and message sizes [bytes/s]."""
         for topic, message in self._newest.copy().items():
             if topic not in self._sizes:
-                self._sizes[topic] = self._recorder.size_of(message)
+                self._sizes[topic] = self.recorder.size_of(message)
         sizes = self._sizes.copy()
         return sum(rate * sizes.get(topic, 0) for topic, rate in self.rates().items())
-
-    @property
-    def min_free(self) -> int:
-        """Disk space that the recorder leaves free [bytes]."""
-        return self._recorder.min_free
-
-    def waiting(self) -> int:
-        """Data accepted by the recorder and not written yet [bytes]."""
-        return self._recorder.waiting()
 
     def silent(self) -> dict[str, float | None]:
         """Silent topics of the contract: topic -> time since the last message [s], None if there was none."""
@@ -242,7 +233,7 @@ class RecordingWorker(SessionWorker):
         self._lost = lost
         self._give_up()
         self._owned = owned
-        self._open = self._did(partial(self._recorder.begin, start))
+        self._open = self._did(partial(self.recorder.begin, start))
         if not self._open:
             self._give_up()
         for item in latched:
@@ -285,7 +276,7 @@ class RecordingWorker(SessionWorker):
         self._open = False
         # Counted now, since messages that were queued when the episode ended may have been lost later.
         dropped = {topic: n for topic, n in self.lost().items() if self._keeps(topic)}
-        whole = self._did(partial(self._recorder.end, attrs.evolve(end, dropped=dropped)))
+        whole = self._did(partial(self.recorder.end, attrs.evolve(end, dropped=dropped)))
         self._give_up()
         return whole
 
@@ -298,7 +289,7 @@ class RecordingWorker(SessionWorker):
     def _write(self, item: Received, received_ns: int) -> None:
         if not self._open or not self._keeps(item.topic):
             return
-        if not self._did(partial(self._recorder.write, item.topic, item.message, received_ns)):
+        if not self._did(partial(self.recorder.write, item.topic, item.message, received_ns)):
             self._finish(EpisodeEnd(received_ns, "unknown"))
 
     def _did(self, act: Callable[[], object]) -> bool:
@@ -333,11 +324,10 @@ class RecordingWorker(SessionWorker):
         absent = [topic for topic in listed if topic not in self._seen]
         if absent and not self._reported_absent:
             self._reported_absent = True
-            available = ", ".join(self.session.bus.topics())
             self.session.log.warning(
                 "recording.topics: no message on %s so far, so none was recorded; available: %s",
                 ", ".join(absent),
-                available,
+                ", ".join(self.session.bus.topics()),
             )
 
     def _watch_model(self) -> None:

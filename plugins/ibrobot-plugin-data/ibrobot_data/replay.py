@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,7 @@ from ibrobot_core.app import (
 from ibrobot_data.config_metadata import metadata_from_config
 from ibrobot_data.episode import recorded_contract
 from ibrobot_data.playback import Playback, read_playback
-from ibrobot_data.replay_source import Replay, ReplaySource
+from ibrobot_data.replay_source import ReplaySource
 from ibrobot_data.same_robot import Identity
 
 _FAR = 0.5
@@ -85,17 +87,13 @@ def replay(
         echo(f"{episode}: has no commands of {', '.join(still)}, which hold their positions", err=True)
     if not summary.finished:
         echo(f"{episode}: is unfinished; {playback.duration:.2f} s of it can be replayed", err=True)
-    run = Replay(str(episode), playback, speed)
     request = LaunchRequest(
-        options["lockstep"], playback.seed or 0, source=lambda session, mode: ReplaySource(session, mode, run)
+        options["lockstep"],
+        playback.seed or 0,
+        source=lambda session, mode: ReplaySource(session, mode, str(episode), playback, speed),
     )
-    run_robot(
-        _without_sensors(robot),
-        request,
-        headless=options["headless"],
-        dry_run=options["dry_run"],
-        as_json=options["as_json"],
-    )
+    shown = {name: options[name] for name in ("headless", "dry_run", "as_json")}
+    run_robot(_without_sensors(robot), request, **shown)
 
 
 def _check_robot(robot: RobotConfig, summary: EpisodeSummary) -> None:
@@ -129,9 +127,7 @@ def _without_sensors(robot: RobotConfig) -> RobotConfig:
 def _named(config: str, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
     """The robot of a YAML, with the mode of the replay added."""
     registry = installed_plugins()
-    path = find_config(config, registry)
-    robot = load_config(path, overrides=changes, sim=sim, registry=registry)
-    return load_config(path, overrides=(*changes, _mode(robot)), mode=_MODE, sim=sim, registry=registry)
+    return _with_mode(partial(load_config, find_config(config, registry), sim=sim, registry=registry), changes)
 
 
 def _recorded(summary: EpisodeSummary, changes: tuple[str, ...], *, sim: bool) -> RobotConfig:
@@ -143,15 +139,13 @@ def _recorded(summary: EpisodeSummary, changes: tuple[str, ...], *, sim: bool) -
         document = json.loads(text)
     except ValueError as error:
         raise RecorderError(f"{summary.path}: its robot YAML cannot be read: {error}; name one as CONFIG") from None
-    source = Path("recorded config")
-    robot = from_document(document, source=source, overrides=changes, sim=sim)
-    return from_document(document, source=source, overrides=(*changes, _mode(robot)), mode=_MODE, sim=sim)
+    return _with_mode(partial(from_document, document, source=Path("recorded config"), sim=sim), changes)
 
 
-def _mode(robot: RobotConfig) -> str:
-    """The override that adds the mode of the replay, with only the executors of the contract's actions."""
-    executors = ", ".join(dict.fromkeys(spec.executor for spec in robot.contract.actions))
-    return f"control_modes.{_MODE}={{executors: [{executors}]}}"
+def _with_mode(load: Callable[..., RobotConfig], changes: tuple[str, ...]) -> RobotConfig:
+    """Load a robot with the mode of the replay, which has only the executors of the contract's actions."""
+    executors = ", ".join(dict.fromkeys(spec.executor for spec in load(overrides=changes).contract.actions))
+    return load(overrides=(*changes, f"control_modes.{_MODE}={{executors: [{executors}]}}"), mode=_MODE)
 
 
 def _check(contract: Contract, summary: EpisodeSummary, name: str, *, force: bool) -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Any, override
 
-import attrs
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S, HardwareError, Vector, ns, seconds
-from ibrobot_core.app import ControlMode, ControlState, RunAccess, SourceWorker, StateWatch
+from ibrobot_core.app import ControlMode, ControlState, RunAccess, SourceWorker
 from ibrobot_data.playback import Playback, Track
 
 _APPROACH_SPEED = 0.5
@@ -21,32 +20,27 @@ _SETTLE_NS = NS_PER_S
 """Maximum time from the last command to the success of the scene, if the recording succeeded [ns]."""
 
 
-@attrs.frozen(eq=False)
-class Replay:
-    """An episode to replay, and its speed."""
-
-    source: str
-    """The episode's name on the command line."""
-    playback: Playback
-    speed: float = 1.0
-    """Seconds of the recording that are played per second."""
-
-
 class ReplaySource(SourceWorker):
     """Plays an episode once, and ends the run. Its commands pass through executors and safety, as those of a teleop.
 
     In simulation the recorded seed sets up the scene first. A fault ends the replay.
+
+    Args:
+        session: the run.
+        mode: the mode of the replay.
+        episode: the episode's name on the command line.
+        playback: its motion.
+        speed: seconds of the recording that are played per second.
     """
 
     autonomous = True
     urgent = True
 
-    def __init__(self, session: RunAccess, mode: ControlMode, replay: Replay) -> None:
-        super().__init__(session, mode, f"{replay.source}, {replay.playback.duration / replay.speed:.1f} s")
-        self._replay = replay
+    def __init__(self, session: RunAccess, mode: ControlMode, episode: str, playback: Playback, speed: float) -> None:
+        super().__init__(session, mode, f"{episode}, {playback.duration / speed:.1f} s")
+        self._episode, self._playback, self._speed = episode, playback, speed
         self._period_ns = ns(1.0 / session.config.control.rate_hz)
-        self._columns = session.config.robot.indices(replay.playback.joints)
-        self._states: StateWatch | None = None
+        self._columns = session.config.robot.indices(playback.joints)
         self._begun_ns: int | None = None
         """When the approach began [ns]; None before."""
         self._rows: Vector = np.empty((0, 0))
@@ -64,7 +58,7 @@ class ReplaySource(SourceWorker):
     @override
     def begin_mode(self, seed: int) -> None:
         self._begun_ns, self._measured, self._success = None, [], None
-        recorded = self._replay.playback.seed
+        recorded = self._playback.seed
         if not self.session.config.simulated or recorded is None:
             return
         if not self.session.command("reset_episode", seed=recorded)["begun"]:
@@ -72,7 +66,6 @@ class ReplaySource(SourceWorker):
 
     @override
     def work(self, timeout_s: float) -> None:
-        assert self._states is not None
         if self._states.get(timeout_s) is None:
             return
         with self.lock:
@@ -103,7 +96,7 @@ class ReplaySource(SourceWorker):
             rows = self._rows[here : here + ahead]
             if len(rows):
                 start_ns = self._begun_ns + here * self._period_ns
-                self.session.send_plan(start_ns, self._period_ns, self._replay.playback.joints, rows)
+                self.session.send_plan(start_ns, self._period_ns, self._playback.joints, rows)
             self._sent = here + len(rows)
         if state.success is not None:
             self._success = bool(self._success or state.success)
@@ -111,7 +104,7 @@ class ReplaySource(SourceWorker):
 
     def _setpoints(self, begin: Vector) -> Vector:
         """The approach from `begin` [rad], shape (J,), and the commands, one row for each control period."""
-        playback, session = self._replay.playback, self.session
+        playback, session = self._playback, self.session
         away = playback.commands.positions[0] - begin
         robot = session.config.robot
         speed = np.minimum(_APPROACH_SPEED, robot.max_velocity[self._columns])
@@ -121,18 +114,18 @@ class ReplaySource(SourceWorker):
         steps = int(np.ceil(max(by_speed.max(), by_acceleration.max()) * session.config.control.rate_hz))
         self._approach_ns = steps * self._period_ns
         approach = begin + _ease(np.arange(steps) / max(steps, 1))[:, None] * away
-        period_s = seconds(self._period_ns) * self._replay.speed
+        period_s = seconds(self._period_ns) * self._speed
         played: Vector = np.arange(np.ceil(playback.duration / period_s) + 1) * period_s
         return np.concatenate([approach, playback.commands.at(played)])
 
     def _end_when_done(self, late_ns: int) -> None:
         """End the run, `late_ns` [ns] after the last setpoint was due."""
         session = self.session
-        provisional = session.config.simulated and self._replay.playback.outcome == "success" and self._success is False
+        provisional = session.config.simulated and self._playback.outcome == "success" and self._success is False
         if late_ns < (_SETTLE_NS if provisional else 0):
             return
         self.active = False
-        if self._success is not None and self._replay.playback.outcome == "success":
+        if self._success is not None and self._playback.outcome == "success":
             session.outcome.episodes += 1
             session.outcome.successes += self._success
         session.finish()
@@ -157,23 +150,22 @@ class ReplaySource(SourceWorker):
 
     def report(self) -> dict[str, Any]:
         """The result, as JSON values."""
-        replay = self._replay
         tracking = {}
         if self._measured:
-            times = np.array([elapsed_ns for elapsed_ns, _ in self._measured]) / NS_PER_S * replay.speed
-            tracking = replay.playback.tracking(Track(times, np.stack([position for _, position in self._measured])))
+            times = np.array([elapsed_ns for elapsed_ns, _ in self._measured]) / NS_PER_S * self._speed
+            tracking = self._playback.tracking(Track(times, np.stack([position for _, position in self._measured])))
         return {
-            "source": replay.source,
-            "speed": replay.speed,
-            "recorded_s": round(replay.playback.duration, 3),
-            "recorded_outcome": replay.playback.outcome,
+            "source": self._episode,
+            "speed": self._speed,
+            "recorded_s": round(self._playback.duration, 3),
+            "recorded_outcome": self._playback.outcome,
             "success": self._success,
             "tracking": tracking,
         }
 
     @override
     def help(self) -> str:
-        return f"replays {self._replay.source}; Esc stops"
+        return f"replays {self._episode}; Esc stops"
 
 
 def _ease(share: Vector) -> Vector:

@@ -128,7 +128,7 @@ class Report:
         return tuple(each for each in self.episodes if each.error)
 
     def summary(self) -> dict[str, Any]:
-        """As JSON values."""
+        """As JSON values, for the whole; the fields of the event of the same name."""
         done = self.converted
         episodes = sum(len(each.stretches) or 1 for each in done)
         return {
@@ -140,5 +140,4 @@ class Report:
             "resets": sum(sum(each.resets.values()) for each in done),
             "without_prompt": sum(not each.prompt for each in done),
             "size_bytes": self.size_bytes, "seconds": round(self.seconds, 3),
-            "reports": [attrs.asdict(each) for each in self.episodes],
         }  # fmt: skip

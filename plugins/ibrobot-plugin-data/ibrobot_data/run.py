@@ -391,9 +391,7 @@ def _refuse_misfits(
             keys = [key for key in {**features, **unit.features} if features.get(key) != unit.features.get(key)]
             each = ", ".join(f"{key} is {unit.features.get(key)}, not {features.get(key)}" for key in keys)
             wrong = f"its features differ from those of {first}: {each}"
-        elif not request.any_robot and (
-            difference := robot.difference(Identity.of_unit(unit), first)
-        ):
+        elif not request.any_robot and (difference := robot.difference(Identity.of_unit(unit), first)):
             wrong = f"{difference}; --any-robot merges them regardless"
         if wrong:
             refused[unit.report.source] = attrs.evolve(unit.report, error=wrong)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any, NoReturn
@@ -243,7 +243,7 @@ class Ticks:
         self.cuts: list[tuple[int, int]] = []
         """Where ticks were left out: the number of the row that follows, from 0, and how many ticks."""
         self.held = 0
-        self.gaps: dict[str, int] = {}
+        self.gaps = Counter[str]()
         """Key -> how often it went missing."""
         self.rows = 0
         """Number of rows so far."""
@@ -282,8 +282,7 @@ class Ticks:
                     leading.append((frame.stamp_ns, missing))
                     continue
                 self._begin_late(leading, frame.stamp_ns)
-            for key in missing - before:
-                self.gaps[key] = self.gaps.get(key, 0) + 1
+            self.gaps.update(missing - before)
             before = missing
             if missing and not self._take(missing, frame.stamp_ns):
                 continue
@@ -307,8 +306,7 @@ class Ticks:
         """Leave out `count` ticks from `t_ns` [ns] at the beginning or end, where no value can be held."""
         if self._missing == "refuse":
             self._refuse(keys, t_ns)
-        for key in keys:
-            self.gaps[key] = self.gaps.get(key, 0) + 1
+        self.gaps.update(keys)
         self._cut(count)
 
     def _take(self, missing: frozenset[str], t_ns: int) -> bool:

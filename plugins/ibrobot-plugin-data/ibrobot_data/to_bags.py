@@ -173,7 +173,10 @@ class _Job:
         }
         self._making.parent.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(self._making, ignore_errors=True)
-        recorder = _make_recorder(self._request)
+        # With a stepped clock it writes immediately, and equal datasets give equal files.
+        ctx = Context("convert", SteppedClock(0), logging.getLogger("ibrobot.convert"), Robot("convert", ()))
+        descriptor = installed_plugins().find("recorder", self._request.type)
+        recorder: Recorder = descriptor.make(self._request.options, ctx)
         counts = dict.fromkeys(contract.topics, 0)
         try:
             recorder.begin(EpisodeStart(self._making, summary.start_ns, contract.topics, metadata))
@@ -190,10 +193,3 @@ class _Job:
         EpisodeDataset(self._request.out).join(contract, metadata.get("robot", ""), metadata.get("robot_type", ""))
         self._making.rename(self._target)
         return max(counts.values(), default=0)
-
-
-def _make_recorder(request: BagRequest) -> Recorder:
-    # With a stepped clock it writes immediately, and equal datasets give equal files.
-    ctx = Context("convert", SteppedClock(0), logging.getLogger("ibrobot.convert"), Robot("convert", ()))
-    recorder: Recorder = installed_plugins().find("recorder", request.type).make(request.options, ctx)
-    return recorder

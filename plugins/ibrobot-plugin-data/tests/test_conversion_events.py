@@ -17,7 +17,7 @@ from ibrobot_core.events import encode_event
 
 
 def report(*episodes: EpisodeReport) -> Report:
-    return Report.of(Conversion(Path("datasets/pick"), episodes, 2_000_000, 1.5, 0).summary())
+    return Report(**Conversion(Path("datasets/pick"), episodes, 2_000_000, 1.5, 0).summary())
 
 
 def test_progress_has_its_share_and_names_episodes_that_are_left_out() -> None:

@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_data.playback import Playback, Track
-from ibrobot_data.replay_source import Replay, ReplaySource
+from ibrobot_data.replay_source import ReplaySource
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import Vector
@@ -50,7 +50,7 @@ def replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
 
     def make(playback: Playback = WAVE, *, speed: float = 1.0, simulated: bool = True) -> Runtime:
         def source(session: Session, mode: Any) -> ReplaySource:
-            return ReplaySource(session, mode, Replay("wave", playback, speed))
+            return ReplaySource(session, mode, "wave", playback, speed)
 
         registry = installed_plugins()
         config = load_config(path, sim=simulated, registry=registry)
