@@ -1,13 +1,11 @@
-"""`ibrobot gamepad …`: lists, tests and maps gamepads and SpaceMice; one file per command."""
+"""`ibrobot gamepad …`: lists, tests and maps gamepads and SpaceMice."""
 
 from __future__ import annotations
 
 import click
 
-from ibrobot_gamepad.commands.list_devices import list_devices
 from ibrobot_gamepad.commands.map_controls import map_controls
-from ibrobot_gamepad.commands.show import show
-from ibrobot_gamepad.commands.udev import udev
+from ibrobot_gamepad.commands.show import list_devices, show, udev
 
 
 @click.group()

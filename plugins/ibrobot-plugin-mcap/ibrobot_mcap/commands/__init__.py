@@ -1,19 +1,15 @@
-"""`ibrobot episodes …`: manages recorded episodes; one file per command."""
+"""`ibrobot episodes …`: manages recorded episodes."""
 
 from __future__ import annotations
 
 import click
 
 from ibrobot_mcap.commands.answers import answers
-from ibrobot_mcap.commands.delete import delete
+from ibrobot_mcap.commands.change import delete, mark, repair, trash_command, trim
 from ibrobot_mcap.commands.export import export
 from ibrobot_mcap.commands.info import info
 from ibrobot_mcap.commands.list_episodes import list_episodes
-from ibrobot_mcap.commands.mark import mark
 from ibrobot_mcap.commands.plot import plot
-from ibrobot_mcap.commands.repair import repair
-from ibrobot_mcap.commands.trash import trash_command
-from ibrobot_mcap.commands.trim import trim
 from ibrobot_mcap.commands.verify import verify
 
 
