@@ -43,17 +43,17 @@ class StartPictures:
     def __init__(self, folder: Path, cameras: list[str]) -> None:
         self._files = {name: folder / f"{name}.jpg" for name in cameras}
 
-    def sights(self, live: Path | None) -> list[Sight]:
+    def sights(self, live: Path) -> list[Sight]:
         """The pictures to show: for each camera that of the start, the live one, or both.
 
         Args:
-            live: folder of the live pictures; None without them.
+            live: folder of the live pictures; it need not exist.
         """
         found = []
         for name, file in self._files.items():
             wanted = str(file) if file.exists() else ""
-            now = live / file.name if live is not None else None
-            present = str(now) if now is not None and now.exists() else ""
+            now = live / file.name
+            present = str(now) if now.exists() else ""
             if wanted or present:
                 found.append(Sight(camera=name, wanted=wanted, live=present))
         return found

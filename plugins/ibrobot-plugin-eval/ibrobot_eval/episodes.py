@@ -6,6 +6,7 @@ import json
 import logging
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from uuid import uuid4
 
@@ -153,11 +154,8 @@ def _checked(bags: list[Path], outcome: str, faults: list[str]) -> Mapping[str, 
     what = f": {'; '.join(faults)}" if faults else ""
     if len(bags) != 1:
         raise RecorderError(f"the episode was not recorded{what}")
-    reader = installed_plugins().open_episode(bags[0])
-    try:
+    with closing(installed_plugins().open_episode(bags[0])) as reader:
         summary = reader.summary()
-    finally:
-        reader.close()
     if not summary.finished or summary.outcome != outcome:
         raise RecorderError(f"the recording of the episode is incomplete{what}")
     return summary.metadata

@@ -28,22 +28,18 @@ def owning(episode: Path, doing: str) -> Iterator[None]:
         InUse: if it has another owner.
         RecorderError: if it cannot be owned, e.g. on a read-only disk.
     """
-    with _owned(episode, doing, shared=False):
+    with owned(episode, doing, shared=False):
         _finish(episode)
         yield
 
 
-def reading_owned(episode: Path, doing: str) -> Ownership:
-    """A context in which nobody changes or records an episode; others may read it.
+def owned(episode: Path, doing: str, *, shared: bool) -> Ownership:
+    """A context in which nobody else changes or records an episode; others may read it if `shared`.
 
     Raises:
-        InUse: if it has an owner.
+        InUse: if it has another owner.
         RecorderError: if it cannot be owned.
     """
-    return _owned(episode, doing, shared=True)
-
-
-def _owned(episode: Path, doing: str, *, shared: bool) -> Ownership:
     try:
         return Ownership(episode, doing, shared=shared)
     except OSError as error:

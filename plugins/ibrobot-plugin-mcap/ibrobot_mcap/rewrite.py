@@ -27,15 +27,6 @@ TRIMMED_FROM = "trimmed_from"
 """Key of the recordings of which an episode is a part, newest last, by UUID or, without one, by digest."""
 
 
-@attrs.frozen
-class Rewritten:
-    """The result of a rewrite."""
-
-    path: Path
-    summary: EpisodeSummary
-    """Summary of the new episode."""
-
-
 def rewrite(
     source: Path,
     target: Path,
@@ -43,8 +34,8 @@ def rewrite(
     begin_ns: int | None = None,
     end_ns: int | None = None,
     marks: Mapping[str, str] | None = None,
-) -> Rewritten:
-    """Copy the messages of an episode to a new one.
+) -> EpisodeSummary:
+    """Copy the messages of an episode to a new one, and return the summary of that.
 
     Args:
         source: an episode, finished or not.
@@ -88,7 +79,7 @@ def rewrite(
             storage.discard()
             raise
     with closing(Rosbag2Reader(target)) as written:
-        return Rewritten(target, written.summary())
+        return written.summary()
 
 
 def _of_a_part(
@@ -101,8 +92,8 @@ def _of_a_part(
     return {"uuid": own, TRIMMED_FROM: f"{summary.metadata.get(TRIMMED_FROM, '')} {whole}".strip()}
 
 
-def repair(path: Path) -> Rewritten | None:
-    """Repair an unfinished or incomplete episode in place; returns None if it is already complete.
+def repair(path: Path) -> EpisodeSummary | None:
+    """Repair an unfinished or incomplete episode in place, and return its summary; None if it is already complete.
 
     The metadata records the missing messages and the former outcome; the new outcome is unknown. The original is
     renamed to `.NAME.unfinished` until the new episode has been read back and has every message.
@@ -115,7 +106,7 @@ def repair(path: Path) -> Rewritten | None:
         return _repair(path)
 
 
-def _repair(path: Path) -> Rewritten | None:
+def _repair(path: Path) -> EpisodeSummary | None:
     with closing(Rosbag2Reader(path)) as reader:
         before, short = reader.summary(), reader.short()
     if before.finished and not short:
@@ -129,8 +120,8 @@ def _repair(path: Path) -> Rewritten | None:
         staging.mkdir()
         marks = {REPAIRED: "true"} | ({STATED: before.stated_outcome} if before.stated_outcome != "unknown" else {})
         made = rewrite(path, staging / path.name, marks=marks)
-        counts = [{n: t.count for n, t in s.topics.items() if t.count} for s in (before, made.summary)]
-        if counts[0] != counts[1] or not made.summary.finished:
+        counts = [{n: t.count for n, t in s.topics.items() if t.count} for s in (before, made)]
+        if counts[0] != counts[1] or not made.finished:
             raise RecorderError(f"{path}: the repaired episode has {counts[1]}, the original {counts[0]}")
         path.rename(aside)
         made.path.rename(path)
@@ -139,7 +130,7 @@ def _repair(path: Path) -> Rewritten | None:
         raise RecorderError(f"{path}: cannot be repaired: {error.strerror}") from error
     finally:
         shutil.rmtree(staging, ignore_errors=True)
-    return Rewritten(path, attrs.evolve(made.summary, path=path))
+    return attrs.evolve(made, path=path)
 
 
 def _is_random(uuid: str) -> bool:

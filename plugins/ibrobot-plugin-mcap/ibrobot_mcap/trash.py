@@ -17,11 +17,11 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.api import RecorderError, ns, seconds
+from ibrobot_core.api import EpisodeSummary, RecorderError, ns, seconds
 from ibrobot_mcap.changes import DELETED, REPLACED, TRIMMED
-from ibrobot_mcap.owning import DELETING, TRIMMING, beside, owning, reading_owned
+from ibrobot_mcap.owning import DELETING, TRIMMING, beside, owned, owning
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
-from ibrobot_mcap.rewrite import Rewritten, rewrite
+from ibrobot_mcap.rewrite import rewrite
 
 TRASH = ".trash"
 _NOTE = "undo.json"
@@ -111,7 +111,7 @@ def _discard(episode: Path, done: str) -> Trashed:
     return trashed
 
 
-def trim(episode: Path, begin_s: float, end_s: float | None) -> tuple[Rewritten, Trashed]:
+def trim(episode: Path, begin_s: float, end_s: float | None) -> tuple[EpisodeSummary, Trashed]:
     """Replace an episode by a part of it; the original moves to the trash folder once the part is complete.
 
     Args:
@@ -129,7 +129,7 @@ def trim(episode: Path, begin_s: float, end_s: float | None) -> tuple[Rewritten,
         return _trim(episode, begin_s, end_s)
 
 
-def _trim(episode: Path, begin_s: float, end_s: float | None) -> tuple[Rewritten, Trashed]:
+def _trim(episode: Path, begin_s: float, end_s: float | None) -> tuple[EpisodeSummary, Trashed]:
     staging = beside(episode, TRIMMING)
     try:
         staging.mkdir()
@@ -144,16 +144,16 @@ def _trim(episode: Path, begin_s: float, end_s: float | None) -> tuple[Rewritten
         raise RecorderError(f"{episode}: cannot be trimmed: {error.strerror}") from error
     finally:
         shutil.rmtree(staging, ignore_errors=True)
-    return Rewritten(episode, attrs.evolve(made.summary, path=episode)), trashed
+    return attrs.evolve(made, path=episode), trashed
 
 
-def copy_part(episode: Path, output: Path, begin_s: float, end_s: float | None) -> Rewritten:
+def copy_part(episode: Path, output: Path, begin_s: float, end_s: float | None) -> EpisodeSummary:
     """Copy a part of an episode to a new one; arguments and errors as of `trim`."""
-    with reading_owned(episode, "is being copied"), owning(output, "is being written"):
+    with owned(episode, "is being copied", shared=True), owning(output, "is being written"):
         return _copy_part(episode, output, begin_s, end_s)
 
 
-def _copy_part(episode: Path, output: Path, begin_s: float, end_s: float | None) -> Rewritten:
+def _copy_part(episode: Path, output: Path, begin_s: float, end_s: float | None) -> EpisodeSummary:
     with closing(Rosbag2Reader(episode)) as reader:
         summary = reader.summary()
     start_ns, length_ns = summary.start_ns, summary.end_ns - summary.start_ns

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
+from io import StringIO
 
 import attrs
+import segno
 
 from ibrobot_core.api import Context, TeleopError
 from ibrobot_core.app import echo
 from ibrobot_webxr.options import WebxrOptions
-from ibrobot_webxr.qr import qr_code
 from ibrobot_webxr.server import PageServer
 
 _SHARED = ("names", "certificate", "key", "cameras", "image_rate")
@@ -68,3 +69,10 @@ def close_page(options: WebxrOptions, ctx: Context) -> None:
             return
         del _open[_key(options, ctx)]
     shared.server.close()
+
+
+def qr_code(text: str) -> str:
+    """A QR code as lines of half blocks, for light text on a dark terminal; phones read inverted codes, too."""
+    drawn = StringIO()
+    segno.make(text, error="l").terminal(drawn, border=2, compact=True)
+    return drawn.getvalue().rstrip("\n")

@@ -10,7 +10,7 @@ from ibrobot_http.certificates import own_certificate
 from ibrobot_webxr.certificate import open_port
 from ibrobot_webxr.doctor import checks
 from ibrobot_webxr.options import WebxrOptions
-from ibrobot_webxr.qr import qr_code
+from ibrobot_webxr.shared import qr_code
 
 from ibrobot_core.api import TeleopError
 

@@ -17,8 +17,7 @@ import yaml
 from click.testing import CliRunner
 from ibrobot_testing import ibrobot_command
 from ibrobot_zenoh.commands import network as network_module
-from ibrobot_zenoh.commands.text import message_from, shown
-from ibrobot_zenoh.commands.topic import topic
+from ibrobot_zenoh.commands.topic import message_from, shown, topic
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 

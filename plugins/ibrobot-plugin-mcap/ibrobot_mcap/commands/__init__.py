@@ -7,8 +7,7 @@ import click
 from ibrobot_mcap.commands.answers import answers
 from ibrobot_mcap.commands.change import delete, mark, repair, trash_command, trim
 from ibrobot_mcap.commands.export import export
-from ibrobot_mcap.commands.info import info
-from ibrobot_mcap.commands.list_episodes import list_episodes
+from ibrobot_mcap.commands.list_episodes import info, list_episodes
 from ibrobot_mcap.commands.plot import plot
 from ibrobot_mcap.commands.verify import verify
 

@@ -68,8 +68,8 @@ def trim(options: TrimOptions, output: Path | None, events: bool) -> None:
             echo(f"to undo: ibrobot episodes trash {episode.parent} --restore {trashed.id}", err=True)
     else:
         made = trash.copy_part(episode, output, begin_s, end_s)
-    count = sum(topic.count for topic in made.summary.topics.values())
-    what = f"{count} messages, {duration_s(made.summary):.2f} s{stated_outcome_text(made.summary)}"
+    count = sum(topic.count for topic in made.topics.values())
+    what = f"{count} messages, {duration_s(made):.2f} s{stated_outcome_text(made)}"
     _report(TRIM, Changed(str(made.path), what), events=events)
 
 
@@ -178,8 +178,8 @@ def repair(options: RepairOptions, events: bool) -> None:
             continue
         what = "is whole"
         if made is not None:
-            count = sum(topic.count for topic in made.summary.topics.values())
-            what = f"repaired, {count} messages, {duration_s(made.summary):.2f} s{_description(made.summary)}"
+            count = sum(topic.count for topic in made.topics.values())
+            what = f"repaired, {count} messages, {duration_s(made):.2f} s{_description(made)}"
         _report(REPAIR, Changed(str(episode), what), events=events)
     if failed:
         raise SystemExit(1)
