@@ -5,34 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ibrobot_core.api import Check, HardwareDescriptor, Late, OptionFault, SensorDescriptor, TeleopDescriptor, hookimpl
+from ibrobot_core.api import Check, HardwareDescriptor, Late, SensorDescriptor, TeleopDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_lerobot_devices.options import CameraOptions, CmdVelOptions, RobotOptions, TeleopOptions
-
-if TYPE_CHECKING:
-    from ibrobot_core.api import Robot
-
-
-def _check_robot(options: RobotOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    from ibrobot_lerobot_devices.registry import check_device, check_joints
-
-    yield from check_device("robot", "robot", options.robot, options.config)
-    yield from check_joints(options, robot)
-
-
-def _check_teleop(options: TeleopOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    from ibrobot_lerobot_devices.registry import check_device, check_joints
-
-    yield from check_device("teleoperator", "teleop", options.teleop, options.config)
-    yield from check_joints(options, robot)
-
-
-def _check_camera(options: CameraOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    from ibrobot_lerobot_devices.registry import check_device
-
-    return check_device("camera", "camera", options.camera, options.config)
 
 
 def _port(options: Any) -> Mapping[str, str]:
@@ -48,7 +25,7 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
         type="lerobot",
         options=RobotOptions,
         make=Late("ibrobot_lerobot_devices.hardware:LeRobotHardware"),
-        check_options=_check_robot,
+        check_options=Late("ibrobot_lerobot_devices.registry:check_robot"),
         devices=_port,
         anchored=lambda options: options.anchored,
         torque_off="ibrobot lerobot torque-off",
@@ -63,7 +40,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         type="lerobot",
         options=TeleopOptions,
         make=Late("ibrobot_lerobot_devices.teleop:LeRobotTeleop"),
-        check_options=_check_teleop,
+        check_options=Late("ibrobot_lerobot_devices.registry:check_teleop"),
         devices=_port,
         keys=lambda options, robot: {} if options.deadman == "none" else {options.deadman_key: "deadman"},
         needs_terminal=lambda options: options.deadman != "none",
@@ -87,7 +64,7 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         type="lerobot",
         options=CameraOptions,
         make=Late("ibrobot_lerobot_devices.camera:LeRobotCamera"),
-        check_options=_check_camera,
+        check_options=Late("ibrobot_lerobot_devices.registry:check_camera"),
         picture=lambda options: options.picture,
         summary="a camera of LeRobot's",
     )

@@ -43,10 +43,6 @@ class Traffic:
     received: int = 0
     """[bytes]."""
 
-    def begin(self) -> None:
-        """Forget the call before."""
-        self.reads = self.received = 0
-
     def watch(self) -> None:
         """Count what every serial port of this process receives; LeRobot's buses all use pyserial."""
         try:
@@ -228,7 +224,7 @@ def serve(device: Device, requests: Requests) -> None:
     channel = requests.channel
     while (request := requests.next(device.patience_s))["do"] != "end":
         what = request["do"]
-        requests.traffic.begin()
+        requests.traffic.reads = requests.traffic.received = 0
         begun_ns = time.monotonic_ns()
         answer: dict[str, Any] = {"event": ANSWER if what in ("read", "picture") else DONE, "id": request.get("id")}
         try:

@@ -10,6 +10,7 @@ import pkgutil
 import re
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -214,7 +215,12 @@ def torque_switches(device: Any) -> list[Any]:
 
 def numbers(values: Mapping[str, Any]) -> dict[str, float]:
     """The plain numbers among the values of a reading."""
-    return {name: float(value) for name, value in values.items() if _is_number(value)}
+    found: dict[str, float] = {}
+    for name, value in values.items():
+        if not isinstance(value, str) and getattr(value, "ndim", 0) == 0:
+            with suppress(TypeError, ValueError):
+                found[name] = float(value)
+    return found
 
 
 def picture_age_s(camera: Any) -> float:
@@ -226,16 +232,6 @@ def picture_age_s(camera: Any) -> float:
 def _plain(features: Mapping[str, Any]) -> list[str]:
     """The names of the features that are numbers, and not pictures."""
     return [name for name, kind in features.items() if not isinstance(kind, tuple | list)]
-
-
-def _is_number(value: Any) -> bool:
-    if isinstance(value, str) or getattr(value, "ndim", 0) != 0:
-        return False
-    try:
-        float(value)
-    except (TypeError, ValueError):
-        return False
-    return True
 
 
 def _names(config: Any) -> set[str]:

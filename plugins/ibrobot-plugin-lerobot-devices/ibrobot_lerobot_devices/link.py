@@ -112,9 +112,10 @@ class DeviceLink:
         Raises:
             DeviceProblem: if the process has died.
         """
-        newest = self._received()
-        if newest is not None:
-            self.late += 1
+        newest = None
+        while (answer := self._next(0.0)) is not None:  # those that came after their tick
+            newest = answer
+        self.late += newest is not None
         if self._asked_s is None:
             self._ask("read")
         deadline_s = time.monotonic() + wait_s
@@ -222,13 +223,6 @@ class DeviceLink:
         if self._child is None:
             raise DeviceProblem("is not connected")
         return self._child
-
-    def _received(self) -> dict[str, Any] | None:
-        """The newest answer that has arrived already."""
-        newest = None
-        while (answer := self._next(0.0)) is not None:
-            newest = answer
-        return newest
 
     def _next(self, timeout_s: float) -> dict[str, Any] | None:
         """The next answer to a request to read; None if none arrives in time."""
