@@ -11,10 +11,19 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ibrobot_core.api import Contract, Frame, HardwareError, Image, SteppedClock, ns
-from ibrobot_core.app import LaunchRequest, RunAccess, Runtime, Session, Subscription, installed_plugins
+from ibrobot_core.api import Contract, Frame, HardwareError, Image, SteppedClock, Vector, ns
+from ibrobot_core.app import (
+    ControlMode,
+    FrameSampler,
+    LaunchRequest,
+    RunAccess,
+    Runtime,
+    Session,
+    SourceWorker,
+    Subscription,
+    installed_plugins,
+)
 from ibrobot_gym.config import RENDERED, environment_config
-from ibrobot_gym.source import EnvironmentSource
 
 STATE, SCENE, IMAGES = "observation.state", "observation.environment_state", "observation.images."
 _RENDERED_TOPIC = f"/camera/{RENDERED}/image_raw"
@@ -24,6 +33,47 @@ _PATIENCE_S = 2.0
 """Time within which the first observations arrive."""
 
 type Observation = dict[str, Any]
+
+
+class EnvironmentSource(SourceWorker):
+    """Takes the place of a policy: `frame` is the newest observation, `act` commands from its tick on."""
+
+    autonomous = True
+
+    def __init__(self, session: RunAccess, mode: ControlMode) -> None:
+        super().__init__(session, mode, "actions of an environment")
+        self._contract = Contract.from_config(session.config)
+        self._sampler: FrameSampler | None = None
+        self.frame: Frame | None = None
+        """The frame of the last tick; None before the first complete one of an episode."""
+
+    @override
+    def begin_mode(self, seed: int) -> None:
+        self.frame = None
+        self._next_ns = self.session.bus.snapshot_ns() + self._contract.step_ns
+        self._sampler = FrameSampler(self._contract, self.session.bus)
+
+    @override
+    def end_mode(self) -> None:
+        if self._sampler is not None:
+            self._sampler.close()
+            self._sampler = None
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        with self.lock:
+            now_ns = self.session.bus.snapshot_ns()
+            if self._sampler is None or now_ns < self._next_ns:
+                return
+            frame = self._sampler.sample(self._next_ns)
+            self._next_ns += self._contract.step_ns
+            if not frame.missing:
+                self.frame = frame
+
+    def act(self, action: Vector) -> None:
+        """Command joint positions [rad], shape (A,), from the tick of the last frame on."""
+        assert self.frame is not None
+        self.session.send_plan(self.frame.stamp_ns, self._contract.step_ns, self._contract.action_joints, action[None])
 
 
 class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):

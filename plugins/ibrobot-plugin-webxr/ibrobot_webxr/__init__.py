@@ -38,6 +38,6 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
 @hookimpl
 def ibrobot_doctor() -> Iterable[Check]:
     """Check the page's own certificate."""
-    from ibrobot_webxr.doctor import checks
+    from ibrobot_webxr.certificate import checks
 
     return checks()

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import segno
 from ibrobot_http.certificates import own_certificate
-from ibrobot_webxr.certificate import open_port
-from ibrobot_webxr.doctor import checks
+from ibrobot_webxr.certificate import checks, open_port
 from ibrobot_webxr.options import WebxrOptions
 from ibrobot_webxr.shared import qr_code
 
