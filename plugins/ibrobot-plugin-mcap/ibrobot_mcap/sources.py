@@ -58,6 +58,15 @@ class Source(ABC):
         """Release the files. Safe to call twice."""
 
 
+def _by_topic(file: McapFile, counts: Mapping[int, int]) -> Counter[str]:
+    """Numbers of messages by channel as those by topic, which may have several channels."""
+    found: Counter[str] = Counter()
+    for key, count in counts.items():
+        if key in file.channels:
+            found[file.channels[key].topic] += count
+    return found
+
+
 class McapSource(Source):
     """MCAP files, finished or not. Messages that a file repeats from the previous one are skipped."""
 
@@ -89,7 +98,6 @@ class McapSource(Source):
         )
         self.compression = next((file.compression(block) for file in self._files for block in file.blocks), "")
         types: dict[str, str] = {}
-        counts: dict[str, int] = {}
         self.definitions = {}
         for file in self._files:
             for schema in file.schemas.values():
@@ -98,21 +106,12 @@ class McapSource(Source):
             for channel in file.channels.values():
                 schema_of = file.schemas.get(channel.schema_id)
                 types[channel.topic] = schema_of.name if schema_of else "?"
-                counts.setdefault(channel.topic, 0)
-        for _, number, block in blocks:
-            for key, count in block.counts.items():
-                counts[self._files[number].channels[key].topic] += count
-        self.types, self.counts, self.custom = types, counts, {}
-        copies: Counter[str] = Counter()
+        counts, copies, stated = Counter(dict.fromkeys(types, 0)), Counter[str](), Counter[str]()
         for number, file in enumerate(self._files):
-            for block in file.blocks if number else ():
-                if block.repeated:
-                    copies.update({file.channels[key].topic: count for key, count in block.counts.items()})
-        self.repeated = copies
-        stated: Counter[str] = Counter()
-        for file in self._files:
-            stated.update({file.channels[key].topic: n for key, n in file.stated.items() if key in file.channels})
-        self.stated = stated
+            stated.update(_by_topic(file, file.stated))
+            for block in file.blocks:
+                (copies if number and block.repeated else counts).update(_by_topic(file, block.counts))
+        self.types, self.counts, self.repeated, self.stated, self.custom = types, counts, copies, stated, {}
 
     @override
     def messages(self, topics: Collection[str], since_ns: int = 0) -> Iterator[Raw]:

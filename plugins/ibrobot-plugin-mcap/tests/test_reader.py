@@ -206,6 +206,22 @@ def test_messages_come_in_the_order_of_receipt(tmp_path_factory, chunking, stamp
     assert kept.topics[JOINTS].count == len(stamps)
 
 
+def test_channels_of_one_topic_count_together(tmp_path):
+    """Each of several publishers may have a channel of its own."""
+    path = tmp_path / "two.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "another writer")
+        schema = writer.register_schema(JointState.ros_type, "ros2msg", definition(JointState.ros_type).encode())
+        for count in (2, 3):
+            channel = writer.register_channel(JOINTS, "cdr", schema, metadata={"publisher": str(count)})
+            for index in range(count):
+                writer.add_message(channel, stamp(index), bytes(encode(JointState(Header(index), ()))), stamp(index))
+        writer.finish()
+    assert len(read(path)) == summary(path).topics[JOINTS].count == 5
+    assert [problem for problem in problems_of(path, 5.0) if "message" in problem] == []
+
+
 @pytest.mark.parametrize("storage", list(StoragePlugin))
 @pytest.mark.parametrize("compression", [None, CompressionMode.MESSAGE, CompressionMode.FILE])
 def test_foreign_bags_are_read(tmp_path, storage, compression):
