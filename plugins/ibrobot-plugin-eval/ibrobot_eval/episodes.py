@@ -14,7 +14,7 @@ import attrs
 
 from ibrobot_core.api import RecorderError, replace_file, seconds
 from ibrobot_core.app import ComponentFailed, LaunchRequest, RobotConfig, Runtime, Session, installed_plugins
-from ibrobot_eval.policies import Policy, document_hash
+from ibrobot_eval.policies import Policy, as_texts, document_hash
 
 SCRATCH = ".unfinished"
 """Folder within the evaluation for episodes until they are complete."""
@@ -30,7 +30,7 @@ class Result:
     """Duration of the episode, in simulated time; of a success, the time to success [s]."""
     interventions: Mapping[str, int]
     """Kind of intervention of the safety layer -> number of interventions, for those that occurred."""
-    faults: tuple[str, ...] = attrs.field(converter=tuple)
+    faults: tuple[str, ...] = attrs.field(converter=as_texts)
     factors: Mapping[str, float]
     """Values drawn by the scene from the seed, e.g. the position of an object, and those of varied keys."""
     acting: Mapping[str, str]

@@ -55,6 +55,11 @@ class Variation:
         return cls(key, tuple(round(first + step * i, 9) for i in range(number)))
 
 
+def as_texts(values: Iterable[str]) -> tuple[str, ...]:
+    """Texts as a tuple, e.g. from a JSON list."""
+    return tuple(values)
+
+
 @attrs.frozen
 class Policy:
     """A policy to evaluate: a mode of a robot with a model."""
@@ -66,11 +71,11 @@ class Policy:
     mode: str
     model: str
     """The name of the model that the mode uses."""
-    overrides: tuple[str, ...] = attrs.field(converter=tuple)
+    overrides: tuple[str, ...] = attrs.field(converter=as_texts)
     """Overrides of the YAML, including that of the model."""
     sim: bool = True
     """Whether it runs in simulation."""
-    vary: tuple[str, ...] = attrs.field(default=(), converter=tuple)
+    vary: tuple[str, ...] = attrs.field(default=(), converter=as_texts)
     """Keys of the YAML that vary over the seeds; see `Variation.of`."""
 
     @property

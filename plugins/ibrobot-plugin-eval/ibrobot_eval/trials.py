@@ -20,6 +20,7 @@ import numpy as np
 
 from ibrobot_core.api import DatasetError
 from ibrobot_eval.episodes import write
+from ibrobot_eval.policies import as_texts
 
 ORDER = "order.sealed"
 OPENED = "order_opened.json"
@@ -45,7 +46,7 @@ class Trial:
     time_s: float
     """Time from its beginning to the operator's key, or to its end [s]."""
     interventions: dict[str, int]
-    faults: tuple[str, ...] = attrs.field(converter=tuple)
+    faults: tuple[str, ...] = attrs.field(converter=as_texts)
     seal: str
     """Hash of the sealed order under which it ran."""
 
