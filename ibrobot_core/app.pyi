@@ -63,13 +63,13 @@ from ibrobot_core.plugins import (
 from ibrobot_core.launch.session import (
     LaunchRequest as LaunchRequest,
     Session as Session,
-    SessionWorker as SessionWorker,
     StateWatch as StateWatch,
 )
 from ibrobot_core.launch.views import RunAccess as RunAccess, RunView as RunView
 from ibrobot_core.launch.runtime import Runtime as Runtime
 from ibrobot_core.component import (
     Component as Component,
+    SessionWorker as SessionWorker,
     CONTROL as CONTROL,
     error_line as error_line,
     error_text as error_text,

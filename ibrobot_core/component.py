@@ -6,12 +6,14 @@ import os
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from typing import override
+from typing import TYPE_CHECKING, override
 
 from ibrobot_core.bug_reports import describe_bug
 from ibrobot_core.errors import ComponentFailed, IbrobotError
+
+if TYPE_CHECKING:
+    from ibrobot_core.launch.views import RunView
 
 CONTROL = "control"
 """Name of the component that owns the hardware; components that need joint states list it in `needs`."""
@@ -55,28 +57,28 @@ class Component(ABC):
         """Lockstep: do the work due at `now_ns` [ns]."""
 
 
-class Worker(Component):
-    """A component that repeats a unit of work, in its own thread, or once per tick in lockstep.
+class SessionWorker(Component):
+    """Repeats a unit of work, in its own thread, or once per tick in lockstep; its failure ends the run.
 
     Args:
-        on_failure: called with the exception that ended the thread.
-        lockstep: whether `step` does the work, without a thread.
-        ready_timeout_s: time for which `start` waits until the worker is ready [s].
+        session: the run; also an attribute.
+        name: unique within the run.
+        summary: one line for `--dry-run`.
+        needs: names of the components that must be ready before this one starts, e.g. `CONTROL`.
 
     Attributes:
         urgent: whether its thread calls `raise_thread_priority`: only for a class whose units of work are short.
+        ready_timeout_s: time for which `start` waits until the worker is ready [s].
     """
 
     urgent = False
+    ready_timeout_s = 60.0
+    session: RunView
+    """A subclass that does more to the run says so: `session: RunAccess`."""
 
-    def __init__(
-        self, name: str, summary: str, needs: tuple[str, ...] = (), *,
-        on_failure: Callable[[str, Exception], None], lockstep: bool, ready_timeout_s: float = 60.0,
-    ) -> None:  # fmt: skip
+    def __init__(self, session: RunView, name: str, summary: str, needs: tuple[str, ...] = ()) -> None:
         super().__init__(name, summary, needs)
-        self._on_failure = on_failure
-        self._lockstep = lockstep
-        self._ready_timeout_s = ready_timeout_s
+        self.session = session
         self._thread: threading.Thread | None = None
         self._set_up = False
         self._end = threading.Event()
@@ -84,8 +86,6 @@ class Worker(Component):
         self._failure: Exception | None = None
         self.on_end = ExitStack()
         """Cleanups registered by `setup`, e.g. `on_end.callback(device.close)`, run in reverse order."""
-        self.given_up = threading.Event()
-        """Set when the run ends, so that `start` stops waiting."""
 
     def setup(self) -> None:
         """Create and open the resources that `work` needs."""
@@ -112,7 +112,7 @@ class Worker(Component):
 
     @override
     def start(self) -> None:
-        if self._lockstep:
+        if self.session.request.lockstep:
             self._set_up = True
             self.setup()
             return
@@ -121,12 +121,12 @@ class Worker(Component):
         self._failure = None
         self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
         self._thread.start()
-        deadline = time.monotonic() + self._ready_timeout_s
-        while not self._ready.wait(min(_POLL_S, self._ready_timeout_s)):
-            if self.given_up.is_set():
+        deadline = time.monotonic() + self.ready_timeout_s
+        while not self._ready.wait(min(_POLL_S, self.ready_timeout_s)):
+            if self.session.finished.is_set():
                 raise ComponentFailed(f"{self.not_ready()} when the run ended")
             if time.monotonic() >= deadline:
-                raise ComponentFailed(f"{self.not_ready()} after {self._ready_timeout_s:g} s")
+                raise ComponentFailed(f"{self.not_ready()} after {self.ready_timeout_s:g} s")
         if self._failure is not None:
             raise self._failure
 
@@ -142,7 +142,7 @@ class Worker(Component):
             if self._thread.is_alive():
                 raise ComponentFailed(f"{self.name} hangs: still working {_STOP_TIMEOUT_S:g} s after the stop")
             self._thread = None
-        if self._lockstep and self._set_up:
+        if self._set_up:
             self._set_up = False
             self.teardown()
 
@@ -163,7 +163,7 @@ class Worker(Component):
             self._failure = as_failure(error)
             self._ready.set()
             if was_ready:
-                self._on_failure(self.name, self._failure)
+                self.session.fail(self.name, self._failure)
 
 
 def as_failure(error: BaseException) -> Exception:

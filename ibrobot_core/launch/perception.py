@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import deque
 from typing import override
 
+from ibrobot_core.component import SessionWorker
 from ibrobot_core.config.schema import PeripheralConfig
 from ibrobot_core.interfaces import Sensor
-from ibrobot_core.launch.session import SensorFigures, Session, SessionWorker
+from ibrobot_core.launch.session import SensorFigures, Session
 from ibrobot_core.units import seconds
 
-_READY_TIMEOUT_S = 30.0
 _RATE_WINDOW = 31
 """Number of messages over which the rate is measured."""
 
@@ -20,15 +20,10 @@ class SensorWorker(SessionWorker):
 
     session: Session
     urgent = True
+    ready_timeout_s = 30.0
 
     def __init__(self, session: Session, peripheral: PeripheralConfig, needs: tuple[str, ...]) -> None:
-        super().__init__(
-            session,
-            f"sensor:{peripheral.name}",
-            f"{peripheral.kind} {peripheral.type}",
-            needs,
-            ready_timeout_s=_READY_TIMEOUT_S,
-        )
+        super().__init__(session, f"sensor:{peripheral.name}", f"{peripheral.kind} {peripheral.type}", needs)
         self._peripheral = peripheral
         self._sensor: Sensor | None = None
         self._received = 0

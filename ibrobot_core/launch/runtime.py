@@ -11,7 +11,7 @@ from typing import Any
 import attrs
 
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.component import Component, Worker, as_failure, error_line, error_text, exit_code
+from ibrobot_core.component import Component, as_failure, error_line, error_text, exit_code
 from ibrobot_core.config.missing import absent_models, unavailable_modes
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, NotSupported, PluginError
@@ -336,8 +336,6 @@ class Runtime:
 
     def _start(self, component: Component) -> None:
         with _named(component):
-            if isinstance(component, Worker):
-                component.given_up = self.session.finished
             component.start()
             if isinstance(component, ControlComponent) and self.session.request.lockstep:
                 component.step(self.session.clock.now_ns())

@@ -14,7 +14,7 @@ import numpy as np
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock, RealClock, SteppedClock
-from ibrobot_core.component import Worker, error_line
+from ibrobot_core.component import error_line
 from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.schema import ControlMode
@@ -24,7 +24,6 @@ from ibrobot_core.interfaces import Context, EngineStats, JointReading, Operator
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, by_cause
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.launch.pulses import Pulse
-from ibrobot_core.launch.views import RunView
 from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
 
@@ -451,27 +450,3 @@ class StateWatch:
                 return None
             self._seen = self._session.state
             return self._seen
-
-
-class SessionWorker(Worker):
-    """A worker of a run; its failure ends the run.
-
-    Args:
-        session: the run; also an attribute.
-        name: unique within the run.
-        summary: one line for `--dry-run`.
-        needs: names of the components that must be ready before this one starts, e.g. `CONTROL`.
-        ready_timeout_s: how long `start` waits to be ready [s].
-    """
-
-    session: RunView
-    """A subclass that does more to the run says so: `session: RunAccess`."""
-
-    def __init__(
-        self, session: RunView, name: str, summary: str, needs: tuple[str, ...] = (), *, ready_timeout_s: float = 60.0
-    ) -> None:
-        super().__init__(
-            name, summary, needs, on_failure=session.fail, lockstep=session.request.lockstep,
-            ready_timeout_s=ready_timeout_s,
-        )  # fmt: skip
-        self.session = session

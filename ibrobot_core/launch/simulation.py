@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import override
 
+from ibrobot_core.component import SessionWorker
 from ibrobot_core.control.core import EMERGENCY_STOP
-from ibrobot_core.launch.session import Session, SessionWorker
+from ibrobot_core.launch.session import Session
 from ibrobot_core.units import NS_PER_S, ns
 
 

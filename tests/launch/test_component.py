@@ -4,23 +4,41 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from typing import cast
 
 import pytest
 
 from ibrobot_core import component as module
-from ibrobot_core.component import Worker
+from ibrobot_core.component import SessionWorker
 from ibrobot_core.errors import ComponentFailed, SensorError
+from ibrobot_core.launch.session import LaunchRequest
+from ibrobot_core.launch.views import RunView
 
 PATIENCE_S = 30.0
 
 
-class Probe(Worker):
-    """Works when it is let, and notes what happens to it."""
+class Run:
+    """What a worker needs of a run."""
 
-    def __init__(self, *, lockstep: bool = False, ready_after: int = 0, ready_timeout_s: float = PATIENCE_S) -> None:
+    def __init__(self, *, lockstep: bool) -> None:
+        self.request = LaunchRequest(lockstep=lockstep)
+        self.finished = threading.Event()
         self.failures: list[tuple[str, Exception]] = []
         self.failed = threading.Event()
-        super().__init__("probe", "a probe", on_failure=self._fail, lockstep=lockstep, ready_timeout_s=ready_timeout_s)
+
+    def fail(self, name: str, error: Exception) -> None:
+        self.failures.append((name, error))
+        self.failed.set()
+
+
+class Probe(SessionWorker):
+    """Works when it is let, and notes what happens to it."""
+
+    ready_timeout_s = PATIENCE_S
+
+    def __init__(self, *, lockstep: bool = False, ready_after: int = 0) -> None:
+        self.run = Run(lockstep=lockstep)
+        super().__init__(cast(RunView, self.run), "probe", "a probe")
         self.calls: list[str] = []
         self.ready_after = ready_after
         self.timeouts: list[float] = []
@@ -29,10 +47,6 @@ class Probe(Worker):
         self.let = threading.Semaphore(0)
         self.worked = threading.Semaphore(0)
         self.stuck = threading.Event()
-
-    def _fail(self, name: str, error: Exception) -> None:
-        self.failures.append((name, error))
-        self.failed.set()
 
     def setup(self) -> None:
         self.calls.append("setup")
@@ -72,12 +86,22 @@ def test_start_returns_when_it_is_ready(probe: Probe):
     assert probe.calls == ["setup", "work", "work", "work"]
     probe.stop()
     assert probe.calls[-1] == "teardown"
-    assert probe.failures == []
+    assert probe.run.failures == []
 
 
 def test_one_that_does_not_become_ready_is_reported():
-    probe = Probe(ready_after=1, ready_timeout_s=0.01)
+    probe = Probe(ready_after=1)
+    probe.ready_timeout_s = 0.01
     with pytest.raises(ComponentFailed, match=r"^no sign of life after 0\.01 s$"):
+        probe.start()
+    probe.stop()
+    assert probe.calls == ["setup", "teardown"]
+
+
+def test_the_end_of_the_run_ends_the_wait():
+    probe = Probe(ready_after=1)
+    probe.run.finished.set()
+    with pytest.raises(ComponentFailed, match=r"^no sign of life when the run ended$"):
         probe.start()
     probe.stop()
     assert probe.calls == ["setup", "teardown"]
@@ -88,15 +112,15 @@ def test_what_fails_before_it_is_ready_is_raised_by_start_alone(probe: Probe):
     with pytest.raises(SensorError, match="no such device"):
         probe.start()
     assert probe.calls == ["setup", "teardown"]
-    assert probe.failures == []
+    assert probe.run.failures == []
 
 
 def test_one_that_dies_later_is_reported_to_the_run(probe: Probe):
     probe.start()
     probe.work_error = SensorError("unplugged")
     probe.let.release()
-    assert probe.failed.wait(PATIENCE_S)
-    assert probe.failures == [("probe", probe.work_error)]
+    assert probe.run.failed.wait(PATIENCE_S)
+    assert probe.run.failures == [("probe", probe.work_error)]
     assert probe.calls == ["setup", "work", "teardown"]
 
 

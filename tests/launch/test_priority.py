@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ibrobot_core.component import Worker
+from ibrobot_core.component import SessionWorker
 from ibrobot_core.launch.perception import SensorWorker
 
 if TYPE_CHECKING:
     from fake_runs import Runs
 
 
-class Patient(Worker):
+class Patient(SessionWorker):
     """A worker whose units of work may be long."""
 
     def work(self, timeout_s: float) -> None:
@@ -47,8 +47,8 @@ def test_a_sensor_is_read_at_the_lowest_real_time_priority(runs: Runs, scheduled
     assert scheduled == [("sensor:top", os.SCHED_RR | os.SCHED_RESET_ON_FORK, 1)]
 
 
-def test_a_worker_that_does_not_opt_in_has_the_ordinary_priority(scheduled: list[tuple[str, int, int]]):
-    worker = Patient("search", "", on_failure=lambda *_: None, lockstep=False)
+def test_a_worker_that_does_not_opt_in_has_the_ordinary_priority(runs: Runs, scheduled: list[tuple[str, int, int]]):
+    worker = Patient(runs.make().session, "search", "")
     worker.start()
     worker.stop()
     assert scheduled == []

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, override
 
+from ibrobot_core.component import SessionWorker
 from ibrobot_core.interfaces.hardware import Severity
-from ibrobot_core.launch.session import SessionWorker
 from ibrobot_core.launch.views import RunView
 from ibrobot_core.messages import (
     DIAGNOSTICS,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from typing import override
 
+from ibrobot_core.component import SessionWorker
 from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.interfaces import Viewer
-from ibrobot_core.launch.session import SessionWorker
 from ibrobot_core.launch.views import RunView
 
 _RATE_HZ = 30.0

@@ -6,9 +6,9 @@ import threading
 from abc import abstractmethod
 from typing import override
 
-from ibrobot_core.component import CONTROL
+from ibrobot_core.component import CONTROL, SessionWorker
 from ibrobot_core.config.schema import ControlMode
-from ibrobot_core.launch.session import CommandSource, SessionWorker
+from ibrobot_core.launch.session import CommandSource
 from ibrobot_core.launch.views import RunAccess
 
 
