@@ -41,7 +41,6 @@ class Subscription:
     def __init__(self, bus: Bus, topic: str, depth: int) -> None:
         self.topic = topic
         self.depth = depth
-        self.dropped = 0
         self.lost = Counter[str]()
         """Topic -> number of dropped messages."""
         self._bus = bus
@@ -52,7 +51,6 @@ class Subscription:
         """Called with the bus lock held."""
         if len(self._queue) >= self.depth:
             oldest = self._queue.popleft()
-            self.dropped += 1
             self.lost[oldest.topic] += 1
         self._queue.append(item)
         self._arrived.notify_all()
@@ -73,7 +71,10 @@ class Subscription:
 
     def close(self) -> None:
         """End the subscription."""
-        self._bus._unsubscribe(self)
+        with self._arrived:
+            subscriptions = self._bus._subscriptions[self.topic]
+            if self in subscriptions:
+                subscriptions.remove(self)
 
 
 class Bus:
@@ -167,11 +168,6 @@ class Bus:
         with self._lock:
             return bool(self._subscriptions.get(topic) or self._subscriptions.get(""))
 
-    def _unsubscribe(self, subscription: Subscription) -> None:
-        with self._lock:
-            if subscription in self._subscriptions[subscription.topic]:
-                self._subscriptions[subscription.topic].remove(subscription)
-
     def snapshot_ns(self) -> int:
         """The present time [ns], such that every message received until then is in its subscribers' queues."""
         with self._lock:
@@ -192,7 +188,7 @@ class Bus:
         with self._lock:
             lost = Counter[str]()
             for topic, subscriptions in self._subscriptions.items():
-                lost[topic or "*"] += sum(subscription.dropped for subscription in subscriptions)
+                lost[topic or "*"] += sum(subscription.lost.total() for subscription in subscriptions)
             return dict(+lost)
 
     def serve[Q, A](

@@ -204,7 +204,16 @@ class GoalRejected(IbrobotError):
 
 
 class ComponentFailed(IbrobotError):
-    """A running component died, e.g. the control process was killed; the others were stopped."""
+    """A running component died, e.g. the control process was killed; the others were stopped.
+
+    Args:
+        message: the cause.
+        exit_code: exit status of the run that it ends.
+    """
+
+    def __init__(self, message: str, exit_code: int = 1) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
 
 
 class NotSupported(IbrobotError):

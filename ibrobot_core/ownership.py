@@ -7,10 +7,9 @@ import fcntl
 import hashlib
 import os
 import time
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import override
 
 from ibrobot_core.errors import IbrobotError, InUse
 
@@ -20,7 +19,7 @@ _POLL_S = 0.02
 _READ_ONLY = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
 
 
-class Ownership:
+class Ownership(AbstractContextManager["Ownership"]):
     """The right to change a folder, or with `shared` to read it while nobody changes it; until `close`.
 
     The lock (`flock`) is on a hidden file beside the folder, so that it covers the folder's name while the folder is
@@ -60,12 +59,8 @@ class Ownership:
                 end = os.lseek(self._descriptor, 0, os.SEEK_CUR)
                 self._line = end - size, end
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    @override
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -129,7 +129,7 @@ class HardwareGroup:
         Until `resume`, only parts whose torque stays on are written.
         """
         outcomes: dict[str, Torque | IbrobotError] = {}
-        for name, outcome in self._outcomes(_relaxed, self._parts, _RELAX_S).items():
+        for name, outcome in self._outcomes(lambda part: part.relax(), self._parts, _RELAX_S).items():
             error = outcome.exception()
             outcomes[name] = error if isinstance(error, IbrobotError) else outcome.result()
         self._off = {name for name, outcome in outcomes.items() if isinstance(outcome, Torque)}
@@ -282,13 +282,6 @@ def _settle(act: Callable[[], Any], called: Future[Any]) -> None:
         called.set_result(act())
     except BaseException as error:  # noqa: BLE001 - raised where the result is needed
         called.set_exception(error)
-
-
-def _relaxed(part: Hardware) -> Torque | IbrobotError:
-    try:
-        return part.relax()
-    except (HardwareError, NotSupported) as error:
-        return error
 
 
 def _named(name: str, act: Callable[[], Any]) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from ibrobot_core.config.schema import Shedding
 from ibrobot_core.interfaces.hardware import Condition, Severity
@@ -25,7 +25,7 @@ class Health:
         self._after_ns = ns(options.after)
         self._log = log
         self._since_ns: dict[_Key, int] = {}
-        self._severity: dict[_Key, Severity] = {}
+        self._known: Collection[_Key] = ()
         self.conditions: Sequence[Condition] = ()
         """The current conditions."""
 
@@ -37,9 +37,9 @@ class Health:
         """Update with the conditions at `now_ns` [ns]."""
         found = {(condition.joint, condition.quantity): condition for condition in conditions}
         for key, condition in found.items():
-            if condition.severity is Severity.WARNING and key not in self._severity:
+            if condition.severity is Severity.WARNING and key not in self._known:
                 self._log.warning("%s", condition.message)
-        self._severity = {key: condition.severity for key, condition in found.items()}
+        self._known = found
         self._since_ns = {
             key: self._since_ns.get(key, now_ns) for key, condition in found.items() if condition.sheds_load
         }

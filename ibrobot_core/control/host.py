@@ -404,9 +404,8 @@ class ControlClient(ControlHost):
     def _death(self, child: Child) -> ComponentFailed:
         if child.failure is None or self._arrived.is_set():
             return self._failure(child, "the control process died")
-        failure = ComponentFailed(child.failure.error)  # the robot did not arrive, and control says why
-        failure.exit_code = child.failure.exit_code
-        return failure
+        # The robot did not arrive, and control says why.
+        return ComponentFailed(child.failure.error, child.failure.exit_code)
 
     def _pass_on(self, child: Child) -> None:
         """Forward states and messages, and give signs of life, until control has ended."""

@@ -48,9 +48,7 @@ def _that_travels(error: IbrobotError) -> IbrobotError:
     try:
         return copy.copy(error)  # made as pickle makes it
     except Exception:  # noqa: BLE001 - whatever its class needs
-        plain = ComponentFailed(str(error))
-        plain.exit_code = error.exit_code
-        return plain
+        return ComponentFailed(str(error), error.exit_code)
 
 
 @attrs.frozen(eq=False)

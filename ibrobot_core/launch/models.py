@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
+from contextlib import closing
 
 from ibrobot_core.calibration import load_calibration
 from ibrobot_core.config import RobotConfig
@@ -14,7 +15,7 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import check_strategy
 from ibrobot_core.errors import ConfigError, ContractError, IbrobotError, Problem
 from ibrobot_core.inference.build import build_policy
-from ibrobot_core.interfaces import Policy, PolicySpec
+from ibrobot_core.interfaces import PolicySpec
 from ibrobot_core.plugins import Registry
 
 
@@ -71,23 +72,16 @@ def check_models(config: RobotConfig, registry: Registry, modes: Iterable[str]) 
     lines, problems = [], []
     for name in dict.fromkeys(inference.model for inference in used):
         try:
-            policy = build_policy(config, registry, name)
-            try:
-                _check(config, name, policy, weights=name in loaded_here)
+            with closing(build_policy(config, registry, name)) as policy:
+                check_model(config, config.models[name], policy.spec, logging.getLogger("ibrobot"))
+                if name in loaded_here:
+                    policy.check_weights()
                 lines.append(_line(name, policy.spec))
-            finally:
-                policy.close()
         except IbrobotError as error:
             problems.append(Problem(config.source, 0, f"models.{name}", str(error)))
     if problems:
         raise ConfigError(problems)
     return lines
-
-
-def _check(config: RobotConfig, name: str, policy: Policy, *, weights: bool) -> None:
-    check_model(config, config.models[name], policy.spec, logging.getLogger("ibrobot"))
-    if weights:
-        policy.check_weights()
 
 
 def _line(name: str, spec: PolicySpec) -> str:

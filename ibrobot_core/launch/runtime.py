@@ -101,7 +101,7 @@ class Runtime:
         config = session.config
         for line in (*absent_models(config.absent_models), *unavailable_modes(config.unavailable)):
             session.log.warning("%s", line)
-        session.bus.serve(ESTOP, self._estop)
+        session.bus.serve(ESTOP, lambda request: session.emergency_stop())
         try:
             for component in self.plan.components:
                 if component is self.plan.episodes_worker:
@@ -111,7 +111,9 @@ class Runtime:
                 self._start(component)
             if self.plan.episodes_worker is None:
                 self._arrive()
-                self._begin_mode()
+                session.begin_source()
+                if not session.request.by_operator:  # one open-ended episode, from the robot's present state
+                    session.episodes.begin()
             self._begun_ns = session.clock.now_ns()
         except BaseException as error:
             ended = session.finished.is_set()
@@ -246,9 +248,6 @@ class Runtime:
                 raise HardwareError(f"{what}: refused, an emergency stop came after it was requested")
             yield
 
-    def _estop(self, request: NoRequest) -> None:
-        self.session.emergency_stop()
-
     def _go_on(self) -> None:
         """Enter the present mode again after a reset made the robot hold."""
         session = self.session
@@ -304,9 +303,7 @@ class Runtime:
             ComponentFailed: with component and cause on one line.
         """
         if self.session.failure is not None:
-            failure = ComponentFailed(self.session.failure_text)
-            failure.exit_code = exit_code(self.session.failure[1])
-            raise failure
+            raise ComponentFailed(self.session.failure_text, exit_code(self.session.failure[1]))
 
     def summary(self) -> dict[str, Any]:
         """The summary as `--json` prints it, including facts from the first mode's command source."""
@@ -406,13 +403,6 @@ class Runtime:
         name = dead.thread.name if dead.thread is not None else "a thread"
         self.session.fail(f"thread {name!r}", as_failure(dead.exc_value or dead.exc_type()))
 
-    def _begin_mode(self) -> None:
-        """Begin a mode without simulated episodes: one open-ended episode from the robot's present state."""
-        session = self.session
-        session.begin_source()
-        if not session.request.by_operator:
-            session.episodes.begin()
-
 
 @contextmanager
 def _named(component: Component) -> Iterator[None]:
@@ -420,6 +410,4 @@ def _named(component: Component) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        failure = ComponentFailed(f"{component.name}: {error_text(error)}")
-        failure.exit_code = exit_code(error)
-        raise failure from error
+        raise ComponentFailed(f"{component.name}: {error_text(error)}", exit_code(error)) from error

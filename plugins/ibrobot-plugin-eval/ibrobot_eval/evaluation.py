@@ -156,9 +156,7 @@ def _result[R](done: Done[R]) -> tuple[Any, R]:
     job = done.job.argument
     if done.error is not None:
         which = f"{job.policy.label}, seed {job.seed}"
-        failed = ComponentFailed(f"{which}: {done.error}; finished episodes are kept")
-        failed.exit_code = done.error.exit_code
-        raise failed
+        raise ComponentFailed(f"{which}: {done.error}; finished episodes are kept", done.error.exit_code)
     return job, done.result()
 
 

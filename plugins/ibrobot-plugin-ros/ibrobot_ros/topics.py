@@ -106,7 +106,7 @@ class Topics:
         first = queue.get(timeout_s) if queue is not None else None
         if queue is None or first is None:
             return False
-        if queue.dropped:
+        if queue.lost:
             self._note_lost(queue)
         frames: list[Frame] = []
         for received in (first, *queue.drain()):
