@@ -29,7 +29,7 @@ class Commanders:
 
     def __init__(self, reader: EpisodeReader, summary: EpisodeSummary) -> None:
         self._changes: list[tuple[int, str]] = []
-        """Times [ns] from which an operator else commands, and who."""
+        """Times [ns] at which the commander changes, and the new one."""
         if is_labelled(summary):
             for item in reader.messages({COMMANDER}):
                 assert isinstance(item.message, String)
