@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import nox
+from nox.command import CommandFailed
 from packaging.requirements import Requirement
 
 nox.needs_version = ">=2026.8.10"
@@ -220,6 +221,15 @@ def lerobot(session: nox.Session) -> None:
     session.run(*PYTEST, "-m", f"lerobot{SHORT}", *marked("lerobot"), *session.posargs, env=folder)
 
 
+def run_again(session: nox.Session, *command: str) -> None:
+    """Run a command, and once more if it fails, as tests do: beside other sessions, a run in real time may be late."""
+    try:
+        session.run(*command, external=True)
+    except CommandFailed:
+        print("RERUN", shlex.join(command), flush=True)
+        session.run(*command, external=True)
+
+
 def check_wheels(session: nox.Session, folder: Path) -> None:
     """What the wheels in `folder / "dist"` install runs by itself, as the pages say; environments land in `folder`."""
     for page in ("README.md", "plugins/ibrobot-plugin-feetech/README.md"):
@@ -233,10 +243,10 @@ def check_wheels(session: nox.Session, folder: Path) -> None:
         with session.chdir(folder):  # away from this repository
             for command in commands:
                 program, *arguments = shlex.split(command, comments=True)
-                session.run(str(environment / "bin" / program), *arguments, external=True)
+                run_again(session, str(environment / "bin" / program), *arguments)
     emulated = Path("tests/house/launch_on_emulators.py").absolute()
     with session.chdir(folder):
-        session.run("python", str(emulated), str(folder / "ibrobot-plugin-feetech/bin/ibrobot"))
+        run_again(session, "python", str(emulated), str(folder / "ibrobot-plugin-feetech/bin/ibrobot"))
 
 
 @nox.session
