@@ -1,4 +1,4 @@
-"""The page's port and certificate: the configured one, or a self-signed one that this installation keeps."""
+"""The page's port and certificate, the configured one or the self-signed one of this installation, and its checks."""
 
 from __future__ import annotations
 
