@@ -11,6 +11,8 @@ from ibrobot_core.units import NS_PER_S
 
 _BOOTTIME = time.CLOCK_BOOTTIME if sys.platform == "linux" else time.CLOCK_MONOTONIC
 """Goes on while the computer is suspended, unlike CLOCK_MONOTONIC; only Linux has it."""
+COMMAND_OFF_NS = NS_PER_S // 2
+"""Largest difference between the time in a command's header and the present [ns]."""
 
 
 class Clock(ABC):
@@ -23,6 +25,28 @@ class Clock(ABC):
     @abstractmethod
     def sleep_until(self, deadline_ns: int) -> None:
         """Return at `deadline_ns` [ns], or at once if it has passed."""
+
+    def wall_ns(self) -> int:
+        """The time of day [ns]. Unlike `now_ns` it may jump, e.g. when NTP sets the computer's clock."""
+        return self.now_ns()
+
+    def age_ns(self, stamp_ns: int) -> int:
+        """Time since a stamp [ns]; negative for one in the future.
+
+        Stamps of this run are times of `now_ns`, those of other computers times of day. The two differ after the
+        computer's clock was set, and then the smaller age counts.
+        """
+        return min(self.now_ns() - stamp_ns, self.wall_ns() - stamp_ns, key=abs)
+
+    def refusal(self, stamp_ns: int) -> str:
+        """Why a command with this time in its header is refused; empty if it is not. A time of 0 stands for now.
+
+        The one rule for every stream of commands that carries a time; ask when the command is about to be followed.
+        """
+        age_ns = self.age_ns(stamp_ns) if stamp_ns else 0
+        if abs(age_ns) <= COMMAND_OFF_NS:
+            return ""
+        return "the time in its header is more than 0.5 s off: set the clocks, or leave the time 0"
 
     def asleep_ns(self) -> int:
         """Time for which the computer was suspended since it was started [ns], which `now_ns` does not count."""
@@ -42,6 +66,10 @@ class RealClock(Clock):
     @override
     def now_ns(self) -> int:
         return time.monotonic_ns() + self.epoch_offset_ns
+
+    @override
+    def wall_ns(self) -> int:
+        return time.time_ns()
 
     @override
     def sleep_until(self, deadline_ns: int) -> None:

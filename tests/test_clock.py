@@ -62,3 +62,32 @@ def test_stepped_sleep_moves_forwards_only() -> None:
 @given(st.integers(0, 2**52))
 def test_nanoseconds_survive_the_way_through_seconds(stamp: int) -> None:
     assert ns(seconds(stamp)) == pytest.approx(stamp, abs=1)
+
+
+class _SetClock(SteppedClock):
+    """A clock whose computer was set to another time of day."""
+
+    set_by_ns = 0
+
+    def wall_ns(self) -> int:
+        return self.now_ns() + self.set_by_ns
+
+
+@pytest.mark.parametrize("set_by_s", [0.0, 3600.0, -3600.0])
+def test_ages_follow_a_computer_whose_clock_is_set(set_by_s: float) -> None:
+    clock = _SetClock(ns(1e9))
+    clock.set_by_ns = ns(set_by_s)
+
+    for now_ns in (clock.now_ns(), clock.wall_ns()):  # of this run, and of other computers
+        assert clock.age_ns(now_ns - ns(0.2)) == ns(0.2)
+        assert clock.refusal(now_ns - ns(0.5)) == clock.refusal(now_ns + ns(0.5)) == ""
+        assert "more than 0.5 s off" in clock.refusal(now_ns - ns(0.6))
+        assert "more than 0.5 s off" in clock.refusal(now_ns + ns(0.6))
+    assert clock.refusal(0) == ""
+
+
+@pytest.mark.parametrize("off_s", [0.6, 3.0, 3600.0, -3600.0, 3.2e7])
+def test_commands_of_another_time_are_refused(off_s: float) -> None:
+    clock = RealClock()
+
+    assert "set the clocks" in clock.refusal(clock.now_ns() - ns(off_s))
