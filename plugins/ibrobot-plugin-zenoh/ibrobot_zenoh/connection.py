@@ -110,11 +110,14 @@ def first_line(error: BaseException) -> str:
 
 
 _open: WeakSet[Connection] = WeakSet()
+_opening = threading.Lock()
+"""Held while `_open` changes or is listed: a set that changes while it is listed raises."""
 
 
 def open_connections() -> list[Connection]:
-    """The connections of this process that are not closed."""
-    return [each for each in tuple(_open) if not each.closed]
+    """The connections of this process that are not closed. Thread-safe."""
+    with _opening:
+        return [each for each in _open if not each.closed]
 
 
 @cache
@@ -127,7 +130,7 @@ def _close_at_the_end() -> None:
 
     def close_all() -> None:
         threading.main_thread().join()
-        for connection in tuple(_open):
+        for connection in open_connections():
             connection.close()
 
     threading.Thread(target=close_all, name="zenoh ends").start()
@@ -156,8 +159,9 @@ class Connection:
         self._declared: dict[object, Declared] = {}
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
-        _open.add(self)
-        _close_at_the_end()
+        with _opening:
+            _open.add(self)
+            _close_at_the_end()
         self._options = options
         self.why_not = f"nobody answers at {self.endpoints}"
         """Why there is no connection yet."""

@@ -12,7 +12,7 @@ from rosbags.typesys.store import Typestore
 
 from ibrobot_core.api import Message
 from ibrobot_ros2.convert import Convert, core_class, decoder, encoder, make_class
-from ibrobot_ros2.definitions import CodecError, define, make_typestore, standard_types, type_hash
+from ibrobot_ros2.definitions import DEFINING, CodecError, define, make_typestore, standard_types, type_hash
 
 _ENCAPSULATIONS = {b"\x00\x00": False, b"\x00\x01": True}
 """First bytes of plain CDR -> whether it is little-endian."""
@@ -20,6 +20,8 @@ _ENCAPSULATIONS = {b"\x00\x00": False, b"\x00\x01": True}
 
 class Codec:
     """Encodes and decodes messages of the standard types, of `ibrobot_msgs`, and of those that are defined here.
+
+    Thread-safe.
 
     Args:
         definitions: type -> its `ros2msg` or `ros2idl` text, e.g. as a bag brings them; they come before the standard
@@ -35,6 +37,7 @@ class Codec:
     @cached_property
     def _types(self) -> Typestore:
         """The types; a store takes too long to make for a bag of which only the summary is read."""
+        # First needed with `DEFINING` held, so that it is made once.
         return make_typestore() if self._definitions else standard_types()
 
     def encode(self, message: Message) -> memoryview:
@@ -46,8 +49,9 @@ class Codec:
         type_name = message.ros_type
         convert = self._encoders.get(type_name)
         if convert is None:
-            self._define(type_name)
-            convert = self._encoders[type_name] = encoder(type_name, self._types)
+            with DEFINING:
+                self._define(type_name)
+                convert = self._encoders[type_name] = encoder(type_name, self._types)
         try:
             return self._types.serialize_cdr(convert(message), type_name, little_endian=True)
         except (SerdeError, struct.error, ValueError, OverflowError, TypeError, AttributeError) as error:
@@ -63,9 +67,10 @@ class Codec:
         """
         convert = self._decoders.get(type_name)
         if convert is None:
-            self._define(type_name)
-            convert = decoder(type_name, self._class_of(type_name), self._types, self._class_of)
-            self._decoders[type_name] = convert
+            with DEFINING:  # so that each type has one class
+                self._define(type_name)
+                convert = decoder(type_name, self._class_of(type_name), self._types, self._class_of)
+                self._decoders[type_name] = convert
         little_endian = _ENCAPSULATIONS.get(bytes(data[:2]))
         if little_endian is None or len(data) < 4:
             raise CodecError(f"{type_name}: not plain CDR: begins with {bytes(data[:4]).hex(' ') or 'nothing'}")
@@ -84,8 +89,9 @@ class Codec:
         Raises:
             CodecError: for a type that nobody defined, or whose definition cannot be read.
         """
-        self._define(type_name)
-        return type_hash(type_name, self._types)
+        with DEFINING:
+            self._define(type_name)
+            return type_hash(type_name, self._types)
 
     def _class_of(self, type_name: str) -> type[Any]:
         """Core's class where the type is as core knows it; else one made from the definition."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+import threading
 from importlib.resources import files
 from typing import Any
 
@@ -13,6 +13,14 @@ from ibrobot_core.api import IbrobotError
 
 _PACKAGE = "ibrobot_msgs"
 _SEPARATOR = "=" * 80 + "\n"
+_EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
+_EVENT_TEXT = "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number\n"
+"""The events of services as ROS defines them: rosbags has characters where ROS has numbers, so its hash differs."""
+
+DEFINING = threading.RLock()
+"""Held while a store of types changes: by `define`, and by what makes several changes. Readers do not need it."""
+_standard: list[Typestore] = []
+"""The store of `standard_types`, once it is made."""
 
 
 class CodecError(IbrobotError):
@@ -53,26 +61,47 @@ def make_typestore() -> Typestore:
 def define(store: Typestore, type_name: str, text: str) -> None:
     """Add a type and the types that its text defines to a store; they replace types of the same names.
 
+    Thread-safe: other threads see a type as it was before or as it is afterwards, and never miss it.
+
     Raises:
         CodecError: for a definition that cannot be used.
     """
     types = parse_definition(type_name, text)
-    for name in types.keys() & store.fielddefs.keys():
-        if types[name][1] == store.fielddefs[name][1]:
-            del types[name]
-        else:
-            del store.fielddefs[name], store.types[name]
+    with DEFINING:
+        for name in types.keys() & store.fielddefs.keys():
+            if types[name][1] == store.fielddefs[name][1]:
+                del types[name]
+        try:
+            register(store, types)
+        except (TypesysError, SyntaxError) as error:
+            raise CodecError(f"{type_name}: its definition cannot be used: {error}") from error
+
+
+def register(store: Typestore, types: dict[str, Any]) -> None:
+    """Add parsed types to a store, or replace them. Thread-safe, as `define`.
+
+    Raises:
+        TypesysError: for types that rosbags cannot use.
+        SyntaxError: for names that Python cannot use.
+    """
+    made = Typestore()
+    with DEFINING:  # also of other stores: rosbags makes classes under one name for all
+        made.register(types)
+        store.types.update(made.types)
+        store.fielddefs.update(made.fielddefs)  # last: a type counts as known from here on
+        for name in types:
             store.cache.pop(name, None)
-    try:
-        store.register(types)
-    except (TypesysError, SyntaxError) as error:
-        raise CodecError(f"{type_name}: its definition cannot be used: {error}") from error
 
 
-@cache
 def standard_types() -> Typestore:
-    """The types of ROS 2 Jazzy and `ibrobot_msgs`."""
-    return make_typestore()
+    """The types of ROS 2 Jazzy and `ibrobot_msgs`. Thread-safe."""
+    if not _standard:
+        with DEFINING:
+            if not _standard:
+                store = make_typestore()
+                define(store, _EVENT_INFO, _EVENT_TEXT)
+                _standard.append(store)
+    return _standard[0]
 
 
 def definition(type_name: str) -> str:

@@ -22,13 +22,12 @@ from rosbags.typesys import TypesysError, get_types_from_msg
 from rosbags.typesys.store import Typestore
 
 from ibrobot_ros2.convert import dtype_of
-from ibrobot_ros2.definitions import CodecError, define, known, standard_types, type_hash
+from ibrobot_ros2.definitions import DEFINING, CodecError, known, register, standard_types, type_hash
 
 FOLDER = files(__package__) / "interfaces"
 """The texts of services, actions and messages that ROS 2 nodes often have: PACKAGE/KIND/NAME.KIND."""
 _EMPTY = "uint8 structure_needs_at_least_one_member\n"
 """What ROS 2 puts into a message without fields."""
-_EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 _EVENT = "service_msgs/ServiceEventInfo info\n{name}_Request[<=1] request\n{name}_Response[<=1] response\n"
 _PARTS = "{name}_Request request_message\n{name}_Response response_message\n{name}_Event event_message\n"
 _UUID = "unique_identifier_msgs/UUID goal_id\n"
@@ -59,22 +58,29 @@ class ActionType:
 
 @cache
 def service_type(name: str) -> ServiceType:
-    """A service, e.g. `std_srvs/srv/Trigger`.
+    """A service, e.g. `std_srvs/srv/Trigger`. Thread-safe.
 
     Raises:
         CodecError: if it is not defined here.
     """
-    request, response = _text(name, "srv", 2)
-    return _service(name, request, response)
+    with DEFINING:
+        request, response = _text(name, "srv", 2)
+        return _service(name, request, response)
 
 
 @cache
 def action_type(name: str) -> ActionType:
-    """An action, e.g. `control_msgs/action/GripperCommand`.
+    """An action, e.g. `control_msgs/action/GripperCommand`. Thread-safe.
 
     Raises:
         CodecError: if it is not defined here.
     """
+    with DEFINING:
+        return _action(name)
+
+
+def _action(name: str) -> ActionType:
+    """An action; called with `DEFINING` held."""
     for part, text in zip(("Goal", "Result", "Feedback"), _text(name, "action", 3), strict=True):
         _define(f"{name}_{part}", text)
     _define(f"{name}_FeedbackMessage", f"{_UUID}{name}_Feedback feedback\n")
@@ -120,20 +126,12 @@ def from_cdr(type_name: str, data: bytes) -> dict[str, Any]:
     return found
 
 
-@cache
-def _mend() -> None:
-    """Define the events of services as ROS does: rosbags has characters where ROS has numbers, so its hash differs."""
-    text = "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number\n"
-    define(standard_types(), _EVENT_INFO, text)
-
-
 def fields_of(type_name: str) -> list[str]:
     """The names of the fields of a message, as ROS has them."""
     return [name for name, _ in standard_types().fielddefs[type_name][1]]
 
 
 def _service(name: str, request: str, response: str) -> ServiceType:
-    _mend()
     _define(f"{name}_Request", request)
     _define(f"{name}_Response", response)
     _define(f"{name}_Event", _EVENT.format(name=name))
@@ -166,7 +164,7 @@ def interfaces(kind: str) -> list[str]:
 
 
 def _define(name: str, text: str) -> None:
-    """Add a message to the standard types, under a name that need not be that of a message."""
+    """Add a message to the standard types, under a name that need not be that of a message; with `DEFINING` held."""
     store = standard_types()
     if name in store.fielddefs:
         return
@@ -175,7 +173,7 @@ def _define(name: str, text: str) -> None:
         (constants, fields) = next(iter(get_types_from_msg(text or _EMPTY, f"{package}/msg/X").values()))
     except TypesysError as error:
         raise CodecError(f"{name}: its definition cannot be read: {error}") from error
-    store.register({name: (constants, [(field, _renamed(desc)) for field, desc in fields])})
+    register(store, {name: (constants, [(field, _renamed(desc)) for field, desc in fields])})
 
 
 def _renamed(desc: Any) -> Any:
