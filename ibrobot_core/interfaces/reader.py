@@ -87,8 +87,8 @@ class EpisodeAddress:
     number: int | None = None
     """Number of the episode in a dataset, from 0; None if not given."""
     given: Mapping[str, str] = attrs.field(factory=dict)
-    """Metadata for an episode that has none, by the recorder's names: `contract`, `config`, `calibration`; and
-    `norm_mode`, the unit of its joints."""
+    """Metadata for an episode that has none, by the recorder's names: `contract`, `config`, `calibration`;
+    `norm_mode`, the unit of its joints; `names`, JSON of feature -> names of its elements in their order."""
 
     @classmethod
     def of(cls, path: Path, given: Mapping[str, str] | None = None) -> EpisodeAddress:

@@ -215,3 +215,19 @@ def test_a_foreign_dataset_is_described_by_a_robot_yaml(exact: Path, convert: Co
     assert isinstance(items[3].message, JointState)
     np.testing.assert_array_equal(items[3].message.position, rows(exact, 0)[3]["observation.state"])
     assert (metadata["prompt"], metadata["robot"]) == ("sort 1", "bench")
+    info = tmp_path / "theirs/meta/info.json"
+    document = json.loads(info.read_text())
+    document["features"]["action"]["names"] = {"motors": list(reversed(JOINTS))}
+    info.write_text(json.dumps(document))
+    done = convert(tmp_path / "theirs", "--to", "bag", "--out", tmp_path / "other", *arguments)
+    assert done.returncode == 1
+    assert "action does not match the contract" in done.stderr
+    document["features"]["action"]["names"] = {"motors": None}
+    info.write_text(json.dumps(document))
+    done = convert(tmp_path / "theirs", "--to", "bag", "--out", tmp_path / "other", *arguments)
+    assert done.returncode == 1
+    assert f"state it with --names action={JOINTS[0]}.pos" in done.stderr
+    arguments += ["--names", f"action={','.join(JOINTS)}"]
+    assert convert(tmp_path / "theirs", "--to", "bag", "--out", tmp_path / "other", *arguments).returncode == 0
+    arguments[-1] = "action=,"
+    assert convert(tmp_path / "theirs", "--to", "bag", "--out", tmp_path / "other", *arguments).returncode == 2

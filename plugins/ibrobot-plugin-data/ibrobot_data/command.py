@@ -29,6 +29,7 @@ from ibrobot_core.app import (
 )
 from ibrobot_data import CONVERT, conversion
 from ibrobot_data.conversion import ConvertOptions
+from ibrobot_data.element_names import names_option
 from ibrobot_data.plural import plural
 from ibrobot_data.prompt import check_prompt
 from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
@@ -65,13 +66,14 @@ def _writer_flags() -> dict[str, click.Option]:
 @declared(CONVERT)
 @click.option("--to", type=click.Choice(("dataset", "bag")), default="dataset", show_default=True, help="What to make.")
 @click.option("--episodes", "numbers", metavar="N,N-M", help="With --to bag: only these episodes, counted from 0.")
+@names_option("With --to bag: names of a feature's elements in their order, for a dataset that does not have them.")
 @click.option("--type", "type_", help="Dataset writer; by default that of an installed plugin.")
 @click.option("--set", "sets", multiple=True, metavar="OPTION=VALUE", help="Any other option of the dataset writer.")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 @click.pass_context
 def convert(
-    context: click.Context, options: ConvertOptions, /, *, to: str, numbers: str | None, type_: str | None,
-    sets: tuple[str, ...], as_json: bool, events: bool, **flags: Any,
+    context: click.Context, options: ConvertOptions, /, *, to: str, numbers: str | None,
+    names: Mapping[str, list[str]], type_: str | None, sets: tuple[str, ...], as_json: bool, events: bool, **flags: Any,
 ) -> None:  # fmt: skip
     """Make a dataset for training from recorded episodes, or with --to bag episodes from a dataset.
 
@@ -84,7 +86,7 @@ def convert(
         for each in context.command.params
         if context.get_parameter_source(each.name or "") is ParameterSource.COMMANDLINE
     }
-    only_other = ("numbers",) if to == "dataset" else (*_ONLY_TO_DATASET, *_writer_flags())
+    only_other = ("numbers", "names") if to == "dataset" else (*_ONLY_TO_DATASET, *_writer_flags())
     if wrong := [flag for name, flag in given.items() if name in only_other]:
         raise click.UsageError(f"{wrong[0]} does not apply to --to {to}")
     try:
@@ -92,8 +94,12 @@ def convert(
             check_prompt(options.prompt)
             progress = _events if events else partial(_progress, quiet=as_json)
             if to == "bag":
+                from ibrobot_data.config_metadata import metadata_from_config
+
                 unit = options.norm_mode if "norm_mode" in given else None
-                report = _to_bags(options, numbers, unit, sets, progress)
+                robot, calibration = _stated(options)
+                stated = metadata_from_config(robot, unit, calibration, names) if robot is not None else {}
+                report = _to_bags(options, numbers, robot, stated, sets, progress)
             else:
                 report = _to_dataset(options, type_, (*_overrides(flags), *sets), progress)
     except KeyboardInterrupt:
@@ -141,10 +147,10 @@ def _to_dataset(options: ConvertOptions, type_: str | None, overrides: Sequence[
 
 
 def _to_bags(
-    options: ConvertOptions, numbers: str | None, norm_mode: str | None, sets: tuple[str, ...], progress: _Progress
-) -> Report:
+    options: ConvertOptions, numbers: str | None, robot: RobotConfig | None, stated: Mapping[str, str],
+    sets: tuple[str, ...], progress: _Progress,
+) -> Report:  # fmt: skip
     from ibrobot_core.api import EpisodeAddress
-    from ibrobot_data.config_metadata import metadata_from_config
     from ibrobot_data.episode import make_writer
     from ibrobot_data.to_bags import BagRequest, convert_to_bags
 
@@ -156,11 +162,10 @@ def _to_bags(
     if (summary := writer.summary(address.path)) is None:
         raise DatasetError(f"{address.path}: not a dataset of type {dataset}")
     chosen = (address.number,) if address.number is not None else _numbers(numbers, summary.episodes)
-    robot, calibration = _stated(options)
     request = BagRequest(
         address.path, chosen, options.out, _options("recorder", recorder, sets), recorder, prompt=options.prompt,
         contract=Contract.from_config(robot) if robot is not None else None,
-        given=metadata_from_config(robot, norm_mode, calibration) if robot is not None else {},
+        given=stated,
     )  # fmt: skip
     with progress(len(chosen)) as watch:
         return convert_to_bags(request, watch)

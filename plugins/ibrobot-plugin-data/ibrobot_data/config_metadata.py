@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,10 @@ def load_contract(path: str | Path) -> RobotConfig:
 
 
 def metadata_from_config(
-    config: RobotConfig, norm_mode: str | None = None, calibration: Mapping[str, Mapping[str, Any]] | None = None
+    config: RobotConfig,
+    norm_mode: str | None = None,
+    calibration: Mapping[str, Mapping[str, Any]] | None = None,
+    names: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, str]:
     """Metadata from a robot YAML, for a dataset without its own; see `EpisodeAddress.given`.
 
@@ -60,8 +63,10 @@ def metadata_from_config(
         config: the robot YAML.
         norm_mode: the unit of the dataset's joint positions.
         calibration: joint -> fields of `JointCalibration`, for a unit that needs them.
+        names: feature of the dataset -> names of its elements in their order, where the dataset does not have them.
     """
     document = json.loads(json.dumps(config.document, default=str))
     calibrations = {"given": with_closed_ends(calibration, config)} if calibration else {}
     given = robot_metadata(Contract.from_config(config).without_signals(), document, calibrations)
+    given |= {"names": json.dumps(names)} if names else {}
     return given | ({"norm_mode": norm_mode} if norm_mode else {})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from ibrobot_core.app import (
     wrong_input,
 )
 from ibrobot_data.config_metadata import metadata_from_config
+from ibrobot_data.element_names import names_option
 from ibrobot_data.episode import recorded_contract
 from ibrobot_data.playback import Playback, read_playback
 from ibrobot_data.replay_source import ReplaySource
@@ -56,10 +57,11 @@ _MODE = "replay"
 @click.option("--any-robot", is_flag=True, help="Replay even if robot, robot type or calibration differ.")
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of joints in a dataset that does not state it.")
 @click.option("--calibration", metavar="NAME", help="Calibration for such a dataset, if its unit needs one.")
+@names_option("Names of a feature's elements in their order, for a dataset that does not have them.")
 @run_options("overrides", "viewer", "headless", "dry_run", "as_json")
 def replay(
     episode: Path, config: str | None, speed: float, force_contract: bool, any_robot: bool, norm_mode: str | None,
-    calibration: str | None, **options: Any,
+    calibration: str | None, names: Mapping[str, list[str]], **options: Any,
 ) -> None:  # fmt: skip
     """Play the commands of a recorded EPISODE, and compare the joints with the recorded ones.
 
@@ -73,7 +75,7 @@ def replay(
     changes, sim = run_overrides(options), options["sim"]
     robot = _named(config, changes, sim=sim) if config is not None else None
     numbers = load_calibration(calibration).snapshot() if calibration is not None else None
-    given = metadata_from_config(robot, norm_mode, numbers) if robot is not None else None
+    given = metadata_from_config(robot, norm_mode, numbers, names) if robot is not None else None
     with wrong_input(), closing(installed_plugins().open_episode(episode, given)) as reader:
         summary = reader.summary()
         robot = robot or _recorded(summary, changes, sim=sim)

@@ -164,6 +164,28 @@ def task_table(tasks: list[str]) -> pa.Table:
     return table_of([{"task_index": number, "task": task} for number, task in enumerate(tasks)], schema)
 
 
+def element_names(names: Any) -> tuple[str, ...]:
+    """The names of a feature's elements, in their order; empty if they are absent or have no known order.
+
+    LeRobot and its converters write a list, a list in a dict (`{"motors": ["pan", "lift"]}`) or positions
+    (`{"pan": 0, "lift": 1}`). Several lists in a dict do not say which comes first.
+
+    Args:
+        names: `names` in the feature's entry of `info.json`.
+    """
+    while isinstance(names, dict | list) and len(names) == 1:
+        [inner] = names.values() if isinstance(names, dict) else names
+        if not isinstance(inner, dict | list):
+            break
+        names = inner
+    if isinstance(names, dict):
+        places = {place: name for name, place in names.items() if type(place) is int}
+        names = [places.get(place) for place in range(len(names))]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        return ()
+    return tuple(names)
+
+
 @attrs.frozen
 class OnDisk:
     """An open dataset."""
@@ -187,7 +209,7 @@ class OnDisk:
     def features(self) -> dict[str, Feature]:
         """The features given to `create`."""
         return {
-            key: Feature(_dtype(entry), tuple(entry["shape"]), tuple(entry["names"] or ()))
+            key: Feature(_dtype(entry), tuple(entry["shape"]), element_names(entry.get("names")))
             for key, entry in self.info["features"].items()
             if key not in COUNTERS
         }

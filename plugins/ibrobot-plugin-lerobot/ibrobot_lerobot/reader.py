@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, override
 
@@ -34,6 +34,9 @@ from ibrobot_core.app import robot_metadata
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.compose import Composer
 from ibrobot_lerobot.rows import EpisodeRows
+
+_POSITION = ".pos"
+"""Ending of the names of joint positions."""
 
 
 class LeRobotReader(EpisodeReader):
@@ -64,7 +67,7 @@ class LeRobotReader(EpisodeReader):
         self._path = root.with_name(f"{root.name}:{address.number}")
         self._origin = origin = episode_origin(root, dataset.metadata, address.number, address.given)
         self._contract = origin.contract
-        _check_features(root, dataset.features, origin.contract)
+        _check_features(root, dataset.features, origin)
         self._units = JointUnits(origin.norm_mode, origin.contract, origin.calibration, origin.document)
         self._composer = Composer(origin.contract)
         self._step_ns = round(NS_PER_S / dataset.info["fps"])
@@ -128,24 +131,39 @@ class LeRobotReader(EpisodeReader):
         }
 
 
-def _check_features(root: Path, features: Mapping[str, Feature], contract: Contract) -> None:
-    """Check that the dataset has the contract's features, in the same order."""
-    for key, wanted in contract.features().items():
+def _check_features(root: Path, features: Mapping[str, Feature], origin: Origin) -> None:
+    """Check that the dataset has the contract's features, with the same elements in the same order."""
+    for key, wanted in origin.contract.features().items():
         found = features.get(key)
         if found is None:
             raise ContractError(
                 f"{root}: lacks {key} of the contract; available: {', '.join(features)}; "
-                f"the contract: {', '.join(contract.features())}"
+                f"the contract: {', '.join(origin.contract.features())}"
             )
-        named = len(wanted.shape) == 1 and len(found.names) == len(wanted.names) == found.shape[0]
         shapes = zip(wanted.shape, found.shape, strict=False)
         same = len(wanted.shape) == len(found.shape) and all(a in (-1, b) for a, b in shapes)
-        if not same or (named and found.names != wanted.names):
-            raise ContractError(
-                f"{root}: {key} does not match the contract:\n"
-                f"   dataset: {found.shape} {', '.join(found.names)}\n"
-                f"  contract: {wanted.shape} {', '.join(wanted.names)}"
+        if same and (len(wanted.shape) > 1 or not wanted.names):
+            continue
+        names = origin.names.get(key, found.names)
+        if same and _are_same(names, wanted.names):
+            continue
+        problem = f"{key} does not match the contract:"
+        if same and not (len(names) == len(set(names)) == found.shape[0]):
+            problem = (
+                f"{key} does not name its elements, so their order is unknown; if you know it, state it with "
+                f"--names {key}={','.join(wanted.names[:2])},…:"
             )
+        raise ContractError(
+            f"{root}: {problem}\n"
+            f"   dataset: {found.shape} {', '.join(names)}\n"
+            f"  contract: {wanted.shape} {', '.join(wanted.names)}"
+        )
+
+
+def _are_same(names: Sequence[str], wanted: Sequence[str]) -> bool:
+    """Whether names are the contract's in its order; joints alone name their positions."""
+    joints = [name.removesuffix(_POSITION) for name in wanted if name.endswith(_POSITION)]
+    return list(names) == list(wanted) or (len(joints) == len(wanted) and list(names) == joints)
 
 
 @attrs.frozen
@@ -164,6 +182,8 @@ class Origin:
     outcome: str = "unknown"
     start_ns: int | None = None
     """Time of receipt of the recording's first message [ns]."""
+    names: Mapping[str, Sequence[str]] = attrs.field(factory=dict)
+    """Feature -> names of its elements, where the caller states them in place of the dataset."""
 
 
 def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, given: Mapping[str, str]) -> Origin:
@@ -212,4 +232,5 @@ def _origin_as_given(root: Path, given: Mapping[str, str]) -> Origin:
     document = json.loads(given.get("config", "{}"))
     joined = {joint: numbers for each in calibrations.values() for joint, numbers in each.items()}
     described = robot_metadata(contract, document, calibrations)
-    return Origin(described, contract, document, joined, given["norm_mode"])
+    names = json.loads(given.get("names", "{}"))
+    return Origin(described, contract, document, joined, given["norm_mode"], names=names)

@@ -1,0 +1,25 @@
+"""The option `--names`, which states the elements of vectors in datasets that do not name them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import click
+
+
+def _parsed(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> Mapping[str, list[str]]:
+    """Feature -> names, from texts such as `action=pan,lift`."""
+    found: dict[str, list[str]] = {}
+    for text in values:
+        key, _, listed = text.partition("=")
+        names = [name.strip() for name in listed.split(",")]
+        if not key or not all(names) or key in found:
+            raise click.BadParameter(f"{text!r} must be the only FEATURE=NAME,NAME,… of its feature")
+        found[key] = names
+    return found
+
+
+def names_option(help_text: str) -> Callable[[Any], Any]:
+    """The option `--names`; the command receives feature -> names of its elements in their order."""
+    return click.option("--names", multiple=True, metavar="FEATURE=NAME,…", callback=_parsed, help=help_text)
