@@ -124,7 +124,11 @@ from ibrobot_core.launch.runtime import (
 )
 from ibrobot_core.launch.sources.policy import TOGGLE_SMOOTHING as TOGGLE_SMOOTHING
 from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
-from ibrobot_core.interfaces.policy import check_tensors as check_tensors, copied_tensors as copied_tensors
+from ibrobot_core.interfaces.policy import (
+    check_finite as check_finite,
+    check_tensors as check_tensors,
+    copied_tensors as copied_tensors,
+)
 
 # Episodes and datasets
 from ibrobot_core.ownership import Ownership as Ownership, owned as owned

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
@@ -290,3 +292,44 @@ def _answer(kind: type[InferenceClient], policy: GatedPolicy) -> Chunk:
     assert chunk is not None
     assert chunk.id == 1
     return chunk
+
+
+class NotFinite(FakePolicy):
+    """Returns a number that is not finite from one of its steps."""
+
+    def __init__(self, stage: str, value: float) -> None:
+        super().__init__(host_context())
+        self._stage, self._value = stage, value
+
+    def _spoiled(self, stage: str, array):
+        array = np.array(array, np.float64)
+        if stage == self._stage:
+            array.flat[-1] = self._value
+        return array
+
+    def preprocess(self, frame):
+        return {name: self._spoiled("preprocess", array) for name, array in super().preprocess(frame).items()}
+
+    def infer(self, tensors):
+        return {name: self._spoiled("infer", array) for name, array in super().infer(tensors).items()}
+
+    def postprocess(self, tensors):
+        return self._spoiled("postprocess", super().postprocess(tensors))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.sampled_from(("preprocess", "infer", "postprocess")), st.sampled_from((np.nan, np.inf, -np.inf)))
+def test_number_that_is_not_finite_is_an_error_of_its_stage(stage: str, value: float):
+    client = LockstepClient(NotFinite(stage, value))
+    client.submit(request(1))
+    chunk = client.poll()
+    assert chunk is not None
+    assert chunk.actions is None
+    assert chunk.error.startswith(f"the policy's {stage}: ")
+    assert chunk.error.endswith(f"is {value}, must be finite")
+
+
+def test_observation_that_is_not_finite_is_named():
+    frame = Frame(1, {"state": np.array([0.0, np.nan], np.float32)})
+    with pytest.raises(PolicyError, match=r"the observation: state\[1\] is nan, must be finite"):
+        frame.observation("state", (2,))

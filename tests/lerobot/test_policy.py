@@ -235,10 +235,22 @@ def test_half_precision_is_near(folders: dict[str, Path]) -> None:
     assert 0 < np.abs(a - b).max() < 0.1
 
 
-def test_a_first_run_that_overflows_is_reported(folders: dict[str, Path], caplog: pytest.LogCaptureFixture) -> None:
-    """One joint did not move in the dataset, so that its normalised zero is beyond float16."""
+def test_a_first_run_that_overflows_is_refused(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     loaded(folders["act"], dtype="float16")
-    assert "act overflows torch.float16 for zero inputs; bfloat16 and float32" in caplog.text
+    chunk = np.full((1, 1, 6), np.inf, np.float32)
+    monkeypatch.setattr("ibrobot_lerobot.model.PolicyModel.predict", lambda self, batch: [chunk])
+    with pytest.raises(PolicyError, match=r"infer of its first run \(torch.float16; .*\): action\[0, 0, 0\] is inf"):
+        make(folders["act"], dtype="float16").load()
+
+
+def test_weights_that_are_not_finite_are_refused(folders: dict[str, Path], tmp_path: Path) -> None:
+    shutil.copytree(folders["act"], tmp_path / "act")
+    weights = load_file(tmp_path / "act/model.safetensors")
+    for value in (np.nan, np.inf):
+        weights["model.action_head.bias"].fill_(value)
+        save_file(weights, tmp_path / "act/model.safetensors")
+        with pytest.raises(PolicyError, match=r"the weights model.action_head.bias have values that are not finite"):
+            make(tmp_path / "act").load()
 
 
 def test_a_first_run_that_fails_is_reported(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from numpy.typing import NDArray
 
 from ibrobot_core.api import PolicyError, Tensors
+from ibrobot_core.app import check_finite
 from ibrobot_lerobot.checkpoint import ACTION, Checkpoint
 from ibrobot_lerobot.draws import Draw, Draws, NotByRequest
 from ibrobot_lerobot.options import LeRobotPolicyOptions
@@ -67,11 +68,12 @@ class PolicyModel:
         self._log = log
         log.info("%s on %s, %d threads", checkpoint.type, self._device, threads)
 
-    def warm_up(self, tensors: Tensors) -> None:
-        """Run the network once and check that it returns an action chunk.
+    def warm_up(self, tensors: Tensors) -> NDArray[np.float32]:
+        """Run the network once and check that it returns an action chunk, shape (1, N, A), which is returned.
 
         Raises:
-            PolicyError: if it fails, or does not return a chunk, e.g. because the policy plans step by step.
+            PolicyError: if it fails, does not return a chunk, e.g. because the policy plans step by step, or returns
+                values that are not finite.
         """
         try:
             [action] = self.predict([tensors])
@@ -85,13 +87,9 @@ class PolicyModel:
                 f"{self._checkpoint.path}: {self._checkpoint.type} returns actions of shape {action.shape}; "
                 f"a chunk has (1, up to {length}, {size})"
             )
-        if self._autocast is not None and not np.isfinite(action).all():
-            self._log.warning(
-                "%s: %s overflows %s for zero inputs; bfloat16 and float32 have a larger range",
-                self._checkpoint.path,
-                self._checkpoint.type,
-                self._autocast,
-            )
+        hint = f" ({self._autocast}; bfloat16 and float32 have a larger range)" if self._autocast is not None else ""
+        check_finite(f"{self._checkpoint.path}: infer of its first run{hint}", {ACTION: action})
+        return action
 
     def predict(self, batch: Sequence[Tensors]) -> list[NDArray[np.float32]]:
         """Compute the chunks of requests whose tensors have equal names and shapes; each has shape (1, N, A).
@@ -188,6 +186,9 @@ class PolicyModel:
                 policy.init_rtc_processor()
         except Exception as error:
             raise PolicyError(f"{path}: LeRobot cannot load it: {error}") from error
+        for name, tensor in policy.named_parameters():
+            if not torch.isfinite(tensor).all():
+                raise PolicyError(f"{path}: the weights {name} have values that are not finite, such as NaN")
         policy.to(self._device, torch.float32 if options.dtype == "float32" else None)
         return policy.eval()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, PictureCodec, Policy, PolicyError, PolicySpec, Tensors
-from ibrobot_core.app import check_tensors
+from ibrobot_core.app import check_finite, check_tensors
 from ibrobot_lerobot.checkpoint import ACTION, POSTPROCESSOR, PREPROCESSOR, check_weights, hash_weights, read_checkpoint
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.steps import read_steps
@@ -60,6 +61,14 @@ class LeRobotPolicy(Policy):
             steps = "; ".join(f"{file}: {', '.join(names)}" for file, names in others.items() if names)
             ctx.log.info("%s has steps that only LeRobot runs, so this process loads torch (%s)", options.path, steps)
             self._lerobot = _import("pipeline").LeRobotSteps(checkpoint)
+        for step in self._pre.normalising:
+            for key in step.modes.keys() - {ACTION}:
+                if constant := step.constant(key):
+                    ctx.log.warning(
+                        "%s: %s: elements %s never changed in the training data; other values become huge "
+                        "for the network",
+                        *(options.path, key, ", ".join(map(str, constant))),
+                    )
         self._pictures: tuple[str, ...] = () if self._pre.others else _pictures(self.spec)
         """Observations that `infer` normalises."""
         self._model: PolicyModel | None = None
@@ -77,8 +86,9 @@ class LeRobotPolicy(Policy):
         self.check_weights()
         weights = hash_weights(self._options.path)
         model = _import("model").PolicyModel(self._checkpoint, self._options, self._pre, self._pictures, self._ctx.log)
-        tensors = self.preprocess(self._zeros())
-        model.warm_up(tensors)
+        tensors = self.preprocess(self._typical())
+        actions = self.postprocess({ACTION: model.warm_up(tensors)})
+        check_finite(f"{self._options.path}: postprocess of its first run", {ACTION: actions})
         # The length of a text, and the output of LeRobot's own steps for it, are not known in advance.
         self._expected = {
             name: (array.dtype, (-1,) * array.ndim if self._pre.others and name != SEED else array.shape)
@@ -194,12 +204,18 @@ class LeRobotPolicy(Policy):
             return self._lerobot.preprocess(batch, prompt, self._ctx.robot.robot_type)
         return self._pre(batch)
 
-    def _zeros(self) -> Frame:
-        """A frame of zeros with the right shapes, for the warm-up."""
+    def _typical(self) -> Frame:
+        """A frame from the middle of the training data, with black images, for the first run."""
         values: dict[str, NDArray[np.generic]] = {
             key: np.zeros(shape, np.uint8 if len(shape) == 3 else np.float32)
             for key, shape in self.spec.observations.items()
         }
+        names = self._checkpoint.names
+        for step in self._pre.normalising:
+            for key, shape in self.spec.observations.items():
+                if len(shape) < 3 and names[key] in step.modes:
+                    middle = np.ravel(step.middle(names[key]))[: math.prod(shape)]  # without padding
+                    values[key] = middle.reshape(shape).astype(np.float32)
         return Frame(0, values, prompt="warm up" if self.spec.prompt else "")
 
 

@@ -11,6 +11,8 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from ibrobot_lerobot.checkpoint import read_checkpoint
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import LeRobotPolicy
@@ -273,6 +275,131 @@ def test_weights_are_compared_with_the_configuration_without_torch(tmp_path: Pat
     else:
         with pytest.raises(PolicyError, match=r"safetensors: actions have 7 values, but config.json says 6"):
             policy.check_weights()
+
+
+def rewrite(path: Path, file: str, statistics: dict[str, Any]) -> None:
+    save_file(statistics, path / f"policy_{file}.safetensors")
+
+
+def renamed(statistics: dict[str, Any], key: str) -> dict[str, Any]:
+    """Statistics of one feature under the key of a data set, as in a public base model."""
+    return {f"so100.buffer.{name}" if name.startswith(f"{key}.") else name: value for name, value in statistics.items()}
+
+
+@pytest.mark.parametrize(
+    ("file", "key"),
+    [("preprocessor", STATE), ("preprocessor", TOP), ("preprocessor", "action"), ("postprocessor", "action")],
+)
+def test_statistics_that_do_not_cover_a_feature_are_refused_with_the_keys_of_both_sides(
+    tmp_path: Path, file: str, key: str
+) -> None:
+    path = write(tmp_path / "act")
+    without = {name: value for name, value in STATISTICS.items() if not name.startswith(f"{key}.")}
+    for statistics in (renamed(STATISTICS, key), without):
+        rewrite(path, file, statistics)
+        with pytest.raises(PolicyError) as found:
+            make(path)
+        assert f"policy_{file}.safetensors: has no statistics of {key}, which M" in str(found.value)
+        assert f"the policy's features: {STATE}, {TOP}, action" in str(found.value)
+        if statistics is not without:
+            assert f"so100.buffer.{key}" in str(found.value)
+
+
+@pytest.mark.parametrize("file", ["preprocessor", "postprocessor"])
+def test_processor_without_its_normalisation_is_refused(tmp_path: Path, file: str) -> None:
+    path = write(tmp_path / "act", normalization_mapping=MODES)
+    make(path)
+    document = json.loads((path / f"policy_{file}.json").read_text())
+    document["steps"].pop()
+    (path / f"policy_{file}.json").write_text(json.dumps(document))
+    with pytest.raises(
+        PolicyError, match=r"no step normalises action, but normalization_mapping in config.json says AC"
+    ):
+        make(path)
+
+
+def test_action_is_unnormalised_if_the_step_does_not_list_it(tmp_path: Path) -> None:
+    """As in LeRobot, whose step takes every action."""
+    path = write(tmp_path / "act")
+    file = path / "policy_postprocessor.json"
+    document = json.loads(file.read_text())
+    del document["steps"][-1]["config"]["features"]["action"]
+    file.write_text(json.dumps(document))
+    actions = make(path).postprocess({"action": np.ones((1, 10, 6), np.float32)})
+    np.testing.assert_allclose(actions, np.tile(2 + np.arange(6), (10, 1)))
+
+
+def test_elements_that_never_changed_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    make(write(tmp_path / "act"))
+    assert f"{STATE}: elements 5 never changed in the training data" in caplog.text
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.data())
+def test_no_checkpoint_passes_normalised_numbers_on(whole: Path, data: st.DataObject) -> None:
+    """300 statistics and steps: keys renamed or lost, sizes, NaN, infinity, swapped ends, no width, or nothing."""
+    file, key = data.draw(st.sampled_from((("pre", STATE), ("pre", TOP), ("pre", "action"), ("post", "action"))))
+    mode = data.draw(st.sampled_from(("MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10")))
+    kinds = dict.fromkeys(MODES, "MEAN_STD") | {FEATURES[key]["type"]: mode}
+    names = {"MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99")}.get(
+        mode, ("q10", "q90")
+    )
+    size = 3 if key == TOP else 6
+    good = {f"{each}.{name}": np.ones(3 if each == TOP else 6) for each in FEATURES for name in ("mean", "std")}
+    good |= {f"{key}.{names[0]}": np.zeros(size), f"{key}.{names[1]}": np.ones(size)}
+    statistics = {name: value.astype(np.float32) for name, value in good.items()}
+    first, second = (f"{key}.{name}" for name in names)
+    spoil = data.draw(st.sampled_from(("none", "key", "lost", "size", "number", "swapped", "flat")))
+    which, element = data.draw(st.sampled_from((first, second))), data.draw(st.integers(0, size - 1))
+    if spoil == "key":
+        prefix = data.draw(st.sampled_from(("so100.buffer.", "x", "observation.", "normalize_inputs.buffer_")))
+        statistics = {f"{prefix}{name}" if name.startswith(key) else name: value for name, value in statistics.items()}
+    elif spoil == "lost":
+        del statistics[which]
+    elif spoil == "size":
+        statistics[which] = np.ones(data.draw(st.sampled_from((1, 2, 5, 7))), np.float32)
+    elif spoil == "number":
+        statistics[which][element] = data.draw(st.sampled_from((np.nan, np.inf, -np.inf)))
+    elif spoil == "swapped":
+        statistics[second][element] = -1.0
+    elif spoil == "flat":
+        statistics[second] = np.zeros_like(statistics[first])
+    document = json.loads((whole / f"policy_{file}processor.json").read_text())
+    document["steps"][-1]["config"]["norm_map"] = kinds
+    (whole / f"policy_{file}processor.json").write_text(json.dumps(document))
+    rewrite(whole, f"{file}processor", statistics)
+    try:
+        policy = make(whole)
+    except PolicyError:
+        assert spoil != "none"
+        return
+    finally:
+        for each in ("pre", "post"):
+            rewrite(whole, f"{each}processor", good_statistics())
+            _with_modes(whole / f"policy_{each}processor.json")
+    assert spoil == "none"
+    assert key in (policy._pre if file == "pre" else policy._post).normalising[0].modes
+
+
+def good_statistics() -> dict[str, Any]:
+    return {
+        f"{each}.{name}": np.ones(3 if each == TOP else 6, np.float32) for each in FEATURES for name in ("mean", "std")
+    }
+
+
+def _with_modes(path: Path) -> None:
+    document = json.loads(path.read_text())
+    document["steps"][-1]["config"]["norm_map"] = dict.fromkeys(MODES, "MEAN_STD")
+    path.write_text(json.dumps(document))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = write(tmp_path_factory.mktemp("checkpoints") / "act")
+    for each in ("pre", "post"):
+        rewrite(path, f"{each}processor", good_statistics())
+        _with_modes(path / f"policy_{each}processor.json")
+    return path
 
 
 @pytest.mark.parametrize(

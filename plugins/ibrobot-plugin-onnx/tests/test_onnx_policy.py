@@ -205,6 +205,28 @@ def test_denoising_is_the_linear_steps_of_the_manifest(tmp_path: Path) -> None:
     np.testing.assert_allclose(chunk(policy, seen), expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("changes", [{}, {"history": 2}, {"noise": NOISE}])
+def test_graph_with_weights_that_are_not_finite_does_not_load(tmp_path: Path, value: float, changes: Any) -> None:
+    folder = exported(tmp_path / "exported", **changes)
+    graph = onnx.load(folder / "policy.onnx")
+    for each in graph.graph.initializer:
+        if each.name == "zeros":
+            weights = np.array(numpy_helper.to_array(each))
+            weights.flat[0] = value
+            each.CopyFrom(numpy_helper.from_array(weights, "zeros"))
+    onnx.save(graph, str(folder / "policy.onnx"))
+    said = r"exported: infer of its first run: action\[0, 0\] is -?(nan|inf), must be finite"
+    with pytest.raises(PolicyError, match=said):
+        loaded(folder)
+
+
+def test_scale_that_overflows_does_not_load(tmp_path: Path) -> None:
+    folder = exported(tmp_path / "exported", scale=[1.7e308] * SIZE, offset=[1.7e308] * SIZE, noise=NOISE)
+    with pytest.raises(PolicyError, match="postprocess of its first run"):
+        loaded(folder)
+
+
 def test_noise_depends_on_the_seed_and_the_tick(tmp_path: Path) -> None:
     policy = loaded(exported(tmp_path / "exported", noise=NOISE))
     policy.reset(1)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Frame, Policy, PolicyError
+from ibrobot_core.app import check_finite
 
 
 class ClientModel:
@@ -63,13 +64,20 @@ class ClientModel:
             prompt: the task.
 
         Raises:
-            PolicyError: if an observation is missing, unknown, or has a wrong dtype or shape.
+            PolicyError: if an observation is missing, unknown, or has a wrong dtype or shape, or if a number is not
+                finite, from the request to the actions; names the stage.
         """
         begun_s = time.perf_counter()
         frame = _frame(values, prompt, self.policy)
+        check_finite("the request", frame.values)
         with self._turn:
             tensors = self.policy.preprocess(frame)
-            actions = self.policy.postprocess(self.policy.infer(tensors)).astype(np.float32)
+            check_finite("the policy's preprocess", tensors)
+            outputs = self.policy.infer(tensors)
+            check_finite("the policy's infer", outputs)
+            with np.errstate(over="ignore"):  # the check names it
+                actions = self.policy.postprocess(outputs).astype(np.float32)
+        check_finite("the policy's postprocess", {"actions": actions})
         self.answered += 1
         return actions, (time.perf_counter() - begun_s) * 1e3
 

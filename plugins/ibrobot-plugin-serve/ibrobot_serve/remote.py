@@ -211,8 +211,9 @@ class RemoteEngine(Engine):
                 f"expected request {request_id} with policy {session.fingerprint!r}"
             )
         for tensor, array in answer.tensors.items():
-            if np.isnan(array).any():
-                raise _OtherServerError(f"the server of {self._model} answered with NaN in {tensor!r}")
+            if not np.isfinite(array).all():
+                value = "NaN" if np.isnan(array).any() else "infinity"
+                raise _OtherServerError(f"the server of {self._model} answered with {value} in {tensor!r}")
         self.stats.queue_ms = min(answer.queued_ns / 1e6, answer.latency_ms)
         self.stats.model_ms = answer.latency_ms - self.stats.queue_ms
         return answer.tensors

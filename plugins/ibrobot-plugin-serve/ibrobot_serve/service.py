@@ -18,7 +18,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, Payload, PictureCodec, Policy, PolicyError, Tensors, Transport
-from ibrobot_core.app import WireError, copied_tensors
+from ibrobot_core.app import WireError, check_finite, copied_tensors
 from ibrobot_serve.fair_queue import FairQueue
 from ibrobot_serve.pacing import Pacing
 from ibrobot_serve.wire import (
@@ -288,6 +288,10 @@ class InferenceService:
         return ""
 
     def _wait_for(self, message: WireMessage, arrived_ns: int) -> _Outcome:
+        try:
+            check_finite("the request", message.tensors)
+        except PolicyError as error:
+            return _Outcome(None, str(error))
         patience_ns = min(message.deadline_ns, round(_LONGEST_WAIT_S * NS_PER_S))
         ticket = _Ticket(message, arrived_ns, arrived_ns + patience_ns)
         self._pacing.ask(message.robot, arrived_ns)
@@ -315,8 +319,9 @@ class InferenceService:
         error, reply = outcome.error, None
         if outcome.outputs is not None:
             try:
+                check_finite("infer", outcome.outputs)
                 reply = encoded(WireKind.ANSWER, outcome.outputs)
-            except WireError as invalid:
+            except (PolicyError, WireError) as invalid:
                 error = f"the policy's outputs: {invalid}"
         with self._lock:
             for counts in (self._all, self._counts(message.robot)):

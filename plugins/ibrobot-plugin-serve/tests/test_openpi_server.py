@@ -83,6 +83,28 @@ def test_damaged_requests_harm_no_other(server: OpenpiServer) -> None:
     assert last["actions"].shape == (10, 6)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("stage", ["request", "preprocess", "infer", "postprocess"])
+def test_numbers_that_are_not_finite_are_errors_of_their_stage(
+    server: OpenpiServer, model: ClientModel, monkeypatch: pytest.MonkeyPatch, stage: str, value: float
+) -> None:
+    def spoiled(result: Any) -> Any:
+        if isinstance(result, dict):
+            return {name: spoiled(array) for name, array in result.items()}
+        return np.where(np.arange(result.size).reshape(result.shape) == 1, value, result)
+
+    state = np.zeros(6)
+    if stage == "request":
+        state[2] = value
+    else:
+        step = getattr(model.policy, stage)
+        monkeypatch.setattr(model.policy, stage, lambda *arguments: spoiled(step(*arguments)))
+    answer = asked(server, {STATE: state})[1]
+    assert answer.startswith("the request: " if stage == "request" else f"the policy's {stage}: ")
+    assert answer.endswith(f"is {value}, must be finite")
+    assert (model.answered, model.failed) == (0, 1)
+
+
 @pytest.mark.usefixtures("broken")
 def test_a_fault_of_the_policy_is_answered_by_a_text(server: OpenpiServer) -> None:
     assert asked(server, {STATE: np.zeros(6)})[1] == "ZeroDivisionError: not today"

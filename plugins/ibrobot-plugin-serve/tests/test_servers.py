@@ -306,10 +306,11 @@ def encoded(request: WireMessage, **changes: Any) -> Payload:
         (lambda request: encoded(request, fingerprint="0ther"), "answered request 1 with policy '0ther'"),
         (lambda request: encoded(request, id=request.id + 1), "answered request 2"),
         (lambda request: encoded(request, tensors={"twice": np.array([np.nan])}), "answered with NaN in 'twice'"),
+        (lambda request: encoded(request, tensors={"twice": np.array([np.inf])}), "answered with infinity in 'twice'"),
         (lambda request: b"nonsense", "8 bytes; a frame has"),
         (lambda request: encoded(request, kind=WireKind.REFUSAL, tensors={}, text="go away"), "go away"),
     ],
-    ids=["other weights than claimed", "another request's answer", "NaN", "nonsense", "refusal"],
+    ids=["other weights than claimed", "another request's answer", "NaN", "infinity", "nonsense", "refusal"],
 )
 def test_robot_leaves_a_server_that_answers_wrongly(
     fleet: Fleet, caplog: pytest.LogCaptureFixture, answer: Callable[[WireMessage], Payload], said: str

@@ -65,7 +65,7 @@ class Net(FakePolicy):
 
     @override
     def infer(self, tensors: Tensors) -> Tensors:
-        return {"twice": tensors["x"] * 2}
+        return {"twice": np.where(tensors["x"] == 17, np.inf, tensors["x"] * 2)}
 
     @override
     def infer_batch(self, batch: Any) -> list[Tensors]:
@@ -259,6 +259,16 @@ def test_faulty_request_does_not_fail_its_batch(caplog: pytest.LogCaptureFixture
         assert [outputs(futures[0]), outputs(futures[2])] == [[2], [6]]
         assert failure(futures[1]) == "ValueError: thirteen"
         assert "ValueError: thirteen" in caplog.text
+
+
+def test_number_that_is_not_finite_fails_only_its_request():
+    with served() as cloud:
+        assert failure(cloud.ask("a", np.nan)) == "the request: x[0] is nan, must be finite"
+        cloud.busy()
+        futures = [cloud.asked("b", 1), cloud.asked("c", 17)]
+        cloud.policy.gate.release(10)
+        assert outputs(futures[0]) == [2]
+        assert failure(futures[1]) == "the policy's outputs: infer: twice[0] is inf, must be finite"
 
 
 def test_expired_work_is_not_begun():

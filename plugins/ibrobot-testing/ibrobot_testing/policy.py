@@ -93,6 +93,18 @@ class PolicySuite(Suite[Policy]):
                 with pytest.raises(PolicyError, match=key):
                     policy.preprocess(attrs.evolve(whole, values=values, missing=frozenset({key})))
 
+    def test_an_observation_that_is_not_finite_is_refused(self) -> None:
+        """NaN or infinity in any vector is a PolicyError that names the key."""
+        with self.loaded() as (policy, ctx):
+            whole = self.frame(policy, ctx, 1)
+            for key in policy.spec.observations:
+                if whole.values[key].dtype.kind == "f":
+                    for value in (np.nan, np.inf):
+                        spoiled = np.array(whole.values[key])
+                        spoiled.flat[-1] = value
+                        with pytest.raises(PolicyError, match=key):
+                            policy.preprocess(attrs.evolve(whole, values={**whole.values, key: spoiled}))
+
     def test_a_history_of_any_length_is_taken(self) -> None:
         """A policy with `history` returns valid chunks at an episode's first tick and soon after."""
         with self.loaded() as (policy, ctx):

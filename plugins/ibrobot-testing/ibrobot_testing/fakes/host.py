@@ -20,7 +20,6 @@ from ibrobot_core.api import (
     OperatorEvent,
     PlanningError,
     Policy,
-    PolicyError,
     PolicySpec,
     Sensor,
     SensorError,
@@ -152,10 +151,8 @@ class FakePolicy(Policy):
 
     @override
     def preprocess(self, frame: Frame) -> Tensors:
-        for key in self.spec.observations:
-            if key not in frame.values:
-                raise PolicyError(f"the frame lacks {key}")
-        return {"state": frame.values["observation.state"].astype(np.float64), "goal": self._goal}
+        seen = {key: frame.observation(key, shape) for key, shape in self.spec.observations.items()}
+        return {"state": seen["observation.state"].astype(np.float64), "goal": self._goal}
 
     @override
     def infer(self, tensors: Tensors) -> Tensors:
