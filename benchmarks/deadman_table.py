@@ -90,6 +90,9 @@ class Person(ABC):
     def rest(self) -> None:
         """One tick with the deadman released."""
 
+    def freeze(self) -> None:
+        """Have the device send nothing more; by default that takes nothing."""
+
     def unplug(self) -> None:
         """Remove the device."""
 
@@ -268,9 +271,18 @@ class _Leader(Keyboard):
     def rest(self) -> None:
         self._turn()
 
+    def tick(self) -> None:
+        """Time passes."""
+        self._line.now_s += 0.01
+
+    def place(self, value: float) -> None:
+        """Have the first servo say that it is far away, on the side of a number's sign."""
+        with self._emulator.lock:
+            self._emulator.servos[1].turn(3300 if value > 0 else 800)
+
     def _turn(self) -> None:
         """The hand moves the leader on, to and fro."""
-        self._line.now_s += 0.01
+        self.tick()
         with self._emulator.lock:
             servo = self._emulator.servos[1]
             if not 1500 < servo.encoder + self._way < 2600:
@@ -283,8 +295,10 @@ class _Leader(Keyboard):
             self._emulator.faults.silent.update(self._emulator.servos)
 
     @override
-    def unplug(self) -> None:
+    def freeze(self) -> None:
         self._silence(True)
+
+    unplug = freeze
 
     @override
     def replug(self) -> None:

@@ -42,12 +42,12 @@ class JogArm:
         self._now_ns = 0
         """The sum of the steps in which the tool moved [ns]."""
 
-    def load_model(self, remedy: str, bus: Bus | None = None) -> None:
+    def load_model(self, remedy: str, bus: Bus | None) -> None:
         """Load the model that `move_tool` needs.
 
         Args:
             remedy: the setting that needs no model, for the error, e.g. `cartesian: false`.
-            bus: the bus of the run; the tool slows down near obstacles of its world.
+            bus: the bus of the run; the tool slows down near obstacles of its world. None without a run.
 
         Raises:
             TeleopError: if the robot has no model of its arm, or one that does not fit.

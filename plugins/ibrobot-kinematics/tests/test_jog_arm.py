@@ -24,7 +24,7 @@ def arm_of(directory: Path) -> JogArm:
     joints = tuple(Joint(name, -1.6, 1.6, max_velocity=3.0, max_acceleration=20.0) for name in FIVE)
     description = Description(mjcf=write_arm(directory, *FIVE), tip="tool")
     arm = JogArm(Robot("five", joints, groups={"gripper": ("gripper",)}, description=description), "gripper")
-    arm.load_model("tool: false")
+    arm.load_model("tool: false", None)
     return arm
 
 
@@ -43,7 +43,7 @@ def test_joints_that_are_not_the_grippers_are_the_arms():
 def test_tool_needs_a_model():
     arm = JogArm(make_robot(), "gripper")
     with pytest.raises(TeleopError, match=r"needs robot\.description\.mjcf: set it, or tool: false$"):
-        arm.load_model("tool: false")
+        arm.load_model("tool: false", None)
     with pytest.raises(TeleopError, match="call load_model before move_tool"):
         arm.move_tool(STILL, np.ones(3), np.zeros(3), DT)
 

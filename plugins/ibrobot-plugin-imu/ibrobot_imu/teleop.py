@@ -54,7 +54,7 @@ class ImuTeleop(Teleop):
                 f"{name}: deadman: key needs a terminal: start ibrobot in one, without --headless and without "
                 "redirecting its input, or wire a button to the port and set deadman: cts"
             )
-        self._arm.load_model("another type of device")
+        self._arm.load_model("another type of device", self._ctx.bus)
         try:
             port = serial.Serial(options.port, options.rate, timeout=0, exclusive=True)
         except (serial.SerialException, ValueError) as error:

@@ -95,7 +95,7 @@ class WebTeleop(Teleop):
         if self._connected:
             return
         if self._tool:
-            self._arm.load_model("robot.description.mjcf")
+            self._arm.load_model("robot.description.mjcf", self._ctx.bus)
         with _opening:
             devices = _devices.setdefault(self._ctx.bus, {})
             if not devices:

@@ -6,7 +6,7 @@ import math
 from typing import override
 
 import numpy as np
-from ibrobot_kinematics import KinematicsError, Servo, TipPose, robot_model
+from ibrobot_kinematics import KinematicsError, Servo, TipPose, robot_model, world_clearance
 from ibrobot_kinematics.rotations import exp, log
 
 from ibrobot_core.api import (
@@ -20,6 +20,7 @@ from ibrobot_core.api import (
     Vector,
     seconds,
 )
+from ibrobot_core.app import Bus
 from ibrobot_webxr.exchange import Inbox, Sample
 from ibrobot_webxr.hand import HandMotion
 from ibrobot_webxr.options import HANDS, WebxrOptions
@@ -78,7 +79,7 @@ class WebxrTeleop(Teleop):
     @override
     def connect(self) -> None:
         if self._page is None:
-            self._tool.load(self._ctx.name)
+            self._tool.load(self._ctx.name, self._ctx.bus)
             self._page = open_page(self._options, self._ctx)
             self._inbox = self._page.exchange.join(self._hands)
             self._restart()
@@ -245,8 +246,8 @@ class _Tool:
         self.joints = joints
         self.motion = HandMotion(options)
 
-    def load(self, device: str) -> None:
-        """Load the model of the arm.
+    def load(self, device: str, bus: Bus | None) -> None:
+        """Load the model of the arm. The tool slows down near obstacles of the world of a run with this bus.
 
         Raises:
             TeleopError: if the robot has none, or it does not fit.
@@ -261,7 +262,7 @@ class _Tool:
         self._is_full = len(model.moving) >= _FULL
         max_acceleration = robot.max_acceleration[self._indices]
         max_velocity = np.minimum(robot.max_velocity[self._indices], _STOP_S * max_acceleration)
-        self._servo = Servo(model, max_velocity, max_acceleration)
+        self._servo = Servo(model, max_velocity, max_acceleration, clearance=world_clearance(bus, self.joints))
 
     def engage(self, position: Vector, sample: Sample) -> None:
         """Start at positions of the joints [rad], with the hand at a sample."""

@@ -1,0 +1,337 @@
+"""The table of entrances to motion in `docs/explanation/safety.md`: it lists all that there are, and each cell is true.
+
+The page is the source: what a cell says is what its check measures. Cells that need what tests here do not have (ROS, a
+browser, LeRobot) name the test that has it.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import deadman_table
+import entrances
+import numpy as np
+import pytest
+from entrance_table import COLUMNS, read_table
+from entrances import CAGE, FAR, WALL, Entrance, Operated
+from ibrobot_testing.site import made_up_site
+
+pytestmark = pytest.mark.integration
+
+ROOT = Path(__file__).parents[2]
+NUMBERS = (np.nan, np.inf, -np.inf, 1e308, -1e308)
+_STILL_RAD = 2e-3
+
+
+TABLE = read_table()
+CELLS = [(each, column, row.cells[column]) for row in TABLE for each in row.names for column in COLUMNS]
+
+
+ADAPTERS: Mapping[str, Callable[[], Entrance]] = {
+    "/planning/go_to": entrances.GoTo,
+    "/move_action": entrances.MoveAction,
+    "/moveit_gateway/move_to_pose": entrances.MoveToPose,
+    "/moveit_gateway/move_to_configuration": entrances.MoveToConfiguration,
+    "/execute_trajectory": entrances.Execute,
+    "/cmd_pose": entrances.CmdPose,
+    "/task/run": entrances.Task,
+    "FollowJointTrajectory": entrances.FollowJointTrajectory,
+    "GripperCommand": entrances.GripperCommand,
+    "ParallelGripperCommand": entrances.ParallelGripperCommand,
+    "lerobot-robot-ibrobot": entrances.Program,
+    "ibrobot-gym": entrances.Gym,
+    "engine monolithic": entrances.Policy,
+    "ibrobot replay": entrances.Replay,
+    "engine process": entrances.PolicyInProcess,
+    "teleop cmd_vel": entrances.CmdVel,
+    "teleop gamepad": lambda: Operated(deadman_table.Xbox()),
+    "teleop imu": lambda: Operated(deadman_table.Imu()),
+    "teleop keyboard": lambda: Operated(deadman_table.KittyKeyboard()),
+    "teleop lerobot": lambda: entrances.LeRobotLeader(_folder()),
+    "teleop so101_leader": lambda: entrances.Leader(deadman_table.LeaderHold(_folder())),
+    "teleop spacemouse": lambda: Operated(deadman_table.SpaceMouse()),
+    "teleop twist": entrances.Twists,
+    "teleop web": entrances.OperatedPage,
+    "teleop webxr": entrances.OperatedHeadset,
+    "page jog": entrances.OperatedPage,
+    "/web_teleop/jog": entrances.OperatedPage,
+    "source planner": entrances.GoTo,
+    "page goal": entrances.PageGoal,
+    "page mode": entrances.PageMode,
+    "/set_mode": entrances.SetMode,
+    "/reset": entrances.Reset,
+}
+"""Entrance -> who uses it."""
+
+
+_CORRECTIONS = "plugins/ibrobot-plugin-data/tests/test_corrections.py"
+_LOST = f"{_CORRECTIONS}::test_a_lost_device_is_a_fault_and_a_reset_gives_the_policy_the_robot"
+_SERVER = "plugins/ibrobot-plugin-serve/tests/test_distributed.py"
+_PAGE = (
+    "plugins/ibrobot-plugin-web/tests/test_commands.py::"
+    "test_what_was_sent_before_a_stop_and_arrives_after_it_is_refused"
+)
+_ALIKE = f"{_SERVER}::test_every_execution_mode_moves_alike"
+_GONE = f"{_SERVER}::test_the_arm_holds_while_the_server_is_gone_and_goes_on_when_it_is_back"
+ELSEWHERE: Mapping[tuple[str, str], str] = {
+    ("page reset", "older"): _PAGE,
+    ("page intervene", "older"): _PAGE,
+    **{(name, "STOP"): _LOST for name in ("source intervene", "page intervene", "/intervene")},
+    ("engine distributed", "world"): _ALIKE,
+    ("engine distributed", "numbers"): _ALIKE,
+    ("engine distributed", "STOP"): _ALIKE,
+    ("engine distributed", "silence"): _GONE,
+    ("engine distributed", "caller dies"): _GONE,
+    ("ibrobot replay", "numbers"): (
+        "plugins/ibrobot-plugin-data/tests/test_playback.py::test_a_command_that_is_not_finite_is_refused"
+    ),
+    ("control.startup", "STOP"): "tests/control/test_core_startup.py::test_a_stop_on_the_way_ends_it",
+    ("control.stop", "STOP"): "tests/control/test_core_stops.py::test_nothing_moves_the_robot_any_more",
+    ("control.load_shedding", "STOP"): (
+        "tests/control/test_health.py::"
+        "test_on_the_way_an_emergency_stop_brakes_and_holds_until_the_load_has_had_its_time_again"
+    ),
+}
+"""Cells whose entrance cannot be here -> the test that has it, which needs a server, a page, or more of control."""
+PENDING = frozenset(
+    {
+        "/cmd_pose-time", "/execute_trajectory-numbers", "FollowJointTrajectory-numbers", "FollowJointTrajectory-world",
+        "FollowJointTrajectory-time", "engine monolithic-caller dies", "engine monolithic-numbers",
+        "engine monolithic-silence", "engine process-caller dies", "engine process-numbers", "engine process-silence",
+        "ibrobot replay-silence", "ibrobot-gym-caller dies", "ibrobot-gym-silence", "lerobot-robot-ibrobot-silence",
+        "teleop cmd_vel-time", "teleop lerobot-numbers",
+    }
+)  # fmt: skip
+"""Cells that are not true yet."""
+TOOLS: Mapping[str, Callable[[], Entrance]] = {
+    "teleop gamepad": lambda: Operated(entrances.ToolPad()),
+    "teleop keyboard": lambda: Operated(entrances.ToolKeys()),
+    "teleop spacemouse": lambda: Operated(entrances.ToolMouse()),
+}
+"""Entrance that moves joints or the tool -> one that moves the tool."""
+
+
+def _folder() -> Path:
+    """A new folder, for the files of a device."""
+    return Path(tempfile.mkdtemp())
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The made-up policy is installed."""
+    folder = tmp_path_factory.mktemp("entrances") / "site"
+    with pytest.MonkeyPatch.context() as patch, made_up_site(folder, entrances.PLUGINS, patch) as site:
+        site.add("far-policy", "far_policy.py")
+        yield
+
+
+def ask_once(entrance: Entrance, ticks: int) -> None:
+    """Ask for the far place, and let time pass."""
+    if entrance.streams:
+        entrance.run.ticks(ticks, entrance.ask)
+    else:
+        entrance.run.ticks(1, entrance.ask)
+        entrance.run.ticks(ticks - 1)
+
+
+def gets_going(entrance: Entrance, most: int = 100) -> None:
+    """Ask, until the robot moves fast."""
+    run = entrance.run
+    entrance.prepare()
+    for i in range(most):
+        run.ticks(1, entrance.ask if entrance.streams or not i else lambda: None)
+        if run.moved(len(run.commands) - 1) > 0.005:
+            return
+    pytest.fail("the entrance does not move the robot")
+
+
+def seconds(cell: str) -> float:
+    """The time in a cell [s]."""
+    found = re.fullmatch(r"([\d.]+) s", cell)
+    assert found, f"{cell!r} is no time in seconds"
+    return float(found[1])
+
+
+def ways(make: Callable[[], Entrance], ask: Callable[[Entrance], Callable[[], object]]) -> list[float]:
+    """How far the robot is moved without and with walls around the tool [rad]."""
+    found = []
+    for walls in ((), (CAGE,)):
+        entrance = make()
+        try:
+            run = entrance.launch(*walls)
+            entrance.prepare()
+            begun = len(run.commands)
+            run.ticks(150, ask(entrance) if entrance.streams else lambda: None)
+            found.append(run.moved(begun))
+        finally:
+            entrance.close()
+    return found
+
+
+def check_unchecked(make: Callable[[], Entrance]) -> None:
+    """Walls make no difference."""
+    free, caged = ways(make, lambda entrance: entrance.ask)
+    assert caged == pytest.approx(free)
+    assert free > 0.1
+
+
+def check_tool(name: str) -> None:
+    """Walls slow the tool down."""
+    free, caged = ways(TOOLS.get(name, ADAPTERS[name]), lambda entrance: entrance.ask_tool)
+    assert caged < 0.8 * free, "walls make no difference"
+
+
+def check_world(entrance: Entrance, cell: str) -> None:
+    assert cell == "checked"
+    run = entrance.launch(WALL)
+    ask_once(entrance, 200)
+    farthest = max(command[entrance.column] for command in run.commands)
+    assert farthest < FAR - 0.01, f"went to {farthest:.2f} rad, behind the wall from {FAR} rad on"
+
+
+def check_silence(entrance: Entrance, cell: str) -> None:
+    run = entrance.launch()
+    gets_going(entrance)
+    begun = len(run.commands)
+    entrance.silence()
+    run.ticks(300)
+    assert run.rest_s(begun) <= seconds(cell) + entrance.ahead_s + 1e-9
+    run.check_limits()
+
+
+def check_time(entrance: Entrance, cell: str) -> None:
+    assert cell == "refused"
+    run = entrance.launch()
+    run.ticks(100)
+    for off_s in (-3600.0, 3600.0, -31e6, 31e6):
+        entrance.prepare()
+        begun = len(run.commands)
+        run.ticks(40, lambda off_s=off_s: entrance.with_time(off_s))
+        run.ticks(40)
+        assert run.moved(begun) < _STILL_RAD, f"a header {off_s} s off moves the robot"
+    entrance.prepare()
+    begun = len(run.commands)
+    run.ticks(40, lambda: entrance.with_time(0.0))
+    assert run.moved(begun) > _STILL_RAD, "right headers move nothing"
+
+
+def check_numbers(entrance: Entrance, cell: str) -> None:
+    run = entrance.launch()
+    for value in NUMBERS:
+        for i, ask in enumerate(entrance.with_number(value)):
+            if run.session.faults:
+                run.reset()
+            entrance.prepare()
+            begun = len(run.commands)
+            run.ticks(30 if entrance.streams else 1, ask)
+            run.ticks(40)
+            run.check_limits()
+            if cell == "refused" or not np.isfinite(value):
+                assert run.moved(begun) < _STILL_RAD, f"{value} at place {i} moves the robot"
+            assert not run.session.finished.is_set(), f"{value} at place {i} ends the run: {run.session.failure}"
+
+
+def check_stop(entrance: Entrance, cell: str) -> None:
+    run = entrance.launch()
+    gets_going(entrance)
+    if entrance.streams:
+        entrance.ask()  # which waits to be carried out
+    run.stop()
+    begun = len(run.commands)
+    run.ticks(60, entrance.ask)
+    assert run.rest_s(begun) <= 0.15
+    if cell == "run ends":
+        assert run.session.finished.is_set()
+        return
+    run.reset()
+    begun = len(run.commands)
+    run.ticks(200, entrance.ask if cell != "emptied" else lambda: None)
+    assert run.moved(begun) < _STILL_RAD, "it moves after the reset"
+    entrance.again()
+    gets_going(entrance)
+    run.check_limits()
+
+
+def check_older(entrance: Entrance, cell: str) -> None:
+    assert cell == "refused"
+    run = entrance.launch()
+    older = entrance.keep()
+    run.stop()
+    run.ticks(30)
+    run.reset()
+    begun = len(run.commands)
+    run.ticks(1, older)
+    run.ticks(100)
+    assert run.moved(begun) < _STILL_RAD, "a command from before the stop moves the robot"
+    gets_going(entrance)
+
+
+def check_death(entrance: Entrance, cell: str) -> None:
+    run = entrance.launch()
+    gets_going(entrance)
+    begun = len(run.commands)
+    entrance.die()
+    run.ticks(300)
+    if cell == "run ends":
+        assert run.session.finished.is_set()
+        run.runtime.stop()
+        assert run.rest_s(begun) <= 0.15
+        return
+    if cell == "goal ends":
+        assert abs(run.commands[-1][entrance.column] - entrance.far) < 0.05, "the motion is not completed"
+    else:
+        assert run.rest_s(begun) <= seconds(cell) + entrance.ahead_s + 1e-9
+    assert run.moved(len(run.commands) - 10) < _STILL_RAD
+
+
+def check_elsewhere(test: str) -> None:
+    """There is a test of this name."""
+    file, _, name = test.partition("::")
+    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+    assert name in {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+
+
+CHECKS: Mapping[str, Callable[[Entrance, str], None]] = dict(
+    zip(
+        COLUMNS,
+        (check_world, check_silence, check_time, check_numbers, check_stop, check_older, check_death),
+        strict=True,
+    )
+)
+
+
+@pytest.mark.usefixtures("parts")
+@pytest.mark.parametrize(
+    ("name", "column", "cell"),
+    [
+        pytest.param(
+            *cell,
+            id=(name := f"{cell[0]}-{cell[1]}"),
+            marks=[pytest.mark.xfail(reason="not true yet")] if name in PENDING else [],
+        )
+        for cell in CELLS
+        if cell[2] != "-"
+    ],
+)
+def test_cell(name: str, column: str, cell: str, tmp_path: Path) -> None:
+    if (elsewhere := ELSEWHERE.get((name, column))) is not None:
+        check_elsewhere(elsewhere)
+        return None
+    make = ADAPTERS[name]
+    match cell:
+        case "not checked":
+            return check_unchecked(make)
+        case "slows down":
+            return check_tool(name)
+        case "tool only":
+            check_unchecked(make)
+            return check_tool(name)
+    entrance = make()
+    try:
+        CHECKS[column](entrance, cell)
+    finally:
+        entrance.close()
