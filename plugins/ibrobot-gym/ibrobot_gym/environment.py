@@ -196,11 +196,18 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @override
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Command joint positions [rad], shape (A,), and run to the next frame, or to the end of the episode."""
+        """Command joint positions [rad], shape (A,), and run to the next frame, or to the end of the episode.
+
+        Raises:
+            ValueError: for an action that is not finite.
+        """
         session, source = self._session, self._source
         if session is None:
             raise gymnasium.error.ResetNeeded("call reset first")
-        command = np.clip(np.asarray(action, dtype=np.float64), *self._limits)
+        wanted = np.asarray(action, dtype=np.float64)
+        if not np.isfinite(wanted).all():
+            raise ValueError(f"an action must be finite, got {wanted.tolist()}")
+        command = np.clip(wanted, *self._limits)
         before = source.frame
         source.act(command)
         success = truncated = False

@@ -48,6 +48,16 @@ def test_gymnasiums_checker_finds_nothing_with_cameras_and_pictures() -> None:
         assert environment.render().shape == (480, 640, 3)  # type: ignore[union-attr]
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_an_action_that_is_not_finite_is_refused(value: float) -> None:
+    with made("PickCube-v0") as environment:
+        environment.reset(seed=7)
+        action = np.zeros(environment.action_space.shape or (), dtype=np.float32)
+        action[0] = value
+        with pytest.raises(ValueError, match="an action must be finite, got"):
+            environment.step(action)
+
+
 def test_seed_is_that_of_a_run_in_lockstep() -> None:
     with made("PickCube-v0") as environment:
         observation, info = environment.reset(seed=7)

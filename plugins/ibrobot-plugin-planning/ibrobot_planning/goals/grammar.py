@@ -15,6 +15,7 @@ from ibrobot_core.api import PlanningError, Pose, Vector, Vector3, documented, o
 from ibrobot_core.app import JointGoal, LinearGoal, NamedGoal, OrientationPolicy, PlanCode, PoseGoal, PositionGoal
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.world.objects import World
+from ibrobot_planning.world.options import FURTHEST
 
 type Triple = tuple[float, float, float]
 
@@ -78,6 +79,11 @@ class GoalOptions:
             raise ValueError("relative needs xyz, and no object")
         if self.beyond_reach != "refuse" and turned not in (["rpy"], ["quaternion"]):
             raise ValueError("beyond_reach needs an orientation: rpy or quaternion")
+        axis = None if isinstance(self.axis, str) else self.axis
+        numbers = {"xyz": self.xyz, "rpy": self.rpy, "axis": axis, "joints": tuple(self.joints.values())}
+        for name, values in numbers.items():
+            if not all(abs(value) <= FURTHEST for value in values or ()):  # NaN fails it, too
+                raise ValueError(f"{name} must be numbers from -{FURTHEST:g} to {FURTHEST:g}, got {list(values or ())}")
         if self.axis is not None and not isinstance(self.axis, str) and not any(self.axis):
             raise ValueError("axis has no length; give a direction, e.g. down, or 0, 0, -1")
         # Written so that NaN fails it.

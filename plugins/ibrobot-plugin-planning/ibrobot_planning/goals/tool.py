@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
@@ -87,7 +88,7 @@ def pose_matrix(goal: PoseGoal) -> Vector:
     vector(goal.pose.position, "the position")
     q = goal.pose.orientation
     quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
-    length = float(np.linalg.norm(quaternion))
+    length = math.hypot(*quaternion)  # which does not overflow
     # Written so that NaN fails it.
     if not abs(length - 1) <= _NEARLY_ONE:
         raise invalid_goal(f"the orientation of the goal is a quaternion of length {length:.3g}, must be 1")
