@@ -121,6 +121,7 @@ from ibrobot_core.launch.runtime import (
     RESET as RESET,
     Reset as Reset,
     ESTOP as ESTOP,
+    CHECK_ESTOP as CHECK_ESTOP,
 )
 from ibrobot_core.launch.sources.policy import TOGGLE_SMOOTHING as TOGGLE_SMOOTHING
 from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
@@ -190,7 +191,8 @@ from ibrobot_core.reports import (
 from ibrobot_core.child import Child as Child, Channel as Channel, Failure as Failure, open_parent as open_parent
 from ibrobot_core.memory import create_memory as create_memory, set_malloc as set_malloc
 from ibrobot_core.control.realtime import go_real_time as go_real_time
-from ibrobot_core.component import raise_thread_priority as raise_thread_priority
+from ibrobot_core.component import as_failure as as_failure, raise_thread_priority as raise_thread_priority
+from ibrobot_core.launch.pulses import PULSE_S as PULSE_S, Pulse as Pulse
 
 # Errors
 from ibrobot_core.errors import (

@@ -185,8 +185,7 @@ class _Signals:
         if number == signal.SIGHUP:  # the terminal may be closed; writing to it must not fail
             discard(self._terminals)
         if session.finished.is_set() and number == signal.SIGTERM:
-            brake = session.emergency_stop
-            threading.Thread(target=_try, args=(session, brake), name="signal", daemon=True).start()
+            _try(session, session.emergency_stop)
             return
         self.came = True
         session.finish()

@@ -46,6 +46,7 @@ SET_MODE = Service("/set_mode", SetMode, NoneType, "Enter another control mode."
 RESET = Service("/reset", Reset, str, "Clear faults and the emergency stop; answers with what the robot does now.")
 """The service `/reset`."""
 ESTOP = Service("/estop", NoRequest, NoneType, "Stop the robot at once, and hold until a reset.", urgent=True)
+CHECK_ESTOP = Service("/estop/check", NoRequest, NoneType, "Go the way of a stop, and stop nothing.", urgent=True)
 """The service `/estop`."""
 _CHANGE_S = 2.0
 """How long the end of a run waits for a mode switch or reset under way [s]."""
@@ -102,6 +103,7 @@ class Runtime:
         for line in (*absent_models(config.absent_models), *unavailable_modes(config.unavailable)):
             session.log.warning("%s", line)
         session.bus.serve(ESTOP, lambda request: session.emergency_stop())
+        session.bus.serve(CHECK_ESTOP, lambda request: session.check_stop())
         try:
             for component in self.plan.components:
                 if component is self.plan.episodes_worker:
@@ -283,7 +285,8 @@ class Runtime:
         finally:
             if changing:
                 session.changing.release()
-            session.bus.unserve(ESTOP)
+            for service in (ESTOP, CHECK_ESTOP):
+                session.bus.unserve(service)
             self._restore_hook()
 
     def _halt(self) -> None:

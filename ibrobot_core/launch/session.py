@@ -6,6 +6,7 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Hashable, Mapping
+from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +15,12 @@ import numpy as np
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock, RealClock, SteppedClock
-from ibrobot_core.component import error_line
+from ibrobot_core.component import as_failure, error_line
 from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.control.link import ControlState, PlanRecord
-from ibrobot_core.errors import ComponentFailed, MissingDependency
+from ibrobot_core.errors import ComponentFailed, IbrobotError, MissingDependency
 from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent, Teleop
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, by_cause
 from ibrobot_core.launch.episodes import Episodes
@@ -340,11 +341,28 @@ class Session:
         Raises:
             IbrobotError: if control does not confirm it.
         """
-        if self._control is not None and self._control.running:
-            self._control.call("estop")
-        else:
+        if self._control is None or not self._control.running:
             self.finish()
             self.log.error("emergency stop while nothing commands the robot: the run ends")
+            return
+        try:
+            self._control.call("estop")
+        except IbrobotError:
+            raise
+        except BaseException as error:  # e.g. no memory: it may not have been sent, and the next one would not be
+            self.fail("emergency stop", as_failure(error))
+            with suppress(Exception):
+                self._control.call("fault", fault="an emergency stop could not be sent")
+            raise
+
+    def check_stop(self) -> None:
+        """Go the way of `emergency_stop` to control and back, and stop nothing.
+
+        Raises:
+            IbrobotError: if control does not answer.
+        """
+        if self._control is not None and self._control.running:
+            self._control.call("counters")
 
     def command(self, do: str, **arguments: Any) -> Mapping[str, Any]:
         """Execute a command that begins a new generation, e.g. a mode switch, and return control's answer."""

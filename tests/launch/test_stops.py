@@ -13,7 +13,7 @@ import pytest
 
 from ibrobot_core.cli.run import _listen, _Panel
 from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, TeleopError, TransportError
-from ibrobot_core.launch.runtime import ESTOP, RESET, SET_MODE, Runtime
+from ibrobot_core.launch.runtime import CHECK_ESTOP, ESTOP, RESET, SET_MODE, Runtime
 from ibrobot_core.run_hooks import RunHooks
 
 if TYPE_CHECKING:
@@ -95,6 +95,39 @@ class TestReset:
             teleop.reset()
         source: Any = teleop.session.command_source
         assert source.active
+
+
+class TestSending:
+    def test_a_stop_that_cannot_be_sent_makes_the_robot_hold_and_ends_the_run(self, teleop: Runtime, monkeypatch):
+        call = teleop.session.control.call
+
+        def short_of_memory(do: str, **arguments: Any) -> Any:
+            if do == "estop":
+                raise MemoryError
+            return call(do, **arguments)
+
+        monkeypatch.setattr(teleop.session.control, "call", short_of_memory)
+        with pytest.raises(MemoryError):
+            teleop.session.bus.call(ESTOP, None)
+        assert teleop.session.finished.is_set()
+        assert teleop.session.failure is not None
+        assert teleop.session.failure[0] == "emergency stop"
+        steps(teleop, 1)
+        assert "an emergency stop could not be sent" in teleop.session.faults[-1]
+
+    def test_a_refusal_of_control_does_not_end_the_run(self, teleop: Runtime, monkeypatch):
+        monkeypatch.setattr(teleop.session.control, "call", lambda do: (_ for _ in ()).throw(HardwareError("no")))
+        with pytest.raises(HardwareError):
+            teleop.session.emergency_stop()
+        assert not teleop.session.finished.is_set()
+
+    def test_the_check_goes_to_control_and_stops_nothing(self, teleop: Runtime, monkeypatch):
+        teleop.session.bus.call(CHECK_ESTOP, None)
+        assert not is_stopped(teleop)
+        assert teleop.session.stops == 0
+        monkeypatch.setattr(teleop.session.control, "call", lambda do: (_ for _ in ()).throw(ComponentFailed("gone")))
+        with pytest.raises(ComponentFailed):
+            teleop.session.bus.call(CHECK_ESTOP, None)
 
 
 class TestModes:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import logging
+import os
 import socket
 import threading
 import weakref
@@ -131,19 +133,40 @@ class ServerThread:
 class _Door(socket.socket):
     """A listening socket that accepts `most` connections at a time, and ends further ones at once.
 
-    Connections count from their first packet: so do those that never finish their TLS handshake.
+    Connections count from their first packet: so do those that never finish their TLS handshake. A descriptor is kept
+    for one, e.g. one that sends an emergency stop, for when this process may open no more files.
     """
 
-    __slots__ = ("_accepted", "most")
+    __slots__ = ("_accepted", "_spare", "most")
 
     def __init__(self, opened: socket.socket) -> None:
         super().__init__(fileno=opened.detach())
         self.most = _CLIENTS
         self._accepted: weakref.WeakSet[socket.socket] = weakref.WeakSet()
+        self._spare: list[int] = []
+        self._keep_spare()
+
+    def _keep_spare(self) -> None:
+        with contextlib.suppress(OSError):
+            if not self._spare:
+                self._spare.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
+
+    def _give_spare(self) -> bool:
+        """Close the descriptor that is kept; return whether there was one."""
+        if not self._spare:
+            return False
+        os.close(self._spare.pop())
+        return True
 
     @override
     def accept(self) -> tuple[socket.socket, Any]:
-        connection, address = super().accept()
+        self._keep_spare()
+        try:
+            connection, address = super().accept()
+        except OSError as error:
+            if error.errno not in (errno.EMFILE, errno.ENFILE) or not self._give_spare():
+                raise
+            connection, address = super().accept()
         if sum(each.fileno() >= 0 for each in self._accepted) >= self.most:
             connection.close()
             raise ConnectionAbortedError
@@ -152,6 +175,7 @@ class _Door(socket.socket):
 
     def end_all(self) -> None:
         """End all connections: browsers keep theirs open, and a handshake may not have ended."""
+        self._give_spare()
         for connection in self._accepted:
             with contextlib.suppress(OSError):  # it has ended
                 connection.shutdown(socket.SHUT_RDWR)

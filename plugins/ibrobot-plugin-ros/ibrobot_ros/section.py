@@ -5,12 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, override
 
 from ibrobot_ros2.goals import Actions, with_goals
 
 from ibrobot_core.api import DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
-from ibrobot_core.app import CONTROL, Component, ComponentFailed, RunAccess, error_line
+from ibrobot_core.app import CONTROL, Component, ComponentFailed, Pulse, RunAccess, error_line
 from ibrobot_ros.options import RosOptions
 from ibrobot_ros.process import NodeProcess
 from ibrobot_ros.services import Services
@@ -26,6 +27,9 @@ _SILENT_S = 2.0
 """Silence after which the node counts as stopped, and its goals are canceled [s]."""
 _SETUP_S = 10.0
 """Time that a new node has until its first sign of life, in addition [s]."""
+_BLOCKED_S = 6.0
+"""Time without a sign of life of the thread that receives calls after which the run ends [s]; it may wait for control,
+which may take 5 s to answer."""
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 1.0, 30.0
 _STATUS_S = 1.0
 _STOP_S = 5.0
@@ -56,6 +60,7 @@ class RosNode(Component):
         self._ending = threading.Event()
         self._threads: list[threading.Thread] = []
         self._restarts = 0
+        self._pulse = Pulse("calls from ROS", _BLOCKED_S)
         self._trouble = ""
         """What is wrong with the node now; empty while it works."""
         self._pinged_s = self._heard_s = 0.0
@@ -96,6 +101,7 @@ class RosNode(Component):
             thread = threading.Thread(target=work, name=name, daemon=True)
             self._threads.append(thread)
             thread.start()
+        self._session.pulses.add(self._pulse)
 
     @override
     def step(self, now_ns: int) -> None:
@@ -112,6 +118,7 @@ class RosNode(Component):
 
     @override
     def stop(self) -> None:
+        self._session.pulses.discard(self._pulse)
         self._ending.set()
         if self._wire is not None and not self._wire.closed:
             self._wire.wake()
@@ -164,6 +171,7 @@ class RosNode(Component):
         wait_s = _FIRST_WAIT_S
         while not self._ending.is_set():
             wire = self._wire
+            self._pulse.beat()
             if wire is not None and not wire.closed:
                 for head, payload in wire.wait(_GLANCE_S):
                     self._take(wire, head, payload)
@@ -173,9 +181,10 @@ class RosNode(Component):
             else:
                 if self._node is not None:
                     self._lose(self._node.cause(), wait_s)
-                if not self._ending.wait(wait_s):
-                    wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
-                    self._restart()
+                with self._pulse.paused():  # nobody can call without a node
+                    if not self._ending.wait(wait_s):
+                        wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+                        self._restart()
             self._publish_status()
 
     def _watch(self, wire: Wire) -> None:
@@ -223,12 +232,18 @@ class RosNode(Component):
             "matched": lambda: self.topics.take_subscribers(head["topic"], head["subscribers"]),
             "dropped": lambda: self._note_flood(head["topic"], head["count"]),
             "trouble": lambda: self.topics.tell(f"{head['topic']}: {head['what']}"),
-            "goal": lambda: self._services.submit(self._decide, wire, head, self._session.stops),
-            "cancel": lambda: self._services.submit(self._decide, wire, head, self._session.stops),
+            "goal": lambda: self._submit(wire, head),
+            "cancel": lambda: self._submit(wire, head),
             "call": lambda: self._services.take_call(wire, head),
             "pong": lambda: None,
         }  # fmt: skip
         takes[head["op"]]()
+
+    def _submit(self, wire: Wire, head: dict[str, Any]) -> None:
+        """Decide about a goal or a cancel in another thread; refuse it if there is none."""
+        if not self._services.submit(partial(self._decide, wire, head, self._session.stops)):
+            self._session.log.warning("ros: a %s is refused: too many calls wait", head["op"])
+            wire.send({"op": "decided", "goal": head["goal"], "accepted": False})
 
     def _decide(self, wire: Wire, head: dict[str, Any], stops: int) -> None:
         """Answer a goal, or a cancel, which was received after `stops` emergency stops."""

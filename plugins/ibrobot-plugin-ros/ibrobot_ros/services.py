@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+import queue
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
-from ibrobot_ros2.offers import Offer, Offers
+from ibrobot_ros2.offers import TRIGGER, Offer, Offers
+from ibrobot_ros2.workers import StopWay, Workers
 
-from ibrobot_core.app import RunView
+from ibrobot_core.app import CHECK_ESTOP, ESTOP, ComponentFailed, RunView
 from ibrobot_ros.options import RosOptions
 from ibrobot_ros.topics import ros_name
 from ibrobot_ros.wire import Wire
 
 _WORKERS, _URGENT_WORKERS = 16, 2
+_MOST = 1000
+"""Most calls that wait."""
+_CHECK_S = 10.0
+"""Longest wait for the answer to a stop that is only tried out [s]."""
+_CHECK = Offer(TRIGGER, CHECK_ESTOP.name, {})
 
 
 class Services:
@@ -24,22 +31,41 @@ class Services:
         self._found = Offers(session, options.offers, lambda name: ros_name(name, options.namespace))
         self._offers: dict[str, Offer] = {}
         """What the present node offers."""
-        self._pools: dict[bool, ThreadPoolExecutor] = {}
+        self._way = StopWay(session, "services for ROS 2 nodes")
+        self._workers: dict[bool, Workers[Callable[[], object]]] = {}
         """Threads for urgent services, and for others."""
 
     def open(self) -> None:
-        """Begin to answer."""
-        self._pools[False] = ThreadPoolExecutor(_WORKERS, "ros call")
-        self._pools[True] = ThreadPoolExecutor(_URGENT_WORKERS, "ros stop")
+        """Begin to answer, and try out an emergency stop, once.
+
+        Raises:
+            IbrobotError: if it would fail.
+        """
+        self._workers[False] = Workers(lambda work: work(), "ros call", _WORKERS, _MOST)
+        self._workers[True] = Workers(lambda work: work(), "ros stop", _URGENT_WORKERS, way=self._way)
+        self._way.open()
+        answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self.submit(lambda: answers.put(self._found.answer(_CHECK, {})), urgent=True)
+        try:
+            answer = answers.get(timeout=_CHECK_S)
+        except queue.Empty:
+            answer = {"success": False, "message": f"no answer within {_CHECK_S:g} s"}
+        if self._session.bus.serves(ESTOP) and not answer["success"]:
+            raise ComponentFailed(f"an emergency stop from ROS would fail: {answer['message']}")
 
     def close(self) -> None:
         """Wait for the answers under way."""
-        for pool in self._pools.values():
-            pool.shutdown(cancel_futures=True)
+        self._way.close()
+        for workers in self._workers.values():
+            workers.end()
 
-    def submit(self, work: Any, *arguments: Any, urgent: bool = False) -> None:
-        """Do work that waits for the run, e.g. for a decision about a goal, in another thread."""
-        self._pools[urgent].submit(self._contained, work, *arguments)
+    def submit(self, work: Callable[[], object], *, urgent: bool = False) -> bool:
+        """Do work that waits for the run, e.g. for a decision about a goal, in another thread.
+
+        Returns:
+            Whether it will be done; not if too many wait, or no thread for it can start now.
+        """
+        return self._workers[urgent].put(work) is None
 
     def declare(self, wire: Wire) -> None:
         """Tell a new node which services there are."""
@@ -56,13 +82,9 @@ class Services:
     def take_call(self, wire: Wire, head: Mapping[str, Any]) -> None:
         """Answer a call, in another thread."""
         offer = self._offers[head["service"]]
-        self.submit(self._answer, wire, offer, head, urgent=offer.urgent)
+        if not self.submit(partial(self._answer, wire, offer, head), urgent=offer.urgent):
+            busy = {"success": False, "message": "the robot has no thread for this call: too many calls wait"}
+            wire.send({"op": "answer", "call": head["call"], **busy})
 
     def _answer(self, wire: Wire, offer: Offer, head: Mapping[str, Any]) -> None:
         wire.send({"op": "answer", "call": head["call"], **self._found.answer(offer, head["request"])})
-
-    def _contained(self, work: Any, *arguments: Any) -> None:
-        try:
-            work(*arguments)
-        except Exception:
-            self._session.log.exception("ros: a request failed")

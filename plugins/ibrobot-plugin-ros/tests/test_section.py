@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import queue
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import attrs
 import numpy as np
@@ -11,10 +14,11 @@ import pytest
 from ibrobot_ros.options import RosOptions
 from ibrobot_ros.section import RosNode
 from ibrobot_ros2 import decode, encode
+from ibrobot_ros2.offers import TRIGGER, Offer
 from ibrobot_testing.section import SectionSuite, make_session
 
 from ibrobot_core.api import Bool, Header, Image, JointState, MissingDependency, String
-from ibrobot_core.app import ComponentFailed, Session
+from ibrobot_core.app import ESTOP, ComponentFailed, Session
 
 from . import fake_node
 
@@ -192,3 +196,32 @@ def test_the_rest_is_sent_at_the_end(started, monkeypatch):
         part.session.bus.publish("/lamp", Bool(True))
     part.node.stop()
     assert len(part.frames("message")) == 5
+
+
+def test_without_further_threads_stops_are_answered_and_other_calls_refused(started, monkeypatch):
+    part = started()
+    services, calls = part.node._services, []
+    part.session.bus.unserve(ESTOP)
+    part.session.bus.serve(ESTOP, lambda request: calls.append("estop"))
+    answers: queue.SimpleQueue[dict[str, object]] = queue.SimpleQueue()
+    wire = SimpleNamespace(send=answers.put)
+    services._offers = {"/estop": Offer(TRIGGER, "/estop", {}, urgent=True), "/slow": Offer(TRIGGER, "/slow", {})}
+
+    def refuse(thread):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    for number in range(3):
+        services.take_call(wire, {"service": "/slow", "call": number, "request": {}})
+        assert "no thread for this call" in answers.get(timeout=PATIENCE_S)["message"]
+        services.take_call(wire, {"service": "/estop", "call": number, "request": {}})
+        assert answers.get(timeout=PATIENCE_S)["success"] is True
+    assert calls == ["estop"] * 3
+    monkeypatch.undo()
+
+
+def test_threads_that_stops_go_through_give_signs_of_life(started):
+    part = started()
+    assert {pulse.name for pulse in part.session.pulses} == {"calls from ROS", "services for ROS 2 nodes"}
+    part.node.stop()
+    assert not part.session.pulses

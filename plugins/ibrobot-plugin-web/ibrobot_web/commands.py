@@ -13,9 +13,11 @@ import attrs
 
 from ibrobot_core.api import IbrobotError, PlanningError, seconds
 from ibrobot_core.app import (
+    PULSE_S,
     RESET,
     SET_MODE,
     TOGGLE_SMOOTHING,
+    Pulse,
     Reset,
     RunView,
     SetMode,
@@ -36,6 +38,11 @@ _ALWAYS = messages.Finish | messages.Reset | messages.Preview
 """Commands that may be older than an emergency stop: a reset says which stops it clears, the others move nothing."""
 _STOPPED = "an emergency stop came after this command was sent, so it is not carried out; reset, then send it again"
 _PREVIEW_ROWS = 40
+_BLOCKED_S = 6.0
+"""Time without a sign of life of a thread that stops go through after which the run ends [s]; control may take 5 s to
+answer."""
+_TRIAL = -1
+"""The number of a stop that is only tried out."""
 _NS_PER_MS = 1_000_000
 _MOTION = tuple(attrs.fields_dict(messages.Motion))
 _log = logging.getLogger("ibrobot.web")
@@ -44,7 +51,7 @@ _log = logging.getLogger("ibrobot.web")
 class Commands:
     """Carries out commands, in order, in a thread; the emergency stop has its own, and waits for no other command.
 
-    An emergency stop empties the queue of the others.
+    An emergency stop empties the queue of the others. Its thread tries one out at the start, and gives signs of life.
 
     Args:
         session: the run.
@@ -66,8 +73,11 @@ class Commands:
             threading.Thread(target=self._guarded, args=(work,), name=f"web {name}", daemon=True)
             for name, work in (("stop", self._work_on_stops), ("other", self._work_on_others))
         ]
+        self._pulse = Pulse("STOP of the page", _BLOCKED_S)
         for thread in self._threads:
             thread.start()
+        session.pulses.add(self._pulse)
+        self._stops.put(_TRIAL)
 
     def stop(self, number: int) -> None:
         """Stop the robot, and refuse the commands that wait."""
@@ -84,6 +94,7 @@ class Commands:
 
     def close(self, timeout_s: float) -> None:
         """End the threads; a command that is being carried out is given `timeout_s` [s]."""
+        self._session.pulses.discard(self._pulse)
         self._stops.put(None)
         self._others.put(None)
         for thread in self._threads:
@@ -99,12 +110,18 @@ class Commands:
     def _work_on_stops(self) -> None:
         """Stop the robot once for all stops that wait."""
         raise_thread_priority()
-        while (first := self._stops.get()) is not None:
-            numbers = [first, *_waiting(self._stops)]
-            reply = self._outcome_of(self._session.emergency_stop)
-            for number in numbers:
-                if number is not None:
+        while True:
+            self._pulse.beat()
+            try:
+                numbers = [self._stops.get(timeout=PULSE_S), *_waiting(self._stops)]
+            except queue.Empty:
+                continue
+            if stops := [number for number in numbers if number not in (None, _TRIAL)]:
+                reply = self._outcome_of(self._session.emergency_stop)
+                for number in stops:
                     self._reply({"reply": number, **reply})
+            elif _TRIAL in numbers:
+                self._session.check_stop()
             if None in numbers:
                 return
 

@@ -14,7 +14,7 @@ from typing import Any, override
 import attrs
 
 from ibrobot_core.api import Context, ContractError, IbrobotError, Viewer
-from ibrobot_core.app import Child, ComponentFailed, RunView, Subscription, error_text, raise_thread_priority
+from ibrobot_core.app import Child, ComponentFailed, Pulse, RunView, Subscription, error_text, raise_thread_priority
 from ibrobot_web.commands import Commands
 from ibrobot_web.desktop import open_browser
 from ibrobot_web.link import FIRST_PICTURE, PLAN, SAMPLES, STATE, STATUS, FrameSender
@@ -28,6 +28,8 @@ _MODULE = "ibrobot_web.server.process"
 _START_S = 30.0
 _END_S = 3.0
 _POLL_S = 0.1
+_BLOCKED_S = 6.0
+"""Time without a sign of life of the thread that receives commands after which the run ends [s]."""
 _SILENT_S = 5.0
 """Time without a sign of life of the server after which the run ends [s]."""
 _STATUS_S, _SAMPLES_S, _TOPICS_S = 0.25, 0.1, 1.0
@@ -179,11 +181,15 @@ class WebViewer(Viewer):
     def _receive(self, child: Child) -> None:
         """Take messages until the server or the viewer ends. Without this thread the page's STOP would be deaf."""
         raise_thread_priority()
+        pulse = Pulse("commands of the page", _BLOCKED_S)
+        self._session.pulses.add(pulse)
         try:
             while not child.channel.closed and self._child is child:
+                pulse.beat()
                 self._take(child)
         except Exception as error:  # noqa: BLE001 - reported to the run, which ends
             self._fail(error)
+        self._session.pulses.discard(pulse)
         if self._child is child:
             self._commands.take(Sent(None, None, Release()))
             self._dead = self._dead or f"the page's server died: {child.cause(_END_S)}"

@@ -9,6 +9,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from ibrobot_http.guard import Guard
 from ibrobot_http.server import ServerThread
 
 from ibrobot_core.api import Clock, RobotStatus
-from ibrobot_core.app import ESTOP, Bus, error_text
+from ibrobot_core.app import CHECK_ESTOP, ESTOP, Bus, NoRequest, Service, error_text
 from ibrobot_webxr.certificate import open_port, own_folder
 from ibrobot_webxr.exchange import Delays, Exchange
 from ibrobot_webxr.images import CameraImages
@@ -31,6 +32,8 @@ _STATE_S = 0.1
 """Period of the states sent to pages [s]."""
 _SILENT_S = 1.0
 """A page that sends nothing for this long loses control [s]."""
+_CHECK_S = 10.0
+"""Longest time for trying out an emergency stop at the start [s]."""
 _MOST_PAGES = 8
 _MOST_REFUSED = 100
 """Wrong messages after which a page is disconnected."""
@@ -91,7 +94,14 @@ class PageServer:
         app.router.add_get("/certificate.pem", self._certificate, allow_head=False)
         app.router.add_get("/socket", self._socket, allow_head=False)
         app.on_shutdown.append(self._close_pages)
-        self._server = ServerThread(self._guard, app, "webxr page", close_s=0.1, beside=self._send_states)
+        # Its thread exists from the trial on; one that a stop had to start might not start.
+        self._stops = ThreadPoolExecutor(1, "webxr stop")
+        try:
+            self._stops.submit(self._call_if_served, CHECK_ESTOP).result(_CHECK_S)
+            self._server = ServerThread(self._guard, app, "webxr page", close_s=0.1, beside=self._send_states)
+        except BaseException:
+            self._stops.shutdown(wait=False)
+            raise
 
     @property
     def address(self) -> str:
@@ -101,6 +111,7 @@ class PageServer:
     def close(self) -> None:
         """Stop the server. Safe to call twice."""
         self._server.close()
+        self._stops.shutdown(wait=False)
         self._images.close()
         self._status.close()
 
@@ -170,11 +181,14 @@ class PageServer:
     async def _stop(self) -> None:
         """Stop the robot, in any mode."""
         self.exchange.stop()
-        if self._bus.serves(ESTOP):
-            try:
-                await asyncio.to_thread(self._bus.call, ESTOP)
-            except Exception as error:  # noqa: BLE001 - contained: the device in `read` stops the robot, too
-                self._log.error("webxr: the emergency stop failed: %s", error_text(error))
+        try:
+            await asyncio.get_running_loop().run_in_executor(self._stops, self._call_if_served, ESTOP)
+        except Exception as error:  # noqa: BLE001 - contained: the device in `read` stops the robot, too
+            self._log.error("webxr: the emergency stop failed: %s", error_text(error))
+
+    def _call_if_served(self, service: Service[NoRequest, Any]) -> None:
+        if self._bus.serves(service):
+            self._bus.call(service)
 
     def _next_image(self, page: _Page, camera: int) -> None:
         names = self._images.names

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import logging
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,7 +36,7 @@ from ibrobot_core.api import (
     TeleopError,
     ns,
 )
-from ibrobot_core.app import ESTOP, Bus, NoRequest, operate
+from ibrobot_core.app import CHECK_ESTOP, ESTOP, Bus, NoRequest, operate
 
 from .browser import Browser, hand, hands
 from .rig import ANY_PORT, BENT, page_of, robot_of
@@ -361,3 +363,32 @@ def test_a_certificate_that_does_not_fit_is_an_error(tmp_path: Path, ctx: Contex
     options = WebxrOptions(port=0, certificate=tmp_path / "a.pem", key=tmp_path / "a.pem")
     with pytest.raises(TeleopError, match=r"certificate .*a\.pem and key .*a\.pem cannot be used"):
         PageServer(options, ctx.clock, ctx.bus, ctx.log)
+
+
+def test_a_stop_needs_no_thread_that_is_not_there_yet(ctx: Context, monkeypatch: pytest.MonkeyPatch):
+    assert ctx.bus is not None
+    called = threading.Event()
+    ctx.bus.serve(ESTOP, lambda request: called.set())
+    server = PageServer(ANY_PORT, ctx.clock, ctx.bus, ctx.log)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(threading.Thread, "start", _refuse)
+            asyncio.run_coroutine_threadsafe(server._stop(), server._server.loop).result(30.0)
+        assert called.is_set()
+    finally:
+        server.close()
+
+
+def _refuse(thread: threading.Thread) -> None:
+    raise RuntimeError("can't start new thread")
+
+
+def test_a_stop_that_would_fail_is_an_error_at_the_start(ctx: Context):
+    assert ctx.bus is not None
+
+    def check(request: NoRequest) -> None:
+        raise TeleopError("control does not answer")
+
+    ctx.bus.serve(CHECK_ESTOP, check)
+    with pytest.raises(TeleopError, match="control does not answer"):
+        PageServer(ANY_PORT, ctx.clock, ctx.bus, ctx.log)

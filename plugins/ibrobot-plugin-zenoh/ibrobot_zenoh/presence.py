@@ -6,10 +6,10 @@ import threading
 from collections.abc import Callable
 
 import zenoh
+from ibrobot_ros2.workers import Workers
 
 from ibrobot_zenoh.access import SERVED
 from ibrobot_zenoh.connection import Connection
-from ibrobot_zenoh.workers import Workers
 
 PREFIX = f"{SERVED}/"
 """Tokens are PREFIX NAME / ID."""

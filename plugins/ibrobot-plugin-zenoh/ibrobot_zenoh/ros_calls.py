@@ -12,14 +12,17 @@ from typing import Any
 import zenoh
 from ibrobot_ros2 import CodecError
 from ibrobot_ros2.interfaces import ServiceType, from_cdr, to_cdr
+from ibrobot_ros2.workers import StopWay, Workers
 
 from ibrobot_core.api import TransportError
 from ibrobot_zenoh.connection import first_line
+from ibrobot_zenoh.own_query import OwnQuery, Query
 from ibrobot_zenoh.ros2 import attachment, caller_of
 from ibrobot_zenoh.sharing import RosHandler
-from ibrobot_zenoh.workers import Workers
 
-_WORKERS = 4
+_WORKERS, _URGENT_WORKERS = 4, 2
+_CHECK_S = 10.0
+"""Longest wait for the answer of a server that is tried out [s]."""
 _CALLER = uuid.uuid4().bytes
 """Id of this process as a client."""
 _numbers = itertools.count(1)
@@ -32,21 +35,45 @@ class RosServer:
     are dropped in this way, with a warning, since ROS has no word for them.
     """
 
-    def __init__(self, name: str, kind: ServiceType, handler: RosHandler, log: logging.Logger, depth: int) -> None:
+    def __init__(
+        self, name: str, kind: ServiceType, handler: RosHandler, log: logging.Logger, depth: int, way: StopWay | None
+    ) -> None:  # fmt: skip
         self._name = name
         self._kind = kind
         self._handler = handler
         self._log = log
-        self.workers = Workers(self._answer, f"the server of {name}", _WORKERS, depth)
+        self._way = way
+        self._checks: dict[Query, RosHandler] = {}
+        """What answers queries that only try the server out."""
+        count = _WORKERS if way is None else _URGENT_WORKERS
+        self.workers = Workers(self._answer, f"the server of {name}", count, depth, way)
 
-    def take(self, query: zenoh.Query) -> None:
+    def take(self, query: Query) -> None:
         """Queue a query."""
-        rejected = self.workers.put(query)
-        if rejected is not None:
-            _end(rejected)
-            self._log.warning("%s is overloaded: a call was dropped", self._name)
+        try:
+            rejected = self.workers.put(query)
+            if rejected is not None:
+                _end(rejected)
+                self._log.warning("%s is overloaded, or has no thread: a call was dropped", self._name)
+        except BaseException as error:
+            if self._way is not None:
+                self._way.lose(error)
+            raise
 
-    def _answer(self, query: zenoh.Query) -> None:
+    def try_out(self, check: RosHandler) -> None:
+        """Call `check`, by the queue and a thread of calls that come from others.
+
+        Raises:
+            TransportError: if there is no answer, or one without `success`.
+        """
+        query = OwnQuery(to_cdr(self._kind.request, {}), "own", attachment(0, time.time_ns(), _CALLER))
+        self._checks[query] = check
+        self.take(query)
+        answer = from_cdr(self._kind.response, query.answer(_CHECK_S))
+        if not answer["success"]:
+            raise TransportError(f"a call of {self._name} would fail: {answer['message']}")
+
+    def _answer(self, query: Query) -> None:
         payload, attached = query.payload, query.attachment
         number, caller = caller_of(attached.to_bytes() if attached is not None else b"")
 
@@ -58,8 +85,9 @@ class RosServer:
                 except zenoh.ZError as error:  # its client is gone
                     self._log.debug("%s: %s", self._name, first_line(error))
 
+        handler = self._checks.pop(query, self._handler) if self._checks else self._handler
         try:
-            self._handler(from_cdr(self._kind.request, payload.to_bytes() if payload is not None else b""), reply)
+            handler(from_cdr(self._kind.request, payload.to_bytes() if payload is not None else b""), reply)
         except CodecError as error:
             self._log.warning("a call of %s was dropped: %s", self._name, error)
             _end(query)
@@ -68,7 +96,7 @@ class RosServer:
             raise
 
 
-def _end(query: zenoh.Query) -> None:
+def _end(query: Query) -> None:
     """Answer nothing."""
     with query:
         pass

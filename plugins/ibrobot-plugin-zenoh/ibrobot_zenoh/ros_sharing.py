@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from typing import Any, Literal, override
@@ -12,10 +12,11 @@ from typing import Any, Literal, override
 import attrs
 from ibrobot_ros2.goals import Actions, with_goals
 from ibrobot_ros2.interfaces import ActionType, ServiceType, action_type, fields_of, service_type, to_cdr
-from ibrobot_ros2.offers import Offer, Offers, time_of
+from ibrobot_ros2.offers import TRIGGER, Offer, Offers, time_of
+from ibrobot_ros2.workers import StopWay
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, NotSupported, did_you_mean
-from ibrobot_core.app import CONTROL, RunAccess, SessionWorker, TransportLink
+from ibrobot_core.app import CHECK_ESTOP, CONTROL, ESTOP, RunAccess, SessionWorker, TransportLink
 from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.ros2 import absolute
 from ibrobot_zenoh.ros_goals import Status
@@ -25,6 +26,8 @@ _ENDED_KEPT = 100
 """Number of ended goals whose results can still be asked for."""
 _LOOK_S = 0.5
 """How often to look for services that a mode has brought."""
+_CHECK = Offer(TRIGGER, CHECK_ESTOP.name, {})
+"""What tries out an emergency stop."""
 _CANCELED, _REJECTED, _UNKNOWN, _OVER = 0, 1, 2, 3
 """Return codes of action_msgs/srv/CancelGoal."""
 
@@ -84,6 +87,7 @@ class RosSharing(SessionWorker):
                 raise NotSupported(f"transport.share.actions: {name} is no executor that takes goals{hint}")
         self._offers = Offers(session, share.offers, self._named)
         self._actions = Actions(session, share.actions, share.offers, self._named, "zenoh", share.gripper_action)
+        self._way = StopWay(session, "services for ROS 2 nodes")
         self._served: set[str] = set()
         self._lock = threading.RLock()
         self._count = 0
@@ -100,6 +104,7 @@ class RosSharing(SessionWorker):
         self._actions.open()
         self._actions.declare(self)
         self._look()
+        self._way.open()
 
     @override
     def work(self, timeout_s: float) -> None:
@@ -109,6 +114,7 @@ class RosSharing(SessionWorker):
 
     @override
     def teardown(self) -> None:
+        self._way.close()
         self._ends.close()
         self._actions.close()
 
@@ -117,10 +123,15 @@ class RosSharing(SessionWorker):
         for name, offer in self._offers.found().items():
             if name not in self._served:
                 self._served.add(name)
-                self._serve(name, service_type(offer.type), partial(self._answer, offer), urgent=offer.urgent)
+                check = partial(self._answer, _CHECK) if offer.service == ESTOP.name else None
+                way = self._way if offer.urgent else None
+                self._serve(name, service_type(offer.type), partial(self._answer, offer), way, check)
 
-    def _serve(self, name: str, kind: ServiceType, handler: RosHandler, *, urgent: bool) -> None:
-        self._ends.callback(self._transport.serve_ros(name, kind, handler, urgent=urgent))
+    def _serve(
+        self, name: str, kind: ServiceType, handler: RosHandler, way: StopWay | None = None,
+        check: RosHandler | None = None,
+    ) -> None:  # fmt: skip
+        self._ends.callback(self._transport.serve_ros(name, kind, handler, way=way, check=check))
 
     def _answer(self, offer: Offer, request: dict[str, Any], reply: Reply) -> None:
         answer = self._offers.answer(offer, request)
@@ -136,10 +147,17 @@ class RosSharing(SessionWorker):
         address = {key: head[key] for key in ("executor", "service") if key in head}
         server = _Server(head["name"], action_type(head["type"]), address)
         name, kind = f"{server.name}/_action", server.type
-        self._serve(f"{name}/send_goal", kind.send_goal, partial(self._take_goal, server), urgent=False)
-        self._serve(f"{name}/cancel_goal", kind.cancel_goal, partial(self._cancel, server), urgent=True)
-        self._serve(f"{name}/get_result", kind.get_result, partial(self._get_result, server), urgent=False)
+        self._serve(f"{name}/send_goal", kind.send_goal, partial(self._take_goal, server))
+        self._serve(f"{name}/cancel_goal", kind.cancel_goal, partial(self._contain, self._cancel, server), self._way)
+        self._serve(f"{name}/get_result", kind.get_result, partial(self._get_result, server))
         self._publish_status(server)
+
+    def _contain(self, handle: Callable[..., None], server: _Server, request: dict[str, Any], reply: Reply) -> None:
+        """Handle an urgent call that is no emergency stop: a bug in it does not end the run."""
+        try:
+            handle(server, request, reply)
+        except Exception:
+            self.session.log.exception("%s: a call failed", server.name)
 
     def _take_goal(self, server: _Server, request: dict[str, Any], reply: Reply) -> None:
         stops, now_ns = self.session.stops, self.session.clock.now_ns()

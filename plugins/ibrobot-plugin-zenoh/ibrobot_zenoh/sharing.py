@@ -9,10 +9,33 @@ from typing import Any, override
 
 import attrs
 from ibrobot_ros2.interfaces import ServiceType
-from ibrobot_ros2.services import DETAILS, SERVICES, Answer, decode_call, encode_answer, endpoint
+from ibrobot_ros2.services import (
+    DETAILS,
+    SERVICES,
+    Answer,
+    Call,
+    decode_answer,
+    decode_call,
+    encode_answer,
+    encode_call,
+    endpoint,
+)
+from ibrobot_ros2.workers import StopWay
 
-from ibrobot_core.api import NS_PER_S, Handler, IbrobotError, Message, NotSupported, Payload, Transport, did_you_mean
+from ibrobot_core.api import (
+    NS_PER_S,
+    Handler,
+    IbrobotError,
+    Message,
+    NotSupported,
+    Payload,
+    Transport,
+    TransportError,
+    did_you_mean,
+)
 from ibrobot_core.app import (
+    CHECK_ESTOP,
+    ESTOP,
     Component,
     RunAccess,
     RunView,
@@ -33,8 +56,23 @@ _MOST_BYTES = 1 << 20
 """Largest request to a service [bytes]."""
 _URGENT_BYTES = 1000
 """Largest request to an urgent service [bytes]."""
+_CHECK_S = 10.0
+"""Longest wait for the answer to a stop that is only tried [s]."""
 _SILENT_NS = 5 * NS_PER_S
 """A topic without a message for this long after the start is reported, once [ns]."""
+
+
+@attrs.frozen
+class Urgent:
+    """Served urgent requests."""
+
+    end: Callable[[], None]
+    """Ends it."""
+    ask: Callable[[bytes, float], bytes]
+    """The answer to an urgent request that comes from here, by the queue and threads of those that come from others.
+
+    Args: the request, and the longest wait [s]. Raises TransportError if there is no answer.
+    """
 
 
 class TopicTransport(Transport):
@@ -63,11 +101,12 @@ class TopicTransport(Transport):
 
     @abstractmethod
     def serve_with_urgent(
-        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool], largest: int
-    ) -> Callable[[], None]:
+        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool], largest: int, way: StopWay
+    ) -> Urgent:
         """Like `serve`; urgent requests have their own queue and threads, so that no other request delays them.
 
-        Requests of more than `largest` bytes are refused at once, so that they cannot fill the memory.
+        Requests of more than `largest` bytes are refused at once, so that they cannot fill the memory. An exception in
+        `is_urgent`, or in `handler` for an urgent request, loses the `way`.
         """
 
     @property
@@ -86,8 +125,9 @@ class TopicTransport(Transport):
 
     @abstractmethod
     def serve_ros(
-        self, name: str, kind: ServiceType, handler: RosHandler, *, urgent: bool = False
-    ) -> Callable[[], None]:
+        self, name: str, kind: ServiceType, handler: RosHandler, *, way: StopWay | None = None,
+        check: RosHandler | None = None,
+    ) -> Callable[[], None]:  # fmt: skip
         """Answer the calls that ROS 2 nodes make of a service, under its full name; returns a function that ends it.
 
         Args:
@@ -95,10 +135,12 @@ class TopicTransport(Transport):
             kind: its type.
             handler: called in a thread with the request, as plain data, and a function to answer it with plain data,
                 now or later, in any thread.
-            urgent: whether it is answered beside other services.
+            way: for urgent services: they are answered beside others, in threads that exist from now on.
+            check: called once, now, in place of `handler`, by the queue and a thread of calls that come from others;
+                it answers whether a call would work, as `success` and `message`.
 
         Raises:
-            TransportError: if closed, or there is a server of this name.
+            TransportError: if closed, or there is a server of this name, or `check` fails.
         """
 
 
@@ -238,13 +280,24 @@ class SharedServices(Component):
         self._session = session
         self._link = link
         self._share = share
+        self._way = StopWay(session, "services for other machines")
         self._ends = ExitStack()
+
+    def _offers(self, name: str) -> bool:
+        return self._share.offers(ESTOP.name if name == CHECK_ESTOP.name else name)
 
     @override
     def start(self) -> None:
         transport = transport_of(self._link)
         name = endpoint(transport.namespace)
-        self._ends.callback(transport.serve_with_urgent(name, self._answer, self._is_urgent, _MOST_BYTES))
+        served = transport.serve_with_urgent(name, self._answer, self._is_urgent, _MOST_BYTES, self._way)
+        self._ends.callback(served.end)
+        self._way.open()
+        self._ends.callback(self._way.close)
+        if self._offers(ESTOP.name):
+            answer = decode_answer(served.ask(encode_call(Call(CHECK_ESTOP.name)), _CHECK_S))
+            if not answer.result:
+                raise TransportError(f"an emergency stop by {name} would fail: {answer.values}")
 
     @override
     def stop(self) -> None:
@@ -261,12 +314,13 @@ class SharedServices(Component):
         return service is not None and service.urgent
 
     def _answer(self, payload: Payload, sender: str | None) -> bytes:
+        call = None
         try:
             call = decode_call(payload)
             if call.service == SERVICES:
                 return encode_answer(Answer(self._shared()))
             name = str(call.request) if call.service == DETAILS else call.service
-            if not self._share.offers(name):
+            if not self._offers(name):
                 raise NotSupported(
                     f"{name} is not shared{did_you_mean(name, self._shared(), 'shared')};"
                     " transport.share.services of the robot lists what is"
@@ -276,7 +330,9 @@ class SharedServices(Component):
             return encode_answer(Answer(self._session.bus.call(name, call.request)))
         except IbrobotError as error:
             return encode_answer(Answer(str(error), result=False))
-        except Exception:
+        except Exception as error:
+            if call is None or call.service == ESTOP.name:
+                self._way.lose(error)
             self._session.log.exception("a service failed")
             return encode_answer(Answer("the service failed; the robot's log has the cause", result=False))
 
@@ -294,4 +350,4 @@ class SharedServices(Component):
 
     def _shared(self) -> list[str]:
         """The shared services that are served at present."""
-        return [name for name in self._session.bus.services() if self._share.offers(name)]
+        return [name for name in self._session.bus.services() if self._offers(name)]

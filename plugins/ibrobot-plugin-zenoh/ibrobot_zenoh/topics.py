@@ -13,6 +13,7 @@ import zenoh
 import zenoh.ext
 from ibrobot_ros2 import decode, encode
 from ibrobot_ros2.interfaces import ServiceType
+from ibrobot_ros2.workers import Workers
 
 from ibrobot_core.api import Context, IbrobotError, Message, TransportError
 from ibrobot_zenoh.connection import Connection, Declared, first_line
@@ -31,7 +32,6 @@ from ibrobot_zenoh.ros2 import (
     type_of_key,
 )
 from ibrobot_zenoh.sharing import TopicTransport
-from ibrobot_zenoh.workers import Workers
 
 DEPTH = 100
 """Queue size of a subscriber; when it is full, the oldest message is dropped."""

@@ -9,18 +9,19 @@ from typing import Any, override
 
 import zenoh
 from ibrobot_ros2.interfaces import ServiceType
+from ibrobot_ros2.workers import StopWay, Workers
 
 from ibrobot_core.api import Context, Handler, Payload, TransportError
 from ibrobot_core.app import HANDLER_THREADS
 from ibrobot_zenoh.access import ANYBODY, SERVED, SERVICES, TOPICS
 from ibrobot_zenoh.connection import first_line
 from ibrobot_zenoh.options import ZenohOptions
+from ibrobot_zenoh.own_query import OwnQuery, Query
 from ibrobot_zenoh.presence import Presence
 from ibrobot_zenoh.ros2 import service_key
 from ibrobot_zenoh.ros_calls import RosServer, call
-from ibrobot_zenoh.sharing import RosHandler
+from ibrobot_zenoh.sharing import RosHandler, Urgent
 from ibrobot_zenoh.topics import RosTransport
-from ibrobot_zenoh.workers import Workers
 
 SUBSCRIBER_DEPTH = 1000
 """Queue size of a subscriber; when it is full, the oldest payload is dropped."""
@@ -52,6 +53,14 @@ def _sendable(payload: Payload) -> bytes | bytearray:
     if isinstance(whole, bytes | bytearray) and len(whole) == payload.nbytes and payload.c_contiguous:
         return whole
     return payload.tobytes()
+
+
+def _put(workers: Workers[Query], query: Query) -> None:
+    """Queue a query; one that is not taken is answered with an error at once."""
+    rejected = workers.put(query)
+    if rejected is not None:
+        with rejected:
+            rejected.reply_err("it is overloaded, has no thread for it, or is about to end", encoding=_FAILED)
 
 
 class ZenohTransport(RosTransport):
@@ -93,53 +102,77 @@ class ZenohTransport(RosTransport):
 
     @override
     def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
-        return self._serve(name, handler, workers, lambda payload: False, self.options.max_message_size)
+        server = self._workers_of(name, handler, workers)
+        limit = self.options.max_message_size
+
+        def take(query: Query) -> None:
+            size = len(query.payload) if query.payload is not None else 0
+            if size > limit:
+                with query:
+                    query.reply_err(f"a request of {size} bytes, at most {limit} are read", encoding=_FAILED)
+            else:
+                _put(server, query)
+
+        return self._serve(name, take, server)
 
     @override
     def serve_with_urgent(
-        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool], largest: int
-    ) -> Callable[[], None]:
-        return self._serve(name, handler, HANDLER_THREADS, is_urgent, largest)
-
-    def _serve(
-        self, name: str, handler: Handler, workers: int, is_urgent: Callable[[Payload], bool], largest: int
-    ) -> Callable[[], None]:
-        key, token = _key(f"{SERVICES}/*", name), _key(SERVED, name).join(uuid.uuid4().hex)
-
-        def answer(query: zenoh.Query) -> None:
-            with query:  # dropping it signals the end of replies to the requester
-                try:
-                    request = query.payload
-                    reply = handler(request.to_bytes() if request is not None else b"", self._sender(query))
-                    self._check_size(len(reply), name)
-                except Exception as error:  # noqa: BLE001 - passed to the requester
-                    query.reply_err(f"{type(error).__name__}: {error}", encoding=_FAILED)
-                else:
-                    query.reply(query.key_expr, _sendable(reply), express=True)
-
-        server = Workers(answer, f"the server of {name}", workers, REQUESTS_WAITING)
+        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool], largest: int, way: StopWay
+    ) -> Urgent:
+        def answer_or_raise(query: Query) -> None:
+            if (error := self._answer(name, handler, query)) is not None:
+                raise error
 
         # A long queue: urgent requests must not be dropped.
-        urgent = Workers(answer, f"the urgent requests of {name}", _URGENT_WORKERS, URGENT_WAITING)
+        urgent = Workers(answer_or_raise, f"the urgent requests of {name}", _URGENT_WORKERS, URGENT_WAITING, way)
+        server = self._workers_of(name, handler, HANDLER_THREADS)
 
-        def take(query: zenoh.Query) -> None:
-            payload = query.payload
-            size = len(payload) if payload is not None else 0
-            if size > largest:
-                with query:
-                    query.reply_err(f"a request of {size} bytes, at most {largest} are read", encoding=_FAILED)
-                return
-            workers = urgent if is_urgent(payload.to_bytes() if payload is not None else b"") else server
-            rejected = workers.put(query)
-            if rejected is not None:
-                with rejected:
-                    rejected.reply_err("it is overloaded, or about to end", encoding=_FAILED)
+        def take(query: Query) -> None:
+            try:
+                payload = query.payload
+                size = len(payload) if payload is not None else 0
+                if size > largest:
+                    with query:
+                        query.reply_err(f"a request of {size} bytes, at most {largest} are read", encoding=_FAILED)
+                    return
+                data = payload.to_bytes() if payload is not None else b""
+                _put(urgent if is_urgent(data) else server, query)
+            except BaseException as error:
+                way.lose(error)
+                raise
 
+        def ask(request: bytes, timeout_s: float) -> bytes:
+            asked = OwnQuery(request, f"{SERVICES}/{self._sender_name}/{name}")
+            take(asked)
+            return asked.answer(timeout_s)
+
+        return Urgent(self._keep(self._serve(name, take, server), urgent), ask)
+
+    def _workers_of(self, name: str, handler: Handler, workers: int) -> Workers[Query]:
+        return Workers(
+            lambda query: self._answer(name, handler, query), f"the server of {name}", workers, REQUESTS_WAITING
+        )
+
+    def _answer(self, name: str, handler: Handler, query: Query) -> Exception | None:
+        """Answer a query; return the error that was its answer."""
+        with query:  # dropping it signals the end of replies to the requester
+            try:
+                request = query.payload
+                reply = handler(request.to_bytes() if request is not None else b"", self._sender(query))
+                self._check_size(len(reply), name)
+            except Exception as error:  # noqa: BLE001 - passed to the requester
+                query.reply_err(f"{type(error).__name__}: {error}", encoding=_FAILED)
+                return error
+            query.reply(query.key_expr, _sendable(reply), express=True)
+            return None
+
+    def _serve(self, name: str, take: Callable[[Query], None], server: Workers[Query]) -> Callable[[], None]:
+        key, token = _key(f"{SERVICES}/*", name), _key(SERVED, name).join(uuid.uuid4().hex)
         end = self._declare_server(
             name, key, take,
             lambda: self.connection.declare(lambda session: session.liveliness().declare_token(token)),
         )  # fmt: skip
-        return self._keep(self._keep(end, server), urgent)
+        return self._keep(end, server)
 
     def _declare_server(
         self, name: str, key: zenoh.KeyExpr | str, take: Callable[[zenoh.Query], None],
@@ -202,9 +235,12 @@ class ZenohTransport(RosTransport):
 
     @override
     def serve_ros(
-        self, name: str, kind: ServiceType, handler: RosHandler, *, urgent: bool = False
-    ) -> Callable[[], None]:
-        server = RosServer(name, kind, handler, self._log, URGENT_WAITING if urgent else REQUESTS_WAITING)
+        self, name: str, kind: ServiceType, handler: RosHandler, *, way: StopWay | None = None,
+        check: RosHandler | None = None,
+    ) -> Callable[[], None]:  # fmt: skip
+        server = RosServer(name, kind, handler, self._log, URGENT_WAITING if way else REQUESTS_WAITING, way)
+        if check is not None:
+            server.try_out(check)
         key = service_key(self.options.domain, name, kind, hashed=self.options.type_hashes)
         end = self._declare_server(name, key, server.take, lambda: self._announce(name, kind))
         return self._keep(end, server.workers)

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from ibrobot_ros2.workers import StopWay
+from ibrobot_testing.section import make_session
 from ibrobot_zenoh import connection as connection_module
 from ibrobot_zenoh import transport as transport_module
 
@@ -176,6 +178,42 @@ def test_connections_that_say_nothing_keep_nobody_out(monkeypatch: pytest.Monkey
         server.close()
 
 
+def test_without_further_threads_stops_are_answered_and_others_refused(monkeypatch: pytest.MonkeyPatch):
+    endpoint = free_endpoint()
+    server, robot = router(endpoint), client(endpoint)
+    way = StopWay(make_session(), "the test")
+    server.serve_with_urgent("services", lambda payload, _: b"done", lambda payload: payload == b"stop", 1000, way)
+    settle(robot, server)
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", _refuse)
+        for _ in range(5):
+            with pytest.raises(TransportError, match="services failed: it is overloaded, has no thread for it"):
+                robot.request("services", b"other", WAIT_S)
+            assert robot.request("services", b"stop", WAIT_S) == b"done"
+    assert robot.request("services", b"other", WAIT_S) == b"done", "threads start again"
+
+
+def _refuse(thread: threading.Thread) -> None:
+    raise RuntimeError("can't start new thread")
+
+
+def test_a_request_that_cannot_be_read_ends_the_run():
+    endpoint = free_endpoint()
+    server, robot = router(endpoint), client(endpoint)
+    session = make_session()
+
+    def is_urgent(payload: Payload) -> bool:
+        raise MemoryError
+
+    server.serve_with_urgent("services", lambda payload, _: b"done", is_urgent, 1000, StopWay(session, "the test"))
+    settle(robot, server)
+    with pytest.raises(TransportError):
+        robot.request("services", b"stop", 1.0)
+    assert session.finished.wait(WAIT_S)
+    assert session.failure is not None
+    assert session.failure[0] == "the test"
+
+
 def test_urgent_requests_wait_for_no_others(monkeypatch: pytest.MonkeyPatch):
     """A stop is answered while a flood keeps every thread busy and fills the queue."""
     monkeypatch.setattr(transport_module, "HANDLER_THREADS", 2)
@@ -190,7 +228,8 @@ def test_urgent_requests_wait_for_no_others(monkeypatch: pytest.MonkeyPatch):
             release.wait()
         return b"done"
 
-    server.serve_with_urgent("services", answer, lambda payload: payload == b"stop", 1000)
+    way = StopWay(make_session(), "the test")
+    server.serve_with_urgent("services", answer, lambda payload: payload == b"stop", 1000, way)
     settle(robot, server)
     outcomes: queue.SimpleQueue[str] = queue.SimpleQueue()
 

@@ -7,7 +7,7 @@ import threading
 import attrs
 from ibrobot_testing.fakes import FakeTransport
 from ibrobot_zenoh.options import Share
-from ibrobot_zenoh.sharing import TopicTransport, components
+from ibrobot_zenoh.sharing import TopicTransport, Urgent, components
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import TransportDescriptor
@@ -37,14 +37,14 @@ class Network(FakeTransport, TopicTransport):
         self.callbacks[topic] = callback
         return lambda: self.callbacks.pop(topic)
 
-    def serve_with_urgent(self, name, handler, is_urgent, largest):
+    def serve_with_urgent(self, name, handler, is_urgent, largest, way):
         self.is_urgent = is_urgent
-        return self.serve(name, handler)
+        return Urgent(self.serve(name, handler), lambda request, timeout_s: handler(request, None))
 
     def publish_cdr(self, name, type_name, payload, *, latched=False):
         self.sent.append((name, type_name, latched))
 
-    def serve_ros(self, name, kind, handler, *, urgent=False):
+    def serve_ros(self, name, kind, handler, *, way=None, check=None):
         return lambda: None
 
     def close(self):
