@@ -285,8 +285,8 @@ class Runtime:
         finally:
             if changing:
                 session.changing.release()
-            for service in (ESTOP, CHECK_ESTOP):
-                session.bus.unserve(service)
+            session.bus.unserve(ESTOP)
+            session.bus.unserve(CHECK_ESTOP)
             self._restore_hook()
 
     def _halt(self) -> None:

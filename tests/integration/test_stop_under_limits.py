@@ -1,4 +1,4 @@
-"""Stops while the system is short of something: one run for each limit of what `benchmarks/stop_under_limits.py` does."""
+"""Stops while the system is short of something: for each limit one run of `benchmarks/stop_under_limits.py`."""
 
 from __future__ import annotations
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
+import os
 import socket
 import ssl
 from collections.abc import Iterator
@@ -27,7 +29,7 @@ from ibrobot_http.certificates import own_certificate
 from ibrobot_http.files import add_files
 from ibrobot_http.guard import Guard
 from ibrobot_http.listener import listen, tls_context
-from ibrobot_http.server import ServerThread
+from ibrobot_http.server import ServerThread, _Door
 from ibrobot_testing.http import HttpSuite, Served
 
 from ibrobot_core.api import IbrobotError
@@ -335,3 +337,34 @@ def test_addresses_of_ipv6_stand_in_brackets() -> None:
     listener = listen("127.0.0.1", 0, ("fe80::1",))
     with contextlib.closing(listener.socket):
         assert listener.url == f"http://[fe80::1]:{listener.port}"
+
+
+def test_one_connection_is_accepted_when_no_file_can_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = socket.create_server(("127.0.0.1", 0))
+    address = opened.getsockname()
+    door = _Door(opened)
+    accept, devnull = socket.socket.accept, os.open
+    spares = door._spare
+
+    def short_of_files(self: socket.socket) -> tuple[socket.socket, Any]:
+        if spares:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return accept(self)
+
+    def refuse(*arguments: Any) -> int:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(socket.socket, "accept", short_of_files)
+    monkeypatch.setattr(os, "open", refuse)
+    with socket.create_connection(address):
+        accepted, _ = door.accept()
+        accepted.close()
+    assert not spares
+    monkeypatch.setattr(os, "open", devnull)
+    monkeypatch.setattr(socket.socket, "accept", accept)
+    with socket.create_connection(address):
+        door.accept()[0].close()
+    assert spares, "it is kept again"
+    door.end_all()
+    door.close()
+    assert not spares

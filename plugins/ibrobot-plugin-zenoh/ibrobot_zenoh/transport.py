@@ -255,7 +255,7 @@ class ZenohTransport(RosTransport):
         key = service_key(self.options.domain, name, kind, hashed=self.options.type_hashes)
         return call(self.connection.session(), key, name, kind, request, timeout_s)
 
-    def _sender(self, query: zenoh.Query) -> str | None:
+    def _sender(self, query: Query) -> str | None:
         """The sender of a request, from its key: the access list permits only keys of the own name."""
         if not self.connection.knows_who_asks:
             return None

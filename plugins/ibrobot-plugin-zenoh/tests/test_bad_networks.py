@@ -286,7 +286,9 @@ def test_a_flood_is_turned_away(monkeypatch: pytest.MonkeyPatch):
     assert begun.wait(WAIT_S)
     for thread in asking[1:]:
         thread.start()
-    assert [outcomes.get(timeout=WAIT_S) for _ in range(3)] == ["slow failed: it is overloaded, or about to end"] * 3
+    assert [outcomes.get(timeout=WAIT_S) for _ in range(3)] == [
+        "slow failed: it is overloaded, has no thread for it, or is about to end"
+    ] * 3
     release.set()
     assert [outcomes.get(timeout=WAIT_S) for _ in range(3)] == ["done"] * 3
     for thread in asking:
