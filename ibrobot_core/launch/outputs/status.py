@@ -73,8 +73,7 @@ class Status(SessionWorker):
             DiagnosticStatus(level if name == "loop" else DiagnosticStatus.OK, name, "", robot, _values(values))
             for name, values in groups.items()
         ]
-        conditions = session.control.report["counters"].get("conditions", ())
-        statuses += [_of_joint(condition, robot) for condition in conditions]
+        statuses += [_of_joint(each, robot) for each in session.control.report["counters"].get("conditions", ())]
         return DiagnosticArray(Header(now_ns), tuple(statuses))
 
 

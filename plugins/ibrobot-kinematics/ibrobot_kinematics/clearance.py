@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import attrs
 
-from ibrobot_core.api import Vector, documented, option
+from ibrobot_core.api import PlanningError, Vector, documented, option
 from ibrobot_core.app import Bus, Service
 
 
@@ -21,7 +21,12 @@ class Configuration:
     )
 
 
-CLEARANCE = Service("/world/clearance", Configuration, float, "Distance from the nearest object [m].")
+CLEARANCE = Service(
+    "/world/clearance",
+    Configuration,
+    float,
+    "Distance from the nearest object [m]; an error if the objects are too old.",
+)
 
 
 def world_clearance(bus: Bus | None, joints: Sequence[str]) -> Callable[[Vector], float] | None:
@@ -32,7 +37,8 @@ def world_clearance(bus: Bus | None, joints: Sequence[str]) -> Callable[[Vector]
         joints: names of the joints that the servo moves.
 
     Returns:
-        Joint positions -> distance from the nearest object [m], infinite without a world. None without a bus.
+        Joint positions -> distance from the nearest object [m]: infinite without a world; minus infinity, so that the
+        tool stops, if it cannot be determined, e.g. because a depth camera is silent. None without a bus.
     """
     if bus is None:
         return None
@@ -40,6 +46,9 @@ def world_clearance(bus: Bus | None, joints: Sequence[str]) -> Callable[[Vector]
     def clearance(position: Vector) -> float:
         if not bus.serves(CLEARANCE):
             return math.inf
-        return bus.call(CLEARANCE, Configuration(dict(zip(joints, position.tolist(), strict=True))))
+        try:
+            return bus.call(CLEARANCE, Configuration(dict(zip(joints, position.tolist(), strict=True))))
+        except PlanningError:  # the section `world` logs what is too old
+            return -math.inf
 
     return clearance

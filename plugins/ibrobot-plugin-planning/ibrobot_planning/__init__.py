@@ -74,10 +74,11 @@ def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
 
 
 def _world(options: WorldOptions, session: RunView) -> Component:
-    if options.clouds:
-        from ibrobot_planning.world.clouds import CloudKeeper
+    ages = [thing.max_age for thing in options.objects.values() if thing.max_age is not None]
+    if options.clouds or options.scene or ages:
+        from ibrobot_planning.world.clouds import SensedWorld
 
-        return CloudKeeper(options, session)
+        return SensedWorld(options, session)
     from ibrobot_planning.world.section import WorldKeeper
 
     return WorldKeeper(options, session)
@@ -119,9 +120,15 @@ def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -
         except ValueError as error:
             yield OptionFault(("objects", name), str(error))
     yield from _unknown_names(options, robot)
-    for name in options.clouds:
+    for name, cloud in options.clouds.items():
         if name in options.objects:
             yield OptionFault(("clouds", name), f"there is an object {name!r} already; clouds need names of their own")
+        if cloud.max_age <= 1 / cloud.rate:
+            yield OptionFault(
+                ("clouds", name, "max_age"),
+                f"{cloud.max_age:g} s is too small for rate {cloud.rate:g} Hz: the cells would be too old before the"
+                f" next update; set it above {1 / cloud.rate:g} s, or rate above {1 / cloud.max_age:g} Hz",
+            )
 
 
 @hookimpl

@@ -11,8 +11,8 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_planning import ibrobot_sections
-from ibrobot_planning.world.clouds import CLEAR, CloudKeeper
-from ibrobot_planning.world.objects import SNAPSHOT, Plane, Voxels
+from ibrobot_planning.world.clouds import CLEAR, SensedWorld
+from ibrobot_planning.world.objects import OBSERVED, Plane, Voxels
 from ibrobot_planning.world.options import WorldOptions
 from ibrobot_planning.world.voxels import cloud_points, outside
 from ibrobot_testing import SectionSuite, make_session
@@ -51,7 +51,7 @@ def session_of(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Session:
     return session
 
 
-class TestCloudKeeper(SectionSuite):
+class TestSensedWorld(SectionSuite):
     @pytest.fixture(autouse=True)
     def _folder(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder, self.monkeypatch = tmp_path, monkeypatch
@@ -62,7 +62,7 @@ class TestCloudKeeper(SectionSuite):
 
     @override
     def component(self, session: Session) -> Component:
-        return CloudKeeper(options(), session)
+        return SensedWorld(options(), session)
 
 
 def cloud(points: Any, frame: str = "lidar") -> PointCloud2:
@@ -95,7 +95,7 @@ class Run:
     """A keeper of a run in lockstep."""
 
     session: Session
-    keeper: CloudKeeper
+    keeper: SensedWorld
 
     def publish(self, message: Message, topic: str = "/points") -> None:
         self.session.bus.publish(topic, message)
@@ -106,7 +106,7 @@ class Run:
 
     def cells(self, name: str = "lidar") -> Vector:
         """Centres of the occupied cells."""
-        objects = self.session.bus.call(SNAPSHOT, None).objects
+        objects = self.session.bus.call(OBSERVED).world.objects
         if name not in objects:
             return np.zeros((0, 3))
         assert isinstance(objects[name].shape, Voxels)
@@ -116,13 +116,13 @@ class Run:
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Run]]:
-    made: list[CloudKeeper] = []
+    made: list[SensedWorld] = []
 
     def started(text: str = CLOUD, *, mounts: bool = True) -> Run:
         session = session_of(tmp_path, monkeypatch)
         if mounts:
             session.bus.publish("/tf_static", MOUNTS, latched=True)
-        made.append(CloudKeeper(options(text), session))
+        made.append(SensedWorld(options(text), session))
         made[-1].start()
         return Run(session, made[-1])
 
@@ -140,7 +140,7 @@ def test_points_become_cells_in_the_base_frame(run):
 def test_depth_images_become_cells(run):
     at = run(DEPTH)
     at.session.bus.publish("/camera/top/camera_info", INFO, latched=True)
-    depth = np.zeros((30, 40))
+    depth = np.full((30, 40), 2.0)  # further than is asked for
     depth[15, 20], depth[5, 20] = 0.75, 0.59
     for encoding in ("16UC1", "32FC1"):
         at.publish(depth_image(depth, encoding), "/camera/top/image_raw")
@@ -198,7 +198,7 @@ def test_cells_are_bounded(run, caplog: pytest.LogCaptureFixture):
 def test_camera_that_moves_is_followed(run):
     at = run(DEPTH)
     at.session.bus.publish("/camera/top/camera_info", INFO, latched=True)
-    depth = np.zeros((30, 40))
+    depth = np.full((30, 40), 2.0)
     depth[15, 20] = 0.69
     moved = attrs.evolve(MOUNTS.transforms[1], translation=Vector3(0.31, 0.21, 0.9))
     at.session.bus.publish("/tf", TFMessage((moved,)))
@@ -250,8 +250,12 @@ def test_malformed_clouds_are_refused(message: PointCloud2, told: str):
 @pytest.mark.parametrize(
     ("text", "message", "told"),
     [
-        (CLOUD, cloud([[0.3, 0.2, 0.0]], "map"), "no transform of frame 'map'; peripherals[].transform says where"),
-        (CLOUD, attrs.evolve(ONE, fields=()), "world.clouds.lidar: /points: the cloud has no field x"),
+        (
+            CLOUD,
+            cloud([[0.3, 0.2, 0.0]], "map"),
+            "no transform of frame 'map' to the base; peripherals[].transform says",
+        ),
+        (CLOUD, attrs.evolve(ONE, fields=()), "cloud 'lidar' (/points): refused a message: the cloud has no field x"),
         (CLOUD, attrs.evolve(depth_image(np.ones((2, 2))), encoding="rgb8"), "got sensor_msgs/msg/Image rgb8"),
         (CLOUD, depth_image(np.ones((30, 40))), "a depth image needs the CameraInfo of its camera on /camera_info"),
     ],

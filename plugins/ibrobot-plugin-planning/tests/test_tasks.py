@@ -25,7 +25,7 @@ REST = """
 peripherals:
   - {name: eye, kind: camera, type: eye}
 models: {wave: {type: wave}}
-world: {scene: true}
+world: {scene: true, scene_when_stale: keep}
 tasks: {}
 contract:
   rate_hz: 20

@@ -271,7 +271,7 @@ IMPOSSIBLE = (
     (ADD, {"name": "can", "object": {"shape": "plane"}}, PlanningError, "there is an object 'can' already"),
     (ADD, {"name": "cup", "object": {"shape": "box", "size": [600, 1, 1]}}, PlanningError, "at most 100 m"),
     (ADD, {"name": "cup"}, RequestError, "/world/add: object: required key is missing"),
-    (ADD, "{name: cup}", RequestError, "expected a mapping with name, object, replace, got '{name: cup}'"),
+    (ADD, "{name: cup}", RequestError, "expected a mapping with name, object, replace, stamp_ns, got '{name: cup}'"),
     (REMOVE, "cup", PlanningError, "no object 'cup'; the objects are: table, can"),
     (ATTACH, {"name": "can", "link": "foot"}, PlanningError, "no link 'foot'; the links are: world, base"),
     (ATTACH, {"name": "can", "link": ""}, PlanningError, "no link ''"),

@@ -36,6 +36,7 @@ from ibrobot_planning.goals.text import Target, target
 from ibrobot_planning.planners.search import length
 from ibrobot_planning.planners.timing import motion_of
 from ibrobot_planning.world.objects import world_of
+from ibrobot_planning.world.options import WorldOptions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -211,7 +212,10 @@ def _session(config: RobotConfig, seed: int) -> Iterator[Session]:
     with ExitStack() as stack:
         for descriptor, options in session.registry.sections(config):
             if descriptor.type == "world":
-                world = descriptor.make(options, session)
+                assert isinstance(options, WorldOptions)
+                if options.clouds:
+                    session.log.warning("planned without clouds, which only a run sees: %s", ", ".join(options.clouds))
+                world = descriptor.make(options.without_ages(), session)
                 stack.callback(world.stop)
                 world.start()
         yield session

@@ -70,9 +70,14 @@ class GoalPlans:
         return Tool(robot_model(self._session.config.robot))
 
     def surroundings(self, goals: Sequence[GoalOptions], start: Vector) -> tuple[World, Vector | None]:
-        """The objects, and the position of the tool [m], shape (3,), at `start` if a goal is relative to it."""
+        """The objects if a goal is relative to one, and the position of the tool [m], shape (3,), at `start` likewise.
+
+        Raises:
+            PlanningError: if the objects are too old.
+        """
+        world = world_of(self._session.bus) if any(each.object is not None for each in goals) else World()
         relative = any(each.relative for each in goals)
-        return world_of(self._session.bus), self.tool.model.forward(start).position if relative else None
+        return world, self.tool.model.forward(start).position if relative else None
 
     def any_goal(self, goals: Sequence[GoalOptions], start: Vector) -> Goal:
         """The only goal, or all as alternatives.

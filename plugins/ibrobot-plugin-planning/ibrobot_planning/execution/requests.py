@@ -21,6 +21,7 @@ from ibrobot_core.api import (
 from ibrobot_core.app import Goal, PlanCode
 from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions
 from ibrobot_planning.goals.text import Target
+from ibrobot_planning.world.ages import AgeSummary
 
 
 def _few(most: int) -> Callable[[object, attrs.Attribute[Any], Sequence[object]], None]:
@@ -83,7 +84,7 @@ class MoveToPose:
 
 @attrs.frozen(eq=False)
 class JointTarget:
-    """A sensor_msgs/msg/JointState as a goal; only names and positions are read."""
+    """A sensor_msgs/msg/JointState as a goal; only names, positions and the header's time are read."""
 
     name: tuple[str, ...]
     position: Vector
@@ -155,6 +156,7 @@ class PlanAnswer:
     message: str = ""
     """The error in one sentence; empty after a success."""
     trajectory: JointTrajectory | None = None
+    """The time in its header is 0, so that it can be executed at any time."""
     fraction: float = 0.0
     """Fraction of a straight path that the trajectory covers."""
     alternative: int = 0
@@ -211,6 +213,9 @@ class PlanningScene:
     """Name of the tool centre point."""
     links: tuple[str, ...]
     objects: Mapping[str, ObjectSummary]
+    """As they were last seen, also while they are too old to plan with."""
+    ages: Mapping[str, AgeSummary] = attrs.field(factory=dict)
+    """Cloud or object -> its age; without objects that never get too old."""
 
 
 @documented
@@ -220,7 +225,9 @@ class Execute:
 
     joint_names: tuple[str, ...] = option(help="the joints of the trajectory")
     points: tuple[JointTrajectoryPoint, ...] = option(help="positions, and velocities and accelerations if wanted")
-    header: Header = option(Header(), help="is not read: a trajectory begins when it is executed")
+    header: Header = option(
+        Header(), help="its time is the present, or 0 for that; a trajectory begins when it is executed"
+    )
 
     def __attrs_post_init__(self) -> None:
         if not self.joint_names or not self.points:

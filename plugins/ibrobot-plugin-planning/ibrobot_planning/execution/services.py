@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import attrs
 import numpy as np
 
 from ibrobot_core.api import Header, IbrobotError, JointState, PlanningError, PoseStamped, Vector
@@ -31,7 +32,7 @@ from ibrobot_planning.goals.text import target
 from ibrobot_planning.goals.tool import Candidate
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
-from ibrobot_planning.world.objects import world_of
+from ibrobot_planning.world.objects import observed_world, world_of
 
 if TYPE_CHECKING:
     from ibrobot_planning.world.arm import Arm
@@ -182,16 +183,19 @@ class PlanningServices:
         from ibrobot_planning.world.arm import robot_arm
 
         robot, reading = self._robot, self._session.measured()
+        observed = observed_world(self._session.bus)
         objects = {
             name: ObjectSummary(type(each.shape).__name__.lower(), each.pose, each.link, tuple(sorted(each.may_touch)))
-            for name, each in world_of(self._session.bus).objects.items()
+            for name, each in observed.world.objects.items()
         }
         try:
             tip, links = self._plans.tool.model.tip, tuple(robot_arm(robot).frames)
         except IbrobotError:  # a robot without a model can still move its joints
             tip, links = "", ()
         state = JointState(Header(reading.stamp_ns), robot.joint_names, reading.position, reading.velocity)
-        return PlanningScene(robot.name, state, robot.groups, tuple(robot.description.poses), tip, links, objects)
+        return PlanningScene(
+            robot.name, state, robot.groups, tuple(robot.description.poses), tip, links, objects, observed.ages
+        )
 
 
 def _answer(plan: Callable[[], PlanResult]) -> PlanAnswer:
@@ -201,7 +205,8 @@ def _answer(plan: Callable[[], PlanResult]) -> PlanAnswer:
         planned = plan()
     except PlanningError as error:
         return PlanAnswer(error.code, str(error), planning_time_s=time.monotonic() - begun)
+    trajectory = attrs.evolve(planned.trajectory, header=attrs.evolve(planned.trajectory.header, stamp_ns=0))
     return PlanAnswer(
-        PlanCode.SUCCESS, "", planned.trajectory, planned.fraction, planned.alternative,
+        PlanCode.SUCCESS, "", trajectory, planned.fraction, planned.alternative,
         planned.position_error, planned.orientation_error, time.monotonic() - begun,
     )  # fmt: skip

@@ -37,6 +37,7 @@ from ibrobot_planning.execution.services import PlanningServices
 from ibrobot_planning.goals.grammar import check_frame
 from ibrobot_planning.goals.text import Target, target
 from ibrobot_planning.goals.tool import pose_matrix
+from ibrobot_planning.world.objects import observed_world
 
 GO_TO = Service(
     "/planning/go_to", GoTo, int, "Move to a goal, which replaces the present one; answers with its number.", "goal"
@@ -104,7 +105,8 @@ class _Move:
     dropped: str = ""
     """Why it stops early; empty otherwise."""
     blocked: str = ""
-    """What is in its way; empty otherwise."""
+    """What is in its way, or why the world cannot be trusted; empty otherwise."""
+    blocked_code: PlanCode = PlanCode.MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE
     result: MoveResult | None = None
     ended: threading.Event = attrs.field(factory=threading.Event)
 
@@ -136,6 +138,8 @@ class PlannerSource(SourceWorker):
         self._unwatched = threading.Event()
         """Set to end the watching thread."""
         self._last_state: ControlState | None = None
+        self._era = 0, 0
+        """Numbers of the emergency stops and of the generation that `/cmd_pose` was last read in."""
         for goal in () if session.has_control else session.request.goals:
             try:
                 self._queue.append(self._new(goal, asked=True))
@@ -177,6 +181,7 @@ class PlannerSource(SourceWorker):
         if self._move is not None:
             self._finish(self._move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, "control was reset")
         self._poses.drain()
+        self._era = self.session.stops, self.session.generation
         self._forget()
         for service, handler in self._services.items():
             self.session.bus.serve(service, handler)
@@ -231,7 +236,7 @@ class PlannerSource(SourceWorker):
             if self._move is not None:
                 self._following(self._move, self._execution.step)
                 self._end_at_rest(self._move)
-            if self._move is None and self._queue and self._at_rest():
+            if self._move is None and self._queue and self._at_rest() and not self._awaits_world():
                 self._begin(self._queue.popleft())
             if self._move is not None and self.session.clock.now_ns() - self._status_ns >= _STATUS_NS:
                 self._show("executing")
@@ -256,17 +261,26 @@ class PlannerSource(SourceWorker):
         """The goals of the request that have ended, with their results."""
         return [(move.target.text, move.result) for move in self._goals if move.result is not None]
 
-    def _new(self, goal: str | Goal | Target, velocity_scaling: float = 1.0, *, asked: bool = False) -> _Move:
+    def _new(
+        self, goal: str | Goal | Target, velocity_scaling: float = 1.0, *, asked: bool = False, stops: int | None = None
+    ) -> _Move:
         """A goal that was checked.
+
+        Args:
+            goal: the goal.
+            velocity_scaling: fraction of the velocity limits.
+            asked: whether the run was started with this goal.
+            stops: number of emergency stops when it was requested; None: all so far.
 
         Raises:
             PlanningError: for an invalid goal, or while the robot is stopped, since a goal must not wait for the reset.
         """
+        stops = self.session.stops if stops is None else stops
         parsed = target(goal, self.session.config.robot, velocity_scaling)
         self._plans.check(parsed)
         if self.session.faults:
             raise PlanningError(f"refused before a reset: {self.session.faults[-1]}", PlanCode.CONTROL_FAILED)
-        return _Move(self._results.number(), parsed, asked, self.session.stops)
+        return _Move(self._results.number(), parsed, asked, stops)
 
     def _submit(self, goal: str | Goal | Target, velocity_scaling: float = 1.0) -> _Move:
         """Replace all goals by this one."""
@@ -279,7 +293,17 @@ class PlannerSource(SourceWorker):
         parsed = target(goal, self.session.config.robot, wanted.velocity_scaling)
         return self._submit(attrs.evolve(parsed, acceleration_scaling=wanted.acceleration_scaling)).number
 
+    def _check_time(self, stamp_ns: int) -> None:
+        """Refuse a goal that is too old, or in the future, by the time in its header [ns].
+
+        Raises:
+            PlanningError: for such a goal.
+        """
+        if refusal := self.session.clock.refusal(stamp_ns):
+            raise PlanningError(refusal, PlanCode.INVALID_GOAL_CONSTRAINTS)
+
     def _execute(self, request: Execute) -> int:
+        self._check_time(request.header.stamp_ns)
         return self._submit(Target("trajectory", trajectory=request.trajectory())).number
 
     def _move_to_pose(self, wanted: MoveToPose) -> MoveResult:
@@ -287,7 +311,12 @@ class PlannerSource(SourceWorker):
 
     def _move_to_configuration(self, wanted: MoveToConfiguration) -> MoveResult:
         state = wanted.target_joint_state
-        return self._wait(lambda: JointGoal(state.name, state.position), wanted.velocity_scaling)
+
+        def goal() -> JointGoal:
+            self._check_time(state.header.stamp_ns)
+            return JointGoal(state.name, state.position)
+
+        return self._wait(goal, wanted.velocity_scaling)
 
     def _wait(self, goal: Callable[[], Goal], velocity_scaling: float) -> MoveResult:
         """Submit a goal and wait for its end; an invalid goal is REJECTED."""
@@ -304,20 +333,30 @@ class PlannerSource(SourceWorker):
         return move.result or _ENDED
 
     def _take_pose(self) -> None:
+        """Move to a pose that has come, unless it is older than a stop or a reset, or too old or too new by its time.
+
+        A pose without a time counts as made when it came, so that one that waited, e.g. for a long plan, is dropped.
+        """
+        session = self.session
+        era, self._era = self._era, (session.stops, session.generation)
+        if era != self._era:
+            self._poses.drain()
         received = self._poses.get()
         if received is None:
             return
         message = received.message
         try:
+            stamp_ns = 0
             if isinstance(message, PoseStamped):
                 check_frame(message.header.frame_id)
-                message = message.pose
+                stamp_ns, message = message.header.stamp_ns, message.pose
+            self._check_time(stamp_ns or received.received_ns)
             if not isinstance(message, Pose):
                 raise PlanningError(
                     f"takes geometry_msgs/msg/PoseStamped or Pose, got {message.ros_type}",
                     PlanCode.UNRECOGNIZED_GOAL_TYPE,
                 )
-            self._replace(self._new(_nearest(message)))
+            self._replace(self._new(_nearest(message), stops=self._era[0]))
         except PlanningError as error:
             self.session.log.error("%s: %s: %s", CMD_POSE, error.code.name, error)
             self._show("failed")
@@ -373,14 +412,18 @@ class PlannerSource(SourceWorker):
         move = self._move
         if move is None or move.dropped or move.blocked:
             return
+        code = PlanCode.SUCCESS
         try:
             blocked = self._execution.blocked()
         except PlanningError as error:
             blocked = f"the motion cannot be checked: {error}"
+            code = error.code
         if blocked:
             with self._choosing:
                 if move is self._move:
                     move.blocked = blocked
+                    if code is PlanCode.SENSOR_INFO_STALE:
+                        move.blocked_code = code
                     self._execution.stop(move.number)
 
     def _watch_on(self) -> None:
@@ -389,6 +432,10 @@ class PlannerSource(SourceWorker):
                 self._watch()
         except Exception as error:  # noqa: BLE001 - an unwatched motion must not go on
             self.session.fail(self.name, error)
+
+    def _awaits_world(self) -> bool:
+        """Whether the first message of a cloud may still come, shortly after the start."""
+        return observed_world(self.session.bus).is_awaited
 
     def _at_rest(self) -> bool:
         """Whether the commands are at rest: the safety layer may follow the executors with a delay."""
@@ -426,8 +473,7 @@ class PlannerSource(SourceWorker):
         if self._execution.under_way:
             return
         if move.blocked:
-            code = PlanCode.MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE
-            self._finish(move, "EXECUTION_FAILED", code, self._stopped(move))
+            self._finish(move, "EXECUTION_FAILED", move.blocked_code, self._stopped(move))
         elif move.dropped:
             self._finish(move, "CANCELLED", PlanCode.PREEMPTED, move.dropped)
         elif move.failures:
@@ -439,6 +485,8 @@ class PlannerSource(SourceWorker):
 
     def _stopped(self, move: _Move) -> str:
         """How a blocked arm came to rest."""
+        if move.blocked_code is PlanCode.SENSOR_INFO_STALE:
+            return f"stopped: {move.blocked}"
         try:
             touched = self._execution.touched()
         except PlanningError as error:

@@ -14,7 +14,7 @@ from ibrobot_kinematics.rotations import from_quaternion, from_rpy
 from ibrobot_core.api import PlanningError, Pose, Vector, Vector3, documented, option
 from ibrobot_core.app import JointGoal, LinearGoal, NamedGoal, OrientationPolicy, PlanCode, PoseGoal, PositionGoal
 from ibrobot_planning.goals.errors import invalid_goal
-from ibrobot_planning.world.objects import World
+from ibrobot_planning.world.objects import BASE_FRAMES, World
 from ibrobot_planning.world.options import FURTHEST
 
 type Triple = tuple[float, float, float]
@@ -23,7 +23,6 @@ DIRECTIONS: Mapping[str, Triple] = {"down": (0.0, 0.0, -1.0), "up": (0.0, 0.0, 1
 POLICIES: tuple[str, ...] = get_args(OrientationPolicy)
 LEAST_SCALING = 0.01
 """Least fraction of the velocity and acceleration limits that a goal may ask for."""
-_BASE_FRAMES = ("", "base", "base_link")
 _NEARLY_ONE = 1e-3
 """Allowed deviation of a quaternion's length from 1."""
 _UPRIGHT = math.cos(math.radians(45.0))
@@ -198,8 +197,8 @@ def check_frame(frame: str) -> None:
     Raises:
         PlanningError: if it is not.
     """
-    if frame not in _BASE_FRAMES:
-        names = ", ".join(filter(None, _BASE_FRAMES))
+    if frame not in BASE_FRAMES:
+        names = ", ".join(filter(None, BASE_FRAMES))
         raise PlanningError(f"frame {frame!r} is not the base; it is called {names}", PlanCode.FRAME_TRANSFORM_FAILURE)
 
 

@@ -32,7 +32,7 @@ from ibrobot_planning.tasks.format import (
     WaitStep,
 )
 from ibrobot_planning.tasks.result import StepOutcome, StepResult
-from ibrobot_planning.world.objects import World, world_of
+from ibrobot_planning.world.objects import World, observed_world, world_of
 from ibrobot_planning.world.options import Attached, Detached, Touched
 from ibrobot_planning.world.section import ATTACH, DETACH, TOUCH
 
@@ -117,6 +117,8 @@ class Performance:
             try:
                 if self.cancelled:
                     raise Cancelled
+                while observed_world(session.bus).is_awaited:
+                    yield from self._tick()
                 facts = dict((yield from self._act(step)))
             except Cancelled:
                 outcome, message = "CANCELLED", self.cancelled

@@ -20,7 +20,7 @@ from ibrobot_planning.tasks.format import Step
 from ibrobot_planning.tasks.performing import Performance
 from ibrobot_planning.tasks.reading import TaskFile, read_task
 from ibrobot_planning.tasks.result import TaskResult
-from ibrobot_planning.world.objects import SNAPSHOT
+from ibrobot_planning.world.objects import OBSERVED
 from ibrobot_planning.world.section import SECTION, scene_objects
 
 
@@ -134,7 +134,7 @@ class TaskRunner(SessionWorker):
             why = "the robot YAML has no section `recording`"
         elif not session.request.by_operator:
             why = "this run records its episodes itself; `ibrobot task run` leaves that to the task"
-        world = session.bus.call(SNAPSHOT) if session.bus.serves(SNAPSHOT) else None
+        world = session.bus.call(OBSERVED).world if session.bus.serves(OBSERVED) else None
         movable = [thing.name for thing in scene if thing.topic]
         start = session.state.command if session.state is not None else None
         return check_task(file, Situation(config, session.registry, world, movable, start, why))

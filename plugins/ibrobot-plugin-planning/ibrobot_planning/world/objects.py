@@ -15,7 +15,10 @@ from numpy.typing import ArrayLike
 
 from ibrobot_core.api import PlanningError, Pose, Vector
 from ibrobot_core.app import Bus, NoRequest, PlanCode, Service
+from ibrobot_planning.world.ages import AgeSummary
 
+BASE_FRAMES = ("", "base", "base_link")
+"""Names of the base frame."""
 FLOOR = "floor"
 """Name of the object that the option `floor` of a planner adds."""
 _LARGEST_M = 100.0
@@ -286,12 +289,39 @@ class World:
         return self.objects[name]
 
 
-SNAPSHOT = Service("/world/snapshot", NoRequest, World, "The objects around the robot.")
+@attrs.frozen
+class ObservedWorld:
+    """The objects around the robot as they were last seen, and how long ago."""
+
+    world: World = World()
+    ages: Mapping[str, AgeSummary] = attrs.field(factory=dict)
+    """Cloud or object -> its age; without objects that never get too old."""
+    refusal: str = ""
+    """Why plans are refused, and what to do about it; empty if they are not."""
+    is_awaited: bool = False
+    """Whether a cloud has not come yet, shortly after the start of the run."""
+
+
+SNAPSHOT = Service(
+    "/world/snapshot", NoRequest, World, "The objects around the robot; an error if they are too old to plan with."
+)
+OBSERVED = Service(
+    "/world/observed", NoRequest, ObservedWorld, "The objects around the robot, and their ages, however old they are."
+)
 
 
 def world_of(bus: Bus) -> World:
-    """The objects around the robot; none in a run without the section `world`."""
+    """The objects around the robot, for plans; none in a run without the section `world`.
+
+    Raises:
+        PlanningError: if a part of the world is too old, and its rule is to refuse plans.
+    """
     return bus.call(SNAPSHOT) if bus.serves(SNAPSHOT) else World()
+
+
+def observed_world(bus: Bus) -> ObservedWorld:
+    """The objects around the robot however old they are, e.g. to show them."""
+    return bus.call(OBSERVED) if bus.serves(OBSERVED) else ObservedWorld()
 
 
 def read_mesh(path: Path, scale: float = 1.0, *, convex: bool = False) -> Mesh:

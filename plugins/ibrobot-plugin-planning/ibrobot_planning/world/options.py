@@ -25,6 +25,9 @@ _KEYS = {
 }
 """Shape -> the keys that it needs."""
 _LONGEST_NAME = 100
+WhenStale = Literal["refuse", "keep", "forget"]
+"""What planners do about a part of the world that is too old: refuse to plan, keep what was seen last, forget it."""
+_RULE = "when it is older: `refuse` plans and stop planned motions, `keep` what was seen last, or `forget` it"
 
 
 def _near(instance: object, attribute: attrs.Attribute[Any], value: Sequence[float] | None) -> None:
@@ -55,6 +58,10 @@ class ObjectOptions:
     )
     link: str | None = option(None, help="link of the MJCF that carries it; its position and turns are in that frame")
     may_touch: tuple[str, ...] = option((), help="links and objects that it may touch")
+    max_age: float | None = option(
+        None, unit="s", gt=0, help="greatest age of its pose, which /world/move renews; none: it stays where it is"
+    )
+    when_stale: WhenStale = option("refuse", help=_RULE)
 
     def __attrs_post_init__(self) -> None:
         needed = _KEYS.get(self.shape, ())
@@ -116,6 +123,18 @@ class CloudOptions:
     rate: float = option(2.0, unit="Hz", gt=0, le=30, help="updates per second, at most")
     keep: float = option(0.0, unit="s", ge=0, help="how long cells stay after they were last seen; 0: until the next")
     most_cells: int = option(20_000, ge=1, help="occupied cells, at most; those nearest to the base are kept")
+    max_age: float = option(1.5, unit="s", gt=0, help="greatest age of the newest usable message, by its stamp")
+    when_stale: WhenStale = option("refuse", help=_RULE)
+    least_valid: float = option(
+        0.05,
+        ge=0,
+        le=1,
+        help="a message is refused as that of a covered sensor if it measures less than this share of its points or"
+        " pixels, or of the points of the last ten; 0: an empty message is an empty world",
+    )
+    transform_tolerance: float = option(
+        0.5, unit="s", gt=0, help="greatest difference between the time of a message and that of its frame on /tf"
+    )
 
 
 @documented
@@ -129,6 +148,13 @@ class WorldOptions:
         None, help="folder of meshes that requests to /world/add may use, besides meshes of packages"
     )
     scene: bool = option(False, help="add the objects of a simulation's scene, at their present poses")
+    scene_max_age: float = option(1.0, unit="s", gt=0, help="greatest age of the poses of the scene's objects")
+    scene_when_stale: WhenStale = option("refuse", help=_RULE)
+
+    def without_ages(self) -> WorldOptions:
+        """The same world without clouds and limits of ages, for plans without a run, in which nothing is measured."""
+        objects = {name: attrs.evolve(thing, max_age=None) for name, thing in self.objects.items()}
+        return attrs.evolve(self, objects=objects, clouds={}, scene_when_stale="keep")
 
 
 def _short(instance: object, attribute: attrs.Attribute[str], value: str) -> None:
@@ -144,6 +170,7 @@ class Added:
     name: str = option(validator=_short, help="a name that no object has")
     object: ObjectOptions = option(help="the object, as in the YAML")
     replace: bool = option(False, help="replace an object of this name")
+    stamp_ns: int = option(0, unit="ns", ge=0, help="when its pose was measured; 0: now")
 
 
 @documented
@@ -164,6 +191,7 @@ class Moved:
         unit="m", validator=_near, help="in the object's frame: of the base, or of the link that carries it"
     )
     rpy: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="rad", help="turns about its x, y and z axis")
+    stamp_ns: int = option(0, unit="ns", ge=0, help="when its pose was measured; 0: now")
 
 
 @documented

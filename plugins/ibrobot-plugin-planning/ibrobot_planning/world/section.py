@@ -26,23 +26,37 @@ from ibrobot_core.api import (
     resolve_path,
 )
 from ibrobot_core.app import Component, NoRequest, PlanCode, Registry, RobotConfig, RunView, Service, Subscription
+from ibrobot_planning.world.ages import Age, Limit, Unusable
 from ibrobot_planning.world.objects import (
     FLOOR,
+    OBSERVED,
     SIMPLE,
     SNAPSHOT,
     Box,
     Mesh,
+    ObservedWorld,
     Shape,
     World,
     WorldObject,
 )
-from ibrobot_planning.world.options import Added, Allowed, Attached, Detached, Moved, Named, Touched, WorldOptions
+from ibrobot_planning.world.options import (
+    FURTHEST,
+    Added,
+    Allowed,
+    Attached,
+    Detached,
+    Moved,
+    Named,
+    Touched,
+    WorldOptions,
+)
 
 if TYPE_CHECKING:
     from ibrobot_planning.world.arm import Arm
     from ibrobot_planning.world.collision import Clearance
 
 SECTION = "world"
+type _Request = Added | Named | Moved | Attached | Detached | Touched | Allowed
 MOST_OBJECTS = 200
 """Most objects of the world; requests for more are refused."""
 MOST_TRIANGLES = 200_000
@@ -61,6 +75,10 @@ ALLOW = Service("/world/allow", Allowed, list, "State what an object may touch."
 SHAPES: Service[NoRequest, Sequence[SceneObject]] = Service(
     "/world/shapes", NoRequest, Sequence, "The objects in the base frame that have simple shapes."
 )
+_MOST_NAMED = 3
+"""Clouds and objects that the reason of a refused plan names."""
+_NEARLY_ONE = 1e-3
+"""Allowed deviation of a quaternion's length from 1."""
 _STILL = 1e-4
 """Smaller changes of an object's position [m] and axes do not count as motion."""
 
@@ -110,11 +128,40 @@ def simple_objects(world: World) -> list[SceneObject]:
     ]
 
 
+def _signalled(message: Float64MultiArray, first: int) -> Pose:
+    """The pose in a message of a simulation that begins at index `first`: position [m], and w, x, y, z.
+
+    Raises:
+        Unusable: if there is none.
+    """
+    values = message.data[first : first + 7]
+    if len(values) != 7 or not (np.abs(values) <= FURTHEST).all():  # so that NaN fails it
+        raise Unusable("malformed", f"seven numbers up to {FURTHEST:g} begin at {first}, got {values.tolist()}")
+    x, y, z, qw, qx, qy, qz = values.tolist()
+    if abs(np.linalg.norm(values[3:]) - 1) > _NEARLY_ONE:
+        raise Unusable("malformed", f"its quaternion has length {np.linalg.norm(values[3:]):.3g}, must be 1")
+    return Pose(Vector3(x, y, z), Quaternion(qx, qy, qz, qw))
+
+
+def _refusal(ages: Sequence[Age]) -> str:
+    """Why plans are refused, and what to do, if these parts of the world are too old; empty without any."""
+    if not ages:
+        return ""
+    more = f"; and {len(ages) - _MOST_NAMED} more" if ages[_MOST_NAMED:] else ""
+    problems = "; ".join(age.problem for age in ages[:_MOST_NAMED]) + more
+    remedies = "; ".join(dict.fromkeys(age.remedy for age in ages[:_MOST_NAMED]))
+    return f"the world is not known well enough to plan: {problems}: {remedies}"
+
+
 class WorldKeeper(Component):
     """Serves `/world/add`, `remove`, `move`, `attach`, `detach`, `allow` and `touch`; snapshots and clearances.
 
     A change answers with the names of all objects, and makes a new world, so that planners see consistent ones. Objects
-    of the simulated scene are where the simulation has them, unless they are attached.
+    of the simulated scene are where the simulation has them, unless they are attached. While a part of the world is too
+    old, snapshots and clearances are refused, or leave it out, by its rule.
+
+    Attributes:
+        ages: cloud or object -> its age.
     """
 
     def __init__(self, options: WorldOptions, session: RunView) -> None:
@@ -122,19 +169,21 @@ class WorldKeeper(Component):
         self._world = first_world(options, scene)
         super().__init__("world", f"{len(self._world.objects)} objects for planners", ())
         self._session = session
-        self._meshes = options.meshes
         self._lock = threading.RLock()
         self._measuring = threading.Lock()
         self._moving = {thing.name: thing for thing in scene if thing.topic}
         """Objects of the scene that may move."""
         self._poses: dict[str, Subscription] = {}
+        self._options = options
+        self.ages: dict[str, Age] = {}
         self._touched: tuple[str, ...] = ()
         self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
             SNAPSHOT: lambda _: self._snapshot(),
-            SHAPES: lambda _: simple_objects(self._snapshot()),
+            OBSERVED: lambda _: self.observed(),
+            SHAPES: lambda _: simple_objects(self.observed().world),
             ADD: self._add,
             REMOVE: self._changing(lambda world, it: world.remove(it.name)),
-            MOVE: self._changing(lambda world, it: world.move(it.name, pose_at(it.position, it.rpy))),
+            MOVE: self._changing(self._move),
             ATTACH: self._changing(self._attach),
             DETACH: self._changing(self._detach),
             TOUCH: self._changing(self._touch),
@@ -152,6 +201,7 @@ class WorldKeeper(Component):
         if self._session.config.robot.description.mjcf is not None:
             _ = self._arm  # slow, so not in the first service call
         self._check(self._world)
+        self._begin_ages()
         for service, handler in self._services.items():
             self._session.bus.serve(service, handler, self._mesh_file)
 
@@ -176,19 +226,71 @@ class WorldKeeper(Component):
             if named := sorted(self._temporary & set(links)):
                 raise PlanningError(f"a cloud has the name of link {named[0]!r}")
 
+    def _begin_ages(self) -> None:
+        """Let everything age from now on: what the YAML and the scene state holds at the start."""
+        options, now_ns = self._options, self._session.clock.now_ns()
+        of_scene = Limit(
+            options.scene_max_age, options.scene_when_stale, "world.scene_max_age", "world.scene_when_stale"
+        )
+        for name in self._world.objects:
+            limit = of_scene if name in self._moving else Limit()
+            if (thing := options.objects.get(name)) is not None:
+                limit = Limit.of(f"world.objects.{name}", thing.max_age, thing.when_stale)
+            self.ages[name] = self._age(name, limit)
+            self.ages[name].renew(now_ns)
+        for name, cloud in options.clouds.items():
+            limit = Limit.of(f"world.clouds.{name}", cloud.max_age, cloud.when_stale)
+            self.ages[name] = self._age(name, limit, f"cloud {name!r} ({cloud.topic})")
+
+    def _age(self, name: str, limit: Limit, what: str = "") -> Age:
+        """A new age of a cloud or object."""
+        session = self._session
+        what = what or f"the pose of object {name!r}"
+        return Age(what, limit, session.clock, session.log, session.clock.now_ns())
+
     def _snapshot(self) -> World:
+        """The world, for plans.
+
+        Raises:
+            PlanningError: if a part of it is too old, and its rule is to refuse plans.
+        """
+        observed = self.observed()
+        if observed.refusal:
+            raise PlanningError(observed.refusal, PlanCode.SENSOR_INFO_STALE)
+        return observed.world
+
+    def observed(self) -> ObservedWorld:
+        """The world however old it is, without what is forgotten; also logs what has become too old."""
         with self._lock:
             self._world = self._observed()
             world = self._world
-            if not self._touched:
-                return world
-            hand = frozenset(self._hand())
-            carried = {name for name, thing in world.objects.items() if thing.link in hand}
-            objects = dict(world.objects)
-            for name in (name for name in self._touched if name in objects):
-                touching = objects[name].may_touch | hand | carried - {name}
-                objects[name] = attrs.evolve(objects[name], may_touch=touching)
-            return World(objects)
+            # What a link carries is where the link is.
+            carried = {name for name, thing in world.objects.items() if thing.link is not None}
+            known = world.objects.keys() | self._options.clouds.keys()
+            ages = {name: age for name, age in self.ages.items() if name in known - carried}
+            for name, age in ages.items():
+                age.report()
+                if age.limit.when_stale == "forget" and age.is_stale and name in world.objects:
+                    world = world.remove(name)
+            refusing = [age for age in ages.values() if age.refuses]
+            return ObservedWorld(
+                self._with_touched(world),
+                {name: age.summary for name, age in ages.items() if age.limit.max_age is not None},
+                _refusal(refusing),
+                any(age.is_awaited for age in refusing),
+            )
+
+    def _with_touched(self, world: World) -> World:
+        """The world with what the hand may touch for now."""
+        if not self._touched:
+            return world
+        hand = frozenset(self._hand())
+        carried = {name for name, thing in world.objects.items() if thing.link in hand}
+        objects = dict(world.objects)
+        for name in (name for name in self._touched if name in objects):
+            touching = objects[name].may_touch | hand | carried - {name}
+            objects[name] = attrs.evolve(objects[name], may_touch=touching)
+        return World(objects)
 
     def _observed(self) -> World:
         """The world with the objects of the scene at their present poses."""
@@ -200,32 +302,85 @@ class WorldKeeper(Component):
             message = received.message
             assert isinstance(message, Float64MultiArray)
             for name, thing in self._moving.items():
-                if thing.topic == topic and name in world.objects and world.objects[name].link is None:
-                    x, y, z, qw, qx, qy, qz = message.data[thing.first : thing.first + 7].tolist()
-                    now = Pose(Vector3(x, y, z), Quaternion(qx, qy, qz, qw))
-                    # Physics jitters: the world stays the same until an object has really moved.
-                    if np.abs(matrix(now) - matrix(world.objects[name].pose)).max() > _STILL:
-                        world = world.move(name, now)
+                if thing.topic != topic or name not in world.objects:
+                    continue
+                try:
+                    now = _signalled(message, thing.first)
+                except Unusable as error:
+                    self.ages[name].refuse(error)
+                    continue
+                self.ages[name].renew(received.received_ns)
+                # Physics jitters: the world stays the same until an object has really moved.
+                placed = world.objects[name]
+                if placed.link is None and np.abs(matrix(now) - matrix(placed.pose)).max() > _STILL:
+                    world = world.move(name, now)
         return world
 
-    def put(self, name: str, thing: WorldObject | None) -> None:
-        """Replace an object, or remove it."""
+    def put(self, name: str, thing: WorldObject | None, measured_ns: int | None = None) -> None:
+        """Replace the object of a cloud, or remove it; `measured_ns` is when it was measured, if it was [ns]."""
         with self._lock:
+            if measured_ns is not None:
+                self.ages[name].renew(measured_ns)
             others = {key: value for key, value in self._world.objects.items() if key != name}
             self._world = World(others if thing is None else {**others, name: thing})
 
-    def _changing[T](self, change: Callable[[World, T], World]) -> Callable[[T], list[str]]:
+    def _changing[T: _Request](self, change: Callable[[World, T], World]) -> Callable[[T], list[str]]:
         def handler(request: T) -> list[str]:
             with self._lock:
                 try:
                     world = change(self._observed(), request)
+                    aged = self._aged(request)
                 except ValueError as error:
                     raise PlanningError(str(error)) from error
                 self._check(world)
                 self._world = world
-                return list(self._world.objects)
+                if aged is not None:
+                    name, age, measured_ns = aged
+                    self.ages[name] = age
+                    age.renew(measured_ns)
+                known = {*world.objects, *self._moving, *self._options.clouds}
+                self.ages = {name: age for name, age in self.ages.items() if name in known}
+                return list(world.objects)
 
         return handler
+
+    def _aged(self, request: _Request) -> tuple[str, Age, int] | None:
+        """The object whose pose a request states, its age, and when it was measured [ns]; None for other requests.
+
+        Raises:
+            Unusable: if that is too old, in the future, or before what is known.
+        """
+        now_ns = self._session.clock.now_ns()
+        if isinstance(request, Detached):
+            return request.name, self.ages[request.name], now_ns
+        if not isinstance(request, Added | Moved):
+            return None
+        age = self.ages.get(request.name)
+        if isinstance(request, Added) and request.name not in self._moving:
+            limit = Limit.of("the object", request.object.max_age, request.object.when_stale)
+            age = attrs.evolve(self._age(request.name, limit), measured_ns=None if age is None else age.measured_ns)
+        assert age is not None
+        try:
+            return request.name, age, age.measured_at(request.stamp_ns, now_ns)
+        except Unusable as error:
+            age.refuse(error)
+            raise Unusable(error.reason, f"{age.what}: {error}") from error
+
+    def _no_cloud(self, name: str) -> None:
+        """Refuse changes of a cloud's cells, which would hide obstacles.
+
+        Raises:
+            PlanningError: for the name of a cloud.
+        """
+        if name in self._options.clouds:
+            raise PlanningError(
+                f"{name!r} is a cloud, whose cells come from {self._options.clouds[name].topic}",
+                PlanCode.INVALID_OBJECT_NAME,
+            )
+
+    def _move(self, world: World, it: Moved) -> World:
+        self._no_cloud(it.name)
+        return world.move(it.name, pose_at(it.position, it.rpy))
 
     def _add(self, it: Added) -> list[str]:
         try:
@@ -234,6 +389,7 @@ class WorldKeeper(Component):
             raise PlanningError(str(error)) from error
 
         def change(world: World, it: Added) -> World:
+            self._no_cloud(it.name)
             if it.replace and it.name in world.objects:
                 world = world.remove(it.name)
             if len(world.objects) >= MOST_OBJECTS:
@@ -257,7 +413,7 @@ class WorldKeeper(Component):
         """
         if Path(text).suffix.lower() not in _MESHES:
             raise ValueError(f"a mesh is a file {', '.join(_MESHES)}, got {text!r}")
-        folder = self._meshes.resolve() if self._meshes is not None else None
+        folder = self._options.meshes.resolve() if self._options.meshes is not None else None
         if text.startswith("package://"):
             path = resolve_path(text, Path())
         elif folder is None or not (path := (folder / text).resolve()).is_relative_to(folder):
@@ -269,6 +425,7 @@ class WorldKeeper(Component):
         return path
 
     def _attach(self, world: World, it: Attached) -> World:
+        self._no_cloud(it.name)
         hand = self._hand() if it.link is None else ()
         link = hand[0] if it.link is None else it.link
         placed = np.linalg.inv(self._link(link)) @ matrix(world.named(it.name).pose)

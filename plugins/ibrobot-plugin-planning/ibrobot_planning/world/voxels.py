@@ -9,7 +9,12 @@ import numpy as np
 
 from ibrobot_core.api import PointCloud2, Vector
 from ibrobot_planning.world.objects import Voxels
+from ibrobot_planning.world.options import FURTHEST
 
+MOST_POINTS = 10_000_000
+"""Points of a cloud, or pixels of an image, beyond this are refused."""
+_SCALES = (0.1, 20.0)
+"""Least and greatest plausible focal length, as a share of the width of the image."""
 _FLOATS = {7: np.float32, 8: np.float64}
 """Datatype of sensor_msgs/msg/PointField -> type of its values."""
 
@@ -29,6 +34,51 @@ def voxels(points: Vector, size: float, *, least_points: int = 1) -> Voxels | No
     cells, counts = np.unique(np.floor(points / size).astype(np.int64), axis=0, return_counts=True)
     cells = cells[counts >= least_points]
     return Voxels(size, cells) if len(cells) else None
+
+
+def check_intrinsics(intrinsics: Vector, height: int, width: int) -> None:
+    """Check that a camera matrix fits images of a size [px]; another one would move or hide what they show.
+
+    Args:
+        intrinsics: camera matrix K as in sensor_msgs/msg/CameraInfo, shape (3, 3).
+        height: of the images.
+        width: of the images.
+
+    Raises:
+        ValueError: if a focal length is implausible, or the optical axis is far from the image.
+    """
+    fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
+    least, most = (scale * width for scale in _SCALES)
+    if not (least <= fx <= most and least <= fy <= most):  # so that NaN fails it, as below
+        raise ValueError(
+            f"the focal lengths of its CameraInfo are {fx:g} and {fy:g} pixels;"
+            f" for {width} pixels across they are from {least:g} to {most:g}"
+        )
+    if not (abs(cx - width / 2) <= width and abs(cy - height / 2) <= height):
+        raise ValueError(
+            f"the optical axis of its CameraInfo is at {cx:g}, {cy:g}, far outside {width}x{height} pixels"
+        )
+
+
+def is_measured(points: Vector) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which points of a sensor are measurements, shape (N,): not those that are not finite, zero, or beyond 1 km.
+
+    Args:
+        points: [m] in the frame of the sensor, shape (N, 3).
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        distance = np.linalg.norm(points, axis=1)
+    return np.asarray((distance > 0) & (distance <= FURTHEST))
+
+
+def is_depth(depth: np.ndarray[tuple[int, ...], Any]) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Which pixels of a depth image [m or, as whole numbers, mm] are measurements: those that are finite and above 0.
+
+    The largest whole number counts as missing, too: some drivers write it for what they do not see.
+    """
+    if np.issubdtype(depth.dtype, np.integer):
+        return np.asarray((depth > 0) & (depth < np.iinfo(depth.dtype).max))
+    return np.asarray(np.isfinite(depth) & (depth > 0))
 
 
 def depth_points(depth: Vector, intrinsics: Vector, furthest: float) -> Vector:
@@ -65,6 +115,12 @@ def cloud_points(message: PointCloud2) -> Vector:
         ValueError: for a cloud without x, y and z as floats, or with too few bytes for its size.
     """
     fields = {field.name: field for field in message.fields}
+    if message.height * message.width > MOST_POINTS:
+        raise ValueError(f"the cloud has {message.height}x{message.width} points, at most {MOST_POINTS} are read")
+    if min(message.height, message.width) < 0 or message.point_step < 1:
+        raise ValueError(
+            f"the cloud has {message.height}x{message.width} points of {message.point_step} bytes each, which is none"
+        )
     needed = message.width * message.point_step
     if message.row_step < needed or message.data.size < message.height * message.row_step:
         raise ValueError(
@@ -81,7 +137,7 @@ def cloud_points(message: PointCloud2) -> Vector:
         if field.datatype not in _FLOATS:
             raise ValueError(f"field {axis} of the cloud has datatype {field.datatype}, must be FLOAT32 or FLOAT64")
         kind = np.dtype(_FLOATS[field.datatype]).newbyteorder(">" if message.is_bigendian else "<")
-        if field.offset + kind.itemsize > message.point_step:
+        if not 0 <= field.offset <= message.point_step - kind.itemsize:
             raise ValueError(f"field {axis} of the cloud ends beyond its points of {message.point_step} bytes")
         values = np.ascontiguousarray(points[:, field.offset : field.offset + kind.itemsize]).view(kind)
         columns.append(values[:, 0].astype(float))
