@@ -21,7 +21,7 @@ KINDS = {"TeleopDescriptor": "teleop", "EngineDescriptor": "engine", "SourceDesc
 """Kinds of plugins whose types are entrances of their own."""
 STILL_SERVICES = {
     # Ends motion.
-    "/estop", "/planning/cancel", "/task/cancel", "/web_teleop/release",
+    "/estop", "/estop/check", "/planning/cancel", "/task/cancel", "/web_teleop/release",
     # Episodes: the robot moves as its mode has it, recorded or not.
     "/record_episode/cancel", "/record_episode/discard", "/record_episode/get_info", "/record_episode/highlight",
     "/record_episode", "/record_episode/progress", "/record_episode/redo", "/record_episode/start",
@@ -31,7 +31,7 @@ STILL_SERVICES = {
     "/get_planning_scene", "/plan_kinematic_path", "/planning/plan", "/planning/result", "/task/check", "/task/result",
     # The world, and how chunks are blended: they change motions that another entrance asks for.
     "/action_dispatcher/toggle_smoothing", "/clear_octomap", "/world/add", "/world/allow", "/world/attach",
-    "/world/clearance", "/world/detach", "/world/move", "/world/remove", "/world/shapes", "/world/snapshot",
+    "/world/clearance", "/world/detach", "/world/move", "/world/observed", "/world/remove", "/world/shapes", "/world/snapshot",
     "/world/touch",
 }  # fmt: skip
 """Services that move nothing."""
@@ -55,7 +55,8 @@ SUBSCRIBERS = {
             "ibrobot_servo/tool_pose.py", "ibrobot_web/objects.py", "ibrobot_web/viewer.py",
             "ibrobot_webxr/images.py", "ibrobot_webxr/server.py", "ibrobot_zenoh/sharing.py",
             # The world.
-            "ibrobot_planning/world/clouds.py", "ibrobot_planning/world/section.py",
+            "ibrobot_planning/world/clouds.py", "ibrobot_planning/world/frames.py",
+            "ibrobot_planning/world/section.py",
         ),
         "",
     ),

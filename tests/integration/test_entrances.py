@@ -99,7 +99,7 @@ ELSEWHERE: Mapping[tuple[str, str], str] = {
 """Cells whose entrance cannot be here -> the test that has it, which needs a server, a page, or more of control."""
 PENDING = frozenset(
     {
-        "/cmd_pose-time", "/execute_trajectory-numbers", "FollowJointTrajectory-numbers", "FollowJointTrajectory-world",
+        "/execute_trajectory-numbers", "FollowJointTrajectory-numbers", "FollowJointTrajectory-world",
         "FollowJointTrajectory-time", "engine monolithic-caller dies", "engine monolithic-numbers",
         "engine monolithic-silence", "engine process-caller dies", "engine process-numbers", "engine process-silence",
         "ibrobot replay-silence", "ibrobot-gym-caller dies", "ibrobot-gym-silence", "lerobot-robot-ibrobot-silence",
@@ -165,6 +165,7 @@ def ways(make: Callable[[], Entrance], ask: Callable[[Entrance], Callable[[], ob
             run = entrance.launch(*walls)
             entrance.prepare()
             begun = len(run.commands)
+            run.ticks(1, ask(entrance))
             run.ticks(150, ask(entrance) if entrance.streams else lambda: None)
             found.append(run.moved(begun))
         finally:
@@ -317,7 +318,8 @@ CHECKS: Mapping[str, Callable[[Entrance, str], None]] = dict(
         if cell[2] != "-"
     ],
 )
-def test_cell(name: str, column: str, cell: str, tmp_path: Path) -> None:
+def test_cell(name: str, column: str, cell: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # for the files of devices
     if (elsewhere := ELSEWHERE.get((name, column))) is not None:
         check_elsewhere(elsewhere)
         return None

@@ -757,6 +757,7 @@ class OperatedPage(Operated):
     @override
     def with_number(self, value: float) -> Iterator[Callable[[], object]]:
         yield lambda: self.jog(joints={"shoulder_pan": value})
+        yield lambda: self.jog(targets={"shoulder_pan": value})
         yield lambda: self.jog(linear=[value, 0.0, 0.0])
         yield lambda: self.jog(turn=[0.0, value, 0.0])
 
@@ -993,7 +994,7 @@ class _LeRobotLeader(deadman_table.Keyboard):
 
     key = b" "
     faults = True
-    at = 5.0
+    at, way = 5.0, 0.5
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -1017,7 +1018,9 @@ class _LeRobotLeader(deadman_table.Keyboard):
 
     def hold(self, *, arrives: bool = True) -> None:
         super().hold()
-        self.at += 0.5
+        if abs(self.at + self.way) > 60.0:
+            self.way = -self.way
+        self.at += self.way
         self.motors.move(shoulder_pan=self.at)
 
     def rest(self) -> None:

@@ -25,6 +25,8 @@ _NS_PER_MS = 1_000_000
 _LIMITS = RequestLimits(values=300, text=1000, depth=4)
 _LARGEST = 2**53
 """Numbers of commands and times are smaller, so that JavaScript can count them."""
+_FARTHEST_RAD = 1000.0
+"""Positions beyond this are mistakes."""
 
 
 def clock_ms() -> int:
@@ -51,6 +53,16 @@ def _within_one(instance: object, attribute: object, values: Mapping[str, float]
         raise ValueError("a speed must lie between -1 and 1")
 
 
+def _plausible(instance: object, attribute: object, values: Mapping[str, float]) -> None:
+    """Check positions; a validator of attrs.
+
+    Raises:
+        ValueError: for one that no joint has.
+    """
+    if not all(abs(value) <= _FARTHEST_RAD for value in values.values()):
+        raise ValueError(f"a position must lie between -{_FARTHEST_RAD:g} and {_FARTHEST_RAD:g}")
+
+
 @attrs.frozen(kw_only=True)
 class Motion:
     """A motion while the deadman is held."""
@@ -58,7 +70,9 @@ class Motion:
     joints: Mapping[str, float] = option(
         factory=dict, validator=_within_one, help="joint -> fraction of its speed, -1 to 1"
     )
-    targets: Mapping[str, float] = option(factory=dict, unit="rad", help="joint -> position that it approaches")
+    targets: Mapping[str, float] = option(
+        factory=dict, unit="rad", validator=_plausible, help="joint -> position that it approaches"
+    )
     linear: tuple[float, float, float] = option(
         (0.0, 0.0, 0.0), validator=_within_one, help="fraction of the tool's speed along the axes of the base"
     )

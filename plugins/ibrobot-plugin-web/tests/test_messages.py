@@ -84,6 +84,7 @@ def test_text_that_is_no_json_is_refused(text: str) -> None:
         ({"do": "jog", "at": 1, "press": 1, "joints": {"a": 2}}, "between -1 and 1"),
         ({"do": "jog", "at": 1, "press": 1, "linear": [1, 2]}, "expected a list of 3 values"),
         ({"do": "jog", "at": 1, "press": 1, "targets": {"a": True}}, "expected a number"),
+        ({"do": "jog", "at": 1, "press": 1, "targets": {"a": 1e308}}, "a position must lie between -1000 and 1000"),
         ({"do": "episode_stop", "outcome": 1}, "outcome: expected text"),
         ({"do": "preview", "goal": {"pose": "home", "xyz": [0, 0, 0]}}, "one of pose, xyz and joints"),
         ({"do": "preview", "goal": {"file": "/etc/passwd"}}, "unknown key"),
