@@ -31,8 +31,8 @@ STILL_SERVICES = {
     "/get_planning_scene", "/plan_kinematic_path", "/planning/plan", "/planning/result", "/task/check", "/task/result",
     # The world, and how chunks are blended: they change motions that another entrance asks for.
     "/action_dispatcher/toggle_smoothing", "/clear_octomap", "/world/add", "/world/allow", "/world/attach",
-    "/world/clearance", "/world/detach", "/world/move", "/world/observed", "/world/remove", "/world/shapes", "/world/snapshot",
-    "/world/touch",
+    "/world/clearance", "/world/detach", "/world/move", "/world/observed", "/world/remove", "/world/shapes",
+    "/world/snapshot", "/world/touch",
 }  # fmt: skip
 """Services that move nothing."""
 OTHER_SERVICES = {
