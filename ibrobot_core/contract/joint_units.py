@@ -22,6 +22,10 @@ ACTION = "action"
 LEROBOT_MODES = ("range_m100_100", "range_0_100", "degrees")
 """LeRobot's units of joint positions, named as in its `MotorNormMode`."""
 _CLOSED_MODE = "range_0_100"
+_UNKNOWN_ENDS = (
+    "{0}: does joint {1!r} range from 0 to 100, as LeRobot's grippers do in every unit? The robot YAML has no hardware "
+    "that states it: add `hardware`, or name those joints with --anchored gripper ('' if none does)"
+)
 _POSITION = "position."
 _DEGREES_PER_RADIAN = 360 / (JointCalibration.TICKS_PER_TURN - 1) * JointCalibration.TICKS_PER_TURN / (2 * math.pi)
 """LeRobot counts a tick less for a turn."""
@@ -95,7 +99,7 @@ class JointUnits:
             in older recordings, or if the hardware's plugin is not installed.
 
     Raises:
-        CalibrationError: if the calibration of a joint is needed and missing.
+        CalibrationError: if the calibration of a joint is needed and missing, or nothing states the anchored joints.
         ValueError: for an unknown unit.
     """
 
@@ -115,6 +119,8 @@ class JointUnits:
         for key, joints in _position_joints(contract).items():
             modes: dict[str, dict[int, str]] = {}
             for index, joint in joints.items():
+                if not document.get("hardware") and "closed_at" not in calibration.get(joint, {"closed_at": None}):
+                    raise CalibrationError(_UNKNOWN_ENDS.format(norm_mode, joint))
                 modes.setdefault(_CLOSED_MODE if joint in closed else norm_mode, {})[index] = joint
             self._elements[key] = [_elements(mode, named, calibration, closed) for mode, named in modes.items()]
 

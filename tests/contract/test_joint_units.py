@@ -10,6 +10,8 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from ibrobot_testing.calibration import write_calibration
 
 from ibrobot_core.calibration import Calibration, JointCalibration
@@ -18,6 +20,7 @@ from ibrobot_core.config.schema import RobotConfig
 from ibrobot_core.contract.joint_units import JointUnits, calibrations, with_closed_ends
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.descriptors import HardwareDescriptor
+from ibrobot_core.errors import CalibrationError
 from ibrobot_core.options import option
 from ibrobot_core.plugins import Entry, discover
 
@@ -120,3 +123,47 @@ def test_recording_without_closed_ends_reads_as_before(foreign: Callable[[str], 
     )
     values = {"action": np.full(2, ANGLE)}
     np.testing.assert_array_equal(before(values)["action"], named(values)["action"])
+
+
+def _stated(config: RobotConfig, anchored: set[str] | None) -> dict[str, dict[str, Any]]:
+    if anchored is None:
+        return with_closed_ends(MADE.snapshot(), config)
+    ends = {"pan": -1.5, "gripper": -1.0}
+    return {
+        joint: {**numbers, "closed_at": ends[joint] if joint in anchored else None}
+        for joint, numbers in MADE.snapshot().items()
+    }
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    mode=st.sampled_from(("degrees", "range_m100_100")),
+    hardware=st.booleans(),
+    anchored=st.none() | st.sets(st.sampled_from(("pan", "gripper"))),
+    percent=st.floats(0, 100),
+)
+def test_no_gripper_is_read_in_a_unit_that_nothing_states(
+    foreign: Callable[[str], RobotConfig], mode: str, hardware: bool, anchored: set[str] | None, percent: float
+):
+    """200 datasets of a robot with and without hardware: what is anchored is from 0 to 100, or it is asked for."""
+    config = foreign("gripper")
+    document = dict(config.document) if hardware else {**config.document, "hardware": None}
+    if not hardware:
+        config = attrs.evolve(config, closed_ends={})
+    calibration = _stated(config, anchored)
+    if not hardware and anchored is None:
+        with pytest.raises(CalibrationError, match=rf"{mode}: does joint 'pan' range from 0 .*--anchored gripper"):
+            JointUnits(mode, Contract.from_config(config), calibration, document)
+        return
+    units = JointUnits(mode, Contract.from_config(config), calibration, document)
+    pan, gripper = units.radians("action", np.full(2, percent))
+    closed = {"gripper"} if anchored is None else anchored
+    for joint, found, lower in (("pan", pan, -1.5), ("gripper", gripper, -1.0)):
+        width = 2000 / 4096 * 2 * np.pi
+        if joint in closed:
+            expected = lower + percent / 100 * width
+        elif mode == "degrees":
+            expected = np.radians(percent) * 4095 / 4096 + (2000 - 2048) / 4096 * 2 * np.pi
+        else:
+            expected = (percent + 100) / 200 * width + (1000 - 2048) / 4096 * 2 * np.pi
+        assert found == pytest.approx(expected, abs=5e-3)

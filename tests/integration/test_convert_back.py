@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 from collections.abc import Callable
 from functools import partial
@@ -231,3 +232,44 @@ def test_a_foreign_dataset_is_described_by_a_robot_yaml(exact: Path, convert: Co
     assert convert(tmp_path / "theirs", "--to", "bag", "--out", tmp_path / "other", *arguments).returncode == 0
     arguments[-1] = "action=,"
     assert convert(tmp_path / "theirs", "--to", "bag", "--out", tmp_path / "other", *arguments).returncode == 2
+
+
+def test_gripper_of_a_robot_without_hardware_is_asked_for(exact: Path, convert: Convert, tmp_path: Path):
+    shutil.copytree(exact, tmp_path / "theirs")
+    (tmp_path / "theirs/meta/ibrobot.json").unlink()
+    (tmp_path / "arm.json").write_text(json.dumps(CALIBRATION))
+    contract = {
+        "rate_hz": 30,
+        "observations": [{"key": "observation.state", "topic": "/joint_states"}],
+        "actions": [{"executor": "arm", "topic": "/commands"}],
+    }
+    robot = {
+        "robot": ROBOT["robot"]
+        | {
+            "joints": [each | {"max_velocity": 1, "max_acceleration": 1} for each in ROBOT["robot"]["joints"]],
+            "groups": {"arm": list(JOINTS)},
+            "description": {"mjcf": str(tmp_path / "arm.xml"), "poses": {"rest": [0] * len(JOINTS)}},
+        },
+        "simulation": {"type": "mujoco"},
+        "executors": {"arm": {"type": "position", "group": "arm"}},
+        "control_modes": {"idle": {"executors": ["arm"]}},
+        "default_control_mode": "idle",
+        "contract": contract,
+    }
+    bodies = "".join(f'<body><joint name="{joint}" range="-1.5 1.5"/><geom size=".1"/></body>' for joint in JOINTS)
+    actuators = "".join(f'<position name="{joint}" joint="{joint}"/>' for joint in JOINTS)
+    model = (
+        f"<mujoco><compiler angle='radian'/><worldbody>{bodies}</worldbody><actuator>{actuators}</actuator></mujoco>"
+    )
+    (tmp_path / "arm.xml").write_text(model)
+    (tmp_path / "sim.yaml").write_text(json.dumps(robot))
+    arguments: list[Any] = ["--to", "bag", "--config", tmp_path / "sim.yaml", "--norm-mode", "degrees"]
+    arguments += ["--calibration", tmp_path / "arm.json", "--out", tmp_path / "back"]
+    done = convert(tmp_path / "theirs", *arguments)
+    assert done.returncode == 1
+    assert "range from 0 to 100" in done.stderr
+    assert not (tmp_path / "back").exists()
+    done = convert(tmp_path / "theirs", *arguments, "--anchored", "jaw")
+    assert "the robot has no joint 'jaw'" in done.stderr
+    done = convert(tmp_path / "theirs", *arguments, "--anchored", JOINTS[-1])
+    assert done.returncode == 0, done.stderr

@@ -235,12 +235,11 @@ def test_half_precision_is_near(folders: dict[str, Path]) -> None:
     assert 0 < np.abs(a - b).max() < 0.1
 
 
-def test_a_first_run_that_overflows_is_refused(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    loaded(folders["act"], dtype="float16")
-    chunk = np.full((1, 1, 6), np.inf, np.float32)
-    monkeypatch.setattr("ibrobot_lerobot.model.PolicyModel.predict", lambda self, batch: [chunk])
-    with pytest.raises(PolicyError, match=r"infer of its first run \(torch.float16; .*\): action\[0, 0, 0\] is inf"):
-        make(folders["act"], dtype="float16").load()
+def test_a_first_run_that_overflows_is_refused(folders: dict[str, Path]) -> None:
+    """The pictures hardly differ in the dataset, so that black ones are beyond float16."""
+    said = r"act: infer of its first run \(torch.float16; bfloat16 and float32 have a larger range\): action.* is nan"
+    with pytest.raises(PolicyError, match=said):
+        loaded(folders["act"], dtype="float16")
 
 
 def test_weights_that_are_not_finite_are_refused(folders: dict[str, Path], tmp_path: Path) -> None:

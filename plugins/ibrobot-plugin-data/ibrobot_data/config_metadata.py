@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.api import Contract, Robot
+from ibrobot_core.api import CalibrationError, Contract, Robot
 from ibrobot_core.app import (
     ExecutorConfig,
     RobotConfig,
@@ -51,6 +51,25 @@ def load_contract(path: str | Path) -> RobotConfig:
     )
 
 
+def with_anchored(
+    calibration: Mapping[str, Mapping[str, Any]], config: RobotConfig, anchored: Collection[str] | None
+) -> dict[str, dict[str, Any]]:
+    """A calibration with `closed_at` of each joint: of `anchored`, or if it is None, as the hardware states.
+
+    Raises:
+        CalibrationError: if the robot lacks a joint of `anchored`.
+    """
+    if anchored is None:
+        return with_closed_ends(calibration, config)
+    lower = dict(zip(config.robot.joint_names, config.robot.lower.tolist(), strict=True))
+    if unknown := sorted(set(anchored) - lower.keys()):
+        raise CalibrationError(f"anchored: the robot has no joint {unknown[0]!r}; it has: {', '.join(lower)}")
+    return {
+        joint: {**numbers, "closed_at": lower[joint] if joint in anchored else None}
+        for joint, numbers in calibration.items()
+    }
+
+
 def metadata_from_config(
     config: RobotConfig,
     norm_mode: str | None = None,
@@ -62,11 +81,11 @@ def metadata_from_config(
     Args:
         config: the robot YAML.
         norm_mode: the unit of the dataset's joint positions.
-        calibration: joint -> fields of `JointCalibration`, for a unit that needs them.
+        calibration: joint -> fields of `JointCalibration` with `closed_at`, for a unit that needs them.
         names: feature of the dataset -> names of its elements in their order, where the dataset does not have them.
     """
     document = json.loads(json.dumps(config.document, default=str))
-    calibrations = {"given": with_closed_ends(calibration, config)} if calibration else {}
+    calibrations = {"given": dict(calibration)} if calibration else {}
     given = robot_metadata(Contract.from_config(config).without_signals(), document, calibrations)
     given |= {"names": json.dumps(names)} if names else {}
     return given | ({"norm_mode": norm_mode} if norm_mode else {})

@@ -44,6 +44,7 @@ class ServedPolicy(Policy):
     def __init__(self, options: ServerOptions, ctx: Context, connection: Connection, *, stateful: bool = False) -> None:
         self._options, self._log, self._connection = options, ctx.log, connection
         self._joints = _joints(options, ctx.robot.joint_names)
+        _check_keys(options)
         self._reference = _reference(options)
         self.spec = PolicySpec(
             observations={each.observation: each.shape for each in options.observations},
@@ -258,6 +259,30 @@ def _check_numbers(where: str, each: ObservationMap | ActionMap, size: int) -> N
     for name, numbers in (("scale", each.scale), ("offset", each.offset)):
         if numbers and len(numbers) != size:
             raise PolicyError(f"{where}: {name} has {len(numbers)} numbers, must have {size}")
+
+
+def _check_keys(options: ServerOptions) -> None:
+    """Check that no value of a request is written over another, and no vector of an answer is read twice.
+
+    Raises:
+        PolicyError: if two keys are equal, or one is inside another, or an observation is sent twice.
+    """
+    sent = [(each.observation, each.key) for each in options.observations]
+    for observation, _ in sent:
+        if [name for name, _ in sent].count(observation) > 1:
+            raise PolicyError(f"observations: {observation} stands twice")
+    sent += [("the prompt", options.prompt)] if options.prompt else []
+    answered = [(", ".join(each.joints), each.key) for each in options.actions]
+    for where, keys in (("request", sent), ("answer", answered)):
+        for i, (name, key) in enumerate(keys):
+            for other, longer in keys[i + 1 :]:
+                shared = min(len(key), len(longer))
+                if key[:shared] == longer[:shared]:
+                    relation = "the same key" if key == longer else "keys inside one another"
+                    raise PolicyError(
+                        f"{name} and {other} have {relation} of the {where}: {list(key)} and {list(longer)}; "
+                        "each needs one of its own"
+                    )
 
 
 def _reference(options: ServerOptions) -> ObservationMap | None:

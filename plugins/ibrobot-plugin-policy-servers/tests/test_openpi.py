@@ -10,6 +10,8 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from ibrobot_policy_servers import ibrobot_policies
 from ibrobot_policy_servers.openpi import OpenpiConnection
 from ibrobot_policy_servers.options import ActionMap, ObservationMap, OpenpiOptions
@@ -124,6 +126,39 @@ def test_nested_keys_layout_and_units(server: OpenpiServer, options: OpenpiOptio
     state = np.linspace(-0.5, 0.5, SIZE, dtype=np.float32)
     np.testing.assert_allclose(request["state"], 2 * state + 1, atol=1e-6)
     np.testing.assert_allclose(actions[0], [*(state[:5] + np.arange(5)[::-1]), 0.5 * 3 + 0.25], atol=1e-6)
+
+
+KEYS = st.lists(st.sampled_from(("a", "b")), min_size=1, max_size=3).map(tuple)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(KEYS, min_size=1, max_size=3), st.just(()) | KEYS, st.lists(KEYS, min_size=1, max_size=2))
+def test_no_value_of_a_mapping_overwrites_another(
+    observations: list[tuple[str, ...]], prompt: tuple[str, ...], actions: list[tuple[str, ...]]
+) -> None:
+    """300 mappings: every value of an accepted one stands in the request, and every answer is a vector of its own."""
+    mapped = tuple(ObservationMap(f"observation.{i}", key, (1,)) for i, key in enumerate(observations))
+    moved = tuple(ActionMap((JOINTS[i],), key) for i, key in enumerate(actions))
+    sent = [*observations, *([prompt] if prompt else [])]
+    clash = any(
+        one[: len(other)] == other
+        for keys in (sent, actions)
+        for i, one in enumerate(keys)
+        for j, other in enumerate(keys)
+        if i != j
+    )
+    options = attrs.evolve(OPTIONS, observations=mapped, prompt=prompt, actions=moved)
+    if clash:
+        with pytest.raises(PolicyError, match=r"have (the same key|keys inside one another) of the (request|answer)"):
+            make(options)
+    else:
+        make(options)
+
+
+def test_observation_cannot_be_sent_twice() -> None:
+    twice = (ObservationMap(STATE, ("a",), (SIZE,)), ObservationMap(STATE, ("b",), (SIZE,)))
+    with pytest.raises(PolicyError, match=r"observations: observation.state stands twice"):
+        make(attrs.evolve(OPTIONS, observations=twice))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The option `--names`, which states the elements of vectors in datasets that do not name them."""
+"""Options that state what a dataset of others does not: names of elements, and joints that range from 0 to 100."""
 
 from __future__ import annotations
 
@@ -23,3 +23,19 @@ def _parsed(context: click.Context, parameter: click.Parameter, values: tuple[st
 def names_option(help_text: str) -> Callable[[Any], Any]:
     """The option `--names`; the command receives feature -> names of its elements in their order."""
     return click.option("--names", multiple=True, metavar="FEATURE=NAME,…", callback=_parsed, help=help_text)
+
+
+def anchored_option() -> Callable[[Any], Any]:
+    """The option `--anchored`; the command receives joints, or None if it is not given."""
+    return click.option(
+        "--anchored",
+        metavar="JOINT,…",
+        callback=_joints,
+        help="With --calibration: joints that range from 0 to 100; by default those of the robot YAML's hardware.",
+    )
+
+
+def _joints(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[str, ...] | None:
+    if value is None:
+        return None
+    return tuple(joint.strip() for joint in value.split(",") if joint.strip())
