@@ -14,6 +14,9 @@ _MARGIN_S = 0.06
 """Part of `HOLD_S` for the control loop and the host [s]."""
 _LEAST_SILENCE_S = 0.05
 """Shortest silence that disarms [s]; devices report at least three times as often."""
+LONGEST_BRAKING_S = 0.2
+"""Longest time to brake with which motion ends within `HOLD_S` [s]: the shortest silence, and as much for the control
+loop and the host, come first."""
 _LATE_NS = ns(0.1)
 """Time after a pause of the host in which reports from before the pause may still be read [ns]."""
 

@@ -108,6 +108,11 @@ class Robot:
         return np.array([j.max_acceleration for j in self.joints])
 
     @cached_property
+    def braking_s(self) -> Vector:
+        """Time to brake from `max_velocity` [s], shape (J,)."""
+        return self.max_velocity / self.max_acceleration
+
+    @cached_property
     def max_lead(self) -> Vector:
         """Maximum distance of a command from the measured position [rad], shape (J,)."""
         velocity = self.max_velocity

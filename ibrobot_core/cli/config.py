@@ -77,6 +77,7 @@ def check(
         return
     body = "simulation" if found.simulated else "hardware"
     echo(f"{path}: ok ({found.robot.name}, {len(found.robot.joints)} joints, {body})")
+    echo(f"joints brake from full speed within {found.robot.braking_s.max() * 1e3:.0f} ms")
     echo(f"modes: {', '.join(found.control_modes)}; starts in {found.default_control_mode}")
     for line in (*unavailable_modes(found.unavailable), *absent_models(found.absent_models)):
         echo(f"note: {line}")

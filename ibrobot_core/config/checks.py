@@ -23,6 +23,7 @@ from ibrobot_core.config.schema import (
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
+from ibrobot_core.deadman import HOLD_S, LONGEST_BRAKING_S
 from ibrobot_core.descriptors import ExecutorDescriptor, TeleopDescriptor, TransportDescriptor
 from ibrobot_core.options import OptionFault, did_you_mean
 from ibrobot_core.plugins import example_type
@@ -51,6 +52,7 @@ class Checks:
             self._hardware(robot)
             self._executors(robot)
             self._behaviours(robot)
+            self._stop_times(robot)
             self._options(robot)
         for name, mode in (self.sections.plain.get("control_modes") or {}).items():
             self._mode(name, mode, robot)
@@ -251,6 +253,22 @@ class Checks:
                 self.document.refer(("control", key), pose, list(robot.description.poses), "pose")
             else:
                 self.document.add(("control", key), f"{value!r} is not one of: {', '.join(words)}, pose NAME")
+
+    def _stop_times(self, robot: Robot) -> None:
+        """Check that joints with a deadman come to rest in time, whatever the limits that they brake within."""
+        longest_s = (self.sections.plain.get("control") or ControlConfig()).stop_time
+        groups = {group for devices in self._used for group in devices}
+        moved = {joint for group in groups for joint in robot.groups.get(group, robot.joint_names)}
+        for i, joint in enumerate(robot.joints):
+            braking_s = float(robot.braking_s[i])
+            if joint.name in moved and braking_s + HOLD_S - LONGEST_BRAKING_S > longest_s:
+                enough = joint.max_velocity / LONGEST_BRAKING_S
+                message = (
+                    f"{joint.name} brakes from {joint.max_velocity:g} rad/s in {braking_s:.2f} s, so that a released "
+                    f"deadman would stop it after up to {braking_s + HOLD_S - LONGEST_BRAKING_S:.2f} s; write "
+                    f"{math.ceil(enough * 10) / 10:g} or more, lower max_velocity, or accept it by control.stop_time"
+                )
+                self.document.add(("robot", "joints", i, "max_acceleration"), message)
 
     def _mode(self, name: str, mode: ControlMode, robot: Robot | None) -> None:
         key: Key = ("control_modes", name)

@@ -16,6 +16,7 @@ import attrs
 
 from ibrobot_core.clock import Clock
 from ibrobot_core.component_config import ComponentConfig, NamedComponentConfig, component_of
+from ibrobot_core.deadman import HOLD_S
 from ibrobot_core.descriptors import (
     Descriptor,
     EngineDescriptor,
@@ -456,6 +457,13 @@ class ControlConfig:
         gt=0.0,
         le=10.0,
         help="longest motion while the host process, or the control loop, is stopped or blocked, braking included",
+    )
+    stop_time: float = option(
+        HOLD_S,
+        unit="s",
+        ge=HOLD_S,
+        help="longest time, at full speed, until joints rest after the last report of the device that drives them; "
+        "joints that need longer to brake are refused",
     )
     following_error: Following = option(factory=Following, help="detection of joints that do not follow setpoints")
     load_shedding: Shedding = option(factory=Shedding, help="relief of joints that stay hot or overloaded")

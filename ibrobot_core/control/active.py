@@ -34,16 +34,21 @@ class ActiveExecutors:
         robot: the robot.
         executors: name -> executor.
         report: called with a `goal` event whenever the state of a goal changes.
+        rest: returns where the joints come to rest if they brake now [rad], shape (J,).
 
     Attributes:
         want_relax: whether an executor requested torque off at the last `update`.
     """
 
     def __init__(
-        self, robot: Robot, executors: Mapping[str, Executor], report: Callable[[Mapping[str, Any]], None]
-    ) -> None:
+        self, robot: Robot, executors: Mapping[str, Executor], report: Callable[[Mapping[str, Any]], None],
+        rest: Callable[[], Vector],
+    ) -> None:  # fmt: skip
         self._all = {name: _Owned(name, each, robot.indices(each.joints)) for name, each in executors.items()}
         self._active: list[_Owned] = []
+        self._streamed: set[str] = set()
+        """The active executors that were given a plan, and have not been stopped since."""
+        self._rest: Callable[[], Vector] = rest
         self._report = report
         self.want_relax = False
 
@@ -53,6 +58,7 @@ class ActiveExecutors:
     def enter(self, names: Iterable[str], measured: JointReading) -> None:
         """Activate the executors of a mode at the measured positions."""
         self._active = [self._all[name] for name in names]
+        self._streamed.clear()
         for owned in self._active:
             owned.executor.activate(owned.reading(measured))
 
@@ -64,18 +70,24 @@ class ActiveExecutors:
             owned.executor.deactivate()
         self._active = []
 
-    def set_plan(self, plan: PlanRecord) -> None:
-        """Pass a plan to the active executors that accept plans and whose joints it contains."""
+    def set_plan(self, plan: PlanRecord, measured: JointReading) -> None:
+        """Pass a plan to the active executors that accept plans and whose joints it contains; stop the others."""
         for owned in self._active:
             if owned.executor.accepts_plans and plan.mask[owned.columns].all():
                 owned.executor.set_plan(Plan(plan.start_ns, plan.step_ns, plan.positions[:, owned.columns]))
+                self._streamed.add(owned.name)
+            elif owned.name in self._streamed:
+                self._brake(owned, measured)
 
     def update(self, measured: JointReading) -> list[tuple[NDArray[np.intp], Vector]]:
         """Return the joint indices of each active executor and its setpoints for them [rad]."""
         setpoints = []
         self.want_relax = False
         for owned in self._active:
-            setpoints.append((owned.columns, owned.executor.update(owned.reading(measured))))
+            setpoint = owned.executor.update(owned.reading(measured))
+            if owned.executor.is_stale:
+                setpoint = self._brake(owned, measured)
+            setpoints.append((owned.columns, setpoint))
             self.want_relax = self.want_relax or owned.executor.wants_relax
             self._report_goals(owned)
         return setpoints
@@ -104,6 +116,13 @@ class ActiveExecutors:
     def counters(self) -> dict[str, dict[str, int]]:
         """The counters of all executors, including inactive ones."""
         return {name: dict(owned.executor.counters()) for name, owned in self._all.items()}
+
+    def _brake(self, owned: _Owned, measured: JointReading) -> Vector:
+        """Stop an executor that streams: its joints brake at once; returns where they come to rest [rad]."""
+        rest = self._rest()[owned.columns]
+        owned.executor.activate(attrs.evolve(owned.reading(measured), position=rest))
+        self._streamed.discard(owned.name)
+        return rest
 
     def _report_goals(self, owned: _Owned) -> None:
         while (status := owned.executor.pop_status()) is not None:

@@ -101,7 +101,7 @@ class ControlCore:
         self.fault = ""
         self.events: deque[Mapping[str, Any]] = deque()
         """Events for the host, of kinds `goal` and `fault`."""
-        self._executors = ActiveExecutors(config.robot, executors, self.events.append)
+        self._executors = ActiveExecutors(config.robot, executors, self.events.append, lambda: self._safety.rest)
         self.state: ControlState | None = None
         """Readings and commands of the last tick; None before the first."""
 
@@ -193,12 +193,15 @@ class ControlCore:
         return self.state
 
     def set_plan(self, plan: PlanRecord) -> None:
-        """Pass a plan to the active executors of its joints; plans of an earlier generation are only counted."""
+        """Pass a plan to the active executors of its joints; plans of an earlier generation are only counted.
+
+        It replaces the plan before: executors that followed that one and have no joints in this one brake.
+        """
         if plan.generation != self.generation or self.fault:
             self._counts["old_plans"] += 1
             return
         self._commanded_ns = self._clock.now_ns()
-        self._executors.set_plan(plan)
+        self._executors.set_plan(plan, self._at_tick)
 
     def note_silence(self, silent_s: float, fault: str) -> None:
         """Raise a fault if braking must begin for motion to end within `control.peer_timeout` of a silence.

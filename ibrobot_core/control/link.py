@@ -60,7 +60,7 @@ class ControlState:
 
 @attrs.frozen(eq=False)
 class PlanRecord:
-    """Timed setpoints for the joints in `mask`."""
+    """Timed setpoints for the joints in `mask`; executors without joints in it brake."""
 
     generation: int
     start_ns: int

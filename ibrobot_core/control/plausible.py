@@ -33,9 +33,12 @@ class Plausibility:
 
         Args:
             before: the last positions that were believed.
-            now: the measured positions; NaN where a joint is not measured.
+            now: the measured positions; one that is not finite is missing, which is as implausible.
             since_ns: time since `before` was measured [ns].
         """
+        if not (finite := np.isfinite(now)).all():
+            joint = int(np.argmin(finite))
+            return f"joint {self._names[joint]} is measured at {now[joint]}; check its encoder and cable"
         away = np.abs(now - before)
         if not (away > self._usual).any():
             return ""

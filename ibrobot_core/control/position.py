@@ -20,8 +20,8 @@ class PositionExecutor(Executor):
     Between setpoints it follows a cubic spline, which stays within the joint limits if the setpoints do. A plan that
     has already begun is joined within one step, without a jump in position or speed. Until one step before the first
     setpoint the executor holds; it moves there during that step. After the last setpoint it holds that setpoint. Once
-    the setpoint is older than `stale_timeout`, the plan is stale and `safety_behavior` applies: `hold` keeps the last
-    output, `relax` requests torque off until a new plan arrives.
+    the setpoint is older than `stale_timeout`, the plan is stale and `safety_behavior` applies: `hold` brakes at once,
+    `relax` requests torque off until a new plan arrives.
     """
 
     accepts_plans: ClassVar[bool] = True
@@ -108,6 +108,11 @@ class PositionExecutor(Executor):
     def wants_relax(self) -> bool:
         """Whether torque should be off: the plan is stale and `safety_behavior` is `relax`."""
         return self._stale and self._relaxes
+
+    @property
+    @override
+    def is_stale(self) -> bool:
+        return self._stale and not self._relaxes
 
     @override
     def counters(self) -> Mapping[str, int]:

@@ -6,6 +6,7 @@ import itertools
 import time
 
 import attrs
+import numpy as np
 
 from ibrobot_core.clock import Clock
 from ibrobot_core.control.hardware_group import HardwareGroup
@@ -54,17 +55,19 @@ class Readings:
         """
         deadline_s = time.monotonic() + patience_s
         last: JointReading | None = None
+        wrong = ""
         for number in itertools.count(1):
             measured = self._hardware.read()
             if not measured.stale:
-                if last is not None and not self._plausibility.jump(last.position, measured.position, 0):
+                wrong = self._plausibility.jump((last or measured).position, measured.position, 0)
+                if last is not None and not wrong:
                     self._answered_ns = measured.stamp_ns
                     return measured
-                last = measured
+                last = measured if np.isfinite(measured.position).all() else None
             else:
                 time.sleep(0.001)  # hardware that reads in a thread of its own is stale at once
             if number > _FIRST and time.monotonic() >= deadline_s:
-                raise HardwareError("the joints do not answer yet, or each time with other positions")
+                raise HardwareError(wrong or "the joints do not answer yet")
         raise AssertionError
 
     def read(self) -> str | None:
@@ -76,7 +79,7 @@ class Readings:
             self.counts["read_errors"] += 1
             self.newest = attrs.evolve(self.newest, stale=True)
             return str(error)
-        wrong = "" if measured.stale else self._implausible(measured)
+        wrong = self._implausible(measured)
         if wrong:
             self.counts["implausible_states"] += 1
             # As after a lost reply, with the positions of the reading before it.
@@ -100,6 +103,8 @@ class Readings:
         return self._clock.now_ns() - self._answered_ns
 
     def _implausible(self, measured: JointReading) -> str:
-        """Why no joint can have moved like that; empty if it can."""
+        """Why no joint can have moved like that; empty if it can, and for a stale reading of finite positions."""
+        if measured.stale and np.isfinite(measured.position).all():
+            return ""
         since_ns = measured.stamp_ns - self._answered_ns
         return self._plausibility.jump(self.newest.position, measured.position, since_ns)

@@ -159,6 +159,12 @@ class SafetyLayer:
         return self._step / self._period_s
 
     @property
+    def rest(self) -> Vector:
+        """Where the joints come to rest if they brake from now on [rad], shape (J,)."""
+        left = np.maximum(np.abs(self._step) - self._change, 0.0)
+        return self._position + np.copysign(_distance(left, self._change), self._step)
+
+    @property
     def at_rest(self) -> bool:
         """Whether the last command moved no joint, so that a stop is complete."""
         return not self._step.any()

@@ -71,6 +71,15 @@ class Executor(ABC):
         """
         return False
 
+    @property
+    def is_stale(self) -> bool:
+        """Whether the setpoints of the last plan are too old to follow: for executors with `accepts_plans`.
+
+        Stale means brake: the joints brake at once, from where they are commanded, and the executor is activated where
+        they come to rest. It does not travel on to its last setpoint.
+        """
+        return False
+
     def deactivate(self) -> None:
         """Release the joints; discard plans and goals."""
 

@@ -14,6 +14,7 @@ from ibrobot_core.component import CONTROL, Component
 from ibrobot_core.config.schema import ControlMode, RobotConfig
 from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
 from ibrobot_core.control.link import ControlState
+from ibrobot_core.deadman import LONGEST_BRAKING_S
 from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import ComponentFailed, HardwareError
 from ibrobot_core.launch.pulses import PULSE_S
@@ -57,6 +58,10 @@ class ControlComponent(Component):
         host.start()
         for line in host.refused:
             session.log.warning(line)
+        braking_s, names = session.config.robot.braking_s, self._joints
+        if braking_s.max() > LONGEST_BRAKING_S:
+            slowest = names[int(braking_s.argmax())]
+            session.log.warning("STOP: %s brakes from full speed for %.2f s", slowest, braking_s.max())
 
     def arrive(self) -> None:
         """Wait until the robot has arrived at its startup pose.

@@ -64,9 +64,9 @@ robot:
   name: bench
   robot_type: bench_follower
   joints:
-    - {{name: pan, lower: -2, upper: 2, max_velocity: 3, max_acceleration: 10}}
-    - {{name: lift, lower: -2, upper: 2, max_velocity: 3, max_acceleration: 10}}
-    - {{name: gripper, lower: -0.1, upper: 2, max_velocity: 3, max_acceleration: 10}}
+    - {{name: pan, lower: -2, upper: 2, max_velocity: 3, max_acceleration: 15}}
+    - {{name: lift, lower: -2, upper: 2, max_velocity: 3, max_acceleration: 15}}
+    - {{name: gripper, lower: -0.1, upper: 2, max_velocity: 3, max_acceleration: 15}}
   groups: {{arm: [pan, lift, gripper]}}
 hardware: {{type: feetech_so101, port: /dev/null, calibration: bench}}
 executors:

@@ -2,46 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import override
 
 import numpy as np
 
 from ibrobot_core.config.schema import ControlMode
-from ibrobot_core.control.link import ControlState
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.launch.sources.operator_devices import OperatorDevices
 from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.launch.views import RunAccess
-from ibrobot_core.units import seconds
-
-
-class Braking:
-    """Lets joints that are no longer commanded brake as fast as they may, without a return to their last setpoint."""
-
-    def __init__(self, session: RunAccess) -> None:
-        self._session = session
-        self.begin()
-
-    def begin(self) -> None:
-        """Forget the joints that were commanded."""
-        self._commanded: frozenset[str] = frozenset()
-        self._before: ControlState | None = None
-
-    def add(self, positions: Mapping[str, float]) -> dict[str, float]:
-        """`positions` [rad], and where the joints stop that were commanded only the last time [rad]."""
-        before, state = self._before, self._session.state
-        dropped = sorted(self._commanded - set(positions))
-        self._commanded, self._before = frozenset(positions), state
-        if not dropped or before is None or state is None or state.stamp_ns <= before.stamp_ns:
-            return dict(positions)
-        robot = self._session.config.robot
-        columns = robot.indices(tuple(dropped))
-        command = state.command[columns]
-        velocity = (command - before.command[columns]) / seconds(state.stamp_ns - before.stamp_ns)
-        stop = command + velocity * np.abs(velocity) / (2 * robot.max_acceleration[columns])
-        stop = np.clip(stop, np.minimum(robot.lower[columns], command), np.maximum(robot.upper[columns], command))
-        return {**positions, **dict(zip(dropped, stop.tolist(), strict=True))}
 
 
 class TeleopSource(SourceWorker):
@@ -56,7 +25,8 @@ class TeleopSource(SourceWorker):
 
     def __init__(self, session: RunAccess, mode: ControlMode) -> None:
         self._devices = OperatorDevices(session, mode.devices)
-        self._braking = Braking(session)
+        self._commands = False
+        """Whether the last plan has joints; one without any lets them brake."""
         super().__init__(session, mode, f"teleop {self._devices}")
 
     @override
@@ -73,7 +43,7 @@ class TeleopSource(SourceWorker):
     @override
     def begin_mode(self, seed: int) -> None:
         self.session.followed_ns = 0
-        self._braking.begin()
+        self._commands = False
         self._devices.activate(self.session.measured())
 
     @override
@@ -96,8 +66,10 @@ class TeleopSource(SourceWorker):
             return
         if session.finished.is_set():
             return  # from here on, only emergency stops count
-        if positions := self._braking.add(command.positions or {}):
+        positions = command.positions or {}
+        if positions or self._commands:
             session.send_plan(session.clock.now_ns(), 1, tuple(positions), np.array([[*positions.values()]]))
+        self._commands = bool(positions)
         if command.positions and not command.approaching:
             session.followed_ns = session.clock.now_ns()
         for event in command.events:

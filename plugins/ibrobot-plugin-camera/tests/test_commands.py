@@ -18,7 +18,7 @@ from stream_server import StreamServer
 from ibrobot_core.api import SensorError
 
 ROBOT = """
-robot: {{name: r, joints: [{{name: j, lower: -1, upper: 1, max_velocity: 1, max_acceleration: 1}}], groups: {{a: [j]}}}}
+robot: {{name: r, joints: [{{name: j, lower: -1, upper: 1, max_velocity: 1, max_acceleration: 5}}], groups: {{a: [j]}}}}
 hardware: {{type: nothing}}
 peripherals:
   - {{name: top, kind: camera, type: opencv, device: "{url}"}}
