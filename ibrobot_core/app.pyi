@@ -157,7 +157,7 @@ from ibrobot_core.cli.declared import (
 )
 from ibrobot_core.options import fields as fields, default_of as default_of
 from ibrobot_core.events import Event as Event, Failed as Failed, Shown as Shown, decode_event as decode_event
-from ibrobot_core.events import Ask as Ask, Choice as Choice, Sight as Sight, Answer as Answer, Questions as Questions
+from ibrobot_core.events import Ask as Ask, Choice as Choice, Sight as Sight, Answer as Answer
 from ibrobot_core.safe_output import echo as echo, LogFormatter as LogFormatter
 from ibrobot_core.screen import Screen as Screen, styled as styled
 from ibrobot_core.terminal import KeyReader as KeyReader, check_key as check_key

@@ -8,14 +8,11 @@ own. A line of another shape is an error.
 from __future__ import annotations
 
 import json
-import os
-import select
-import time
 from collections.abc import Mapping, Sequence
 
 import attrs
 
-from ibrobot_core.errors import ComponentFailed, WireError
+from ibrobot_core.errors import WireError
 from ibrobot_core.options import option
 
 _BEGIN = '{"event": '
@@ -73,7 +70,10 @@ class Sight:
 
 @attrs.frozen(kw_only=True)
 class Ask(Event):
-    """A question to an operator, until it is answered or the next one comes; see `Questions`."""
+    """A question to an operator, until it is answered or the next one comes.
+
+    The answer is an `Answer`: a line of JSON on standard input.
+    """
 
     ask: int = option(help="its number")
     text: str = option(help="the question")
@@ -87,52 +87,6 @@ class Answer:
 
     ask: int = option(help="number of the question")
     answer: str = option(help="key of the choice, or the text")
-
-
-class Questions:
-    """Reads the answers to the questions of a command: lines of standard input.
-
-    Args:
-        fd: where they come from.
-    """
-
-    def __init__(self, fd: int = 0) -> None:
-        self._fd = fd
-        self._read = b""
-        self._last = Ask(ask=0, text="")
-
-    def next(self, text: str, choices: Sequence[Choice] = (), sights: Sequence[Sight] = ()) -> Ask:
-        """The event for the next question, which the command prints. Answers to earlier ones are ignored."""
-        self._last = Ask(ask=self._last.ask + 1, text=text, choices=tuple(choices), sights=tuple(sights))
-        return self._last
-
-    def answer(self, timeout_s: float) -> str | None:
-        """The answer to the last question: the key of a choice, or a text; None if it does not come in time.
-
-        Raises:
-            ComponentFailed: if nobody can answer any more.
-            WireError: for a line that is no answer.
-        """
-        from ibrobot_core.convert import Converter
-
-        until_s = time.monotonic() + timeout_s
-        while True:
-            line, end, rest = self._read.partition(b"\n")
-            if end:
-                self._read = rest
-                try:
-                    given: Answer = Converter().structure(json.loads(line), Answer)
-                except ValueError as error:
-                    raise WireError(f"malformed answer: {error}: {line[:200]!r}") from None
-                keys = [each.key for each in self._last.choices]
-                if given.ask == self._last.ask and (given.answer in keys or not keys):
-                    return given.answer
-                continue
-            if not select.select([self._fd], [], [], max(0.0, until_s - time.monotonic()))[0]:
-                return None
-            if not (data := os.read(self._fd, 65_536)):
-                raise ComponentFailed("nobody can answer: standard input has ended")
-            self._read += data
 
 
 def encode_event(event: Event) -> str:

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from ibrobot_core.robot import Vector
 
+LONGEST_CHUNK = 1000
+"""Largest number of actions in a chunk: a longer plan would occupy a control tick."""
 _FIRST_GAINS = 256
 
 Lead = Callable[[Vector, Vector], Vector]
@@ -130,6 +132,8 @@ class TemporalSmoother:
         actions = np.asarray(chunk, dtype=np.float64)
         if actions.ndim != 2 or actions.shape[1] != self.action_size or not len(actions):
             raise ValueError(f"a chunk must have the shape (N, {self.action_size}) with N >= 1, got {actions.shape}")
+        if len(actions) > LONGEST_CHUNK:
+            raise ValueError(f"a chunk may have {LONGEST_CHUNK} actions, got {len(actions)}")
         if not np.isfinite(actions).all():
             raise ValueError(f"a chunk must be finite, got {_first_not_finite(actions)}")
         length = len(self._positions)

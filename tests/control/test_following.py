@@ -5,10 +5,13 @@ from __future__ import annotations
 import attrs
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from ibrobot_testing.contexts import make_robot
 
 from ibrobot_core.config.schema import Following
 from ibrobot_core.control.following import FollowingError
+from ibrobot_core.control.safety import SafetyLayer
 
 ROBOT = make_robot()
 PERIOD_NS = 10_000_000
@@ -167,3 +170,73 @@ class TestControl:
         rig.tick(400)
 
         assert rig.core.fault == ""
+
+
+class Servos:
+    """Joints whose motors get each other's commands, with a servo's lag, below the safety layer.
+
+    Args:
+        start: where they are [rad], shape (6,).
+        order: `order[j]` is the joint whose command motor j gets.
+        lag_s: time constant of the motors [s].
+    """
+
+    def __init__(self, start: np.ndarray, order: np.ndarray, lag_s: float = 0.08) -> None:
+        fast = tuple(attrs.evolve(joint, max_velocity=3.0, max_acceleration=40.0) for joint in ROBOT.joints)
+        robot = attrs.evolve(ROBOT, joints=fast)
+        self.start, self.measured, self.order = start, start.copy(), order
+        self.share = 1 - np.exp(-PERIOD_NS / 1e9 / lag_s)
+        self.safety = SafetyLayer(robot, PERIOD_NS)
+        self.safety.activate(start)
+        self.following = FollowingError(Following(), robot, PERIOD_NS)
+
+    def tick(self, target: np.ndarray, push: np.ndarray = STILL) -> str:
+        command = self.safety.apply(target, self.measured)
+        self.measured = self.measured + (command[self.order] - self.measured) * self.share + push
+        return self.following.check(command, self.safety.velocity, self.measured)
+
+    def run(self, target: np.ndarray, ticks: int = 150) -> str:
+        return next((fault for _ in range(ticks) if (fault := self.tick(target))), "")
+
+
+def within(share: float) -> st.SearchStrategy[np.ndarray]:
+    """Positions in this share of the joints' limits, shape (6,)."""
+    return st.tuples(*[st.floats(-share, share)] * 6).map(
+        lambda at: np.where(np.array(at) > 0, ROBOT.upper, -ROBOT.lower) * np.array(at)
+    )
+
+
+class TestExchangedMotors:
+    @settings(max_examples=20, deadline=None)
+    @given(start=within(0.6), target=within(1.0), order=st.permutations(range(6)), lag_s=st.floats(0.02, 0.12))
+    def test_joints_that_move_as_others_are_commanded_are_a_fault(self, start, target, order, lag_s):
+        servos = Servos(start, np.array(order), lag_s)
+        fault = servos.run(target)
+
+        far = np.abs(servos.measured - servos.start).max() > 0.15 and list(order) != list(range(6))
+        assert not far or "their motors are exchanged" in fault
+
+    def test_both_joints_are_named(self):
+        order = np.array([0, 3, 2, 1, 4, 5])
+        target = STILL.copy()
+        target[1] = 0.6
+        fault = Servos(STILL.copy(), order).run(target)
+
+        names = ROBOT.joint_names
+        assert fault.startswith(f"joint {names[3]} moves as {names[1]} is commanded")
+        assert "check their ids and cables" in fault
+
+    @settings(max_examples=20, deadline=None)
+    @given(start=within(0.6), targets=st.lists(within(1.0), min_size=1, max_size=4), lag_s=st.floats(0.02, 0.15))
+    def test_joints_that_follow_their_own_commands_are_none(self, start, targets, lag_s):
+        servos = Servos(start, np.arange(6), lag_s)
+
+        assert {servos.run(target, 80) for target in targets} == {""}
+
+    @pytest.mark.parametrize("joint", range(6))
+    def test_a_joint_that_a_hand_pushes_is_none(self, joint):
+        servos, push = Servos(STILL.copy(), np.arange(6)), STILL.copy()
+        push[joint] = 0.05
+        faults = {servos.tick(STILL, push) for _ in range(60)} | {servos.tick(STILL) for _ in range(60)}
+
+        assert faults == {""}

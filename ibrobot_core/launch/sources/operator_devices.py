@@ -9,11 +9,13 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from ibrobot_core.control.plausible import Plausibility
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import JointReading, Teleop, TeleopCommand, begin_operation, operate
 from ibrobot_core.launch.pulses import Pulse
 from ibrobot_core.launch.views import RunAccess
-from ibrobot_core.robot import Robot
+from ibrobot_core.robot import Robot, Vector
+from ibrobot_core.units import ns
 
 _BLOCKED_S = 6.0
 """Time without a sign of life of the thread that reads devices after which the run ends [s]; the answer of control may
@@ -22,13 +24,41 @@ take 5 s."""
 
 @attrs.define(eq=False)
 class _Connected:
-    """A device, and the indices of the joints that it sees and moves."""
+    """A device, the indices of the joints that it sees and moves, and the last positions that were believed."""
 
     name: str
     device: Teleop
     columns: NDArray[np.intp]
-    joints: frozenset[str]
+    robot: Robot
+    plausibility: Plausibility
     lost: bool = False
+    followed: Vector | None = None
+    """[rad], shape (J,); None while it commands nothing."""
+    followed_ns: int = 0
+
+    def believed(self, command: TeleopCommand, measured: JointReading, patience_ns: int) -> TeleopCommand:
+        """The command, or the one before it while it jumps to where no hand can have moved the device.
+
+        Raises:
+            TeleopError: if that lasts for `patience_ns`, or it commands joints that are not its own.
+        """
+        now_ns, robot, positions = measured.stamp_ns, self.robot, command.positions
+        if positions is None:
+            self.followed = None
+            return command
+        if strange := set(positions) - set(robot.joint_names):
+            raise TeleopError(f"{self.name}: commands joints that are not its own: {', '.join(sorted(strange))}")
+        before = measured.position if self.followed is None else self.followed
+        wanted = np.array([positions.get(joint, at) for joint, at in zip(robot.joint_names, before, strict=True)])
+        # A trigger snaps; what it grips with follows within its limits.
+        steady = np.where(robot.grips & np.isfinite(wanted), before, wanted)
+        if self.followed is None or not (jump := self.plausibility.jump(before, steady, now_ns - self.followed_ns)):
+            self.followed, self.followed_ns = wanted, now_ns
+            return command
+        if now_ns - self.followed_ns > patience_ns:
+            raise TeleopError(f"{self.name}: {jump}")
+        kept = dict(zip(robot.joint_names, before.tolist(), strict=True))
+        return attrs.evolve(command, positions={joint: kept[joint] for joint in positions})
 
 
 class OperatorDevices:
@@ -49,6 +79,8 @@ class OperatorDevices:
         self._session = session
         self._devices = devices
         self._connected: list[_Connected] = []
+        control = session.config.control
+        self._period_ns, self._patience_ns = ns(1.0 / control.rate_hz), ns(control.state_timeout)
         self.pulse = Pulse(f"teleop {self}", _BLOCKED_S)
 
     def __str__(self) -> str:
@@ -69,7 +101,7 @@ class OperatorDevices:
             part = robot.part(group) if group else robot
             device = self._session.devices.take((group, name), partial(self._opened, name, part))
             self._connected.append(
-                _Connected(name, device, robot.indices(part.joint_names), frozenset(part.joint_names))
+                _Connected(name, device, robot.indices(part.joint_names), part, Plausibility(part, self._period_ns))
             )
         self.pulse.beat()
         self._session.pulses.add(self.pulse)
@@ -98,6 +130,7 @@ class OperatorDevices:
         """Let all devices start from the measured position; see `Teleop.activate`."""
         for each in self._connected:
             begin_operation(each.device, measured.of(each.columns))
+            each.followed = None
             each.device.deadman.disarm(self._session.clock.now_ns())  # reports since the measurement do not count
 
     def approach(self, measured: JointReading) -> bool:
@@ -119,12 +152,7 @@ class OperatorDevices:
             own = measured.of(each.columns)
             each.device.deadman.braking_s = self._braking_s(own, each.columns)
             try:
-                command = operate(each.device, own)
-                if strange := set(command.positions or ()) - each.joints:
-                    raise TeleopError(
-                        f"{each.name}: commands joints that are not its own: {', '.join(sorted(strange))}"
-                    )
-                commands.append(command)
+                commands.append(each.believed(operate(each.device, own), own, self._patience_ns))
             except TeleopError as error:
                 each.lost = True
                 faults.append(str(error))

@@ -10,9 +10,10 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import override
 
 from ibrobot_core.api import TeleopError
-from ibrobot_core.app import Choice, KeyReader, Questions, Sight, echo, emit
+from ibrobot_core.app import Choice, KeyReader, Sight, echo, emit
 from ibrobot_eval import EVAL
 from ibrobot_eval.options import Told
+from ibrobot_eval.questions import Questions
 
 QUIT = Choice(key="q", text="stop for now")
 _POLL_S = 0.5

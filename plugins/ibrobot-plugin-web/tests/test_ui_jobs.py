@@ -179,14 +179,15 @@ class Asking:
     """A page's server whose job asks two questions, and says what was answered."""
 
     PROGRAM = """
-from ibrobot_core.events import Choice, Questions, Sight, encode_event
-questions = Questions()
-for text, choices in (("go on?", [Choice(key="y", text="yes"), Choice(key="n", text="no")]), ("why?", [])):
-    sight = Sight(camera="top", wanted="a.jpg", live="../b.jpg")
-    print(encode_event(questions.next(text, choices, [sight])), flush=True)
-    while (given := questions.answer(0.1)) is None:
+import json, sys
+from ibrobot_core.events import Ask, Choice, Sight, encode_event
+sight = Sight(camera="top", wanted="a.jpg", live="../b.jpg")
+yes_or_no = (Choice(key="y", text="yes"), Choice(key="n", text="no"))
+for number, text, choices in ((1, "go on?", yes_or_no), (2, "why?", ())):
+    print(encode_event(Ask(ask=number, text=text, choices=choices, sights=(sight,))), flush=True)
+    while (given := json.loads(sys.stdin.readline()))["ask"] != number:
         pass
-    print("answered:", given, flush=True)
+    print("answered:", given["answer"], flush=True)
 """
 
     def __init__(self, folder: Path) -> None:
