@@ -19,7 +19,7 @@ from ibrobot_core.config import (
     load_config as load_config,
     from_document as from_document,
 )
-from ibrobot_core.config.copying import variables_of as variables_of, write_copy as write_copy
+from ibrobot_core.config.expand import VARIABLE as VARIABLE
 from ibrobot_core.config.schema import (
     ControlMode as ControlMode,
     ExecutorConfig as ExecutorConfig,

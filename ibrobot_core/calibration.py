@@ -17,7 +17,7 @@ import attrs
 from ibrobot_core.errors import CalibrationError
 
 VERSION = 2
-"""Version of the companion file. Version 1 had no `zero_at`; 0 rad was at the pose."""
+"""Version of the companion file."""
 ZERO_AT = ("pose", "range")
 """Positions of 0 rad: the pose that was set by hand at calibration, or the middle of each joint's calibrated range."""
 
@@ -284,10 +284,10 @@ def _with_meta(calibration: Calibration, path: Path, tool: str | None, *, any_nu
     if not companion.exists():
         return calibration
     _, meta = _document(companion)
-    if not isinstance(meta, dict) or meta.get("version") not in (1, VERSION):
+    if not isinstance(meta, dict) or meta.get("version") != VERSION:
         found = meta.get("version") if isinstance(meta, dict) else meta
-        raise CalibrationError(f"{companion}: version: must be 1 or {VERSION}, not {found!r}")
-    zero_at = "pose" if meta["version"] == 1 else str(meta.get("zero_at"))
+        raise CalibrationError(f"{companion}: version: must be {VERSION}, not {found!r}")
+    zero_at = str(meta.get("zero_at"))
     if zero_at not in ZERO_AT:
         raise CalibrationError(f"{companion}: zero_at: must be one of {', '.join(ZERO_AT)}, not {zero_at!r}")
     if meta.get("sha256") != calibration.fingerprint() and not any_numbers:

@@ -130,14 +130,15 @@ def test_ib_robots_file_has_zero_at_the_pose(tmp_path: Path) -> None:
     assert load_calibration(tmp_path / "arm.json", ["pan"]).joints["pan"].zero() == 2048
 
 
-def test_a_companion_that_does_not_say_it_means_the_pose(tmp_path: Path) -> None:
+def test_a_companion_that_does_not_say_it_is_refused(tmp_path: Path) -> None:
     made = Calibration({"pan": JointCalibration(**GOOD)})
     path = write_calibration(made, tmp_path / "arm.json")
     companion = tmp_path / "arm.meta.json"
     meta = json.loads(companion.read_text())
     assert (meta["version"], meta.pop("zero_at")) == (2, "pose")
     companion.write_text(json.dumps({**meta, "version": 1}))
-    assert load_calibration(path).zero_at == "pose"
+    with pytest.raises(CalibrationError, match=r"arm\.meta\.json: version: must be 2, not 1"):
+        load_calibration(path)
     companion.write_text(json.dumps(meta))
     with pytest.raises(CalibrationError, match=r"arm\.meta\.json: zero_at: must be one of pose, range, not 'None'"):
         load_calibration(path)

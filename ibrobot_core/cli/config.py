@@ -1,11 +1,10 @@
-"""`ibrobot config check|show|copy|schema`: check, show and copy robot YAMLs, and print their JSON Schema."""
+"""`ibrobot config check|show|schema`: check and show robot YAMLs, and print their JSON Schema."""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import override
 
 import attrs
@@ -40,7 +39,7 @@ class ConfigGroup(click.Group):
 
 @click.group(cls=ConfigGroup)
 def config() -> None:
-    """Check, show and copy robot YAMLs.
+    """Check and show robot YAMLs; copies and others come with plugins.
 
     CONFIG is a file, or the name of a config shipped with ibrobot or a plugin; so101 by default.
     """
@@ -118,39 +117,6 @@ def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | 
     if found.missing:
         raise PluginError(f"{found.source}: not all defaults are known: {describe(found.missing)}")
     echo(to_yaml(found), nl=False)
-
-
-@config.command()
-@click.argument("config")
-@click.argument("copy", type=click.Path(path_type=Path, dir_okay=False))
-@click.option(
-    "--value", "values", multiple=True, metavar="NAME=VALUE",
-    help="Default of the variable ${NAME} in the copy, e.g. IBROBOT_FOLLOWER_PORT=/dev/ttyACM1.",
-)  # fmt: skip
-@click.option("--defaults", is_flag=True, help="Keep all other defaults; do not ask.")
-@click.pass_context
-def copy(context: click.Context, config: str, copy: Path, values: tuple[str, ...], defaults: bool) -> None:
-    """Copy CONFIG to a file of your own, with your ports and cameras.
-
-    The copy has the same text, with its comments. In a terminal, the command asks for the default of each variable,
-    such as ${IBROBOT_FOLLOWER_PORT:/dev/ttyACM0}; the environment still overrides it. `ibrobot doctor` lists what is
-    connected. The copy is checked at the end.
-    """
-    from ibrobot_core.config.copying import variables_of, write_copy
-
-    source = find_config(config, installed_plugins())
-    chosen = {}
-    for each in values:
-        name, equals, value = each.partition("=")
-        if not equals or not value:
-            raise click.BadParameter(f"expected NAME=VALUE, got {each!r}", param_hint="--value")
-        chosen[name] = value
-    if not defaults and sys.stdin.isatty():
-        for name, default in variables_of(source).items():
-            if name not in chosen:
-                chosen[name] = click.prompt(name, default=default or None, err=True)
-    write_copy(source, copy, chosen)
-    context.invoke(check, config=str(copy), sim=False, overrides=(), mode=None, as_json=False, deep=False)
 
 
 @config.command()

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)(?::([^}]*))?\}")
+"""A variable in a value of a robot YAML: its name, and its default."""
 
 
 def expand(text: str) -> str:

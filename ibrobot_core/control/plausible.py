@@ -26,7 +26,6 @@ class Plausibility:
         self._names = robot.joint_names
         self._velocity = robot.max_velocity
         self._knock: Vector = np.maximum(KNOCKED, 2 * self._velocity) * seconds(period_ns)
-        self._usual: Vector = self._knock + self._velocity * seconds(period_ns)
 
     def jump(self, before: Vector, now: Vector, since_ns: int) -> str:
         """What is implausible about positions `now` after `before` [rad], shape (J,); empty if nothing is.
@@ -40,8 +39,6 @@ class Plausibility:
             joint = int(np.argmin(finite))
             return f"joint {self._names[joint]} is measured at {now[joint]}; check its encoder and cable"
         away = np.abs(now - before)
-        if not (away > self._usual).any():
-            return ""
         beyond = away > self._knock + self._velocity * seconds(since_ns)
         if not beyond.any():
             return ""

@@ -1,4 +1,4 @@
-"""The plugin's hooks: viewer and teleop `web`, the command `ibrobot ui`."""
+"""The plugin's hooks: viewer and teleop `web`, the commands `ibrobot ui` and `ibrobot config copy`."""
 
 from __future__ import annotations
 
@@ -47,5 +47,10 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """`ibrobot ui`."""
+    """`ibrobot ui` and `ibrobot config copy`."""
     yield Command("ui", "Set up, launch and record robots in the browser.", Late("ibrobot_web.ui.command:ui").load)
+    yield Command(
+        "config copy",
+        "Copy a robot YAML, with your ports and cameras.",
+        Late("ibrobot_web.ui.copying:config_copy").load,
+    )

@@ -185,8 +185,9 @@ sight = Sight(camera="top", wanted="a.jpg", live="../b.jpg")
 yes_or_no = (Choice(key="y", text="yes"), Choice(key="n", text="no"))
 for number, text, choices in ((1, "go on?", yes_or_no), (2, "why?", ())):
     print(encode_event(Ask(ask=number, text=text, choices=choices, sights=(sight,))), flush=True)
-    while (given := json.loads(sys.stdin.readline()))["ask"] != number:
-        pass
+    given = {}
+    while given.get("ask") != number:
+        given = json.loads(sys.stdin.readline() or sys.exit("nobody can answer: standard input has ended"))
     print("answered:", given["answer"], flush=True)
 """
 

@@ -20,11 +20,10 @@ from ibrobot_core.app import (
     load_config,
     shipped_configs,
     unavailable_modes,
-    variables_of,
-    write_copy,
 )
 from ibrobot_web.modes import modes_json
 from ibrobot_web.ui.context import Routes, Ui
+from ibrobot_web.ui.copying import variables_of, write_copy
 
 _ROBOT = re.compile(r"^robot:", re.MULTILINE)
 _SUMMARY = re.compile(r"\A(?:#[^\n]*\n)+")

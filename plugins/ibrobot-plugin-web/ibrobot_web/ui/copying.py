@@ -1,13 +1,15 @@
-"""Copies of robot YAMLs with the same text, but for the defaults of `${NAME:default}`."""
+"""`ibrobot config copy`: copies of robot YAMLs with the same text, but for the defaults of `${NAME:default}`."""
 
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from ibrobot_core.config.expand import VARIABLE
-from ibrobot_core.errors import ConfigError, Problem
+import click
+
+from ibrobot_core.app import VARIABLE, ConfigError, Problem, echo, find_config, installed_plugins, load_config
 
 _ODD = re.compile(r"[{}\"'#\s\\]|:$")
 
@@ -65,3 +67,35 @@ def write_copy(source: Path, copy: Path, defaults: Mapping[str, str]) -> None:
         raise ConfigError([Problem(copy, 0, "", "exists already, and is not overwritten")]) from None
     except OSError as error:
         raise ConfigError([Problem(copy, 0, "", f"cannot be written: {error.strerror}")]) from error
+
+
+@click.command("copy")
+@click.argument("config")
+@click.argument("copy", type=click.Path(path_type=Path, dir_okay=False))
+@click.option(
+    "--value", "values", multiple=True, metavar="NAME=VALUE",
+    help="Default of the variable ${NAME} in the copy, e.g. IBROBOT_FOLLOWER_PORT=/dev/ttyACM1.",
+)  # fmt: skip
+@click.option("--defaults", is_flag=True, help="Keep all other defaults; do not ask.")
+def config_copy(config: str, copy: Path, values: tuple[str, ...], defaults: bool) -> None:
+    """Copy CONFIG to a file of your own, with your ports and cameras.
+
+    The copy has the same text, with its comments. In a terminal, the command asks for the default of each variable,
+    such as ${IBROBOT_FOLLOWER_PORT:/dev/ttyACM0}; the environment still overrides it. `ibrobot doctor` lists what is
+    connected. The copy is checked at the end.
+    """
+    source = find_config(config, installed_plugins())
+    chosen = {}
+    for each in values:
+        name, equals, value = each.partition("=")
+        if not equals or not value:
+            raise click.BadParameter(f"expected NAME=VALUE, got {each!r}", param_hint="--value")
+        chosen[name] = value
+    if not defaults and sys.stdin.isatty():
+        for name, default in variables_of(source).items():
+            if name not in chosen:
+                chosen[name] = click.prompt(name, default=default or None, err=True)
+    write_copy(source, copy, chosen)
+    found = load_config(copy)
+    body = "simulation" if found.simulated else "hardware"
+    echo(f"{copy}: ok ({found.robot.name}, {len(found.robot.joints)} joints, {body})")
