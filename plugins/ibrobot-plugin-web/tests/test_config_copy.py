@@ -60,7 +60,7 @@ def test_it_overwrites_nothing(source: Path) -> None:
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("MINI_PROT=/dev/zero", "mini.yaml has no variable 'MINI_NAEM'; its variables are: MINI_PORT"),
+        ("MINI_PROT=/dev/zero", "mini.yaml has no variable 'MINI_PROT'; its variables are: MINI_PORT"),
         ("NOT_A_VARIABLE=1", "its variables are: MINI_PORT"),
         ("MINI_PORT=a}, x: {", "'a}, x: {' cannot be a default: no spaces, quotes, braces or #"),
         ("MINI_PORT", "expected NAME=VALUE, got 'MINI_PORT'"),
