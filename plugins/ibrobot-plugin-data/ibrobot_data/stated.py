@@ -1,4 +1,4 @@
-"""Options that state what a dataset of others does not: names of elements, and joints that range from 0 to 100."""
+"""Options that state what foreign datasets do not: names of elements, and joints that range from 0 to 100."""
 
 from __future__ import annotations
 
