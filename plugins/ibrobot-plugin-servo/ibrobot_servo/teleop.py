@@ -36,8 +36,6 @@ _PAUSE_NS = ns(0.5)
 """A stream of twists that was silent for so long counts as released [ns]."""
 _SOON_NS = ns(0.25)
 """Time after the beginning of the mode in which a stream shows that it goes on [ns]."""
-_OFF_NS = ns(0.5)
-"""Largest difference between the time in a twist's header and ours [ns]."""
 
 
 class TwistTeleop(Teleop):
@@ -168,9 +166,8 @@ class TwistTeleop(Teleop):
             return f"its frame is neither {frames[0]} nor {frames[1]}"
         if self._ctx.clock.now_ns() - received_ns > ns(self._options.timeout):
             return "read too late"
-        stamp_ns = message.header.stamp_ns
-        if stamp_ns and abs(stamp_ns - received_ns) > _OFF_NS:
-            return "the time in its header is more than 0.5 s off: set the clocks, or leave the time 0"
+        if refusal := self._ctx.clock.refusal(message.header.stamp_ns):
+            return refusal
         moves = _array(message.twist.linear).any() or _array(message.twist.angular).any()
         self.deadman.report(bool(moves), now_ns)
         if not moves or self.deadman.allows(now_ns):

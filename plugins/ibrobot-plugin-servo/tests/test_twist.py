@@ -14,6 +14,7 @@ from ibrobot_servo import ibrobot_sections, ibrobot_teleop
 from ibrobot_servo.options import TwistOptions
 from ibrobot_servo.teleop import TwistTeleop
 from ibrobot_testing import TeleopSuite, host_context, make_robot
+from ibrobot_testing.contexts import START_NS, SetClock
 
 from ibrobot_core.api import (
     Bool,
@@ -115,7 +116,8 @@ class Rig:
 
     def __init__(self, path: Path, options: TwistOptions = TwistOptions()) -> None:  # noqa: B008 - it is frozen
         self.robot = robot_of(path)
-        self.ctx = host_context("twist", robot=self.robot)
+        self.clock = SetClock(START_NS)
+        self.ctx = host_context("twist", robot=self.robot, clock=self.clock)
         assert self.ctx.bus is not None
         self.bus = self.ctx.bus
         self.kinematics: KinematicModel = robot_model(self.robot)
@@ -205,6 +207,21 @@ def test_a_twist_whose_time_is_off_moves_nothing(model, off_s: float):
         np.testing.assert_array_equal(rig.tick(stamped), BENT)
     assert any("more than 0.5 s off" in reason for reason in rig.counts())
     assert rig.follow(attrs.evolve(twist(), header=Header(rig.ctx.clock.now_ns(), "")), 0.3).any()
+
+
+@pytest.mark.parametrize("set_by_s", [3600.0, -3600.0])
+def test_twists_of_now_move_the_tool_after_the_computers_clock_is_set(model, set_by_s: float):
+    rig = Rig(model)
+    rig.clock.set_by_ns = ns(set_by_s)
+    for now_ns in (rig.clock.now_ns, rig.clock.wall_ns):  # a program of this run's, and one of another computer's
+        old = attrs.evolve(twist(), header=Header(now_ns() - ns(3.0), ""))
+        assert not rig.follow(old, 0.1).any()
+        rig.tick(twist((0.0, 0.0, 0.0)))
+        before = rig.position.copy()
+        for _ in range(30):
+            rig.tick(attrs.evolve(twist(), header=Header(now_ns(), "")))
+        assert (rig.position != before).any()
+        rig.follow(twist((0.0, 0.0, 0.0)), 0.5)
 
 
 def test_a_stream_that_goes_on_over_a_reset_moves_nothing_before_a_zero_twist_or_a_pause(model):

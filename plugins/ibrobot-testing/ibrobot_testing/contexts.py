@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
+from typing import Any, override
 
 from ibrobot_core.api import NS_PER_S, Clock, Context, Description, Joint, Robot, SteppedClock
 from ibrobot_core.app import Bus
@@ -13,6 +13,20 @@ START_NS = 1_700_000_000 * NS_PER_S
 
 ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 GRIPPER = ("gripper",)
+
+
+class SetClock(SteppedClock):
+    """A stepped clock of a computer whose time of day was set, e.g. by NTP.
+
+    Attributes:
+        set_by_ns: how far the time of day was set forward [ns].
+    """
+
+    set_by_ns = 0
+
+    @override
+    def wall_ns(self) -> int:
+        return self.now_ns() + self.set_by_ns
 
 
 def make_robot() -> Robot:
