@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import Contract, JointCalibration, Vector, load_calibration
-from ibrobot_core.app import RobotConfig
+from ibrobot_core.app import ComponentFailed, RobotConfig
 
 _IMAGES = "observation.images."
 _TURN = JointCalibration.TICKS_PER_TURN
@@ -72,23 +72,33 @@ class RobotFeatures:
         found = (radians - self.offset) / self.factor
         return {f"{joint}.pos": float(value) for joint, value in zip(self.joints, found, strict=True)}
 
-    def radians(self, values: Mapping[str, float]) -> dict[str, float]:
-        """LeRobot's features as positions of joints [rad].
+    def numbers(self, values: Mapping[str, object]) -> dict[str, float]:
+        """LeRobot's features as plain numbers.
 
         Raises:
-            KeyError: for a feature that is not one of its joints.
-            ValueError: for a value that is not finite.
+            ComponentFailed: for a feature that is not one of its joints, or a value that is no finite number.
         """
-        indices = {f"{joint}.pos": i for i, joint in enumerate(self.joints)}
+        known = [f"{joint}.pos" for joint in self.joints]
         found = {}
         for name, value in values.items():
-            if name not in indices:
-                raise KeyError(f"no joint {name!r}; the joints are: {', '.join(indices)}")
-            if not math.isfinite(value):
-                raise ValueError(f"{name} is {value}")
-            i = indices[name]
-            found[self.joints[i]] = float(value * self.factor[i] + self.offset[i])
+            if name not in known:
+                raise ComponentFailed(f"action: no feature {name!r}; the features are: {', '.join(known)}")
+            try:
+                found[name] = float(value)  # type: ignore[arg-type]  # also of arrays and tensors
+            except (TypeError, ValueError):
+                found[name] = math.nan
+            if isinstance(value, str | bool) or not math.isfinite(found[name]):
+                raise ComponentFailed(f"action: {name} is {value!r}: give a finite number, as observations have")
         return found
+
+    def radians(self, values: Mapping[str, object]) -> dict[str, float]:
+        """LeRobot's features as positions of joints [rad]; the errors are those of `numbers`."""
+        indices = {f"{joint}.pos": i for i, joint in enumerate(self.joints)}
+        return {
+            self.joints[i]: float(value * self.factor[i] + self.offset[i])
+            for name, value in self.numbers(values).items()
+            for i in [indices[name]]
+        }
 
 
 def _scale(

@@ -109,9 +109,17 @@ class ProgramLink:
         self.measured = self.features.radians(answer["values"])
         return answer["values"], pictures
 
-    def act(self, action: Mapping[str, float]) -> None:
-        """Command positions in LeRobot's units; a fault is raised by the next `read`."""
-        self._running().channel.send({"do": "act", "action": dict(action)})
+    def act(self, action: Mapping[str, object]) -> dict[str, float]:
+        """Command positions in LeRobot's units, and return them; a fault is raised by the next `read`.
+
+        Joints without a position keep the one that they were sent last, as with LeRobot's followers.
+
+        Raises:
+            ComponentFailed: for an unknown feature, or a value that is no finite number; nothing is commanded then.
+        """
+        wanted = self.features.numbers(action)
+        self._running().channel.send({"do": "act", "action": wanted})
+        return wanted
 
     def end(self) -> None:
         """End the run, and let the robot come to rest as its YAML says. Safe to call twice."""

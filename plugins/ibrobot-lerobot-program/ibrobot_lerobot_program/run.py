@@ -79,12 +79,15 @@ class ProgramSource(SourceWorker):
         self._contract = Contract.from_config(session.config)
         self._columns = session.config.robot.indices(features.joints)
         self._sampler: FrameSampler | None = None
+        self._sent: dict[str, float] = {}
+        """Joint -> the position that was sent last [rad]; empty before the first action of the mode."""
         self._refused = ""
         """Why an action was refused since the last answer."""
 
     @override
     def begin_mode(self, seed: int) -> None:
         self._sampler = FrameSampler(self._contract, self.session.bus)
+        self._sent = {}
 
     @override
     def end_mode(self) -> None:
@@ -111,7 +114,7 @@ class ProgramSource(SourceWorker):
         elif request["do"] == "act":
             try:
                 self._act(request["action"])
-            except (IbrobotError, KeyError, ValueError) as error:
+            except IbrobotError as error:
                 self._refused = error_text(error)
         else:
             try:
@@ -120,11 +123,16 @@ class ProgramSource(SourceWorker):
                 self._channel.send({"event": ANSWER, "error": error_text(error)})
 
     def _act(self, action: Mapping[str, float]) -> None:
+        """Command joints; those without a position keep the one that they were sent last, or stay where they are."""
         session, positions = self.session, self._features.radians(action)
-        robot = session.config.robot
-        order = robot.indices(tuple(positions))
-        wanted = np.clip([*positions.values()], robot.lower[order], robot.upper[order])
-        session.send_plan(session.clock.now_ns(), self._contract.step_ns, tuple(positions), wanted[None])
+        joints, limits = self._features.joints, session.config.robot
+        if not self._sent:
+            self._sent = dict(zip(joints, session.measured().position[self._columns].tolist(), strict=True))
+        self._sent |= positions
+        wanted = np.clip(
+            [self._sent[joint] for joint in joints], limits.lower[self._columns], limits.upper[self._columns]
+        )
+        session.send_plan(session.clock.now_ns(), self._contract.step_ns, joints, wanted[None])
 
     def _observe(self) -> None:
         """Send positions, as measured now, and the newest pictures."""

@@ -89,10 +89,14 @@ class IbrobotRobot(Robot):  # type: ignore[misc]
         return {**values, **pictures}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """Command positions; the control process limits speed, acceleration and range."""
-        wanted = {name: float(value) for name, value in action.items()}
-        self.link.act(wanted)
-        return wanted
+        """Command positions; the control process limits speed, acceleration and range.
+
+        Joints without a position keep their last one.
+
+        Raises:
+            ComponentFailed: for an unknown feature, or a value that is no finite number; nothing is commanded then.
+        """
+        return self.link.act(action)
 
     def disconnect(self) -> None:
         """End the run; the robot comes to rest as `control.stop` of its YAML says."""
