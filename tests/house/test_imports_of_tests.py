@@ -10,12 +10,17 @@ from pathlib import Path
 import pytest
 
 PLUGINS = Path(__file__).parents[2] / "plugins"
+DRIVE = "the control core of a run in simulated time, with faults at chosen ticks"
 LOOP = "a loop of a few lines with core's own smoother and safety layer, which plans of policies pass through"
 ALLOWED = {
     (
         "ibrobot-plugin-lerobot/tests/test_compose.py",
         "ibrobot_core.contract.image",
     ): "every encoding that contracts know",
+    ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.config"): DRIVE,
+    ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.control.build"): DRIVE,
+    ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.control.link"): DRIVE,
+    ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.plugins"): DRIVE,
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.control.safety"): LOOP,
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.dispatch.smoother"): LOOP,
     ("ibrobot-plugin-mujoco/tests/test_model_limits.py", "ibrobot_core.config.models"): (

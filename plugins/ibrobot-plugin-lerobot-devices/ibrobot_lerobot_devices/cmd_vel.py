@@ -8,6 +8,7 @@ import numpy as np
 
 from ibrobot_core.api import (
     Context,
+    Header,
     JointReading,
     Message,
     Teleop,
@@ -28,6 +29,9 @@ _PAUSE_NS = ns(0.5)
 """A stream of twists that was silent for so long counts as released [ns]."""
 _SOON_NS = ns(0.25)
 """Time after the beginning of the mode in which a stream shows that it goes on [ns]."""
+
+_LEAST_PACE = 0.1
+"""Share of the wanted velocity at which the setpoint leaves a base behind that does not move."""
 
 
 class CmdVelTeleop(Teleop):
@@ -112,8 +116,13 @@ class CmdVelTeleop(Teleop):
         elapsed_s = min(seconds(measured.stamp_ns - self._set_ns), _LONGEST_STEP_S)
         change = acceleration * elapsed_s
         self._velocity = self._velocity + np.clip(wanted - self._velocity, -change, change)
-        lead = robot.max_lead[self._columns] / 2
-        self._setpoint = np.clip(self._setpoint + self._velocity * elapsed_s, here - lead, here + lead)
+        # A base that falls behind is waited for, along all axes, so that the twist keeps its direction.
+        lead = robot.max_lead[self._columns] / 4
+        behind = np.sign(self._velocity) * (self._setpoint - here)
+        pace = float(np.clip(2.0 * np.min(1.0 - behind / lead), _LEAST_PACE, 1.0))
+        self._setpoint = self._setpoint + pace * self._velocity * elapsed_s
+        if (np.abs(self._setpoint - here) > 1.5 * lead).any():  # something holds it: it starts anew from where it is
+            self._setpoint, self._velocity = here.copy(), np.zeros_like(here)
         self._set_ns = measured.stamp_ns
         command = TeleopCommand(dict(zip(self._joints, self._setpoint.tolist(), strict=True)))
         if not wanted.any() and not self._velocity.any():
@@ -127,14 +136,16 @@ class CmdVelTeleop(Teleop):
         """The velocities of a message [m/s, rad/s], or None if it is refused."""
         twist = message.twist if isinstance(message, TwistStamped) else message
         assert isinstance(twist, Twist)
-        frame = message.header.frame_id if isinstance(message, TwistStamped) else ""
+        header = message.header if isinstance(message, TwistStamped) else Header(0)
         linear, angular = twist.linear, twist.angular
         given = {
             "linear.x": linear.x, "linear.y": linear.y, "linear.z": linear.z,
             "angular.x": angular.x, "angular.y": angular.y, "angular.z": angular.z,
         }  # fmt: skip
-        if frame not in ("", self._options.frame):
-            why = f"its frame is {frame!r}, not {self._options.frame!r}"
+        if header.frame_id not in ("", self._options.frame):
+            why = f"its frame is {header.frame_id!r}, not {self._options.frame!r}"
+        elif refusal := self._ctx.clock.refusal(header.stamp_ns):
+            why = refusal
         elif not np.isfinite(list(given.values())).all():
             why = "it is not finite"
         elif strange := [field for field, value in given.items() if value and field not in self._axes.values()]:

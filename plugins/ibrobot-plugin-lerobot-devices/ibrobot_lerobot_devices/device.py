@@ -25,14 +25,22 @@ from ibrobot_lerobot_devices.units import driven
 _FAREWELL_S = 1.0
 """How long a call may go on after the parent has ended or died [s]."""
 _SILENCE_S = 0.25
-"""A base that drives stands again when no action has come for this long [s]."""
+"""How old the newest action that a base drives by may get; then it stands [s]."""
+_AGAIN_S = 0.05
+"""Time between attempts to let a base stand [s]."""
 _NICE = -10
 _PICTURE_MS = 200
 """Longest time to wait for a picture before an answer without one [ms]."""
 READY, ANSWER, DONE, TRAFFIC = "ready", "answer", "done", "traffic"
 """Events: it is connected; a reading or why there is none; a request is carried out; what its ports received."""
+STAND = "stand"
+"""The request to let a base stand."""
+CONNECT = "connect"
+"""The request to connect, to a process that has imported what it needs and waits."""
 _END: dict[str, Any] = {"do": "end"}
-_STAND: dict[str, Any] = {"do": "stand"}
+_OVERDUE: dict[str, Any] = {"do": "overdue"}
+_NEWEST = ("act", "read", STAND)
+"""Requests of which only the newest counts."""
 
 
 @attrs.define
@@ -63,7 +71,7 @@ class Traffic:
 
 @attrs.define
 class Requests:
-    """Requests of the parent, in order; of actions and of requests to read only the newest counts."""
+    """Requests of the parent, in order; of actions, and of requests to read or to stand, only the newest counts."""
 
     channel: Channel
     traffic: Traffic = attrs.field(factory=Traffic)
@@ -76,17 +84,26 @@ class Requests:
         threading.Thread(target=self._take, daemon=True).start()
 
     def next(self, timeout_s: float | None) -> dict[str, Any]:
-        """The next request; one to stand if none comes within `timeout_s` [s], which is unlimited if it is None."""
+        """The next request; `_OVERDUE` if none comes within `timeout_s` [s], which is unlimited if it is None."""
         while True:
             try:
                 request = self._waiting.get(timeout=timeout_s)
             except queue.Empty:
-                return _STAND
-            if request["do"] not in ("act", "read"):
+                return _OVERDUE
+            if request["do"] not in _NEWEST:
                 return request
             newest = self._newest.pop(request["do"], None)
             if newest is not None:
                 return newest
+
+    def put(self, request: dict[str, Any]) -> None:
+        """Take a request."""
+        if request["do"] == TRAFFIC:  # whatever LeRobot's call does
+            self.channel.send({"event": TRAFFIC, **attrs.asdict(self.traffic)})
+            return
+        if request["do"] in _NEWEST:
+            self._newest[request["do"]] = request
+        self._waiting.put(request)
 
     def _take(self) -> None:
         try:
@@ -94,12 +111,7 @@ class Requests:
                 for request in self.channel.wait(None):
                     if request["do"] == "end":
                         raise ComponentFailed("ended")
-                    if request["do"] == TRAFFIC:  # whatever LeRobot's call does
-                        self.channel.send({"event": TRAFFIC, **attrs.asdict(self.traffic)})
-                        continue
-                    if request["do"] in ("act", "read"):
-                        self._newest[request["do"]] = request
-                    self._waiting.put(request)
+                    self.put(request)
         except ComponentFailed:
             self._waiting.put(_END)
             if not self.ended.wait(_FAREWELL_S):
@@ -121,9 +133,16 @@ class Device:
         self._order = order
         self._pictures = pictures
         self._device: Any = None
-        self._driving: dict[str, float] = {}
-        """The last action, if a base drives by it."""
-        self._acted_s = 0.0
+        self._acted: dict[str, float] = {}
+        """The last action."""
+        self._until_s: float | None = None
+        """When a base that drives must stand, unless a new action comes [s]; None if it stands."""
+        self.failures = 0
+        """How many actions in a row LeRobot has not carried out."""
+
+    def prepare(self) -> None:
+        """Import what the device needs, without touching it."""
+        self._library.choices(self._order["kind"], self._order["type"])
 
     def make(self) -> dict[str, Any]:
         """Make LeRobot's object; return what it says about itself without being connected."""
@@ -147,6 +166,7 @@ class Device:
                 f"is not calibrated: LeRobot finds no calibration that fits its motors; its file is "
                 f"{device.calibration_fpath}"
             )
+        self.stand()  # the motors may have kept their velocities from an earlier process
         return found | {"motors": self._library.motors(device)}
 
     def read(self) -> dict[str, float]:
@@ -167,24 +187,69 @@ class Device:
             "content": content,
         }  # fmt: skip
 
-    def act(self, action: Mapping[str, float]) -> dict[str, Any]:
-        """Send an action."""
-        self._driving, self._acted_s = {}, time.monotonic()
-        if any(action[name] for name in driven(list(action)).values()):
-            self._driving = dict(action)
+    def act(self, action: Mapping[str, float], made_ns: int) -> None:
+        """Send an action, which was made at `made_ns` (`time.monotonic_ns`); an old one lets the base stand."""
+        axes = driven(list(action)).values()
+        until_s = made_ns / 1e9 + _SILENCE_S
+        if until_s <= time.monotonic():  # e.g. since this process was stopped
+            action = {**action, **dict.fromkeys(axes, 0.0)}
+        drives = any(action[name] for name in axes)
+        if drives and self._until_s is None:  # also if LeRobot fails: some motors may have received it
+            self._until_s = until_s
+        self._acted = dict(action)
+        self.failures += 1
         self._device.send_action(dict(action))
-        return {}
+        self.failures = 0
+        self._until_s = until_s if drives else None
 
     @property
     def patience_s(self) -> float | None:
         """How long a base may still drive without another action [s]; None if it stands."""
-        return max(0.0, self._acted_s + _SILENCE_S - time.monotonic()) if self._driving else None
+        return None if self._until_s is None else max(0.0, self._until_s - time.monotonic())
+
+    @property
+    def is_overdue(self) -> bool:
+        """Whether a base drives by an action that is too old."""
+        return self.patience_s == 0.0
 
     def stand(self) -> dict[str, Any]:
-        """Let the base stand."""
-        if self._driving:
-            self.act(self._driving | dict.fromkeys(driven(list(self._driving)).values(), 0.0))
-        return {}
+        """Let the base stand, by the first means that works.
+
+        Raises:
+            DeviceError: if none does.
+        """
+        axes = driven(list(self._device.action_features)).values() if self._order["kind"] == "robot" else ()
+        if not axes:
+            return {}
+        why = ""
+        for mean in (self._stand_by_action, self._stand_by_lerobot, self._stand_without_torque):
+            try:
+                if mean(dict.fromkeys(axes, 0.0)):
+                    self._until_s = None
+                    return {}
+            except Exception as error:  # noqa: BLE001 - of LeRobot's; another means may work
+                why = why or _one_line(error)
+        if self._until_s is not None:
+            self._until_s = time.monotonic() + _AGAIN_S
+        raise self._library.DeviceError(f"LeRobot cannot stop the base: {why}")
+
+    def _stand_by_action(self, rest: Mapping[str, float]) -> bool:
+        """By an action that leaves the arm where it was sent, or where it is."""
+        features = self._device.action_features
+        arm = self._acted or {name: value for name, value in self.read().items() if name in features}
+        self._device.send_action({**arm, **rest})
+        return True
+
+    def _stand_by_lerobot(self, rest: Mapping[str, float]) -> bool:
+        """By LeRobot's own call, if the robot has one, as LeKiwi."""
+        return self._library.stop_base(self._device)
+
+    def _stand_without_torque(self, rest: Mapping[str, float]) -> bool:
+        """By switching off the torque of the wheels."""
+        wheels = self._library.wheels(self._device)
+        for bus, names in wheels:
+            bus.disable_torque(names)
+        return bool(wheels)
 
     def relax(self) -> dict[str, Any]:
         """Switch the torque off."""
@@ -196,7 +261,7 @@ class Device:
         """Switch the torque on, with the present positions as goals."""
         features = self._device.action_features
         here = {name: value for name, value in self.read().items() if name in features}
-        self.act(here | dict.fromkeys(driven(list(features)).values(), 0.0))
+        self.act(here | dict.fromkeys(driven(list(features)).values(), 0.0), time.monotonic_ns())
         for owner in self._library.torque_switches(self._device):
             owner.enable_torque()
         return {}
@@ -221,25 +286,45 @@ def _one_line(error: BaseException) -> str:
 
 def serve(device: Device, requests: Requests) -> None:
     """Carry requests out until the parent ends or dies."""
-    channel = requests.channel
-    while (request := requests.next(device.patience_s))["do"] != "end":
-        what = request["do"]
-        requests.traffic.reads = requests.traffic.received = 0
-        begun_ns = time.monotonic_ns()
-        answer: dict[str, Any] = {"event": ANSWER if what in ("read", "picture") else DONE, "id": request.get("id")}
-        try:
-            found: dict[str, Any] = device.act(request["action"]) if what == "act" else getattr(device, what)()
-        except Exception as error:  # noqa: BLE001 - contained: the answer has the error
-            channel.send(answer | {"do": what, "error": _one_line(error)})
-            continue
-        if what == "picture":
-            content = found.pop("content")
-            channel.send(answer | found)
-            _send(device._pictures, content)
-        elif what == "read":
-            channel.send(answer | {"values": found, "made_ns": (begun_ns + time.monotonic_ns()) // 2})
-        elif what not in ("act", "stand"):
-            channel.send(answer | {"do": what, "found": found})
+    while serve_next(device, requests, device.patience_s):
+        pass
+
+
+def serve_next(device: Device, requests: Requests, timeout_s: float | None) -> bool:
+    """Carry the next request out, and let a base that is overdue stand before; False at the end."""
+    request = requests.next(timeout_s)
+    requests.traffic.reads = requests.traffic.received = 0
+    if device.is_overdue:  # e.g. since this process was stopped and goes on
+        with contextlib.suppress(Exception):  # it tries again, and the parent finds that actions fail
+            device.stand()
+    if request is not _OVERDUE and request["do"] != "end":
+        carry_out(device, request, requests.channel)
+    return request["do"] != "end"
+
+
+def carry_out(device: Device, request: Mapping[str, Any], channel: Channel) -> None:
+    """Carry a request out, and answer it."""
+    what = request["do"]
+    begun_ns = time.monotonic_ns()
+    answer: dict[str, Any] = {
+        "event": ANSWER if what in ("read", "picture") else DONE, "do": what, "id": request.get("id"),
+    }  # fmt: skip
+    try:
+        if what == "act":
+            device.act(request["action"], request["made_ns"])
+            return
+        found: dict[str, Any] = getattr(device, what)()
+    except Exception as error:  # noqa: BLE001 - contained: the answer has the error
+        channel.send(answer | {"error": _one_line(error), "times": device.failures})
+        return
+    if what == "picture":
+        content = found.pop("content")
+        channel.send(answer | found)
+        _send(device._pictures, content)
+    elif what == "read":
+        channel.send(answer | {"values": found, "made_ns": (begun_ns + time.monotonic_ns()) // 2})
+    else:
+        channel.send(answer | {"found": found})
 
 
 def _send(pipe: int, content: memoryview) -> None:
@@ -263,8 +348,10 @@ def main(parent: int, pictures: int) -> int:
     """Run with the parent's channel; returns the exit status."""
     prefer()
     channel = open_parent(parent)
-    order = channel.wait(None)[0]
+    order, *early = channel.wait(None)
     requests = Requests(channel)
+    for request in early:  # e.g. to connect, although it has just begun to import
+        requests.put(request)
     try:
         if not order["torch"]:
             replace_torch()
@@ -277,8 +364,12 @@ def main(parent: int, pictures: int) -> int:
         if order["only_make"]:
             channel.send({"event": READY, "found": device.make()})
             return 0
-        requests.traffic.watch()
         requests.start()
+        if order["waits"]:
+            device.prepare()
+            if requests.next(None)["do"] != CONNECT:
+                return 0
+        requests.traffic.watch()
         try:
             found = device.connect()
             channel.send({"event": READY, "found": found})

@@ -5,26 +5,30 @@ from __future__ import annotations
 import json
 import shlex
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, override
 
 import numpy as np
 
 from ibrobot_core.api import (
+    Condition,
     Context,
     Hardware,
     HardwareError,
     Holding,
     JointReading,
     NotSupported,
+    Severity,
     Torque,
     Vector,
     nan_vector,
+    ns,
     seconds,
 )
 from ibrobot_lerobot_devices.base import Base
 from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem, age_ns
 from ibrobot_lerobot_devices.options import RobotOptions
+from ibrobot_lerobot_devices.standing import MAY_DRIVE, Standing
 from ibrobot_lerobot_devices.units import (
     EFFORT,
     POSITION,
@@ -43,6 +47,7 @@ _RELAX_S = 0.5
 """How long switching the torque may take [s]."""
 _RECONNECT_S = 1.0
 """How long a reset waits for the device to connect again [s]."""
+_AGAIN = "LeRobot starts again, which takes some seconds: reset once more"
 _SPAN = 4
 """Readings from which a velocity is computed if LeRobot gives none."""
 
@@ -53,6 +58,8 @@ class LeRobotHardware(Hardware):
     A reading has the time at which it was made. One that comes too late for its tick counts in the next, and until
     then readings are stale; after `blocked` seconds without one it is a fault that names the call. Meanwhile LeRobot's
     robots keep their last goal.
+
+    A base stands without a measurement for `blocked` seconds, and at every fault.
 
     Args:
         options: options from the YAML.
@@ -69,7 +76,11 @@ class LeRobotHardware(Hardware):
         self._starting = False
         self._newest: JointReading | None = None
         self._lost = 0
-        self._base = Base((), {}, (), np.zeros(0), seconds(ctx.period_ns))
+        self._base = Base((), {}, (), np.zeros(0), np.zeros(0), seconds(ctx.period_ns))
+        self._measured_ns = 0
+        """When the newest reading came [ns]."""
+        self._standing: Standing | None = None
+        """Makes the base stand after a fault; None without one."""
         self._on = False
         self._has_torque = False
         self._relaxed = False
@@ -87,21 +98,28 @@ class LeRobotHardware(Hardware):
     @override
     def read(self) -> JointReading:
         if self._fault is not None:
+            if self._standing is not None:
+                self._standing.step()
             raise self._fault
         try:
             answer = self._link.read(self._wait_s)
         except DeviceProblem as problem:
             raise self._fail(problem) from None
         self._counts["late_readings"] = self._link.late
-        if answer is not None and "error" in answer:
+        times, why = self._link.refused
+        if self._base.features and times > self._options.lost_readings:
+            raise self._fail(f"LeRobot does not carry actions out: {why}")
+        if answer is not None:
+            wrong = answer.get("error") or self._wrong(answer["values"])
+            if not wrong:
+                self._lost = 0
+                self._measured_ns = self._ctx.clock.now_ns()
+                self._newest = self._reading(answer)
+                return self._newest
             self._lost += 1
             self._counts["lost_readings"] += 1
             if self._lost > self._options.lost_readings:
-                raise self._fail(answer["error"])
-        elif answer is not None:
-            self._lost = 0
-            self._newest = self._reading(answer)
-            return self._newest
+                raise self._fail(wrong)
         if self._link.blocked_s > self._options.blocked:
             raise self._fail(self._link.blockage("get_observation"))
         newest = self._newest
@@ -116,7 +134,7 @@ class LeRobotHardware(Hardware):
     def write(self, position: Vector) -> None:
         if np.shape(position) != (len(self.joints),) or not np.isfinite(position).all():
             raise self._error(f"expected {len(self.joints)} finite positions, got {position}")
-        if self._link.pid is None or self._starting:
+        if self._link.pid is None or self._starting or (self._standing is not None and self._standing.is_starting):
             raise self._fault or self._error("is not connected")
         try:
             if self._relaxed:
@@ -124,7 +142,9 @@ class LeRobotHardware(Hardware):
                 self._relaxed, self._on = False, True
                 self._base.forget()
             values = (position[self._turned] - self._offset) / self._factor
-            driven_at = self._base.drive(position[self._rolled])
+            unmeasured = self._ctx.clock.now_ns() - self._measured_ns > ns(self._options.blocked)
+            stands = self._fault is not None or unmeasured
+            driven_at = self._base.stand() if stands else self._base.drive(position[self._rolled])
             self._link.act({**self._rest, **driven_at, **dict(zip(self._features, values.tolist(), strict=True))})
         except DeviceProblem as problem:
             raise self._fail(problem) from None
@@ -152,11 +172,26 @@ class LeRobotHardware(Hardware):
         return Holding(where, f"ibrobot lerobot torque-off {options.robot} --config {shlex.quote(config)}")
 
     @override
+    def health(self) -> Sequence[Condition]:
+        standing = self._standing
+        if standing is None or not standing.is_in_doubt:
+            return ()
+        joint = self.joints[self._rolled[0]]
+        message = f"{self._ctx.name}: {MAY_DRIVE}; LeRobot has not confirmed that it stands"
+        return (Condition(joint, "velocity", float("nan"), "m/s", Severity.FAULT, message),)
+
+    @override
     def reset_faults(self) -> None:
+        self._base.forget()  # the command begins anew where the base is
         if self._fault is None:
             return
-        link = self._link
+        link, standing = self._link, self._standing
         try:
+            if standing is not None and (link.pid is None or standing.is_starting or standing.found is not None):
+                if (found := standing.restart(_RECONNECT_S)) is None:
+                    raise self._fail(_AGAIN)
+                self._take(found, again=True)
+                return
             if not self._starting and link.pid is not None:
                 link.read(self._wait_s)  # the call may have returned meanwhile
             if not self._starting and link.pid is not None and link.blocked_s <= self._options.blocked:
@@ -166,7 +201,7 @@ class LeRobotHardware(Hardware):
                 link.begin()
                 self._starting = True
             if (found := link.poll_start(_RECONNECT_S)) is None:
-                raise self._fail("LeRobot starts again, which takes some seconds: reset once more")
+                raise self._fail(_AGAIN)
             self._take(found, again=True)
         except (DeviceProblem, UnitProblem) as problem:
             self._starting = False
@@ -176,7 +211,7 @@ class LeRobotHardware(Hardware):
     def disconnect(self) -> None:
         if self._link.pid is not None and self._fault is None:
             self._ctx.log.info("%s: LeRobot reports no torque, temperature or voltage of its motors", self._ctx.name)
-        self._fault, self._starting = self._error("is not connected"), False
+        self._fault, self._starting, self._standing = self._error("is not connected"), False, None
         self._link.end()
 
     @override
@@ -199,8 +234,9 @@ class LeRobotHardware(Hardware):
         self._factor, self._offset = columns(mapped)
         self._turned = [self.joints.index(joint) for joint in turned]
         self._rolled = [self.joints.index(joint) for joint in rolled]
-        fastest, period_s = robot.max_velocity[robot.indices(rolled)], seconds(self._ctx.period_ns)
-        base = Base(axes, driven(actions), found["observation_features"], fastest, period_s)
+        at, period_s = robot.indices(rolled), seconds(self._ctx.period_ns)
+        highest = robot.max_velocity[at], robot.max_acceleration[at]
+        base = Base(axes, driven(actions), found["observation_features"], *highest, period_s)
         if again:
             base.way = self._base.way
         self._base = base
@@ -219,7 +255,9 @@ class LeRobotHardware(Hardware):
         if again and self._relaxed:  # LeRobot has switched the torque on
             self._link.call("relax", _RELAX_S)
             self._on = False
-        self._fault = None
+        self._fault = self._standing = None
+        if self._base.features:
+            self._link.prepare()
         if not again:
             self._say(found)
 
@@ -233,6 +271,13 @@ class LeRobotHardware(Hardware):
         if not found["keeps_torque"]:
             log.warning("%s: LeRobot's %s may switch its torque off at the end", name, self._options.robot)
 
+    def _wrong(self, values: Mapping[str, float]) -> str:
+        """Why the values of a reading are no measurement; empty if they are one."""
+        for name in self._columns[0]:
+            if name is not None and not np.isfinite(values.get(name, np.nan)):
+                return f"LeRobot gave no finite position of {self.joints[self._turned[self._columns[0].index(name)]]}"
+        return self._base.wrong(values)
+
     def _reading(self, answer: Mapping[str, Any]) -> JointReading:
         values = answer["values"]
         position, velocity, effort = (
@@ -243,8 +288,6 @@ class LeRobotHardware(Hardware):
         turned = self._factor * position + self._offset
         self._base.measure(values, stamp_ns)
         position = self._whole(turned, self._base.way)
-        if not np.isfinite(position).all():
-            raise self._fail(f"LeRobot gave no finite position of {self.joints[int(np.argmin(np.isfinite(position)))]}")
         self._history.append((stamp_ns, position))
         measured = self._differences()
         velocity = self._whole(self._factor * velocity, self._base.velocity)
@@ -269,5 +312,9 @@ class LeRobotHardware(Hardware):
         return HardwareError(f"{self._ctx.name}: {text}")
 
     def _fail(self, text: object) -> HardwareError:
+        if self._base.features and self._standing is None:
+            self._standing = Standing(self._link, self._ctx.log)
+            if self._base.drives:
+                text = f"{text}; unless the log says that it stands, {MAY_DRIVE}"
         self._fault = self._error(text)
         return self._fault

@@ -17,6 +17,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ibrobot_core.api import did_you_mean
 from ibrobot_lerobot_devices.registry import KEEPS_TORQUE, third_parties
+from ibrobot_lerobot_devices.units import POSITION, bases
 
 Kind = Literal["robot", "teleoperator", "camera"]
 KINDS: tuple[Kind, ...] = ("robot", "teleoperator", "camera")
@@ -211,6 +212,21 @@ def torque_switches(device: Any) -> list[Any]:
     if hasattr(device, "disable_torque") and hasattr(device, "enable_torque"):
         return [device]
     return [bus for _, bus in buses(device) if hasattr(bus, "enable_torque")]
+
+
+def stop_base(device: Any) -> bool:
+    """Call LeRobot's own stop of the base; false if the robot has none, unlike LeKiwi."""
+    if not hasattr(device, "stop_base"):
+        return False
+    device.stop_base()
+    return True
+
+
+def wheels(device: Any) -> list[tuple[Any, list[str]]]:
+    """The motors of a device that no position commands, by bus."""
+    driven = bases(list(device.action_features), POSITION)
+    found = [(bus, [name for name in bus.motors if f"{prefix}{name}" not in driven]) for prefix, bus in buses(device)]
+    return [(bus, names) for bus, names in found if names]
 
 
 def numbers(values: Mapping[str, Any]) -> dict[str, float]:

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from ibrobot_core.app import Child, ComponentFailed
-from ibrobot_lerobot_devices.device import ANSWER, DONE, READY, TRAFFIC
+from ibrobot_lerobot_devices.device import ANSWER, CONNECT, DONE, READY, STAND, TRAFFIC
 
 INSTALL = "pip install 'lerobot>=0.6.1,<0.7'"
 """The command that installs LeRobot; its devices need extras, e.g. `lerobot[feetech]`."""
@@ -52,16 +52,21 @@ class DeviceLink:
         self, kind: str, type: str, config: Mapping[str, Any], *, torch: bool = False, only_make: bool = False
     ) -> None:
         self._order = {
-            "kind": kind, "type": type, "config": dict(config), "torch": torch, "only_make": only_make,
+            "kind": kind, "type": type, "config": dict(config), "torch": torch, "only_make": only_make, "waits": False,
         }  # fmt: skip
         self.type = type
         self._child: Child | None = None
+        self._standby: Child | None = None
+        """A process that has imported LeRobot and waits, to take the place of one that dies."""
         self._number = 0
         self._asked_s: float | None = None
         """When the request without an answer was sent [s]; None if there is none."""
         self._pipe = -1
         self.late = 0
         """How many readings came after the tick that asked for them."""
+        self._stood: str | None = None
+        self.refused = (0, "")
+        """How many actions in a row LeRobot has not carried out, and why."""
 
     @property
     def pid(self) -> int | None:
@@ -88,13 +93,30 @@ class DeviceLink:
         """Start the process, which connects the device; `poll_start` waits for that."""
         if not is_installed():
             raise DeviceProblem(f"LeRobot is not installed here: {INSTALL}")
-        self.end()
-        self._pipe, far_end = os.pipe()
-        try:
-            self._child = Child(_MODULE, self._order, far_end)
-        finally:
+        self._end_child()
+        if self._standby is not None and self._standby.alive:
+            self._child, self._standby = self._standby, None
+            self._child.channel.send({"do": CONNECT})
+        else:
+            self._child = self._start(self._order)
+        self._asked_s, self._stood, self.refused = None, None, (0, "")
+
+    def prepare(self) -> None:
+        """Start a process that waits, so that `begin` takes a fraction of a second, if none waits yet."""
+        if self._standby is None or not self._standby.alive:
+            self._end_standby()
+            self._standby = self._start({**self._order, "waits": True})
+
+    def _start(self, order: Mapping[str, Any]) -> Child:
+        far_end, pipe = os.pipe()
+        if order["waits"]:  # robots send no pictures
             os.close(far_end)
-        self._asked_s = None
+        else:
+            self._pipe = far_end
+        try:
+            return Child(_MODULE, order, pipe)
+        finally:
+            os.close(pipe)
 
     def poll_start(self, timeout_s: float) -> Mapping[str, Any] | None:
         """What the device says about itself, once it is connected; None if that takes more than `timeout_s` [s].
@@ -182,7 +204,32 @@ class DeviceLink:
         """
         channel = self._running().channel
         if channel.backlog < _MANY:
-            channel.send({"do": "act", "action": dict(action)})
+            channel.send({"do": "act", "action": dict(action), "made_ns": time.monotonic_ns()})
+
+    def stand(self) -> str | None:
+        """Ask LeRobot to let the base stand; does not wait. Continues a process that is stopped.
+
+        Returns:
+            The newest answer to this or to an earlier call: empty if the base stands, else why LeRobot cannot stop it;
+            None if none has come since the last call.
+
+        Raises:
+            DeviceProblem: if the process has died.
+        """
+        child = self._running()
+        child.resume()
+        if child.channel.backlog < _MANY:
+            child.channel.send({"do": STAND})
+        self._stood = None
+        while self._message(0.0) is not None and self._stood != "":
+            pass
+        return self._stood
+
+    def kill(self) -> None:
+        """Kill the process, whose call of LeRobot's does not return."""
+        if self._child is not None:
+            self._child.kill()
+        self._end_child()
 
     def call(self, what: str, timeout_s: float) -> Any:
         """Carry a request out: `relax`, `hold` or `reconnect`; returns its result.
@@ -194,10 +241,15 @@ class DeviceLink:
         found = self._await(what, timeout_s)
         if found is None:
             raise DeviceProblem(f"a call of LeRobot's blocks: {what} is not done after {timeout_s:g} s")
+        self.refused = (0, "")
         return found
 
     def end(self) -> None:
         """End the process; safe at any time."""
+        self._end_standby()
+        self._end_child()
+
+    def _end_child(self) -> None:
         child, self._child = self._child, None
         if child is not None:
             child.channel.send({"do": "end"})
@@ -208,6 +260,13 @@ class DeviceLink:
         if self._pipe >= 0:
             os.close(self._pipe)
             self._pipe = -1
+
+    def _end_standby(self) -> None:
+        standby, self._standby = self._standby, None
+        if standby is not None:
+            standby.kill()  # it has touched nothing
+            standby.end(_END_S)
+            standby.channel.close()
 
     def _content(self, size: int) -> bytearray:
         """The bytes of a picture, which follow its answer."""
@@ -228,11 +287,7 @@ class DeviceLink:
         """The next answer to a request to read; None if none arrives in time."""
         message = self._message(timeout_s)
         if message is None or message["event"] != ANSWER:
-            if message is not None and "error" in message:
-                return dict(message)  # an action that failed
             return None
-        if message["id"] == self._number:
-            self._asked_s = None
         answer = dict(message)
         if "size" in answer:
             answer["content"] = self._content(answer["size"])
@@ -241,13 +296,8 @@ class DeviceLink:
     def _await(self, what: str, timeout_s: float) -> Mapping[str, Any] | None:
         """The result of a request, or of the start; None if there is none in time."""
         deadline_s = time.monotonic() + timeout_s
-        while (left_s := deadline_s - time.monotonic()) > 0:
-            message = self._message(left_s)
-            if message is None:
-                continue
-            if message["event"] == ANSWER:
-                self._asked_s = None
-            elif message["event"] == READY or (message["event"] == DONE and message.get("do") == what):
+        while (message := self._message(max(0.0, deadline_s - time.monotonic()))) or time.monotonic() < deadline_s:
+            if message and (message["event"] == READY or (message["event"] == DONE and message["do"] == what)):
                 if "error" in message:
                     raise DeviceProblem(message["error"])
                 return dict(message["found"])
@@ -260,11 +310,18 @@ class DeviceLink:
             raise self._death() from None
         if found is None and self._running().failure is not None:
             raise self._death()
+        if found is not None and found["event"] == ANSWER and found["id"] == self._number:
+            self._asked_s = None
+        if found is not None and found["event"] == DONE:
+            if found["do"] == "act":  # only those that fail are answered
+                self.refused = (found["times"], found["error"])
+            elif found["do"] == STAND:
+                self._stood = found.get("error", "")
         return found
 
     def _death(self) -> DeviceProblem:
         child = self._running()
         cause = child.cause(_END_S)
         failed = child.failure is not None
-        self.end()
+        self._end_child()
         return DeviceProblem(cause if failed else f"LeRobot's process has ended: {cause}")

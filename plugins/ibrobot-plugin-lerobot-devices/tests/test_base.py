@@ -13,7 +13,7 @@ from ibrobot_lerobot_devices.cmd_vel import CmdVelTeleop
 from ibrobot_lerobot_devices.hardware import LeRobotHardware
 from ibrobot_lerobot_devices.options import CmdVelOptions, RobotOptions
 from ibrobot_testing import TeleopSuite
-from ibrobot_testing.contexts import control_context, host_context
+from ibrobot_testing.contexts import START_NS, SetClock, control_context, host_context
 
 from ibrobot_core.api import (
     Context,
@@ -86,8 +86,9 @@ class TestAxes:
             np.testing.assert_allclose(reading.position, setpoint, atol=0.01)
             np.testing.assert_allclose(reading.velocity[[0, 2, 3]], [-0.4, 0.2, 0.0], atol=0.03)
             np.testing.assert_allclose(driven(motors), [0.2, 0.0, np.rad2deg(-0.4)], rtol=0.05)
-            for _ in range(2):
-                base.write(setpoint)  # the end: it stands, although it is a little away
+            for _ in range(10):
+                base.write(setpoint)  # the end: it brakes and stands, although it is a little away
+                clock.advance(ns(PERIOD_S))
                 base.read()
             assert driven(motors) == [0.0, 0.0, 0.0]
 
@@ -104,9 +105,9 @@ class TestAxes:
         with connected(motors) as (base, _):
             begun = base.read().position
             base.write(begun)
-            base.write(begun + np.array([0.0, 0.0, 0.004, 0.0]))
+            base.write(begun + np.array([0.0, 0.0, 0.006, 0.0]))
             base.read()
-            assert driven(motors)[0] == pytest.approx(0.4, abs=0.05)
+            assert driven(motors)[0] == pytest.approx(0.05)  # as far as the acceleration permits
             while driven(motors)[0]:
                 base.read()
             assert driven(motors) == [0.0, 0.0, 0.0]
@@ -115,7 +116,9 @@ class TestAxes:
         with connected(motors) as (base, _):
             begun = base.read().position
             base.write(begun)
-            base.write(begun + np.array([0.0, 0.0, 0.004, 0.0]))
+            base.write(begun + np.array([0.0, 0.0, 0.006, 0.0]))
+            base.read()
+            assert driven(motors)[0] > 0
         assert driven(motors) == [0.0, 0.0, 0.0]
 
     def test_an_axis_that_lerobot_does_not_measure_is_named(self, motors: Motors) -> None:
@@ -139,6 +142,10 @@ AHEAD = Twist(Vector3(0.1, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
 
 def twist(x: float = 0.0, y: float = 0.0, theta: float = 0.0, **more: float) -> Twist:
     return Twist(Vector3(x, y, more.get("z", 0.0)), Vector3(0.0, 0.0, theta))
+
+
+def stamped(stamp_ns: int, x: float, frame: str = "") -> TwistStamped:
+    return TwistStamped(Header(stamp_ns, frame), twist(x))
 
 
 class TestCmdVel(TeleopSuite):
@@ -175,7 +182,8 @@ class Rig:
     """A program that sends twists, and a base that is at every setpoint at once."""
 
     def __init__(self) -> None:
-        self.ctx = host_context("wheels", robot=ROBOT)
+        self.clock = SetClock(START_NS)
+        self.ctx = host_context("wheels", robot=ROBOT, clock=self.clock)
         self.teleop = CmdVelTeleop(CmdVelOptions(), self.ctx)
         self.teleop.connect()
         self.at = np.zeros(4)
@@ -229,10 +237,7 @@ class TestTwists:
         [
             (twist(float("nan")), "it is not finite"),
             (twist(0.1, z=0.1), "the base has no axis for linear.z"),
-            (
-                TwistStamped(Header(0, "map"), Twist(Vector3(0.1, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))),
-                "its frame is 'map', not 'base_link'",
-            ),
+            (stamped(0, 0.1, "map"), "its frame is 'map', not 'base_link'"),
         ],
     )
     def test_a_wrong_twist_is_refused_and_named(
@@ -242,6 +247,27 @@ class TestTwists:
         for _ in range(10):
             assert not rig.tick(message)
         assert caplog.text.count(f"wheels: refused a twist: {why}") == 1
+
+    @pytest.mark.parametrize("off_s", [0.6, 3.0, 3600.0, -0.6, -3600.0])
+    def test_a_twist_of_another_time_is_refused_and_named(self, off_s: float, caplog: pytest.LogCaptureFixture) -> None:
+        rig = Rig()
+        for _ in range(100):
+            assert not rig.tick(stamped(rig.clock.now_ns() + ns(off_s), 0.2))
+        assert caplog.text.count("wheels: refused a twist: the time in its header is more than 0.5 s off") == 1
+        rig.tick(stamped(0, 0.0))
+        assert rig.tick(stamped(rig.clock.now_ns(), 0.2))
+
+    @pytest.mark.parametrize("set_by_s", [3600.0, -3600.0])
+    def test_twists_of_now_drive_after_the_computers_clock_is_set(self, set_by_s: float) -> None:
+        rig = Rig()
+        rig.clock.set_by_ns = ns(set_by_s)
+        for now_ns in (rig.clock.now_ns, rig.clock.wall_ns):  # a program of this run's, and one of another computer's
+            assert not rig.tick(stamped(now_ns() - ns(3.0), 0.2))
+            rig.tick(stamped(0, 0.0))
+            for _ in range(30):
+                assert rig.tick(stamped(now_ns(), 0.2))
+            for _ in range(60):
+                rig.tick()
 
     def test_a_robot_without_its_joints_is_named(self) -> None:
         with pytest.raises(TeleopError, match="none of the joints x, y, theta: give those of its base"):
