@@ -125,13 +125,13 @@ class ExecutorConfig(NamedComponentConfig):
     joints: tuple[str, ...] = not_a_key(())
     """The joints of its group, in group order."""
     goals: str = not_a_key("trajectory")
-    """Kind of goals that a planner sends to it."""
+    """Kind of goals that it takes; empty if it streams."""
 
     @classmethod
     def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
         """The kind of goals that it takes."""
         assert isinstance(descriptor, ExecutorDescriptor)
-        return {"goals": descriptor.goals}
+        return {"goals": "" if descriptor.streams else descriptor.goals}
 
 
 @attrs.frozen

@@ -117,6 +117,9 @@ class Runtime:
                 if not session.request.by_operator:  # one open-ended episode, from the robot's present state
                     session.episodes.begin()
             self._begun_ns = session.clock.now_ns()
+            takers = [name for name, each in config.executors.items() if each.goals == "trajectory"]
+            if takers and session.goal_door is None:
+                session.log.warning("goals of %s are limited, not checked: no plugin checks them", ", ".join(takers))
         except BaseException as error:
             ended = session.finished.is_set()
             session.start_failed = True

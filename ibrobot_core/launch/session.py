@@ -20,8 +20,9 @@ from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.control.link import ControlState, PlanRecord
-from ibrobot_core.errors import ComponentFailed, IbrobotError, MissingDependency
+from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, MissingDependency
 from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent, Teleop
+from ibrobot_core.interfaces.executor import trajectory_goal
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, by_cause
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.launch.pulses import Pulse
@@ -171,6 +172,8 @@ class Session:
         state: the newest state of the joints and of control; None before the first. Set by `take_state`.
         on_state: called with each state before its messages are published, in the thread that receives states.
         on_goal: called with each change of an executor's goal, of any client, in the same thread.
+        goal_door: completes and checks the goals of all clients: called with the executor's name, the goal's name, the
+            goal, and what sends it to control, once it is checked; None without a plugin that checks goals.
         mode: name of the active control mode.
         generation: counts mode switches and resets; plans of an earlier generation are ignored.
         factors: what the present episode of a simulation has drawn; see `Scene.factors`.
@@ -220,6 +223,7 @@ class Session:
         self.state: ControlState | None = None
         self.on_state: list[Callable[[ControlState], None]] = []
         self.on_goal: list[Callable[[Mapping[str, Any]], None]] = []
+        self.goal_door: Callable[..., None] | None = None
         self.plan: PlanRecord | None = None
         self.acting: ActingPolicy | None = None
         self.sensors: dict[str, SensorFigures] = {}
@@ -329,6 +333,29 @@ class Session:
         full[:, columns] = positions
         self.plan = PlanRecord(self.generation, start_ns, step_ns, mask, full)
         self.control.write_plan(self.plan)
+
+    def send_goal(self, executor: str, goal_id: str, goal: Mapping[str, Any], stops: int | None = None) -> None:
+        """Send a goal to an executor of the present mode: the one door for the goals of every client.
+
+        Args:
+            executor: its name.
+            goal_id: names the goal in events.
+            goal: as for `Executor.set_goal`, but a `trajectory` is a `JointTrajectory`.
+            stops: number of emergency stops when it was requested; control refuses it after a newer one.
+
+        Raises:
+            PlanningError: if it fails a check of limits or of the world.
+            IbrobotError: if the robot is stopped or holds, or the executor refuses it.
+        """
+        if self.faults or self.held:
+            raise HardwareError(f"refused before a reset: {(*self.faults, f'holding: {self.to_go_on()}')[0]}")
+
+        def send(checked: Mapping[str, Any]) -> None:
+            if "trajectory" in checked:
+                checked = {**checked, **trajectory_goal(checked["trajectory"])}
+            self.control.call("goal", executor=executor, goal_id=goal_id, goal=checked, stops=stops)
+
+        send(goal) if self.goal_door is None else self.goal_door(executor, goal_id, goal, send)
 
     @property
     def stops(self) -> int:

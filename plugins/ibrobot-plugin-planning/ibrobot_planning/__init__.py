@@ -1,4 +1,4 @@
-"""The plugin's hooks: planners, their command source, executors, the sections `world` and `tasks`, commands."""
+"""The plugin's hooks: planners, their command source, executors, sections, commands."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ibrobot_core.api import ExecutorDescriptor, Late, OptionFault, did_you_mean, hookimpl
 from ibrobot_core.app import Command, PlannerDescriptor, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
-from ibrobot_planning.planners.options import JointPlannerOptions, RrtConnectOptions
+from ibrobot_planning.planners.options import GoalCheckOptions, JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
 from ibrobot_planning.world.options import WorldOptions
 
@@ -133,7 +133,7 @@ def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -
 
 @hookimpl
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
-    """The sections `world` and `tasks`."""
+    """The sections `world`, `goals` and `tasks`."""
     yield SectionDescriptor(
         type="world",
         options=WorldOptions,
@@ -141,6 +141,15 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         check=find_engines,
         check_options=_check_world,
         summary="what planners avoid: boxes, spheres, cylinders, meshes, planes, point clouds; services change it",
+    )
+    yield SectionDescriptor(
+        type="goals",
+        options=GoalCheckOptions,
+        make=lambda options, session: Late("ibrobot_planning.execution.door:GoalDoor")(
+            options or GoalCheckOptions(), session
+        ),
+        without_section=lambda config: any(each.goals == "trajectory" for each in config.executors.values()),
+        summary="checks trajectories of all clients against limits, the arm and the world before control gets them",
     )
     yield SectionDescriptor(
         type="tasks",

@@ -16,7 +16,7 @@ from ibrobot_planning.execution.requests import Execute, GoTo
 from ibrobot_planning.execution.results import MoveResult
 from ibrobot_planning.execution.source import EXECUTE, GO_TO
 from ibrobot_planning.goals.text import Target
-from ibrobot_planning.planners.completion import MOST_POINTS, completed
+from ibrobot_planning.planners.completion import MOST_POINTS, Start, completed
 from ibrobot_planning.planners.timing import LONGEST_S
 from ibrobot_testing.fakes import FakePlanner
 
@@ -208,7 +208,7 @@ def test_what_is_accepted_is_whole_and_within_the_limits(gaps, values, speeds, f
     )
     wanted = JointTrajectory(Header(), ("pan",), points)
     try:
-        made = completed(wanted, np.zeros(1), ONE, PERIOD_NS)
+        made = completed(wanted, Start(np.zeros(1)), ONE, PERIOD_NS)
     except PlanningError:
         return
     stamps = np.array([p.time_from_start_ns for p in made.points])
@@ -234,7 +234,7 @@ def test_jump_and_return_between_two_setpoints_is_refused(there: float):
     times = range(0, 5_000_000, 1_000_000)
     points = tuple(JointTrajectoryPoint(t, np.array([there if t == 3_000_000 else 0.0])) for t in times)
     with pytest.raises(PlanningError, match="pan near 0"):
-        completed(JointTrajectory(Header(), ("pan",), points), np.zeros(1), ONE, PERIOD_NS)
+        completed(JointTrajectory(Header(), ("pan",), points), Start(np.zeros(1)), ONE, PERIOD_NS)
 
 
 @pytest.mark.parametrize("fields", [1, 3], ids=["positions", "accelerations"])
@@ -257,7 +257,7 @@ def test_jump_of_a_planner_of_another_plugin_is_refused(
 
 def test_complete_trajectory_stays_as_it_is():
     wanted = trajectory((0, [0.0]), (1, [0.5]), fields=3, names=("pan",))
-    assert completed(wanted, np.zeros(1), ONE, PERIOD_NS) is wanted
+    assert completed(wanted, Start(np.zeros(1)), ONE, PERIOD_NS) is wanted
 
 
 def test_planner_proves_nothing_of_an_incomplete_trajectory(tmp_path: Path):

@@ -123,12 +123,23 @@ def test_all_goals_are_canceled_at_once(robot: Any):
     assert result["status"] == Status.UNKNOWN
 
 
-def test_what_ros2_control_rejects_is_rejected(robot: Any, caplog: pytest.LogCaptureFixture):
-    _, near = robot
-    for goal, code in ((to(9.0), "INVALID_GOAL"), ({"trajectory": {"joint_names": ["x"]}}, "INVALID_JOINTS")):
-        with pytest.raises(TransportError, match="rejected the goal; the robot's log says why"):
-            SentGoal(near, ARM, FOLLOW, goal)
-        assert code in caplog.text
+def test_result_of_a_refused_goal_says_why(robot: Any):
+    runtime, near = robot
+    before = runtime.session.state.command.copy()
+    nan = {"path_tolerance": [{"name": "pan", "position": float("nan")}]}
+    old = to(0.2)
+    old["trajectory"] = {**old["trajectory"], "header": {"stamp": {"sec": 1}}}
+    for goal, code, why in (
+        (to(9.0), -1, "outside its limits"),
+        ({"trajectory": {"joint_names": ["x"]}}, -2, "joint_names must be"),
+        (to(0.9, at=0), -1, "leaves no time"),
+        ({**to(0.2), **nan}, -1, "path_tolerance: pan: position is nan"),
+        (old, -3, "it was to begin"),
+    ):
+        ended = SentGoal(near, ARM, FOLLOW, goal).result(WAIT_S)
+        assert (ended.status, ended.result["error_code"]) == (Status.ABORTED, code)
+        assert why in ended.result["error_string"]
+    assert (runtime.session.state.command == before).all()
 
 
 def test_a_stop_by_service_ends_a_goal(robot: Any):

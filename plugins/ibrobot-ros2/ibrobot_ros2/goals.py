@@ -6,7 +6,9 @@ plain mappings whose key `op` says what they are. The key `values` of a head has
 
 from __future__ import annotations
 
+import math
 import threading
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from enum import IntEnum
 from typing import Any
@@ -16,17 +18,16 @@ import numpy as np
 
 from ibrobot_core.api import (
     NS_PER_S,
-    ExecutorDescriptor,
     GoalRejected,
     Header,
     IbrobotError,
     JointReading,
     JointTrajectory,
     JointTrajectoryPoint,
+    PlanningError,
     seconds,
-    trajectory_goal,
 )
-from ibrobot_core.app import ControlState, ExecutorConfig, RunAccess
+from ibrobot_core.app import ControlState, ExecutorConfig, PlanCode, RunAccess
 from ibrobot_ros2.calls import Calls, Wire
 from ibrobot_ros2.inference import serve_chunks
 from ibrobot_ros2.offers import time_of, with_ns
@@ -80,13 +81,7 @@ def action_of(executor: ExecutorConfig, gripper_action: str) -> tuple[str, str]:
 
 def with_goals(session: RunAccess) -> dict[str, ExecutorConfig]:
     """The executors of a run that take goals, by name."""
-    found = {}
-    for name, executor in session.config.executors.items():
-        descriptor = session.registry.find("executor", executor.type)
-        assert isinstance(descriptor, ExecutorDescriptor)
-        if not descriptor.streams:
-            found[name] = executor
-    return found
+    return {name: executor for name, executor in session.config.executors.items() if executor.goals}
 
 
 class Actions:
@@ -102,6 +97,9 @@ class Actions:
 
     A goal replaces the one before, of any client, as on ros2_control's controllers: also one of the run's own planner,
     which then reports its motion as replaced.
+
+    ROS 2 rejects a goal without saying why. A trajectory that is refused is therefore accepted and aborted at once, so
+    that its result says why; grippers' results have no such field, and their goals are rejected (ADR 58).
     """
 
     def __init__(
@@ -114,6 +112,8 @@ class Actions:
         self._gripper_action = gripper_action
         self._executors = {name: each for name, each in with_goals(session).items() if name in executors}
         self._calls = Calls(session, is_offered, named, who)
+        self._refused = Counter[str]()
+        """Cause -> number of goals that were refused for it."""
         self._end_chunks: Callable[[], None] = lambda: None
         self._lock = threading.Lock()
         self._goals: dict[str, _Goal] = {}
@@ -159,21 +159,34 @@ class Actions:
         executor = self._executors[head["executor"]]
         name = self._name(head["goal"])
         now_ns = self._session.clock.now_ns()
+        with self._lock:
+            self._goals[name] = _Goal(head["goal"], executor.name, now_ns, now_ns)
         try:
             goal = self._read(executor, with_ns(head["fields"]))
-            if self._session.faults:
-                raise _Invalid(f"refused before a reset: {self._session.faults[-1]}")
-            if self._session.held:
-                raise _Invalid(f"the robot holds after a reset: {self._session.to_go_on()}")
-            with self._lock:
-                self._goals[name] = _Goal(head["goal"], executor.name, now_ns, now_ns)
-            self._session.control.call("goal", executor=executor.name, goal_id=name, goal=goal, stops=stops)
+            self._session.send_goal(executor.name, name, goal, stops)
         except IbrobotError as error:
             with self._lock:
                 self._goals.pop(name, None)
-            code = error.code if isinstance(error, _Invalid) else TrajectoryCode.INVALID_GOAL
-            self._session.log.warning("%s: goal for %s rejected: %s: %s", self._who, executor.name, code.name, error)
+            return self._refuse(wire, head["goal"], executor, error)
+        return True
+
+    def _refuse(self, wire: Wire, number: int, executor: ExecutorConfig, error: IbrobotError) -> bool:
+        """Say why a goal is refused; returns whether it was accepted, only to say so."""
+        code = error.code if isinstance(error, _Invalid) else TrajectoryCode.INVALID_GOAL
+        if isinstance(error, PlanningError) and error.code is PlanCode.INVALID_GROUP_NAME:
+            code = TrajectoryCode.INVALID_JOINTS
+        # Whatever follows may be a client's own words: it must not make a new cause of each goal.
+        cause = error.code.name if isinstance(error, PlanningError) else f"{code.name}: {error}"[:32]
+        self._refused[cause] += 1
+        count = self._refused[cause]
+        if math.log10(count).is_integer():  # the first, the tenth, …: a flood of them must not flood the log
+            so_far = f" ({count} such goals so far)" if count > 1 else ""
+            line = f"goal for {executor.name} refused: {code.name}: {error}{so_far}"
+            self._session.log.warning("%s: %s", self._who, line)
+        if executor.goals != "trajectory":
             return False
+        values = {"error_code": int(code), "error_string": str(error)}
+        wire.send({"op": "ended", "goal": number, "state": "aborted", "values": values})
         return True
 
     def cancel(self, wire: Wire, number: int) -> bool:
@@ -295,26 +308,29 @@ class Actions:
             )
         points = tuple(JointTrajectoryPoint(**point) for point in trajectory["points"])
         message = JointTrajectory(Header(**trajectory["header"]), tuple(trajectory["joint_names"]), points)
-        goal = trajectory_goal(self._begun(message))
+        goal: dict[str, Any] = {"trajectory": self._begun(message)}
         for key in ("path_tolerance", "goal_tolerance"):
             goal[key] = _tolerances(key, fields[key])
         goal["goal_time"] = seconds(fields["goal_time_tolerance_ns"])
         return goal
 
     def _begun(self, message: JointTrajectory) -> JointTrajectory:
-        """A trajectory that begins now, of one that begins at its stamp; 0 stands for now.
+        """A trajectory that begins now, of one that begins at its stamp; 0 stands for now, as does a moment ago.
 
-        What has passed is left out. Until a stamp in the future, the joints hold.
+        Until a stamp in the future, the joints hold, or move to a point at that time.
+
+        Raises:
+            _Invalid: if it was to begin earlier.
         """
-        stamp_ns = message.header.stamp_ns
-        late_ns = self._session.clock.now_ns() - stamp_ns if stamp_ns else 0
-        if not late_ns:
+        clock, stamp_ns = self._session.clock, message.header.stamp_ns
+        late_ns = clock.age_ns(stamp_ns) if stamp_ns else 0
+        if late_ns >= 0:
+            if refusal := clock.refusal(stamp_ns):
+                why = f"it was to begin {seconds(late_ns):.3f} s ago: {refusal}"
+                raise _Invalid(why, TrajectoryCode.OLD_HEADER_TIMESTAMP)
             return message
         points = [attrs.evolve(each, time_from_start_ns=each.time_from_start_ns - late_ns) for each in message.points]
-        points = [each for each in points if each.time_from_start_ns > 0]
-        if not points:
-            raise _Invalid(f"it ended {seconds(late_ns):.3f} s ago", TrajectoryCode.OLD_HEADER_TIMESTAMP)
-        if late_ns < 0:
+        if points and points[0].time_from_start_ns > -late_ns:
             state = self._session.state
             assert state is not None
             command = dict(zip(self._session.config.robot.joint_names, state.command.tolist(), strict=True))
@@ -326,13 +342,16 @@ class Actions:
                 velocities=zeros[: points[0].velocities.size],
                 accelerations=zeros[: points[0].accelerations.size],
             )
-            points = [hold, *(each for each in points if each.time_from_start_ns > -late_ns)]
+            points = [hold, *points]
         return attrs.evolve(message, points=tuple(points))
 
 
 def _tolerances(key: str, given: list[dict[str, Any]]) -> dict[str, float]:
     """Tolerances of positions by joint; 0 stands for the executor's own, below 0 for none, as in ros2_control."""
     for each in given:
+        for name in ("position", "velocity", "acceleration"):
+            if not math.isfinite(each[name]):
+                raise _Invalid(f"{key}: {each['name']}: {name} is {each[name]}; it must be a finite number")
         if each["velocity"] > 0 or each["acceleration"] > 0:
             raise _Invalid(
                 f"{key}: {each['name']}: tolerances of velocities and accelerations are not checked; leave them out"

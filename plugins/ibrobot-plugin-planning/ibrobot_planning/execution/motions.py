@@ -15,12 +15,13 @@ from ibrobot_core.api import (
     Header,
     JointTrajectory,
     JointTrajectoryPoint,
+    PlanningError,
     Vector,
     ns,
     seconds,
-    trajectory_goal,
 )
-from ibrobot_core.app import Planner, RunView
+from ibrobot_core.app import Planner, RunAccess, RunView
+from ibrobot_planning.execution.door import GoalDoor
 from ibrobot_planning.planners.blend import Limits, braking, cut, joined
 from ibrobot_planning.planners.timing import Motion, motion_of, trajectory_of
 
@@ -70,11 +71,13 @@ class Execution:
     Args:
         session: the run.
         planner: checks motions for collisions.
+        door: through which its goals pass.
     """
 
-    def __init__(self, session: RunView, planner: Planner) -> None:
+    def __init__(self, session: RunAccess, planner: Planner, door: GoalDoor) -> None:
         self._session = session
         self._planner = planner
+        self._door = door
         self._lock = threading.RLock()
         self._tracks: dict[str, _Track] = {}
         """Executor -> the goal that it follows."""
@@ -89,6 +92,11 @@ class Execution:
         """Whether an executor follows a goal."""
         return bool(self._tracks or self._ahead)
 
+    def follows(self, goal_id: str) -> bool:
+        """Whether a goal is one of these."""
+        with self._lock:
+            return any(track.goal_id == goal_id for track in self._tracks.values())
+
     def begin(self, number: int, goals: Mapping[str, ExecutorGoal], stops: int) -> None:
         """Send goals to executors at rest.
 
@@ -99,13 +107,14 @@ class Execution:
 
         Raises:
             HardwareError: if an executor refuses its goal; the others are cancelled.
+            PlanningError: the same, if a trajectory fails a check.
         """
         with self._lock:
             self._tracks, self._ahead, self._number, self._stops = {}, {}, number, stops
             try:
                 for name, goal in goals.items():
                     self._send(name, f"{number}:{name}", goal)
-            except HardwareError:
+            except (HardwareError, PlanningError):
                 self._session.control.call("cancel")
                 self._tracks = {}
                 raise
@@ -118,7 +127,7 @@ class Execution:
             for name in sorted(self._tracks):
                 goal_id = f"{number}:stop:{name}"
                 try:
-                    session.control.call("goal", executor=name, goal_id=goal_id, goal={"stop": True})
+                    session.send_goal(name, goal_id, {"stop": True})
                 except HardwareError as error:
                     session.log.warning("%s does not slow down, and is cancelled: %s", name, error)
                     session.control.call("cancel")
@@ -143,9 +152,10 @@ class Execution:
             try:
                 for name, (begin_ns, way) in braked.items():
                     takes_over = {"goal": self._tracks[name].goal_id, "time_ns": begin_ns}
+                    self._door.free(way)  # along the path under way
                     self._send(name, f"{number}:brake:{name}", way, takes_over)
                     rest[self._session.config.robot.indices(way.joint_names)] = way.points[-1].positions
-            except HardwareError as error:
+            except (HardwareError, PlanningError) as error:
                 self._session.log.warning("the arm stops before its next motion: braking was refused: %s", error)
                 return None
             self._number, self._stops = number, stops
@@ -218,11 +228,14 @@ class Execution:
         return ""
 
     def _send(self, name: str, goal_id: str, goal: ExecutorGoal, takes_over: Mapping[str, Any] | None = None) -> None:
-        message: dict[str, Any] = {"position": goal} if isinstance(goal, float) else trajectory_goal(goal)
+        message: dict[str, Any] = {"position": goal} if isinstance(goal, float) else {"trajectory": goal}
         if takes_over is not None:
             message["takes_over"] = takes_over
-        self._session.control.call("goal", executor=name, goal_id=goal_id, goal=message, stops=self._stops)
-        self._tracks[name] = _Track(goal_id, None if isinstance(goal, float) else goal)
+        if not isinstance(goal, float):
+            self._door.complete(goal)
+        track = _Track(goal_id, None if isinstance(goal, float) else goal)
+        self._session.send_goal(name, goal_id, message, self._stops)
+        self._tracks[name] = track
 
     def _begin(self, name: str, following: _Next) -> bool:
         """Send a goal to an executor at rest; True, as it needs no retry."""
@@ -235,7 +248,7 @@ class Execution:
         """Let a trajectory take over from the running one; False if the executor refuses it, e.g. as too late."""
         try:
             self._send(name, f"{self._number}:{name}", way, takes_over)
-        except HardwareError as error:
+        except (HardwareError, PlanningError) as error:
             following.refused = str(error)
             return False
         return True
@@ -282,5 +295,6 @@ class Execution:
             overlap = trajectory_of(cut(way, old.duration - begin_s), running.joint_names, goal.header.stamp_ns)
             if not self._planner.blocked(overlap, others):
                 blend = trajectory_of(way, running.joint_names, goal.header.stamp_ns)
+                self._door.free(blend)
                 return self._take_over(name, following, blend, {"goal": track.goal_id, "time_ns": ns(begin_s)})
         return False

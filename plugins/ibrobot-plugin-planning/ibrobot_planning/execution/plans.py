@@ -25,13 +25,13 @@ from ibrobot_core.app import (
     RobotConfig,
     RunView,
 )
-from ibrobot_planning.execution.motions import ExecutorGoal
+from ibrobot_planning.execution.motions import ExecutorGoal, commanded
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import GoalOptions
 from ibrobot_planning.goals.joints import without_names
 from ibrobot_planning.goals.text import Target
 from ibrobot_planning.goals.tool import Tool
-from ibrobot_planning.planners.completion import check_size, completed
+from ibrobot_planning.planners.completion import Start, check_size, completed
 from ibrobot_planning.world.objects import World, world_of
 
 
@@ -190,9 +190,11 @@ class GoalPlans:
             PlanningError: if it fails a check.
         """
         robot, config = self._session.config.robot, self._session.config
-        whole = completed(
-            trajectory, start[robot.indices(trajectory.joint_names)], robot, ns(1.0 / config.control.rate_hz)
-        )
+        order = robot.indices(trajectory.joint_names)
+        begin = Start(start[order])
+        if self._session.state is not None and np.array_equal(start, commanded(self._session)):
+            begin = Start(start[order], measured=self._session.measured().position[order])
+        whole = completed(trajectory, begin, robot, ns(1.0 / config.control.rate_hz))
         if touched := self.planner.blocked(whole, others):
             raise PlanningError(f"the trajectory is not free: {touched}", PlanCode.INVALID_MOTION_PLAN)
         return whole

@@ -29,6 +29,8 @@ from ibrobot_core.app import (
     Service,
     SourceWorker,
 )
+from ibrobot_planning.execution.door import door_of
+from ibrobot_planning.execution.log_limiter import LogLimiter
 from ibrobot_planning.execution.motions import Execution, commanded
 from ibrobot_planning.execution.plans import GoalPlans
 from ibrobot_planning.execution.requests import Execute, GoTo, MoveRequest, MoveToConfiguration, MoveToPose, Numbered
@@ -130,6 +132,8 @@ class PlannerSource(SourceWorker):
         """Events of executors; goals that replace others; None to cancel."""
         self._queue: deque[_Move] = deque()
         self._move: _Move | None = None
+        self._errors = LogLimiter(session.clock, session.log.error)
+        self._drops = LogLimiter(session.clock, session.log.info)
         self._status = ""
         self._status_ns = 0
         self._worker = 0
@@ -164,7 +168,9 @@ class PlannerSource(SourceWorker):
     def setup(self) -> None:
         planner = self._plans.make()
         self.on_end.callback(planner.close)
-        self._execution = Execution(self.session, planner)
+        door = door_of(self.session)
+        self._execution = Execution(self.session, planner, door)
+        door.watched_by = self._execution.follows
         self._poses = self.session.bus.subscribe(CMD_POSE, 1, PoseStamped, Pose)
         self.on_end.callback(self._poses.close)
         self.on_end.callback(self._drop_all)
@@ -358,7 +364,7 @@ class PlannerSource(SourceWorker):
                 )
             self._replace(self._new(_nearest(message), stops=self._era[0]))
         except PlanningError as error:
-            self.session.log.error("%s: %s: %s", CMD_POSE, error.code.name, error)
+            self._errors(f"{CMD_POSE} {error.code.name}", f"{CMD_POSE}: {error.code.name}: {error}")
             self._show("failed")
 
     def _replace(self, move: _Move | None) -> None:
@@ -509,9 +515,10 @@ class PlannerSource(SourceWorker):
         if success:
             session.log.info("goal %s reached", move.target.text)
         elif outcome == "CANCELLED":
-            session.log.info("goal %s dropped: %s", move.target.text, message)
+            self._drops(f"{move.number}" if move.asked else "", f"goal {move.target.text} dropped: {message}")
         else:
-            session.log.error("goal %s failed: %s: %s", move.target.text, code.name, message)
+            cause = f"{move.number}" if move.asked else code.name  # what the run was started for is always reported
+            self._errors(cause, f"goal {move.target.text} failed: {code.name}: {message}")
         if not success and (move.asked or outcome != "CANCELLED"):
             session.outcome.goals_failed += 1
         self._show("succeeded" if success else "failed")

@@ -25,6 +25,8 @@ from ibrobot_core.api import (
 )
 from ibrobot_planning.executors.options import GripperOptions
 
+_STRONGEST = 1000.0
+"""Largest `max_effort` of a goal [Nm]; 0 stands for no limit."""
 _SHARE = 0.99
 """Share of the acceleration limit that is used, so that rounding does not exceed it."""
 
@@ -112,8 +114,8 @@ class GripperExecutor(Executor):
                 f"position {position:.6g} rad is outside the limits of {self.joints[0]}, "
                 f"{self._lower:.6g} to {self._upper:.6g}"
             )
-        if max_effort < 0:
-            raise GoalRejected(f"max_effort is {max_effort:.6g} Nm; it must be at least 0")
+        if not 0 <= max_effort <= _STRONGEST:
+            raise GoalRejected(f"max_effort is {max_effort:.6g} Nm; it must be from 0, for no limit, to {_STRONGEST:g}")
         if max_effort > 0 and not np.isfinite(measured.effort[0]):
             raise GoalRejected(f"max_effort cannot be kept: {self.joints[0]} has no measured effort; leave it out")
         self._begin(_Running(goal_id), position)

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from ibrobot_core.api import Context, Executor, GoalRejected, GoalState, GoalStatus, JointReading, Vector, seconds
 from ibrobot_core.app import Spline
 from ibrobot_planning.executors.options import TrajectoryOptions
-from ibrobot_planning.executors.trajectory_goal import Takeover, TrajectoryGoal, parse_goal
+from ibrobot_planning.executors.trajectory_goal import (
+    Takeover,
+    TrajectoryGoal,
+    check_plausible,
+    check_positions,
+    parse_goal,
+)
 
 LAG_S = 0.1
 """Longest lag of a joint behind its setpoint [s], as in ADR 16."""
@@ -68,7 +74,7 @@ class TrajectoryExecutor(Executor):
         self._options = options
         indices = ctx.robot.indices(ctx.joints)
         self._lower, self._upper = ctx.robot.lower[indices], ctx.robot.upper[indices]
-        self._acceleration = ctx.robot.max_acceleration[indices]
+        self._velocity, self._acceleration = ctx.robot.max_velocity[indices], ctx.robot.max_acceleration[indices]
         self._period_ns = ctx.period_ns
         self._held: Vector | None = None
         self._running: _Running | None = None
@@ -112,13 +118,7 @@ class TrajectoryExecutor(Executor):
             self._begin_stop(goal_id, goal)
             return
         parsed = parse_goal(goal, self.joints, self._options)
-        outside = (parsed.positions[-1] < self._lower) | (parsed.positions[-1] > self._upper)
-        if outside.any():
-            joint = int(outside.argmax())
-            raise GoalRejected(
-                f"the last point has {self.joints[joint]} at {parsed.positions[-1, joint]:.6g} rad, outside its limits "
-                f"{self._lower[joint]:.6g} to {self._upper[joint]:.6g}"
-            )
+        check_plausible(parsed, self.joints, self._velocity, self._acceleration)
         begin_ns = self._now_ns if parsed.takes_over is None else self._takeover_ns(parsed.takes_over)
         following = _Running(goal_id, parsed, begin_ns, self._spline(parsed, begin_ns))
         if self._next is not None:
@@ -256,12 +256,19 @@ class TrajectoryExecutor(Executor):
             times_ns, positions = times_ns[1:], positions[1:]
             velocities = None if velocities is None else velocities[1:]
             accelerations = None if accelerations is None else accelerations[1:]
-        return Spline(
-            np.concatenate(([begin_ns], begin_ns + times_ns)),
-            np.vstack((position, positions)),
-            None if velocities is None else np.vstack((velocity, velocities)),
-            None if accelerations is None else np.vstack((acceleration, accelerations)),
-        )
+        outside = (positions[-1] < self._lower) | (positions[-1] > self._upper)
+        if outside.any():
+            joint = int(outside.argmax())
+            raise GoalRejected(
+                f"the last point has {self.joints[joint]} at {positions[-1, joint]:.6g} rad, outside its limits "
+                f"{self._lower[joint]:.6g} to {self._upper[joint]:.6g}"
+            )
+        times_ns, fields = np.concatenate(([begin_ns], begin_ns + times_ns)), [np.vstack((position, positions))]
+        for start, values in ((velocity, velocities), (acceleration, accelerations)):
+            if values is not None:
+                fields.append(np.vstack((start, values)))
+        check_positions(times_ns, fields, self.joints, self._lower, self._upper)
+        return Spline(times_ns, *fields)
 
     def _stop(
         self, state: GoalState, why: str, measured: JointReading, result: Mapping[str, Any] | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,8 +14,16 @@ from numpy.typing import NDArray
 from ibrobot_core.api import GoalRejected, Vector, ns
 from ibrobot_planning.executors.options import TrajectoryOptions
 
-_LONGEST_S = 1e9
-"""Largest `goal_time` [s]: 30 years, in nanoseconds still an int64."""
+_LONGEST_S = 86_400.0
+"""Largest `goal_time` [s]."""
+_WIDEST_RAD = 100.0
+"""Largest tolerance; to check none, a goal says -1."""
+_PLAUSIBLE = 10.0
+"""Largest velocity and acceleration of a point, as a share of the limits: whatever is above is a mistake."""
+BEYOND_RAD = 2e-5
+"""Allowed excess of positions beyond a limit, for rounding."""
+_SHARES = np.linspace(0.0, 1.0, 65)
+"""Where pieces of a spline that may leave the limits are sampled."""
 
 
 @attrs.frozen
@@ -84,6 +93,88 @@ def parse_goal(goal: Mapping[str, Any], joints: Sequence[str], options: Trajecto
         goal_tolerance=_tolerance(goal, "goal_tolerance", options.goal_tolerance, joints),
         goal_time_ns=ns(_setting(goal.get("goal_time", 0), options.goal_time, "goal_time", _LONGEST_S)),
         takes_over=_takeover(goal["takes_over"]) if "takes_over" in goal else None,
+    )
+
+
+def check_plausible(goal: TrajectoryGoal, joints: Sequence[str], velocity: Vector, acceleration: Vector) -> None:
+    """Refuse velocities and accelerations of points that are far beyond the limits of the joints, each shape (J,).
+
+    Raises:
+        GoalRejected: for the first one.
+    """
+    for what, values, limits in (
+        ("velocities", goal.velocities, velocity),
+        ("accelerations", goal.accelerations, acceleration),
+    ):
+        if values is None:
+            continue
+        beyond = np.abs(values) > _PLAUSIBLE * limits
+        if beyond.any():
+            number, joint = np.argwhere(beyond)[0]
+            raise GoalRejected(
+                f"point {number} has {values[number, joint]:.6g} among its {what}, for {joints[joint]}, whose limit is "
+                f"{limits[joint]:.6g}"
+            )
+
+
+def check_positions(
+    times_ns: NDArray[np.int64], fields: Sequence[Vector], joints: Sequence[str], lower: Vector, upper: Vector
+) -> None:
+    """Refuse a spline that leaves the position limits, at its points or between them.
+
+    Args:
+        times_ns: times of the points [ns], shape (N,).
+        fields: positions [rad], and, if given, velocities and accelerations of the points, each shape (N, J).
+        joints: their names.
+        lower: lower limits [rad], shape (J,).
+        upper: upper limits [rad], shape (J,).
+
+    Raises:
+        GoalRejected: for the joint that leaves them furthest.
+    """
+    positions = fields[0]
+    # A joint may begin outside its limits, and move inwards.
+    lower, upper = np.minimum(lower, positions[0]) - BEYOND_RAD, np.maximum(upper, positions[0]) + BEYOND_RAD
+    _check_inside(positions, times_ns, joints, lower, upper)
+    if len(fields) == 1:
+        return
+    h = (np.diff(times_ns) / 1e9)[:, None]
+    # The curve stays within the hull of its control points (Bernstein): only pieces whose hull leaves are sampled.
+    v0, v1 = fields[1][:-1] * h, fields[1][1:] * h
+    if len(fields) == 2:
+        control = [positions[:-1], positions[:-1] + v0 / 3, positions[1:] - v1 / 3, positions[1:]]
+    else:
+        a0, a1 = fields[2][:-1] * h**2, fields[2][1:] * h**2
+        control = [
+            positions[:-1],
+            positions[:-1] + v0 / 5,
+            positions[:-1] + 2 * v0 / 5 + a0 / 20,
+            positions[1:] - 2 * v1 / 5 + a1 / 20,
+            positions[1:] - v1 / 5,
+            positions[1:],
+        ]
+    hull = np.stack(control)
+    leaving = ((hull < lower) | (hull > upper)).any(axis=(0, 2))
+    degree, at = len(hull) - 1, np.flatnonzero(leaving)
+    weights = np.stack([math.comb(degree, k) * _SHARES**k * (1 - _SHARES) ** (degree - k) for k in range(degree + 1)])
+    for piece in at.tolist():
+        stamps = times_ns[piece] + (_SHARES * (times_ns[piece + 1] - times_ns[piece])).astype(np.int64)
+        _check_inside(np.einsum("ks,kj->sj", weights, hull[:, piece]), stamps, joints, lower, upper)
+
+
+def _check_inside(
+    positions: Vector, times_ns: NDArray[np.int64], joints: Sequence[str], lower: Vector, upper: Vector
+) -> None:
+    """Refuse positions, shape (N, J), that are not within limits. Written so that NaN is outside."""
+    inside = (positions >= lower) & (positions <= upper)
+    if inside.all():
+        return
+    beyond = np.where(inside, 0.0, np.maximum(lower - positions, positions - upper))
+    row, joint = np.unravel_index(int(np.nan_to_num(beyond, nan=np.inf).argmax()), beyond.shape)
+    raise GoalRejected(
+        f"the trajectory leads {joints[int(joint)]} to {positions[row, joint]:.6g} rad "
+        f"{(times_ns[row] - times_ns[0]) / 1e9:.3f} s after its start, outside its limits {lower[joint]:.6g} to "
+        f"{upper[joint]:.6g}"
     )
 
 
@@ -157,10 +248,10 @@ def _tolerance(goal: Mapping[str, Any], name: str, default: float, joints: Seque
     for joint in by_joint:
         if joint not in joints:
             raise GoalRejected(f"{name} names {joint!r}, which is not a joint here; the joints are {', '.join(joints)}")
-    return np.array([_setting(by_joint.get(joint, 0), default, name) for joint in joints], dtype=np.float64)
+    return np.array([_setting(by_joint.get(joint, 0), default, name, _WIDEST_RAD) for joint in joints])
 
 
-def _setting(value: Any, default: float, name: str, highest: float = sys.float_info.max) -> float:
+def _setting(value: Any, default: float, name: str, highest: float) -> float:
     """A setting; 0 means the default, -1 none (returned as 0)."""
     if not _is_finite(value) or (value < 0 and value != -1):
         raise GoalRejected(f"{name} is {value!r}; it must be above 0, or 0 for the default, or -1 for none")

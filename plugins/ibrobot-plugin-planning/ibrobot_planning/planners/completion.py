@@ -7,6 +7,7 @@ fields are computed here, so that the robot makes exactly the motion that was ch
 - Positions and velocities: the cubic between two points. Where the acceleration jumps from one cubic to the next, two
   more points close by limit the change to a fraction of a control period.
 - A first point not quite where the robot stands: a short motion from rest to rest leads there.
+- A first point after time 0: the motion begins where the robot is, and reaches the point at its time.
 """
 
 from __future__ import annotations
@@ -22,9 +23,13 @@ from ibrobot_core.app import PlanCode
 from ibrobot_planning.planners.timing import LONGEST_S, Motion, evaluated, motion_of, quintics, trajectory_of
 
 START_RAD = 0.01
-"""Allowed distance between the start of a trajectory and the robot, as in MoveIt."""
+"""Allowed distance between a point at time 0 and the robot, as in MoveIt."""
+MOVING_START_RAD = 0.1
+"""The same for a trajectory that takes over from another one, whose point at time 0 is not used."""
 MOST_POINTS = 2000
 """Most points of a trajectory from outside: the control process reads them between two ticks."""
+_PLAUSIBLE = 1e6
+"""Largest number of a trajectory's points, in whatever unit: its sums stay finite."""
 _SAME_RAD = 1e-6
 """A start this near to the robot needs no motion to it."""
 _STILL = 1e-6
@@ -55,6 +60,20 @@ class _Points:
     """[rad/s^2], shape (N, J)."""
 
 
+@attrs.frozen(eq=False)
+class Start:
+    """Where a motion begins: the commanded state of J joints."""
+
+    position: Vector
+    """[rad], shape (J,)."""
+    velocity: Vector | None = None
+    """[rad/s], shape (J,); None at rest."""
+    acceleration: Vector | None = None
+    """[rad/s^2], shape (J,); None at rest."""
+    measured: Vector | None = None
+    """Measured positions [rad], shape (J,), from which trajectories may have been planned, too."""
+
+
 def check_size(trajectory: JointTrajectory) -> None:
     """Refuse a trajectory that costs too much to check and to send.
 
@@ -68,12 +87,12 @@ def check_size(trajectory: JointTrajectory) -> None:
         raise _invalid(f"the trajectory takes {seconds(last_ns):g} s; at most {LONGEST_S:g} s are accepted")
 
 
-def completed(trajectory: JointTrajectory, start: Vector, robot: Robot, period_ns: int) -> JointTrajectory:
-    """The motion of a robot that follows a trajectory from rest, with velocities and accelerations in all points.
+def completed(trajectory: JointTrajectory, start: Start, robot: Robot, period_ns: int) -> JointTrajectory:
+    """The motion of a robot that follows a trajectory, with velocities and accelerations in all points.
 
     Args:
-        trajectory: from rest to rest.
-        start: commanded positions of its joints [rad], shape (J,).
+        trajectory: to rest; also from rest if it has a point at time 0 and the robot is at rest.
+        start: where its joints are.
         robot: the robot.
         period_ns: control period.
 
@@ -86,23 +105,26 @@ def completed(trajectory: JointTrajectory, start: Vector, robot: Robot, period_n
     """
     names = trajectory.joint_names
     order = robot.indices(names)
-    points = _from_robot(_points(trajectory), start, robot, order, names, period_ns)
+    given = _points(trajectory, start)
+    _check_given(given, robot, order, names)
+    points = _from_robot(given, start, robot, order, names, period_ns)
     made = motion_of(trajectory)
     if made is None or not _is_whole(made, start):
-        made = _smooth(points, robot.max_acceleration[order], period_ns)
+        made = _smooth(points, start, robot.max_acceleration[order], period_ns)
         trajectory = trajectory_of(made, names, trajectory.header.stamp_ns)
     shortest_s = float(np.diff(points.times_ns).min()) / ns(1.0)
     _check_limits(made, robot, order, names, seconds(period_ns), shortest_s)
     return trajectory
 
 
-def _is_whole(made: Motion, start: Vector) -> bool:
+def _is_whole(made: Motion, start: Start) -> bool:
     """Whether a motion begins exactly at `start`, at rest and without acceleration."""
-    begins = made.times[0] == 0 and np.abs(made.positions[0] - start).max() <= _SAME_RAD
-    return bool(begins and not made.velocities[0].any() and not made.accelerations[0].any())
+    begins = made.times[0] == 0 and np.abs(made.positions[0] - start.position).max() <= _SAME_RAD
+    at_rest = start.velocity is None and not made.velocities[0].any() and not made.accelerations[0].any()
+    return bool(begins and at_rest)
 
 
-def _points(trajectory: JointTrajectory) -> _Points:
+def _points(trajectory: JointTrajectory, start: Start) -> _Points:
     """The checked points as arrays."""
     points, names = trajectory.points, trajectory.joint_names
     if not points:
@@ -123,7 +145,7 @@ def _points(trajectory: JointTrajectory) -> _Points:
     if accelerations is not None and velocities is None:
         raise _invalid("the trajectory has accelerations but no velocities; give both, or positions alone")
     if velocities is not None:
-        for number in (0, -1) if times[0] == 0 else (-1,):
+        for number in (0, -1) if times[0] == 0 and start.velocity is None else (-1,):
             if np.abs(velocities[number]).max() > _STILL:
                 joint = int(np.abs(velocities[number]).argmax())
                 where = "ends" if number else "begins"
@@ -141,56 +163,97 @@ def _field(rows: list[Vector], name: str, number: int) -> Vector | None:
     for index, row in enumerate(rows):
         if row.shape != (number,):
             raise _invalid(f"point {index} of the trajectory has {row.size} {name} for {number} joints")
-        if not np.isfinite(row).all():
-            raise _invalid(f"point {index} of the trajectory has {name} that are not finite")
+        # Written so that NaN fails it.
+        if not (np.abs(row) <= _PLAUSIBLE).all():
+            raise _invalid(f"point {index} of the trajectory has {name} that are not finite, or beyond {_PLAUSIBLE:g}")
     return np.array(rows)
 
 
+def _check_given(points: _Points, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...]) -> None:
+    """Check the velocities and accelerations that a trajectory states for its points.
+
+    Raises:
+        PlanningError: for the joint that exceeds a limit most.
+    """
+    for what, unit, values, limits in (
+        ("a velocity", "rad/s", points.velocities, robot.max_velocity[order]),
+        ("an acceleration", "rad/s²", points.accelerations, robot.max_acceleration[order]),
+    ):
+        if values is not None and not (np.abs(values) <= _MORE * limits).all():
+            number, joint = np.unravel_index(int((np.abs(values) / limits).argmax()), values.shape)
+            fault = f"{what} of {values[number, joint]:.4g} {unit}; its limit is {limits[joint]:.4g} {unit}"
+            raise _invalid(f"point {number} of the trajectory gives {names[int(joint)]} {fault}")
+
+
 def _from_robot(
-    points: _Points, start: Vector, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...], period_ns: int
+    points: _Points, start: Start, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...], period_ns: int
 ) -> _Points:
-    """The points, after a motion from where the robot stands to the first one.
+    """The points, after a motion from where the robot is to the first one.
 
     Raises:
         PlanningError: if they begin elsewhere.
     """
-    away = np.abs(points.positions[0] - start)
-    # Written so that NaN fails it.
-    if not away.max() <= START_RAD:
-        joint = int(away.argmax())
-        raise PlanningError(
-            f"the trajectory begins with {names[joint]} at {points.positions[0, joint]:.4f} rad, the robot is at"
-            f" {start[joint]:.4f} rad; at most {START_RAD} rad may lie between them",
-            PlanCode.START_STATE_INVALID,
-        )
-    if points.times_ns[0] == 0 and away.max() <= _SAME_RAD:
-        return attrs.evolve(points, positions=np.vstack([start, points.positions[1:]]))
     later_ns = 0
-    velocities = points.velocities
     if points.times_ns[0] == 0:
-        fastest, strongest = robot.max_velocity[order], robot.max_acceleration[order]
-        lead_s = max(
-            float((_QUINTIC_SPEED * away / fastest).max()), float(np.sqrt(_QUINTIC_RATE * away / strongest).max())
-        )
-        later_ns = max(ns(_MORE * lead_s), 2 * period_ns)
-        if velocities is None:  # the motion to the first point ends at rest: the spline begins after it
-            velocities = _spline_velocities(points.times_ns, points.positions)
-    rest = np.zeros((1, len(start)))
+        _check_begin(points.positions[0], start, names)
+        away = np.abs(points.positions[0] - start.position)
+        if start.velocity is not None or away.max() <= _SAME_RAD:
+            points = _Points(
+                points.times_ns[1:],
+                points.positions[1:],
+                *(None if field is None else field[1:] for field in (points.velocities, points.accelerations)),
+            )
+        else:
+            fastest, strongest = robot.max_velocity[order], robot.max_acceleration[order]
+            lead_s = max(
+                float((_QUINTIC_SPEED * away / fastest).max()), float(np.sqrt(_QUINTIC_RATE * away / strongest).max())
+            )
+            later_ns = max(ns(_MORE * lead_s), 2 * period_ns)
+            if points.velocities is None:  # the motion to the first point ends at rest: the spline begins after it
+                velocities = _spline_velocities(points.times_ns, points.positions)
+                points = attrs.evolve(points, velocities=velocities)
+    rest = np.zeros(len(start.position))
+    firsts = start.position, rest if start.velocity is None else start.velocity, rest
+    if start.acceleration is not None:
+        firsts = *firsts[:2], start.acceleration
+    fields = points.positions, points.velocities, points.accelerations
     return _Points(
         np.concatenate([[0], points.times_ns + later_ns]),
-        np.vstack([start, points.positions]),
-        None if velocities is None else np.vstack([rest, velocities]),
-        None if points.accelerations is None else np.vstack([rest, points.accelerations]),
+        *(None if field is None else np.vstack([first, field]) for first, field in zip(firsts, fields, strict=True)),  # type: ignore[arg-type]
     )
 
 
-def _spline_velocities(times_ns: NDArray[np.int64], positions: Vector) -> Vector:
-    """Velocities [rad/s], shape (N, J), of the cubic spline through the points whose acceleration is continuous."""
+def _check_begin(first: Vector, start: Start, names: tuple[str, ...]) -> None:
+    """Check that a point at time 0 is where the robot is.
+
+    Raises:
+        PlanningError: if not.
+    """
+    away, most = np.abs(first - start.position), START_RAD if start.velocity is None else MOVING_START_RAD
+    if start.measured is not None:
+        away = np.fmin(away, np.abs(first - start.measured))
+    # Written so that NaN fails it.
+    if not away.max() <= most:
+        joint = int(away.argmax())
+        raise PlanningError(
+            f"the trajectory begins with {names[joint]} at {first[joint]:.4f} rad, the robot is at"
+            f" {start.position[joint]:.4f} rad; at most {most} rad may lie between them",
+            PlanCode.START_STATE_INVALID,
+        )
+
+
+def _spline_velocities(times_ns: NDArray[np.int64], positions: Vector, first: Vector | None = None) -> Vector:
+    """Velocities [rad/s], shape (N, J), of the cubic spline through the points whose acceleration is continuous.
+
+    It begins with the velocities `first` [rad/s], shape (J,), by default at rest, and ends at rest.
+    """
     h = (np.diff(times_ns) / ns(1.0))[:, None]
     slopes = np.diff(positions, axis=0) / h
     velocities = np.zeros_like(positions)
     # h[i] v[i-1] + 2 (h[i-1] + h[i]) v[i] + h[i-1] v[i+1] = 3 (h[i] s[i-1] + h[i-1] s[i]), solved from both ends.
     factors, rests = np.zeros(len(positions)), np.zeros_like(positions)
+    if first is not None:
+        velocities[0] = rests[0] = first
     for i in range(1, len(positions) - 1):
         before, after = float(h[i - 1, 0]), float(h[i, 0])
         pivot = 2 * (before + after) - after * factors[i - 1]
@@ -201,16 +264,17 @@ def _spline_velocities(times_ns: NDArray[np.int64], positions: Vector) -> Vector
     return velocities
 
 
-def _smooth(points: _Points, max_acceleration: Vector, period_ns: int) -> Motion:
-    """The points as one motion whose acceleration does not jump; it begins and ends without any."""
+def _smooth(points: _Points, start: Start, max_acceleration: Vector, period_ns: int) -> Motion:
+    """The points as one motion whose acceleration does not jump; it begins with that of `start` and ends without."""
     velocities = points.velocities
     if velocities is None:
-        velocities = _spline_velocities(points.times_ns, points.positions)
+        velocities = _spline_velocities(points.times_ns, points.positions, start.velocity)
     left, right = _accelerations(points, velocities)
     none = np.zeros((1, points.positions.shape[1]))
-    before, after = np.concatenate([none, right]), np.concatenate([left, none])
+    begins = none if start.acceleration is None else start.acceleration[None]
+    before, after = np.concatenate([begins, right]), np.concatenate([left, none])
     means = (before + after) / 2
-    means[[0, -1]] = 0.0
+    means[0], means[-1] = begins[0], 0.0
     jumps = (np.abs(after - before) > _JUMP * max_acceleration).any(axis=1)
     lengths = np.diff(points.times_ns)
     near_ns = np.minimum(lengths, period_ns) // 4
@@ -265,7 +329,9 @@ def _check_limits(
     step = period_s / 2 / parts
     inner = made.sampled(step)[0]
     rest = np.repeat(inner[-1:], 3 * parts, axis=0)
-    positions = np.concatenate([np.repeat(inner[:1], 2 * parts, axis=0), inner, rest])
+    before = step * np.arange(-2 * parts, 0)[:, None]
+    begins = inner[0] + before * (made.velocities[0] + before * made.accelerations[0] / 2)
+    positions = np.concatenate([begins, inner, rest])
     # A motion may begin outside the limits, and lead inwards.
     lower, upper = np.minimum(robot.lower[order], inner[0]), np.maximum(robot.upper[order], inner[0])
     speeds = np.abs(positions[parts:] - positions[:-parts]) / (parts * step)

@@ -22,6 +22,18 @@ class JointPlannerOptions:
 
 @documented
 @attrs.frozen
+class GoalCheckOptions:
+    """The section `goals`: how far trajectories of any client keep away, in modes whose planner does not say so."""
+
+    padding: float = option(0.005, unit="m", ge=0, le=0.1, help="minimum distance of the arm from objects")
+    self_padding: float = option(0.0, unit="m", ge=0, le=0.1, help="minimum distance between links of the arm")
+    floor: float | None = option(
+        None, unit="m", help="height of the table or floor in the base frame; everything below is blocked"
+    )
+
+
+@documented
+@attrs.frozen
 class RrtConnectOptions:
     """Options of `type: rrt_connect`."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import override
@@ -12,7 +11,7 @@ import attrs
 import numpy as np
 from ibrobot_kinematics import robot_model
 
-from ibrobot_core.api import Context, JointTrajectory, PlanningError, Pose, Vector, Vector3, seconds
+from ibrobot_core.api import Context, JointTrajectory, PlanningError, Vector
 from ibrobot_core.app import (
     AnyGoal,
     Goal,
@@ -32,20 +31,17 @@ from ibrobot_planning.goals.tool import Candidate, Tool
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.search import Pace, Space, connect, shortened
-from ibrobot_planning.planners.timing import Motion, motion_of, resting, timed, trajectory_of
+from ibrobot_planning.planners.timing import Motion, resting, timed, trajectory_of
 from ibrobot_planning.world.arm import Arm
 from ibrobot_planning.world.checked_arm import checked_arm
-from ibrobot_planning.world.collision import Collisions, Contact
-from ibrobot_planning.world.objects import FLOOR, SNAPSHOT, Plane, World, WorldObject
+from ibrobot_planning.world.collision import Collisions
+from ibrobot_planning.world.objects import World
+from ibrobot_planning.world.paths import CHECK_S, FreePaths, collisions, outwards, sentence
 
 _RESOLUTIONS_M = (0.05, 0.02, 0.005)
 """Maximum motion of the arm between checks of the search; finer ones follow if the timed motion touches."""
 _FINEST_M = 0.0015
 """The same for a whole path before it is timed."""
-_CHECK_S = 0.001
-"""Time between checks of the timed motion."""
-_WATCH_STRIDE = 2
-"""Every second one of these times is checked again when the world has changed."""
 _REPAIRS = 12
 """Attempts to time a path, each with smaller blends at the contacts of the previous one."""
 _LEAST_BLEND = 0.01
@@ -54,8 +50,6 @@ _WIDEST_WINDOW_S, _LINEAR_WINDOW_S = 0.1, 0.03
 """Widths of the moving average of free motions and of straight lines; a wider one leaves the path further."""
 _ROUNDING = 1e-6
 """Allowed excess of positions beyond a limit [rad]."""
-_WORSE_M = 1e-4
-"""Allowed decrease of a distance while the arm leaves a contact [m]."""
 _EXITS = 60
 """Number of directions tried at each distance to leave a contact."""
 
@@ -73,8 +67,7 @@ class RrtConnectPlanner(Planner):
         self._ctx = ctx
         self._arm: Arm | None = None
         self._tool: Tool | None = None
-        self._checked: deque[tuple[JointTrajectory, World]] = deque(maxlen=8)
-        """Free trajectories, each with the world in which it is free."""
+        self._paths = FreePaths(lambda: self.arm, ctx.bus, lambda: self.world)
 
     @override
     def load(self) -> None:
@@ -92,43 +85,17 @@ class RrtConnectPlanner(Planner):
     def plan(self, request: PlanRequest) -> PlanResult:
         begun = time.monotonic()
         start = self._check_start(request)
-        world = self._snapshot()
-        checks = self._collisions(world, request.joints, request.others)
+        world = self._paths.snapshot(self._options)
+        checks = collisions(self.arm, world, request.joints, request.others, self._options)
         deadline = begun + self._options.planning_time
         assert self._tool is not None
         result = _Plan(self._ctx, self._options, self._tool, request, start, checks, deadline).solve()
-        self._checked.append((result.trajectory, world))
+        self._paths.note(result.trajectory, world)
         return result
 
     @override
     def blocked(self, trajectory: JointTrajectory, others: Mapping[str, float], from_ns: int = 0) -> str:
-        world = self._snapshot()
-        if any(known is trajectory and in_world == world for known, in_world in tuple(self._checked)):
-            return ""
-        checks = self._collisions(world, trajectory.joint_names, others)
-        made = motion_of(trajectory)
-        if made is None:
-            return "a trajectory without velocities and accelerations cannot be checked"
-        positions = made.sampled(_CHECK_S)[0][round(seconds(from_ns) / _CHECK_S) :: _WATCH_STRIDE]
-        # Contacts at the start may open.
-        leaving = _outwards(checks, positions) or 0 if len(positions) else 0
-        hit = leaving + checks.first_hit_on_path(positions[leaving:])
-        if hit < len(positions):
-            return _sentence(checks.contacts(positions[hit]))
-        self._checked.append((trajectory, world))
-        return ""
-
-    def _collisions(self, world: World, joints: Sequence[str], others: Mapping[str, float]) -> Collisions:
-        options = self._options
-        return Collisions(self.arm, world, joints, others, padding=options.padding, self_padding=options.self_padding)
-
-    def _snapshot(self) -> World:
-        bus = self._ctx.bus
-        world = bus.call(SNAPSHOT) if bus is not None and bus.serves(SNAPSHOT) else self.world
-        floor = self._options.floor
-        if floor is None or FLOOR in world.objects:
-            return world
-        return world.add(FLOOR, WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor))))
+        return self._paths.blocked(trajectory, others, self._options, from_ns)
 
     def _check_start(self, request: PlanRequest) -> Vector:
         robot = self._ctx.robot
@@ -256,7 +223,7 @@ class _Plan:
             key=lambda contacts: contacts[0].padding - contacts[0].distance,
         )
         at_all = f" in all of its {len(candidates)} configurations" if len(candidates) > 1 else ""
-        raise PlanningError(f"the goal is in collision{at_all}: {_sentence(least)}", PlanCode.GOAL_IN_COLLISION)
+        raise PlanningError(f"the goal is in collision{at_all}: {sentence(least)}", PlanCode.GOAL_IN_COLLISION)
 
     def _nearby(self, whole: Vector, goal: JointGoal) -> list[Candidate]:
         """The nearest of random free configurations within the goal's tolerance."""
@@ -285,7 +252,7 @@ class _Plan:
             return way
         deepest = min(touching, key=lambda contact: contact.distance, default=None)
         if deepest is None or deepest.distance < -self.options.start_overlap:
-            raise PlanningError(f"the start is in collision: {_sentence(touching)}", PlanCode.START_STATE_IN_COLLISION)
+            raise PlanningError(f"the start is in collision: {sentence(touching)}", PlanCode.START_STATE_IN_COLLISION)
         rng = np.random.default_rng(self.ctx.seed)
         for distance in (0.03, 0.06, 0.1, 0.2, 0.4):
             for _ in range(_EXITS):
@@ -294,14 +261,14 @@ class _Plan:
                 if self.checks.free(end) and self._leaves(self.start, end):
                     return [self.start, end]
         raise PlanningError(
-            f"the start is in collision, and no short motion leads out: {_sentence(touching)}",
+            f"the start is in collision, and no short motion leads out: {sentence(touching)}",
             PlanCode.START_STATE_IN_COLLISION,
         )
 
     def _leaves(self, start: Vector, end: Vector) -> bool:
         """Whether contacts at the start only open on the line to a free end, and no other contact occurs."""
         line = Space(self.checks, *self._limits, _FINEST_M).line(start, end)
-        return _outwards(self.checks, np.concatenate([start[None], line])) is not None
+        return outwards(self.checks, np.concatenate([start[None], line])) is not None
 
     def _linear(self, goal: LinearGoal) -> PlanResult:
         self._check_chain()
@@ -309,14 +276,14 @@ class _Plan:
             raise invalid_goal(f"least_fraction is {goal.least_fraction}, must be above 0 and at most 1")
         touching = self.checks.contacts(self.start)
         if touching:
-            raise PlanningError(f"the start is in collision: {_sentence(touching)}", PlanCode.START_STATE_IN_COLLISION)
+            raise PlanningError(f"the start is in collision: {sentence(touching)}", PlanCode.START_STATE_IN_COLLISION)
         line = linear_path(self.tool, goal.waypoints, self._whole())
         path = line.joints[:, self._order]
         space = Space(self.checks, *self._limits, _FINEST_M)
         possible, reason = len(path), line.reason
         for number in range(1, len(path)):
             if not space.free(path[number - 1], path[number]):
-                possible, reason = number, _sentence(self.checks.contacts(path[number]))
+                possible, reason = number, sentence(self.checks.contacts(path[number]))
                 break
         motion = None
         while possible > 1:
@@ -394,7 +361,7 @@ class _Plan:
 
     def _touching(self, motion: Motion) -> Vector:
         """Where a motion touches or leaves the limits, shape (N, J)."""
-        positions = motion.positions_within(_CHECK_S)
+        positions = motion.positions_within(CHECK_S)
         lower, upper = self._limits
         # A joint outside its limits may only move inwards.
         lower, upper = np.minimum(lower, self.start), np.maximum(upper, self.start)
@@ -402,7 +369,7 @@ class _Plan:
         bad = [positions[outside]]
         checked = 0
         if not self.checks.free(self.start):
-            out = _outwards(self.checks, positions)
+            out = outwards(self.checks, positions)
             if out is None:
                 return np.asarray(positions[:1])
             checked = out
@@ -420,7 +387,7 @@ class _Plan:
         message = f"no path found within {self.options.planning_time:g} s"
         if hit == len(line):
             return message
-        return f"{message}; on the straight way {_sentence(self.checks.contacts(line[hit]))}"
+        return f"{message}; on the straight way {sentence(self.checks.contacts(line[hit]))}"
 
     def _result(self, motion: Motion, end: Candidate, number: int, fraction: float = 1.0) -> PlanResult:
         # Executors refuse positions outside the limits, even if only by rounding.
@@ -429,23 +396,3 @@ class _Plan:
         inside = attrs.evolve(motion, positions=positions)
         trajectory = trajectory_of(inside, self.request.joints, self.ctx.clock.now_ns())
         return PlanResult(trajectory, fraction, number, end.position_error, end.orientation_error)
-
-
-def _outwards(checks: Collisions, configurations: Vector) -> int | None:
-    """Number of configurations before the first free one, while distances grow; None if one shrinks."""
-    before = {(each.first, each.second): each.distance for each in checks.contacts(configurations[0])}
-    for number, q in enumerate(configurations):
-        if checks.free(q):
-            return number
-        now = {(each.first, each.second): each.distance for each in checks.contacts(q)}
-        if any(pair not in before or distance < before[pair] - _WORSE_M for pair, distance in now.items()):
-            return None
-        before = {pair: max(distance, before[pair]) for pair, distance in now.items()}
-    return None
-
-
-def _sentence(contacts: Sequence[Contact], most: int = 3) -> str:
-    if not contacts:
-        return "something touches"
-    further = f", and {len(contacts) - most} more" if len(contacts) > most else ""
-    return "; ".join(str(contact) for contact in contacts[:most]) + further

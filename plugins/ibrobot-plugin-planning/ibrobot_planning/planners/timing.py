@@ -79,6 +79,13 @@ class Motion:
         u = (times - self.times[at])[:, None] / h
         return np.stack(evaluated(self._quintics[:, at], u, h))
 
+    def at(self, time: float) -> Vector:
+        """Position, velocity and acceleration at a time [s] within the motion, shape (3, J)."""
+        at = min(int(np.searchsorted(self.times, time, side="right")), len(self.times) - 1) - 1
+        h = np.diff(self.times)[at : at + 1, None]
+        u = (time - self.times[at]) / h
+        return np.stack(evaluated(self._quintics[:, at : at + 1], u, h))[:, 0]
+
     def positions_within(self, step: float) -> Vector:
         """Positions of the quintic at most `step` [s] apart, shape (M, J), all points among them."""
         number = int(np.ceil(np.diff(self.times).max() / step - 1e-6))

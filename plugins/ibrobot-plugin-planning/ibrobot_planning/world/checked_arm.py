@@ -6,7 +6,8 @@ What does not touch the convex hull of a link does not touch the shapes in it.
 from __future__ import annotations
 
 import logging
-from collections import Counter
+import threading
+from collections import Counter, deque
 from collections.abc import Sequence
 
 import attrs
@@ -22,17 +23,29 @@ from ibrobot_planning.world.objects import World
 
 _SAMPLES = 200
 """Random configurations that decide which hulls make checks faster."""
+_MADE: deque[tuple[Robot, Arm]] = deque(maxlen=2)
+"""The newest models, each with its robot."""
+_MAKING = threading.Lock()
 _VAIN_SHARE = 0.05
 """A link keeps its shapes if its hull touches another link in more of the free configurations."""
 
 
 def checked_arm(robot: Robot, log: logging.Logger) -> Arm:
-    """The collision model of a robot, from its MJCF, URDF and SRDF.
+    """The collision model of a robot, from its MJCF, URDF and SRDF. It takes seconds to make: users share it.
 
     Raises:
         PlanningError: as `robot_arm`.
         KinematicsError: for a URDF or SRDF that cannot be read.
     """
+    with _MAKING:
+        made = next((arm for known, arm in _MADE if known is robot), None)
+        if made is None:
+            made = _made(robot, log)
+            _MADE.append((robot, made))
+        return made
+
+
+def _made(robot: Robot, log: logging.Logger) -> Arm:
     arm = robot_arm(robot)
     arm = with_hulls(attrs.evolve(arm, unchecked=unchecked_pairs(arm)))
     if robot.description.urdf is None:

@@ -5,7 +5,7 @@ A plan uses one `World`; changes make a new one.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -310,13 +310,13 @@ OBSERVED = Service(
 )
 
 
-def world_of(bus: Bus) -> World:
-    """The objects around the robot, for plans; none in a run without the section `world`.
+def world_of(bus: Bus | None, otherwise: Callable[[], World] = World) -> World:
+    """The objects around the robot, for plans; those of `otherwise`, by default none, without the section `world`.
 
     Raises:
         PlanningError: if a part of the world is too old, and its rule is to refuse plans.
     """
-    return bus.call(SNAPSHOT) if bus.serves(SNAPSHOT) else World()
+    return bus.call(SNAPSHOT) if bus is not None and bus.serves(SNAPSHOT) else otherwise()
 
 
 def observed_world(bus: Bus) -> ObservedWorld:

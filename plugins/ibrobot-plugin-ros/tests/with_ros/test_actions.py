@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 
 import pytest
+from ibrobot_ros2.goals import TrajectoryCode
 
 from .conftest import scaled
 
@@ -73,7 +74,7 @@ def test_a_new_goal_replaces_the_old_at_random_times(start, peer):
     run.check_steps()
 
 
-REJECTED = {
+REFUSED = {
     "partial joints": ({"joints": ["pan", "lift"], "points": to(0.1, 0.1)}, "INVALID_JOINTS"),
     "unknown joint": ({"joints": ["pan", "lift", "elbow"]}, "INVALID_JOINTS"),
     "beyond limits": ({"points": to(9.0, 0.1, 0.1)}, "INVALID_GOAL"),
@@ -84,13 +85,14 @@ REJECTED = {
 }
 
 
-def test_goals_that_ros2_control_rejects(start, peer, caplog):
+def test_results_of_refused_goals_say_why(start, peer, caplog):
     start()
-    for name, (changes, code) in REJECTED.items():
+    for name, (changes, code) in REFUSED.items():
         caplog.clear()
         goal = {"action": ACTION, "joints": ARM, "points": to(0.1, 0.1, 0.1), **changes}
-        assert peer.ask("follow", **goal) == {"accepted": False}, name
-        assert code in caplog.text, name
+        ended = peer.ask("follow", **goal)
+        assert (ended["status"], ended["error_code"]) == ("ABORTED", TrajectoryCode[code]), name
+        assert ended["error_string"], name
 
 
 def test_tolerances_end_a_goal_with_their_codes(start, peer):
@@ -115,7 +117,8 @@ def test_an_emergency_stop_ends_a_goal(start, peer):
     run.session.emergency_stop()
     (outcome,) = peer.ask("outcomes")
     assert (outcome["status"], outcome["error_code"]) == ("ABORTED", -1)
-    assert peer.ask("follow", action=ACTION, joints=ARM, points=to(0.0, 0.0, 0.0)) == {"accepted": False}
+    refused = peer.ask("follow", action=ACTION, joints=ARM, points=to(0.0, 0.0, 0.0))
+    assert (refused["status"], "before a reset" in refused["error_string"]) == ("ABORTED", True)
     run.check_steps()
 
 

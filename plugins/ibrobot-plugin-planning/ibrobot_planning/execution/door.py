@@ -1,0 +1,319 @@
+"""The door through which all goals of trajectories pass, of any client: completed, within the limits, free."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, override
+from weakref import WeakKeyDictionary
+
+import attrs
+import numpy as np
+
+from ibrobot_core.api import (
+    GoalRejected,
+    HardwareError,
+    IbrobotError,
+    JointTrajectory,
+    PlanningError,
+    Vector,
+    ns,
+    seconds,
+)
+from ibrobot_core.app import ControlState, PlanCode, RunAccess, RunView, SessionWorker
+from ibrobot_planning.planners.completion import Start, check_size, completed
+from ibrobot_planning.planners.options import GoalCheckOptions, RrtConnectOptions
+from ibrobot_planning.planners.timing import Motion, motion_of
+from ibrobot_planning.world.engines import find_engines
+
+if TYPE_CHECKING:
+    from ibrobot_planning.world.paths import FreePaths, Margins
+
+WORLD = "world"
+"""The section whose objects are the world."""
+_AHEAD_S = (0.05, 0.15, 0.4)
+"""How far ahead a trajectory takes over from the running one, at each attempt; its check takes a part of the time."""
+_WATCH_S = 0.02
+"""Interval at which motions are checked against the present world [s]."""
+_STILL_RAD = 1e-4
+"""Commands that change less in a tick count as at rest."""
+_GLANCE_S = 0.1
+_REST_S = 1.0
+"""Longest wait for joints that come to rest, e.g. after a cancel [s]."""
+
+type Send = Callable[[Mapping[str, Any]], None]
+
+
+@attrs.define(eq=False)
+class _Track:
+    """A goal that an executor follows."""
+
+    goal_id: str
+    trajectory: JointTrajectory | None
+    """None while it slows down."""
+    begin_ns: int | None = None
+    """When it began [ns]; None until the executor reports it."""
+
+    @cached_property
+    def motion(self) -> Motion | None:
+        return None if self.trajectory is None else motion_of(self.trajectory)
+
+
+class GoalDoor(SessionWorker):
+    """Completes and checks each trajectory before control gets it, and stops it if the world comes into its way.
+
+    A trajectory for joints that follow another one takes over from it without a step: it is completed and checked from
+    where the joints will be then. Goals of positions, as of grippers, are checked by their executors.
+    """
+
+    session: RunAccess
+
+    def __init__(self, options: GoalCheckOptions, session: RunAccess) -> None:
+        super().__init__(session, "goals", "checks goals before control gets them")
+        self._options = options
+        self._robot = session.config.robot
+        self._executors = [name for name, each in session.config.executors.items() if each.goals == "trajectory"]
+        self._period_ns = ns(1.0 / session.config.control.rate_hz)
+        self._unchecked: str | None = None
+        """Why trajectories are not checked against the world; empty if they are, None before the model is loaded."""
+        self._loading = threading.Lock()
+        self._complete: deque[JointTrajectory] = deque(maxlen=16)
+        """Trajectories that a planner's source has completed from where the robot is."""
+        self._door = threading.Lock()
+        """Held while a goal passes."""
+        self._tracks: dict[str, _Track] = {}
+        """Executor -> the goal that it follows."""
+        self._begun = threading.Condition()
+        """Notified when goals begin or end."""
+        self._command: Vector | None = None
+        self._moved_ns = np.zeros(len(self._robot.joints), dtype=np.int64)
+        """When the command of each joint last changed [ns], shape (J,)."""
+        self.watched_by: Callable[[str], bool] = lambda goal_id: False
+        """Whether its sender stops a goal if the world comes into its way."""
+        _DOORS[session] = self
+
+    @override
+    def setup(self) -> None:
+        session = self.session
+        if self._robot.description.mjcf is None:
+            self._go_unchecked("robot.description.mjcf is missing")
+        elif WORLD not in session.config.plugin_sections:
+            names = ", ".join(self._executors)
+            session.log.info("goals of %s are checked against the arm itself; a section world adds objects", names)
+        active = set(session.config.control_modes[session.mode].executors)
+        if active.intersection(self._executors) and not session.request.lockstep:
+            # It takes seconds: not while the first goal waits.
+            threading.Thread(target=self._is_checked, name=f"{self.name} model", daemon=True).start()
+        session.on_state.append(self._take_state)
+        session.on_goal.append(self._take_event)
+        session.goal_door = self.take
+        self.on_end.callback(session.on_state.remove, self._take_state)
+        self.on_end.callback(session.on_goal.remove, self._take_event)
+
+    def _go_unchecked(self, why: str) -> None:
+        """Let trajectories pass that are within the limits, and say so."""
+        self._unchecked = why
+        names = ", ".join(self._executors)
+        self.session.log.warning("goals of %s are limited, not checked against the world: %s", names, why)
+
+    def _is_checked(self) -> bool:
+        """Whether trajectories are checked against the world; the first call loads the arm's model."""
+        with self._loading:
+            if self._unchecked is None:
+                try:
+                    find_engines()
+                    _ = self._arm
+                except IbrobotError as error:
+                    self._go_unchecked(str(error))
+                else:
+                    self._unchecked = ""
+            return not self._unchecked
+
+    @cached_property
+    def _paths(self) -> FreePaths:
+        from ibrobot_planning.world.paths import FreePaths
+
+        return FreePaths(lambda: self._arm, self.session.bus)
+
+    @property
+    def _arm(self) -> Any:
+        from ibrobot_planning.world.checked_arm import checked_arm
+
+        return checked_arm(self._robot, self.session.log)
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        if timeout_s:
+            self.pause(min(timeout_s, _WATCH_S))
+        for name, track in list(self._tracks.items()):
+            if track.begin_ns is not None and track.trajectory is not None and not self.watched_by(track.goal_id):
+                self._watch(name, track, track.trajectory, track.begin_ns)
+
+    def complete(self, trajectory: JointTrajectory) -> None:
+        """Take note that a trajectory was completed from where the robot is, and is within the limits."""
+        self._complete.append(trajectory)
+
+    def free(self, trajectory: JointTrajectory) -> None:
+        """Take note that a trajectory that takes over from the running one is free and within the limits."""
+        if self._is_checked():
+            self._paths.note(trajectory, self._paths.snapshot(self._margins()))
+
+    def take(self, executor: str, goal_id: str, goal: Mapping[str, Any], send: Send) -> None:
+        """Let a goal pass. See `Session.goal_door`.
+
+        Raises:
+            PlanningError: if it fails a check.
+            IbrobotError: if control refuses it.
+        """
+        if "trajectory" not in goal or executor not in self._executors:
+            if "stop" in goal:
+                self._tracks.pop(executor, None)  # it slows down: who sends this watches it
+            send(goal)
+            return
+        if executor not in self.session.config.control_modes[self.session.mode].executors:
+            raise GoalRejected(f"executor {executor!r} is not active in mode {self.session.mode}")
+        with self._door:
+            if "takes_over" in goal or any(known is goal["trajectory"] for known in self._complete):
+                self._check_free(goal["trajectory"])
+                self._send(executor, goal_id, goal, send)
+            else:
+                self._complete_and_send(executor, goal_id, goal, send)
+
+    def _complete_and_send(self, executor: str, goal_id: str, goal: Mapping[str, Any], send: Send) -> None:
+        trajectory: JointTrajectory = goal["trajectory"]
+        check_size(trajectory)
+        unknown = [name for name in trajectory.joint_names if name not in self._robot.joint_names]
+        if unknown or not trajectory.joint_names:
+            raise PlanningError(f"no joints {unknown}", PlanCode.INVALID_GROUP_NAME)
+        for ahead_s in _AHEAD_S:
+            start, takes_over = self._start(executor, trajectory.joint_names, ahead_s)
+            whole = completed(trajectory, start, self._robot, self._period_ns)
+            self._check_free(whole)
+            try:
+                self._send(executor, goal_id, {**goal, "trajectory": whole, **takes_over}, send)
+            except HardwareError as error:
+                if not takes_over:
+                    raise
+                refused = error  # e.g. too late: the running goal has gone on, or ended
+            else:
+                return
+        raise refused
+
+    def _start(self, executor: str, joints: tuple[str, ...], ahead_s: float) -> tuple[Start, dict[str, Any]]:
+        """Where a trajectory begins, and what it takes over from: the running one, if there is one."""
+        session, order = self.session, self._robot.indices(joints)
+        track = self._tracks.get(executor)
+        if track is not None and track.begin_ns is None and not session.request.lockstep:
+            with self._begun:
+                self._begun.wait_for(lambda: track.begin_ns is not None, _GLANCE_S)
+        state = session.state
+        motion = track.motion if track is not None else None
+        if state is None or track is None or motion is None or track.begin_ns is None or track.trajectory is None:
+            return self._at_rest(order), {}
+        passed_s = seconds(state.stamp_ns - track.begin_ns)
+        if passed_s >= motion.duration:
+            return self._at_rest(order), {}
+        begin_s = min(round(passed_s + ahead_s, 3), motion.duration)
+        columns = [track.trajectory.joint_names.index(name) for name in joints]
+        position, velocity, acceleration = motion.at(begin_s)[:, columns]
+        takes_over = {"takes_over": {"goal": track.goal_id, "time_ns": ns(begin_s)}}
+        if begin_s == motion.duration:
+            return Start(position), takes_over
+        return Start(position, velocity, acceleration), takes_over
+
+    def _at_rest(self, order: Any) -> Start:
+        """Where joints are that no goal moves, once they are at rest.
+
+        Raises:
+            PlanningError: if they are not.
+        """
+        session = self.session
+        states = session.watch_states()
+        ticks = 1 if session.request.lockstep else round(ns(_REST_S) / self._period_ns)
+        for _ in range(ticks):
+            measured, state = session.measured().position, session.state
+            assert state is not None
+            if state.stamp_ns >= self._moved_ns[order].max() + 2 * self._period_ns:
+                return Start(state.command[order], measured=measured[order])
+            if session.request.lockstep or states.get(_GLANCE_S) is None:
+                break
+        raise PlanningError("the joints still move: wait until they are at rest", PlanCode.START_STATE_INVALID)
+
+    def _margins(self) -> Margins:
+        """Distances of the mode's planner, or of the section."""
+        planner = self.session.config.control_modes[self.session.mode].planner
+        if planner is not None and isinstance(planner.options, RrtConnectOptions):
+            return planner.options
+        return self._options
+
+    def _others(self) -> dict[str, float]:
+        """Joint -> its commanded position [rad]."""
+        state = self.session.state
+        command = state.command if state is not None else self.session.measured().position
+        return dict(zip(self._robot.joint_names, command.tolist(), strict=True))
+
+    def _check_free(self, trajectory: JointTrajectory) -> None:
+        """Check a trajectory against the present world.
+
+        Raises:
+            PlanningError: if it is not free.
+        """
+        if self._is_checked() and (touched := self._paths.blocked(trajectory, self._others(), self._margins())):
+            raise PlanningError(f"the trajectory is not free: {touched}", PlanCode.INVALID_MOTION_PLAN)
+
+    def _send(self, executor: str, goal_id: str, goal: Mapping[str, Any], send: Send) -> None:
+        before, track = self._tracks.get(executor), _Track(goal_id, goal["trajectory"])
+        self._tracks[executor] = track
+        try:
+            send(goal)
+        except BaseException:
+            if self._tracks.get(executor) is track:
+                self._tracks.pop(executor)
+                if before is not None:
+                    self._tracks[executor] = before
+            raise
+
+    def _watch(self, name: str, track: _Track, trajectory: JointTrajectory, begin_ns: int) -> None:
+        """Stop a motion that the present world blocks."""
+        state = self.session.state
+        if state is None or not self._is_checked():
+            return
+        try:
+            passed_ns = max(0, state.stamp_ns - begin_ns)
+            touched = self._paths.blocked(trajectory, self._others(), self._margins(), passed_ns)
+        except PlanningError as error:
+            touched = f"the motion cannot be checked: {error}"
+        if not touched or self._tracks.get(name) is not track:
+            return
+        control = self.session.control
+        self.session.log.warning("%s stops before an obstacle: %s", name, touched)
+        track.trajectory = None
+        try:
+            control.call("goal", executor=name, goal_id=f"{track.goal_id} before {touched}", goal={"stop": True})
+        except HardwareError:  # an executor of another plugin may not know how to slow down
+            control.call("cancel", executor=name)
+
+    def _take_event(self, event: Mapping[str, Any]) -> None:
+        with self._begun:
+            track = self._tracks.get(event["executor"])
+            if track is not None and track.goal_id == event["goal"]:
+                if event["state"] == "executing":
+                    track.begin_ns = event["result"].get("begin_ns")
+                else:
+                    self._tracks.pop(event["executor"], None)
+            self._begun.notify_all()
+
+    def _take_state(self, state: ControlState) -> None:
+        if self._command is not None:
+            self._moved_ns[np.abs(state.command - self._command) > _STILL_RAD] = state.stamp_ns
+        self._command = state.command
+
+
+_DOORS: WeakKeyDictionary[RunView, GoalDoor] = WeakKeyDictionary()
+
+
+def door_of(session: RunView) -> GoalDoor:
+    """The door of a run."""
+    return _DOORS[session]

@@ -1,0 +1,111 @@
+"""Checks of whole trajectories against a world: for planners, and for goals from outside."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+from ibrobot_core.api import JointTrajectory, Pose, Vector, Vector3, seconds
+from ibrobot_core.app import Bus
+from ibrobot_planning.planners.timing import motion_of
+from ibrobot_planning.world.arm import Arm
+from ibrobot_planning.world.collision import Collisions, Contact
+from ibrobot_planning.world.objects import FLOOR, Plane, World, WorldObject, world_of
+
+CHECK_S = 0.001
+"""Time between checks of a timed motion."""
+_STRIDE = 2
+"""Every second one of these times is checked in the present world."""
+_WORSE_M = 1e-4
+"""Allowed decrease of a distance while the arm leaves a contact [m]."""
+
+
+class Margins(Protocol):
+    """Options that say how far the arm keeps away."""
+
+    @property
+    def padding(self) -> float:
+        """Least distance of the arm from objects [m]."""
+
+    @property
+    def self_padding(self) -> float:
+        """Least distance between links [m]."""
+
+    @property
+    def floor(self) -> float | None:
+        """Height of the floor in the base frame [m]; everything below is blocked."""
+
+
+class FreePaths:
+    """Whether trajectories are free in the present world. Methods may be called from several threads.
+
+    Args:
+        arm: the arm, once it is loaded.
+        bus: serves the world; None without a run.
+        world: the objects, if the run has no section `world`.
+    """
+
+    def __init__(self, arm: Callable[[], Arm], bus: Bus | None, world: Callable[[], World] = World) -> None:
+        self._arm, self._bus, self._world = arm, bus, world
+        self._free: deque[tuple[JointTrajectory, World]] = deque(maxlen=16)
+        """Trajectories, each with the world in which it is free."""
+
+    def snapshot(self, margins: Margins) -> World:
+        """The present world, with the floor."""
+        world = world_of(self._bus, self._world)
+        if margins.floor is None or FLOOR in world.objects:
+            return world
+        return world.add(FLOOR, WorldObject(Plane(), Pose(Vector3(0.0, 0.0, margins.floor))))
+
+    def note(self, trajectory: JointTrajectory, world: World) -> None:
+        """Remember that a trajectory, or all of it that is still new, is free in a world."""
+        self._free.append((trajectory, world))
+
+    def blocked(
+        self, trajectory: JointTrajectory, others: Mapping[str, float], margins: Margins, from_ns: int = 0
+    ) -> str:
+        """What a trajectory touches in the present world, in words; empty if nothing. As `Planner.blocked`."""
+        world = self.snapshot(margins)
+        if any(known is trajectory and in_world == world for known, in_world in tuple(self._free)):
+            return ""
+        made = motion_of(trajectory)
+        if made is None:
+            return "a trajectory without velocities and accelerations cannot be checked"
+        checks = collisions(self._arm(), world, trajectory.joint_names, others, margins)
+        positions = made.sampled(CHECK_S)[0][round(seconds(from_ns) / CHECK_S) :: _STRIDE]
+        # Contacts at the start may open.
+        leaving = outwards(checks, positions) or 0 if len(positions) else 0
+        hit = leaving + checks.first_hit_on_path(positions[leaving:])
+        if hit < len(positions):
+            return sentence(checks.contacts(positions[hit]))
+        self.note(trajectory, world)
+        return ""
+
+
+def collisions(
+    arm: Arm, world: World, joints: Sequence[str], others: Mapping[str, float], margins: Margins
+) -> Collisions:
+    """Checks of some joints in a world."""
+    return Collisions(arm, world, joints, others, padding=margins.padding, self_padding=margins.self_padding)
+
+
+def outwards(checks: Collisions, configurations: Vector) -> int | None:
+    """Number of configurations before the first free one, while distances grow; None if one shrinks."""
+    before = {(each.first, each.second): each.distance for each in checks.contacts(configurations[0])}
+    for number, q in enumerate(configurations):
+        if checks.free(q):
+            return number
+        now = {(each.first, each.second): each.distance for each in checks.contacts(q)}
+        if any(pair not in before or distance < before[pair] - _WORSE_M for pair, distance in now.items()):
+            return None
+        before = {pair: max(distance, before[pair]) for pair, distance in now.items()}
+    return None
+
+
+def sentence(contacts: Sequence[Contact], most: int = 3) -> str:
+    """The deepest contacts in words."""
+    if not contacts:
+        return "something touches"
+    further = f", and {len(contacts) - most} more" if len(contacts) > most else ""
+    return "; ".join(str(contact) for contact in contacts[:most]) + further
