@@ -73,7 +73,8 @@ SENDERS = {
     "ibrobot_planning/execution/motions.py": "/planning/go_to",
     "ibrobot_planning/execution/source.py": "source planner",
     "ibrobot_ros2/goals.py": "FollowJointTrajectory",
-    # The session and control, through which all others go.
+    # The session, the door of goals, and control, through which all others go.
+    "ibrobot_planning/execution/door.py": "",
     "ibrobot_core/control/host.py": "",
     "ibrobot_core/launch/session.py": "",
 }
@@ -188,7 +189,7 @@ def test_topics_that_are_read_have_rows_or_move_nothing() -> None:
 
 
 def test_what_sends_plans_and_goals_to_control_has_a_row() -> None:
-    found = {file for file, _ in calls("send_plan", "write_plan")}
+    found = {file for file, _ in calls("send_plan", "write_plan", "send_goal")}
     found |= {file for file, call in calls("call", "command") if call.args and ast.unparse(call.args[0]) == "'goal'"}
     for file, node in NODES:
         if isinstance(node, ast.ClassDef):
