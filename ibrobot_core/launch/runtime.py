@@ -117,9 +117,8 @@ class Runtime:
                 if not session.request.by_operator:  # one open-ended episode, from the robot's present state
                     session.episodes.begin()
             self._begun_ns = session.clock.now_ns()
-            takers = [name for name, each in config.executors.items() if each.goals == "trajectory"]
-            if takers and session.goal_door is None:
-                session.log.warning("goals of %s are limited, not checked: no plugin checks them", ", ".join(takers))
+            if session.goal_door is None and any(each.goals == "trajectory" for each in config.executors.values()):
+                session.log.warning("goals of trajectories are limited, not checked: no plugin checks them")
         except BaseException as error:
             ended = session.finished.is_set()
             session.start_failed = True

@@ -21,8 +21,7 @@ from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.schema import ControlMode
 from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, MissingDependency
-from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent, Teleop
-from ibrobot_core.interfaces.executor import trajectory_goal
+from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent, Teleop, trajectory_goal
 from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, by_cause
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.launch.pulses import Pulse
@@ -290,8 +289,7 @@ class Session:
 
     def context(self, name: str, **more: Any) -> Context:
         """The context for a plugin's `make` in the host, with the further fields `more`."""
-        request = self.request
-        return self.config.context(name, self.clock, request.seed, bus=self.bus, keys=request.keys, **more)
+        return self.config.context(name, self.clock, self.request.seed, bus=self.bus, keys=self.request.keys, **more)
 
     def make(self, kind: str, component: ComponentConfig, name: str, **more: Any) -> Any:
         """Make a component of the YAML by its plugin; `name` and `more` go into the context."""
@@ -351,9 +349,8 @@ class Session:
             raise HardwareError(f"refused before a reset: {(*self.faults, f'holding: {self.to_go_on()}')[0]}")
 
         def send(checked: Mapping[str, Any]) -> None:
-            if "trajectory" in checked:
-                checked = {**checked, **trajectory_goal(checked["trajectory"])}
-            self.control.call("goal", executor=executor, goal_id=goal_id, goal=checked, stops=stops)
+            plain = trajectory_goal(checked["trajectory"]) if "trajectory" in checked else {}
+            self.control.call("goal", executor=executor, goal_id=goal_id, goal={**checked, **plain}, stops=stops)
 
         send(goal) if self.goal_door is None else self.goal_door(executor, goal_id, goal, send)
 
