@@ -111,6 +111,7 @@ def test_dry_run_prints_the_plan_and_starts_nothing(launch: Callable[..., Ran], 
         "mode:moveit_planning",
         "status",
         "description",
+        "goals",
         "tool_pose",
     ]
     assert "planner rrt_connect" in components[3]["summary"]
