@@ -32,9 +32,11 @@ class Component(ABC):
         summary: one line for `--dry-run`.
         sends_stops: whether an operator can send an emergency stop by it; at the end of the run it stops only after
             the robot.
+        may_wait: whether its `stop` may take long, e.g. for a slow disk; it, too, stops only after the robot.
     """
 
     sends_stops = False
+    may_wait = False
 
     def __init__(self, name: str, summary: str, needs: tuple[str, ...] = ()) -> None:
         self.name = name

@@ -65,7 +65,13 @@ class Recorder(ABC):
 
     @abstractmethod
     def end(self, episode: EpisodeEnd) -> Path | None:
-        """Close the episode; returns its path, or None if it was discarded and removed."""
+        """Close the episode; returns its path, or None if it was discarded and removed.
+
+        If the recorder has lost the newest message of a topic, the end is missing, and the outcome becomes `unknown`.
+
+        Raises:
+            RecorderError: if the episode could not be written to its end.
+        """
 
     def size_of(self, message: Message) -> int:
         """Approximate size of a message on the disk [bytes]. Called from any thread, also between episodes."""
@@ -74,6 +80,10 @@ class Recorder(ABC):
     def waiting(self) -> int:
         """Amount of data that is not yet written to the disk [bytes]. Called from any thread."""
         return 0
+
+    def lost(self) -> Mapping[str, int]:
+        """Topic -> messages of the present episode that the recorder did not write, so far. Called from any thread."""
+        return {}
 
     def close(self) -> None:
         """Release all resources; an open episode ends as `unknown`. Safe to call twice."""

@@ -263,7 +263,7 @@ class Runtime:
         session.log.info("mode %s goes on", session.mode)
 
     def stop(self) -> None:
-        """Stop every component in reverse starting order, and the robot before those that can send emergency stops.
+        """Stop every component in reverse starting order, and the robot before those that send stops or may wait.
 
         Errors are logged, so that all are stopped.
         """
@@ -280,7 +280,7 @@ class Runtime:
         try:
             started, self._started = self._started, []
             control = next((i for i, each in enumerate(started) if isinstance(each, ControlComponent)), -1)
-            first = [each for each in started[control + 1 :] if not each.sends_stops]
+            first = [each for each in started[control + 1 :] if not (each.sends_stops or each.may_wait)]
             self._stop_all(first)
             self._halt()
             self._stop_all([each for each in started if each not in first])

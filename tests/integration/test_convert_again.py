@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import random
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -337,6 +338,40 @@ def test_cuts_have_row_numbers_of_the_episode(tmp_path: Path) -> None:
     stamps = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet").to_pydict()
     assert len(stamps["index"]) == kept["stretch"][1]
     assert len(found["reports"][0]["cuts"]) == 2, "of the recording: row numbers of the recording"
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_cuts_add_up_to_the_skipped_ticks(tmp_path: Path, seed: int) -> None:
+    """Gaps at the beginning, in the middle and at the end, of one or two cameras."""
+    draw = random.Random(seed)
+    places = [(0.0, 1.3), (0.5, draw.uniform(0.8, 1.2)), (draw.uniform(1.3, 1.6), 2.1)]
+    gap = {topic: draw.choice(places) for topic in draw.sample(["/top", "/wrist"], draw.randint(1, 2))}
+    record(tmp_path / "bag", seed, 2.0, gap=gap)
+    found = report(tmp_path / "bag", "--out", tmp_path / "set", "--no-videos")
+    assert found["code"] == 0, found["err"]
+    (kept,) = own(tmp_path / "set")["episodes"]
+    assert sum(ticks for _, ticks in kept["cuts"]) == kept["skipped"] > 0, gap
+    rows = [row for row, _ in kept["cuts"]]
+    assert (rows == sorted(set(rows)), rows[0] >= 0, rows[-1] <= kept["frames"]) == (True, True, True), rows
+    begins, ends = (any(place == at for place in gap.values()) for at in (places[0], places[2]))
+    assert (0 in rows, kept["frames"] in rows) == (begins, ends), (gap, rows)
+
+
+def test_a_success_whose_end_is_left_out_is_in_no_row(tmp_path: Path) -> None:
+    record(tmp_path / "bag", 1, 3.0, gap={"/wrist": (1.2, 3.0)})
+    found = report(tmp_path / "bag", "--out", tmp_path / "set", "--no-videos", "--success")
+    assert found["code"] == 1
+    (each,) = found["reports"]
+    assert each["error"].startswith("next.success cannot be determined: the last ")
+    assert each["error"].endswith("since something is missing; --missing hold repeats the last value")
+    held = report(tmp_path / "bag", "--out", tmp_path / "held", "--no-videos", "--success", "--missing", "hold")
+    assert held["code"] == 0, held["err"]
+    table = pq.read_table(tmp_path / "held/data/chunk-000/file-000.parquet").to_pydict()
+    assert table["next.success"] == [False] * (len(table["index"]) - 1) + [True]
+    brief = tmp_path / "brief"
+    record(brief, 1, 3.0, gap={"/wrist": (2.7, 3.0)})
+    short = report(brief, "--out", tmp_path / "short", "--no-videos", "--success")
+    assert short["code"] == 0, "less than max_age is missing"
 
 
 @pytest.mark.parametrize("name", [b"caf\xe9", b"e" * 245])

@@ -51,7 +51,7 @@ DATASET = "dataset"
 MAKING = ".making."
 """Part of the names of folders of incomplete units."""
 _RECORD = "episode.json"
-_VERSION = 5
+_VERSION = 6
 """Version of the unit format; units of an older one are converted again."""
 
 
@@ -285,7 +285,7 @@ def _write(
         if waiting is None:
             return None
         succeeds = report.outcome == "success" and number == ticks.rows - 1
-        _add(writer, waiting, request, features, last=True, succeeds=succeeds)
+        _add(writer, waiting, request, features, last=True, succeeds=succeeds and _has_end(ticks, request))
         writer.save_episode()
     finally:
         writer.finalize()
@@ -300,6 +300,20 @@ def _write(
     record = {name: value for name, value in attrs.asdict(unit).items() if name != "path"}
     (folder / _RECORD).write_text(json.dumps(record, indent=2), encoding="utf-8")
     return unit
+
+
+def _has_end(ticks: Ticks, request: ConversionRequest) -> bool:
+    """Whether the last row is the end of the episode.
+
+    Raises:
+        DatasetError: if not, and the request asks in which row it succeeded.
+    """
+    if ticks.lacks_end and request.success:
+        raise DatasetError(
+            f"{SUCCESS} cannot be determined: the last {ticks.cuts[-1][1]} ticks are left out, since something is "
+            "missing; --missing hold repeats the last value"
+        )
+    return not ticks.lacks_end
 
 
 def _labelled(

@@ -20,6 +20,7 @@ from ibrobot_data.prompt import check_prompt
 
 if TYPE_CHECKING:
     from ibrobot_data.recording_worker import RecordingWorker
+    from ibrobot_data.written import WrittenEpisode
 
 
 @documented
@@ -201,6 +202,11 @@ class EpisodeService(Episodes):
         """Whether an episode that has ended is not completely written yet."""
         return self._recording.writing
 
+    @property
+    def written(self) -> Sequence[WrittenEpisode]:
+        """The episodes that have ended, as they are on the disk, without discarded and replaced ones."""
+        return self._recording.written
+
     def play(self, cue: Cue) -> None:
         """Let the operator hear a cue, unless the mode begins and ends the episodes."""
         if not self.by_mode:
@@ -262,9 +268,12 @@ class EpisodeService(Episodes):
         if self.failure is not None:
             return RecordedEpisode(False, str(self.failure))
         kept = self._recording.kept
+        if self.writing:
+            return RecordedEpisode(False, f"episode {number} is not written to its end yet: the disk is slow")
         if kept == before:
             return RecordedEpisode(False, f"episode {number} was discarded")
-        return RecordedEpisode(True, f"episode {number} is {kept}")
+        remark = next((f"; {each.line()}" for each in self.written if each.path == kept and each.lost), "")
+        return RecordedEpisode(True, f"episode {number} is {kept}{remark}")
 
     def progress(self) -> RecordProgress:
         """How the present episode goes on."""

@@ -13,6 +13,7 @@ from ibrobot_data.episode_service import RECORD, START, EpisodeService
 from ibrobot_data.options import has_button
 from ibrobot_data.plural import plural
 from ibrobot_data.recording_session import Session as SessionEvent
+from ibrobot_data.written import lost_text, rows
 
 _MIB = 1 << 20
 _START, _FAILURE, _DISCARD, _REDO = "tab", "f11", "f12", "backspace"
@@ -163,13 +164,14 @@ class Operator(RunHooks):
     def rows(self) -> list[tuple[str, str]]:
         """Heading and text, for the panel."""
         status = self._service.status()
-        lost = sum(status.lost.values())
+        before = sum(sum(each.lost.values()) for each in self._service.written)
+        earlier = f"; {before} in earlier episodes of this run" if before else ""
         rates = "  ".join(f"{topic} {rate:g} Hz" for topic, rate in status.rates_hz.items())
         return [  # a small terminal leaves out the end
             ("record", self._state()),
             *([("", self._complaint)] if self._complaint else []),
             ("saved", f"{self._saved()} into {self._service.folder}"),
-            ("lost", f"{lost} messages"),
+            ("lost", f"{lost_text(status.lost) if status.lost else 'nothing'}{earlier}"),
             (
                 "disk",
                 f"{status.free_bytes // _MIB} MiB left at {status.bytes_per_s / _MIB:.1f} MiB/s, "
@@ -181,7 +183,8 @@ class Operator(RunHooks):
     @override
     def line(self) -> str:
         """One line, where there is no panel."""
-        return f"{self._state()}, saved {self._saved()}"
+        lost = sum(self._service.status().lost.values())
+        return f"{self._state()}, saved {self._saved()}{f', lost {lost} messages' if lost else ''}"
 
     @override
     def help(self) -> str:
@@ -202,7 +205,7 @@ class Operator(RunHooks):
         """For the summary of the run."""
         self._tell(ended=True)
         episodes = plural(self._service.saved if self._count is None else self._count, "episode")
-        return [("recorded", f"{self._saved()} {episodes} into {self._service.folder}")]
+        return [("recorded", f"{self._saved()} {episodes} into {self._service.folder}"), *rows(self._service.written)]
 
     def _state(self) -> str:
         service = self._service
@@ -216,6 +219,8 @@ class Operator(RunHooks):
         if service.waiting:
             return "ready: recording begins when the robot follows you"
         pause_s = self._not_before_s - self._clock_s()
+        if self._service.writing and self._service.status().waiting_bytes >= _MIB:
+            return f"writing the last episode, {self._service.status().waiting_bytes / _MIB:.0f} MiB are left"
         if pause_s > 0:
             return f"reset the scene, {pause_s:.0f} s"
         return "waiting: Tab starts" if self._keys and not (self._auto or self._service.by_mode) else "waiting"

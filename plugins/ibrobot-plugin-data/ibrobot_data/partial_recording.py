@@ -57,6 +57,8 @@ class PartialRecording(RecordingWorker):
 
     @override
     def end(self, outcome: str, faults: tuple[str, ...] = ()) -> None:
+        with self._pending_lock:
+            self._ending += 1
         self._later(partial(self._end_run_episode, outcome, faults))
 
     @override
@@ -101,6 +103,8 @@ class PartialRecording(RecordingWorker):
         self._present = None
         if self._open:
             self._end_part(self.session.bus.snapshot_ns(), outcome, faults)
+        with self._pending_lock:
+            self._ending -= 1
 
     def _begin_part(self, now_ns: int) -> None:
         assert self._present is not None

@@ -43,8 +43,9 @@ def provenance(
         kept["calibration"] = _file(calibrations, unit.calibration)
         kept["config"] = _file(configs, unit.document)
         cuts = kept.pop("cuts")
+        last = unit.report.frames if request.only == "all" else None
         episodes += [
-            kept | {"stretch": [first, count], "cuts": _cuts_within(cuts, first, count)}
+            kept | {"stretch": [first, count], "cuts": _cuts_within(cuts, first, count, last)}
             for first, count in kept.pop("stretches")
         ]
     contract = before.get("contract", units[0].contract)
@@ -64,9 +65,13 @@ def provenance(
     }  # fmt: skip
 
 
-def _cuts_within(cuts: Sequence[Sequence[int]], first: int, count: int) -> list[list[int]]:
-    """The cuts within a stretch of a recording's rows, with the row numbers of the stretch."""
-    return [[row - first, ticks] for row, ticks in cuts if first < row < first + count]
+def _cuts_within(cuts: Sequence[Sequence[int]], first: int, count: int, last: int | None) -> list[list[int]]:
+    """The cuts within a stretch of a recording's rows, with the row numbers of the stretch.
+
+    Those before the first row of the recording, and after its last one, number `last`, belong to the stretch there.
+    """
+    inside = range(first + 1, first + count)
+    return [[row - first, ticks] for row, ticks in cuts if row in inside or row == 0 == first or row == last]
 
 
 def _file(kept: dict[str, Any], document: Mapping[str, Any]) -> str:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+import queue
 import shutil
 import threading
-from collections import deque
+import time
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -23,9 +26,19 @@ from ibrobot_core.api import (
     RecorderError,
     seconds,
 )
-from ibrobot_core.app import Component, Ownership, Received, RecordingConfig, RunAccess, SessionWorker, error_line
+from ibrobot_core.app import (
+    Component,
+    ComponentFailed,
+    Ownership,
+    Received,
+    RecordingConfig,
+    RunAccess,
+    SessionWorker,
+    error_line,
+)
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.episode_start import episode_start, is_kept, model_topics, take_next_folder
+from ibrobot_data.written import WrittenEpisode, lost_text, read_back
 
 _DEPTH = 4096
 """Length of the queue to the recorder, in messages."""
@@ -33,6 +46,15 @@ _RATE_WINDOW = 31
 """Number of messages over which a rate is measured."""
 _SILENT_NS = NS_PER_S
 """A topic without a message for this time is silent [ns]."""
+_PATIENCE_S = 60.0
+"""How long the end of a run waits for a disk that takes nothing [s]."""
+_TELL_S = 5.0
+"""Interval of the lines about a disk for which the end of a run waits [s]."""
+_GLANCE_S = 0.05
+"""Interval at which the end of a run looks whether everything is written [s]."""
+GIVE_UP = "f12"
+"""The key that ends the wait for a slow disk."""
+_MIB = 1 << 20
 
 
 class NoRecording(Component):
@@ -53,10 +75,13 @@ class RecordingWorker(SessionWorker):
     If the recorder fails, e.g. on a full disk, the recording of the episode ends with a fault. The robot continues, and
     the next episode is recorded again. A run of `ibrobot record` whose mode begins the episodes ends instead: nobody is
     there to make room.
+
+    At the end of the run, it waits for a slow disk as long as that takes data, until an operator gives up.
     """
 
     session: RunAccess
     urgent = True
+    may_wait = True
     keeps_whole = True
     """Whether an episode of the run is one recording, so that it can be recorded again."""
 
@@ -83,6 +108,12 @@ class RecordingWorker(SessionWorker):
         """Topic -> size of a message [bytes], measured once per episode, since images may have to be encoded."""
         self._lost: Mapping[str, int] = {}
         """Topic -> messages lost in the queue before the present episode."""
+        self._lost_before: dict[str, int] = {}
+        """Topic -> messages lost in the queue before the newest one that was written in the present episode."""
+        self._lost_by_now = Counter[str]()
+        """Topic -> messages lost in the queue when it was last emptied."""
+        self._told_of_loss = False
+        """Whether the log has a line about the losses of the present episode."""
         self._reported_absent = False
         self._whole = 0
         """Complete episodes that were kept."""
@@ -94,12 +125,20 @@ class RecordingWorker(SessionWorker):
         """Whether the present episode replaces the one kept last."""
         self.kept: Path | None = None
         """The folder of the episode kept last."""
+        self.written: list[WrittenEpisode] = []
+        """The episodes that have ended, as they are on the disk, without discarded and replaced ones."""
+        self._handled = 0
+        """Number of messages and actions handled so far."""
+        self._closed = False
+        """Whether the thread has ended, or the disk was given up."""
         self.failure: RecorderError | None = None
         """The error that cut short the recording of the present or last episode; None without an error."""
 
     @override
     def setup(self) -> None:
         session = self.session
+        self._closed = False
+        self.on_end.callback(self._close)
         self.recorder: Recorder = session.make("recorder", self._config, "recording")
         self._incoming = session.bus.subscribe(None, _DEPTH)
         self.on_end.callback(self._incoming.close)
@@ -108,6 +147,55 @@ class RecordingWorker(SessionWorker):
         self.on_end.callback(self._give_up)
         self.on_end.callback(self._did, self.recorder.close)
         self.on_end.callback(self.work, 0.0)
+
+    @override
+    def stop(self) -> None:
+        given_up = not (self.session.request.lockstep or self._wait_until_written())
+        try:
+            super().stop()
+        except ComponentFailed:
+            if not given_up:
+                raise
+        if given_up and self.writing:
+            self._abandon()
+
+    def _wait_until_written(self) -> bool:
+        """Wait until all episodes are written; False if the disk takes nothing any more, or an operator gives up."""
+        keys: queue.SimpleQueue[str] | None = None
+        begin = moved = told = time.monotonic()
+        progress = self._progress()
+        while self.writing and not self._closed:
+            if keys is None and self.session.request.keys is not None:
+                keys = self.session.request.keys()
+            self.pause(_GLANCE_S)
+            now, before, progress = time.monotonic(), progress, self._progress()
+            moved = now if progress != before else moved
+            if now - moved >= _PATIENCE_S or _was_pressed(keys):
+                return False
+            if now - told >= _TELL_S:
+                told = now
+                how = "Ctrl-C, pressed twice, gives up" if keys is None else f"{GIVE_UP.upper()} gives up"
+                self.session.log.warning(
+                    "still writing the recording, for %.0f s; %.1f MiB are left, nothing was written for %.0f s; %s",
+                    now - begin, self.recorder.waiting() / _MIB, now - moved, how,
+                )  # fmt: skip
+        return True
+
+    def _progress(self) -> object:
+        return self.recorder.waiting(), self._handled, self._ending
+
+    def _abandon(self) -> None:
+        """Leave an episode that the disk does not take."""
+        owned, left = self._owned, self.recorder.waiting()
+        self._closed = True
+        if owned is not None:
+            self.written.append(WrittenEpisode(owned.path, "unknown", "unknown", whole=False))
+            self._fail(RecorderError(f"{owned.path}: unfinished: the disk did not take the last {left / _MIB:.1f} MiB"))
+        else:
+            self._fail(RecorderError("the disk did not take the last episode"))
+
+    def _close(self) -> None:
+        self._closed = True
 
     def begin(self, number: int, prompt: str, *, again: bool = False) -> None:
         """Begin an episode; it gets all messages from now on.
@@ -170,21 +258,30 @@ class RecordingWorker(SessionWorker):
     def saved(self) -> int:
         """Number of episodes kept, including those still being written; incomplete ones are subtracted later."""
         with self._pending_lock:
-            return self._whole + self._provisional
+            return self._whole + (0 if self._closed else self._provisional)
 
     @override
     def work(self, timeout_s: float) -> None:
+        lost = self._incoming.lost.copy()
         first = self._incoming.get(timeout_s)
         with self._pending_lock:
             pending, self._pending = self._pending, deque()
+            # The queue drops its oldest message: what was lost until now came before those that are left.
+            lost_until = self._incoming.lost.copy()
             items = [*([first] if first is not None else []), *self._incoming.drain()]
+            self._lost_by_now = self._incoming.lost.copy()
+        self._tell_losses()
         for item in items:
             self._note(item)
             while pending and pending[0][0] < item.received_ns:
                 pending.popleft()[1]()
+            self._lost_before[item.topic] = (lost if item is first else lost_until)[item.topic]
             self._write(item, item.received_ns)
+            self._handled += 1
         for _, action in pending:
             action()
+            self._handled += 1
+        self._tell_losses()
 
     def rates(self) -> dict[str, float]:
         """Measured rate of each recorded topic [Hz]; 0 after a single message."""
@@ -215,10 +312,27 @@ class RecordingWorker(SessionWorker):
         return found
 
     def lost(self) -> dict[str, int]:
-        """Topic -> messages lost in the queue during the present episode."""
-        return {
-            topic: n for topic, total in self._incoming.lost.copy().items() if (n := total - self._lost.get(topic, 0))
-        }
+        """Topic -> messages of the present episode that were not recorded, so far."""
+        return dict(Counter(self._lost_in_queue(self._incoming.lost.copy())) + Counter(self.recorder.lost()))
+
+    def _lost_in_queue(self, total: Mapping[str, int]) -> dict[str, int]:
+        """Topic -> kept messages lost in the queue during the present episode, of those lost in the whole run."""
+        return {t: n for t, count in total.items() if self._keeps(t) and (n := count - self._lost.get(t, 0))}
+
+    def _lacks_end(self) -> bool:
+        """Whether the newest message of a topic was lost in the queue."""
+        return any(
+            self._lost_by_now[topic] > self._lost_before.get(topic, self._lost.get(topic, 0))
+            for topic in self._lost_in_queue(self._lost_by_now)
+        )
+
+    def _tell_losses(self) -> None:
+        """Report once per episode, and at once, that messages are lost."""
+        if self._open and not self._told_of_loss and (lost := self.lost()):
+            self._told_of_loss = True
+            self.session.log.warning(
+                "the recording loses messages: %s so far; the disk or this computer is too slow", lost_text(lost)
+            )
 
     def _note(self, item: Received) -> None:
         if self._keeps(item.topic):
@@ -230,7 +344,7 @@ class RecordingWorker(SessionWorker):
     ) -> None:
         """Open an episode; `latched` and `lost` are the latched messages and the lost ones counted when it began."""
         self.failure = None
-        self._lost = lost
+        self._lost, self._lost_before, self._told_of_loss = lost, {}, False
         self._give_up()
         self._owned = owned
         self._open = self._did(partial(self.recorder.begin, start))
@@ -245,8 +359,9 @@ class RecordingWorker(SessionWorker):
         `provisional`: whether it was complete at the request to end it, and is to be kept.
         """
         folder = self._owned.path if self._owned is not None else None
-        kept = self._finish(end) and provisional
-        replaced = kept and again and self._remove_kept()
+        found = self._finish(end)
+        kept = found is not None and found.whole and provisional
+        replaced = found is not None and kept and again and not found.unknown and self._remove_kept()
         with self._pending_lock:
             self._provisional -= provisional and not again
             self._whole += kept and not replaced
@@ -267,18 +382,32 @@ class RecordingWorker(SessionWorker):
         except (OSError, IbrobotError) as error:
             self.session.log.warning("the episode that was recorded again stays: %s", error_line(error))
             return False
+        self.written = [each for each in self.written if each.path != self.kept]
         return True
 
-    def _finish(self, end: EpisodeEnd) -> bool:
-        """End the open episode, if any; return whether it is complete."""
+    def _finish(self, end: EpisodeEnd) -> WrittenEpisode | None:
+        """End the open episode, and return what is on the disk; None without an episode, and for a discarded one."""
         if not self._open:
-            return False
+            return None
         self._open = False
-        # Counted now, since messages that were queued when the episode ended may have been lost later.
-        dropped = {topic: n for topic, n in self.lost().items() if self._keeps(topic)}
-        whole = self._did(partial(self.recorder.end, attrs.evolve(end, dropped=dropped)))
+        assert self._owned is not None
+        folder, lost = self._owned.path, self.lost()
+        # Of what the queue held when the episode ended, nothing can be lost after it was taken.
+        dropped = self._lost_in_queue(self._lost_by_now)
+        lacks_end = end.outcome != "discarded" and self._lacks_end()
+        told = attrs.evolve(end, outcome="unknown" if lacks_end else end.outcome, dropped=dropped)
+        ended = self._did(partial(self.recorder.end, told))
+        found = None
+        if end.outcome != "discarded":
+            if ended:
+                found = read_back(self.session, folder, end.outcome, told.outcome, lost)
+            else:
+                found = WrittenEpisode(folder, end.outcome, "unknown", whole=False, error=str(self.failure))
+            if not self._closed:
+                self.written.append(found)
+                self.session.log.log(logging.INFO if found.whole else logging.ERROR, "%s", found.line())
         self._give_up()
-        return whole
+        return found
 
     def _give_up(self) -> None:
         """Leave the folder of the last episode to others."""
@@ -337,3 +466,11 @@ class RecordingWorker(SessionWorker):
 
     def _keeps(self, topic: str) -> bool:
         return topic in self._of_model or is_kept(topic, self._config, self._contract)
+
+
+def _was_pressed(keys: queue.SimpleQueue[str] | None) -> bool:
+    """Whether an operator gave up since the last call."""
+    pressed = False
+    while keys is not None and not keys.empty():
+        pressed = keys.get() == GIVE_UP or pressed
+    return pressed

@@ -256,6 +256,12 @@ class Ticks:
         return sum(count for _, count in self.cuts)
 
     @property
+    def lacks_end(self) -> bool:
+        """Whether more than `max_age` of ticks is left out after the last row, so that the rows end too early."""
+        row, count = self.cuts[-1] if self.cuts else (0, 0)
+        return row == self.rows and count * self._contract.step_ns > self._max_age_ns
+
+    @property
     def resets(self) -> Mapping[str, int]:
         """Topic -> number of jumps of its stamps, where there are any; without signals, which may pause."""
         return {topic: count for topic, count in self._assembler.resets().items() if topic not in self._signals}

@@ -64,7 +64,9 @@ class JointLogReader(EpisodeReader):
     @override
     def summary(self) -> EpisodeSummary:
         count, facts = len(self._log.times), self._facts
-        topics = {TOPIC: TopicSummary(JointState.ros_type, count)}
+        dropped = facts.get("dropped", {})
+        lost = dropped.get(TOPIC, 0) if isinstance(dropped, dict) else 0  # else not by our recorder
+        topics = {TOPIC: TopicSummary(JointState.ros_type, count, lost)}
         topics |= {topic: TopicSummary(Float64MultiArray.ros_type, count) for topic in self._commands}
         outcome = str(facts.get("outcome", "unknown"))
         finished = outcome != "unfinished"

@@ -62,7 +62,8 @@ class TestJointLogRecorder(RecorderSuite):
 
     @override
     def read_dropped(self, path: Path) -> Mapping[str, int]:
-        return json.loads((path / "metadata.json").read_text())["dropped"]
+        topics = JointLogReader(EpisodeAddress(path)).summary().topics
+        return {topic: each.dropped for topic, each in topics.items()}
 
     @override
     def read_metadata(self, path: Path) -> Mapping[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import closing
 from itertools import pairwise
@@ -54,10 +54,12 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
     for topic, known in summary.topics.items():
         if known.missing and topic not in short:
             problems.append(f"{topic}: {known.missing} messages that the recorder wrote are missing since a repair")
-        if known.dropped:
-            problems.append(f"{topic}: {known.dropped} messages were lost while recording")
         if topic in times:
             problems += times[topic].problems(topic, longest_gap, needed.get(topic), span_ns)
+    lost = Counter({topic: each.dropped for topic, each in summary.topics.items() if each.dropped})
+    if lost:  # first, since it may explain the others
+        of_each = ", ".join(f"{topic} {count}" for topic, count in lost.most_common())
+        problems.insert(0, f"{lost.total()} messages were lost while recording: {of_each}")
     return problems
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import override
 
@@ -75,9 +76,11 @@ class McapRecorder(Recorder):
         discard = episode.outcome == "discarded"
         dropped = Counter(episode.dropped)
         failure: RecorderError | None = None
+        cut = False
         if self._thread is not None:
             failure = self._thread.stop(discard=discard)
             dropped.update(self._thread.dropped)
+            cut = bool(self._thread.cut)
         self._episode = self._storage = self._thread = None
         if discard:
             storage.discard()
@@ -85,7 +88,7 @@ class McapRecorder(Recorder):
         for topic, type_ in start.topics.items():
             if topic not in self._topics:
                 storage.announce(self._topic(topic, type_))
-        storage.finish(episode.outcome, dropped, episode.faults)
+        storage.finish(episode.outcome, dropped, episode.faults, cut=cut)
         if failure is not None:
             self._ctx.log.warning("%s ends early: %s", start.directory, failure)
         return start.directory
@@ -104,6 +107,11 @@ class McapRecorder(Recorder):
     def waiting(self) -> int:
         thread = self._thread  # `end` may remove it meanwhile
         return 0 if thread is None else thread.size
+
+    @override
+    def lost(self) -> Mapping[str, int]:
+        thread = self._thread
+        return {} if thread is None else thread.dropped.copy()
 
     @override
     def close(self) -> None:

@@ -13,7 +13,7 @@ import attrs
 
 from ibrobot_core.api import EpisodeStart, EpisodeSummary, RecorderError
 from ibrobot_mcap.bagfile import Item
-from ibrobot_mcap.metadata import MARKED, MISSING
+from ibrobot_mcap.metadata import MARKED, MISSING, STATED
 from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.owning import REPAIRING, UNFINISHED, beside, owning
 from ibrobot_mcap.reader import Rosbag2Reader
@@ -21,8 +21,6 @@ from ibrobot_mcap.storage import Storage
 
 REPAIRED = "repaired"
 """Key of `custom_data` that states that an episode was repaired."""
-STATED = "stated_outcome"
-"""Key of the outcome before the repair, or before the end was cut off."""
 TRIMMED_FROM = "trimmed_from"
 """Key of the recordings of which an episode is a part, newest last, by UUID or, without one, by digest."""
 

@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from ibrobot_core.api import NS_PER_S, EpisodeStart, RecorderError, ns
 from ibrobot_mcap.bagfile import BagFile, Item
-from ibrobot_mcap.metadata import DROPPED, FAULTS, OUTCOME, Counted, Topic, information, write_metadata
+from ibrobot_mcap.metadata import DROPPED, FAULTS, OUTCOME, STATED, Counted, Topic, information, write_metadata
 from ibrobot_mcap.options import MIB, McapOptions
 
 _LOOK_SIZE = 16 * MIB
@@ -114,8 +114,16 @@ class Storage:
         except OSError as error:
             self._fail(error)
 
-    def finish(self, outcome: str, dropped: Mapping[str, int], faults: Sequence[str] = ()) -> None:
+    def finish(
+        self, outcome: str, dropped: Mapping[str, int], faults: Sequence[str] = (), *, cut: bool = False
+    ) -> None:
         """Finish the episode: write the files' indices, then `metadata.yaml`, which marks it as complete.
+
+        Args:
+            outcome: how the episode ended.
+            dropped: topic -> number of lost messages.
+            faults: the faults and emergency stops during the episode.
+            cut: whether its end was lost, so that its outcome is unknown.
 
         Raises:
             RecorderError: if the write fails; the episode then remains unfinished but readable. Also if its folder or
@@ -125,7 +133,8 @@ class Storage:
             self._file.abandon()
             raise self._broken
         lost = json.dumps(dict(sorted(dropped.items())))
-        custom = {**self._episode.metadata, OUTCOME: outcome, DROPPED: lost}
+        custom = {**self._episode.metadata, OUTCOME: "unknown" if cut else outcome, DROPPED: lost}
+        custom |= {STATED: outcome} if cut and outcome != "unknown" else {}
         custom |= {FAULTS: json.dumps(list(faults))} if faults else {}
         try:
             self._check_place()

@@ -24,6 +24,8 @@ class WriterThread:
     def __init__(self, storage: Storage, limit: int) -> None:
         self.dropped: dict[str, int] = {}
         """Topic -> number of dropped messages."""
+        self.cut: set[str] = set()
+        """Topics whose newest message was dropped."""
         self._storage = storage
         self._limit = limit
         self._items: deque[Item] = deque()
@@ -52,6 +54,7 @@ class WriterThread:
             if self._size + size > self._limit:
                 self._drop(item)
                 return
+            self.cut.discard(item.topic.name)
             self._items.append(item)
             self._size += size
             self._changed.notify()
@@ -64,21 +67,24 @@ class WriterThread:
                 self._items.clear()
             self._changed.notify()
         self._thread.join()
+        self._drop_all()  # what came after the thread had died
         return self._failure
 
     def _run(self) -> None:
+        taken: Item | None = None
         try:
-            while (item := self._next()) is not None:
-                self._storage.write(item)
+            while (taken := self._next()) is not None:
+                self._storage.write(taken)
                 with self._changed:
-                    self._size -= len(item.data) + _OVERHEAD
+                    self._size -= len(taken.data) + _OVERHEAD
+                taken = None
                 self._storage.flush_due()
         except RecorderError as error:
-            with self._changed:
-                self._failure = error
-                for left in self._items:
-                    self._drop(left)
-                self._items.clear()
+            self._failure = error
+        finally:
+            if taken is not None:
+                self._items.appendleft(taken)
+            self._drop_all()
 
     def _next(self) -> Item | None:
         """The next item; None at the end."""
@@ -92,5 +98,14 @@ class WriterThread:
                     return None
             self._storage.flush_due()
 
+    def _drop_all(self) -> None:
+        """Drop the items that nobody will write."""
+        with self._changed:
+            for left in self._items:
+                self._drop(left)
+            self._items.clear()
+            self._size = 0
+
     def _drop(self, item: Item) -> None:
         self.dropped[item.topic.name] = self.dropped.get(item.topic.name, 0) + 1
+        self.cut.add(item.topic.name)

@@ -11,7 +11,7 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ibrobot_mcap import rewrite
+from ibrobot_mcap import metadata, rewrite
 from ibrobot_mcap.commands import episodes
 from ibrobot_mcap.commands.plot import PlotData, actions_of
 from ibrobot_mcap.reader import Rosbag2Reader
@@ -153,7 +153,7 @@ def test_repair_makes_an_episode_whole_with_all_that_was_there(tmp_path, cut):
     after, again = contents(path)
     assert after.finished
     assert again == messages
-    stated = {rewrite.STATED: "success"} if before.stated_outcome == "success" else {}
+    stated = {metadata.STATED: "success"} if before.stated_outcome == "success" else {}
     assert after.metadata == {**before.metadata, rewrite.REPAIRED: "true", **stated}
     assert after.outcome == "unknown"
     assert [p.name for p in path.parent.iterdir()] == [path.name], "nothing else is left"
@@ -218,7 +218,7 @@ def test_verify_says_what_is_wrong(tmp_path):
     bench.recorder.write(JOINTS, joints(3), stamp(80))
     bench.end("success", **{JOINTS: 4})
     output = run("verify", tmp_path, code=1)
-    assert "4 messages were lost while recording" in output
+    assert f"{bench.path}: 4 problems\n  4 messages were lost while recording: {JOINTS} 4\n" in output
     assert "header stamps went back 1 times" in output
     assert "a pause of 310 ms at 0.49 s, its period is 10.0 ms" in output
     assert "its contract is bbbbbbbbbbbb, that of episode_000001 is aaaaaaaaaaaa" in output

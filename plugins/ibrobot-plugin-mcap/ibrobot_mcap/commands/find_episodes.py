@@ -8,9 +8,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from ibrobot_core.api import NS_PER_S, EpisodeSummary, RecorderError
+from ibrobot_mcap.metadata import STATED
 from ibrobot_mcap.owning import interrupted, is_owned
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
-from ibrobot_mcap.rewrite import STATED
 
 
 def episodes_in(path: Path) -> list[Path]:

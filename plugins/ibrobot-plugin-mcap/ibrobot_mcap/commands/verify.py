@@ -20,7 +20,7 @@ from ibrobot_core.app import EpisodePath, Job, echo, installed_plugins, wrong_in
 def verify(path: Path, gap: float, on: str, jobs: int | None) -> None:
     """Check every message of the episodes in PATH.
 
-    Prints problems, and exits with 1 if there are any.
+    Prints problems, one on each line, and exits with 1 if there are any.
 
     Problems are: unfinished episodes, messages that cannot be decoded, counts that differ from metadata.yaml, lost
     messages, topics of the contract without messages, header stamps that decrease, pauses in a topic longer than --gap
@@ -37,7 +37,9 @@ def verify(path: Path, gap: float, on: str, jobs: int | None) -> None:
         if fingerprint != first:
             problems.append(f"its contract is {fingerprint[:12]}, that of {where.name} is {first[:12]}")
         bad += bool(problems)
-        echo(f"{episode}: {'; '.join(problems) or 'good'}")
+        echo(f"{episode}: {f'{len(problems)} problems' if len(problems) > 1 else ''.join(problems) or 'good'}")
+        for problem in problems if len(problems) > 1 else ():
+            echo(f"  {problem}")
     if bad:
         raise SystemExit(1)
 
