@@ -12,14 +12,14 @@ from pathlib import Path
 import attrs
 import click
 
-from ibrobot_core.app import Failed, declared, echo, emit, installed_plugins, run_options, wrong_input
+from ibrobot_core.app import ComponentFailed, Failed, declared, echo, emit, installed_plugins, run_options, wrong_input
 from ibrobot_eval import EVAL
 from ibrobot_eval.blinded import Blinded, reset_of
 from ibrobot_eval.episodes import Result
 from ibrobot_eval.evaluation import Evaluation, Watch, opened
 from ibrobot_eval.merge import WithMerge
 from ibrobot_eval.operators import AtPage, AtTerminal, Operator
-from ibrobot_eval.options import Begin, EvalOptions, Progress, Told
+from ibrobot_eval.options import Begin, EvalOptions, Progress, Told, outcome_of
 from ibrobot_eval.options import Report as ReportEvent
 from ibrobot_eval.page import write_all
 from ibrobot_eval.policies import Policy, find_policies
@@ -44,7 +44,8 @@ def evaluate(options: EvalOptions, /, *, overrides: tuple[str, ...], as_json: bo
     each policy.
 
     After an interruption, run the same command again to continue; a larger --episodes adds episodes. The verdict stays
-    valid however often you look and whenever you stop. Exits with 0 whatever the policies achieve.
+    valid however often you look and whenever you stop. Exits with 0 whatever the policies achieve, but with 1 if all
+    episodes of one ended in an error.
     """
     with wrong_input():
         policies = find_policies(options.config, options.mode, options.model, overrides, options.vary, sim=options.sim)
@@ -70,6 +71,8 @@ def evaluate(options: EvalOptions, /, *, overrides: tuple[str, ...], as_json: bo
             echo("not finished: run the same command again to continue")
     else:
         _tell(options.out, report, events=events, as_json=as_json)
+        if evaluation.broken:
+            raise ComponentFailed(evaluation.broken)
 
 
 def _checked(options: EvalOptions, policies: Sequence[Policy]) -> bool:
@@ -120,10 +123,17 @@ def _evaluated(evaluation: Evaluation, *, events: bool, quiet: bool) -> Report:
             echo(f"filming {failures} failures", err=True)
 
     options = evaluation.options
-    evaluation.film(results, options.videos, filming)
-    report = Report.of_simulation(evaluation.policies, results, options.margin, until_decided=options.until_decided)
-    write_all(options.out, report)
-    return report
+
+    def written(notes: Sequence[str]) -> Report:
+        report = Report.of_simulation(
+            evaluation.policies, results, options.margin, until_decided=options.until_decided, notes=notes
+        )
+        write_all(options.out, report)
+        return report
+
+    report = written(())  # before the videos, which may fail
+    notes = evaluation.film(results, options.videos, filming)
+    return written(notes) if notes or options.videos else report
 
 
 def _judged(
@@ -148,7 +158,7 @@ def _events(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
     def tell(done: int, total: int, policy: Policy, result: Result) -> None:
         event = Progress(
             done=done, of=total, policy=policy.label, seed=result.seed, success=result.success, time_s=result.time_s,
-            seconds=round(time.monotonic() - begin, 1),
+            error=result.error if result.is_error else "", seconds=round(time.monotonic() - begin, 1),
         )  # fmt: skip
         emit(EVAL, event)
 
@@ -158,13 +168,15 @@ def _events(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
 @contextmanager
 def _lines(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
     """Yield a function that shows the progress: a bar on a terminal, otherwise one line per episode."""
+    for line in evaluation.damaged:
+        echo(line, err=True)
     if evaluation.resumed and not quiet:
         echo(f"continuing: {evaluation.resumed} episodes are done already", err=True)
     if not sys.stderr.isatty():
 
         def line(done: int, total: int, policy: Policy, result: Result) -> None:
             if not quiet:
-                outcome = "success" if result.success else "failure"
+                outcome = outcome_of(result.success, result.error)
                 echo(f"{policy.label}, seed {result.seed}: {outcome} ({done} of {total})", err=True)
 
         yield line

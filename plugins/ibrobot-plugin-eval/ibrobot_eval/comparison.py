@@ -42,6 +42,8 @@ class Summary:
     """Kind of intervention of the safety layer -> number over all episodes."""
     disturbed: int
     """Number of episodes with a fault."""
+    errors: int
+    """Number of episodes that ended in an error; they count as failures."""
 
     @classmethod
     def of(cls, label: str, results: Sequence[Result]) -> Summary:
@@ -54,7 +56,7 @@ class Summary:
         return cls(
             label, count, len(times), wilson(len(times), count), clopper_pearson(len(times), count),
             statistics.median(times) if times else None, dict(sorted(interventions.items())),
-            sum(bool(each.faults) for each in results),
+            sum(bool(each.faults) for each in results), sum(each.is_error for each in results),
         )  # fmt: skip
 
 

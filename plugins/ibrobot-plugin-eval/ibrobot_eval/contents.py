@@ -66,6 +66,9 @@ def contents_of(out: Path, report: Report) -> list[ReportSection]:
     if panels := list(_panels(report)):
         note = Text("Dots are successes, crosses failures. Bars are 95 % intervals.", "note")
         found.append(ReportSection("Where it succeeds and fails", (note, Plots(tuple(panels)))))
+    for title, lines in (("Errors of policies", report.errors), ("Notes", report.notes)):
+        if lines:
+            found.append(ReportSection(title, tuple(Text(line) for line in lines)))
     failures = report.failures
     cases = Cases(tuple(_case(out, each) for each in failures))
     found.append(ReportSection(f"Failures ({len(failures)})", (cases if failures else Text("None."),)))
@@ -131,7 +134,7 @@ def _panels(report: Report) -> Iterator[str]:
 def _case(out: Path, episode: Episode) -> Case:
     """A failure: its reason, recording, video if any, and the command that repeats it."""
     result = episode.result
-    ended = "; ".join(result.faults) or f"no success within {result.time_s:.1f} s"
+    ended = result.error or "; ".join(result.faults) or f"no success within {result.time_s:.1f} s"
     video = out / episode.video
     shown = video if episode.video and video.is_file() else None
     return Case(f"{episode.policy}, seed {result.seed}", ended, out / episode.recording, shown, episode.command)

@@ -5,19 +5,30 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from uuid import uuid4
 
 import attrs
 
-from ibrobot_core.api import RecorderError, replace_file, seconds
+from ibrobot_core.api import (
+    MODEL_ANSWERS,
+    DatasetError,
+    Message,
+    ModelAnswer,
+    RecorderError,
+    replace_file,
+    seconds,
+)
 from ibrobot_core.app import ComponentFailed, LaunchRequest, RobotConfig, Runtime, Session, installed_plugins
+from ibrobot_eval.limits import Attempt, EpisodeTooLong
 from ibrobot_eval.policies import Policy, as_texts, document_hash
 
 SCRATCH = ".unfinished"
 """Folder within the evaluation for episodes until they are complete."""
+_DEPTH = 1_000_000
+"""More answers of a policy than an episode has."""
 
 
 @attrs.frozen
@@ -35,11 +46,25 @@ class Result:
     """Values drawn by the scene from the seed, e.g. the position of an object, and those of varied keys."""
     acting: Mapping[str, str]
     """Model, weights and fingerprint of the policy that acted, as recordings state them."""
+    error: str = ""
+    """What the policy did wrong besides acting badly: it raised, hung, or ended its process; empty if nothing."""
+
+    @property
+    def is_error(self) -> bool:
+        """Whether the episode counts as an error rather than a failure."""
+        return bool(self.error) and not self.success
 
     @classmethod
     def read(cls, file: Path) -> Result:
-        """Read the result in a file."""
-        return cls(**json.loads(file.read_text(encoding="utf-8")))
+        """Read the result in a file.
+
+        Raises:
+            DatasetError: if it is not a result, e.g. because a power failure cut it.
+        """
+        try:
+            return cls(**json.loads(file.read_text(encoding="utf-8")))
+        except (ValueError, TypeError) as error:
+            raise DatasetError(f"{file}: is not the result of an episode: {error}") from None
 
 
 @attrs.frozen
@@ -68,6 +93,15 @@ class EpisodeJob:
     seed: int
     document: str
     """Hash of the robot YAML with which the evaluation began."""
+    answer_s: float
+    """Longest time of a step, e.g. of an answer of the policy [s]."""
+    episode_s: float
+    """Longest time of the episode, in real time [s]."""
+
+    def attempt(self, what: str) -> Attempt:
+        """An attempt to do something with the episode."""
+        file = self.out / SCRATCH / "attempts" / self.policy.folder / f"{what}_{self.seed:06d}"
+        return Attempt(file, self.answer_s, self.episode_s)
 
     @property
     def place(self) -> Place:
@@ -85,21 +119,39 @@ def run_episode(job: EpisodeJob, progress: Callable[[int], None]) -> Result:
     place, policy, seed = job.place, job.policy, job.seed
     if document_hash(policy.load()) != job.document:
         raise ComponentFailed(f"{policy.config}: changed during the evaluation")
+    attempt = job.attempt("episode")
+    if attempt.error:
+        result = Result(seed, False, 0.0, {}, (), policy.varied_names(seed), {}, attempt.error)
+        write(place.result, json.dumps(attrs.asdict(result), indent=1) + "\n")
+        return result
+    with attempt:
+        return _run(job, attempt)
+
+
+def _run(job: EpisodeJob, attempt: Attempt) -> Result:
+    """Run an episode, within the limits of an attempt."""
+    place, policy, seed = job.place, job.policy, job.seed
     scratch = job.out / SCRATCH / uuid4().hex  # another process may run the episode at the same time
     config, recordings = recorded_in(scratch, policy.load(seed))
     runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=seed, episodes=1)))
     session = runtime.session
-    run_to_end(runtime)
+    answers = session.bus.subscribe(MODEL_ANSWERS, _DEPTH)
+    too_long = ""
+    try:
+        run_to_end(runtime, attempt)
+    except EpisodeTooLong as error:
+        too_long = str(error)
     if session.state is None or session.state.success is None:
         raise ComponentFailed(f"{config.source}: the scene has no task, so success is not defined")
     time_s = seconds(session.clock.now_ns() - session.episodes.begun_ns)
     bags = list(recordings.glob("*/"))
-    metadata = _checked(bags, "success" if session.outcome.successes else "failure", session.outcome.faults)
-    varied = {key.rpartition(".")[2]: value for key, value in policy.varied(seed).items()}
-    factors = json.loads(metadata.get("factors", "{}")) | varied
+    outcome = "success" if session.outcome.successes else "failure"
+    metadata = _checked(bags, "unknown" if too_long else outcome, session.outcome.faults)
+    factors = json.loads(metadata.get("factors", "{}")) | policy.varied_names(seed)
     acting = json.loads(metadata.get("policy", "{}"))
     success, faults = session.outcome.successes == 1, session.outcome.faults
-    result = Result(seed, success, round(time_s, 6), interventions(session), faults, factors, acting)
+    error = too_long or _errors([each.message for each in answers.drain()])
+    result = Result(seed, success, round(time_s, 6), interventions(session), faults, factors, acting, error)
     place.episode.parent.mkdir(parents=True, exist_ok=True)
     try:
         bags[0].rename(place.episode)
@@ -110,6 +162,13 @@ def run_episode(job: EpisodeJob, progress: Callable[[int], None]) -> Result:
     write(place.result, json.dumps(attrs.asdict(result), indent=1) + "\n")
     shutil.rmtree(scratch)
     return result
+
+
+def _errors(answers: Sequence[Message]) -> str:
+    """What went wrong with requests to the policy; empty if nothing did."""
+    asked = [each for each in answers if isinstance(each, ModelAnswer)]
+    failed = [each.error for each in asked if each.error]
+    return f"{len(failed)} of {len(asked)} requests to the policy failed: {failed[0]}" if failed else ""
 
 
 def hide_messages() -> None:
@@ -134,16 +193,17 @@ def interventions(session: Session) -> dict[str, int]:
     return {kind: count for kind, count in counts.items() if count and kind not in ("missing", "estop")}
 
 
-def run_to_end(runtime: Runtime) -> None:
+def run_to_end(runtime: Runtime, attempt: Attempt) -> None:
     """Run in lockstep.
 
     Raises:
         IbrobotError: if a component fails.
+        EpisodeTooLong: if it exceeds the limit of the attempt.
     """
     runtime.start()
     try:
         while not runtime.step():
-            pass
+            attempt.beat()
     finally:
         runtime.stop()
     runtime.raise_failure()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -22,6 +23,8 @@ from ibrobot_eval.policies import Identity, Policy, identify
 ASKED = "asked"
 """Key of the settings for the policies as the user named them; a later call may name them differently."""
 _FORMAT = 1
+_ENOUGH_ERRORS = 5
+"""Number of episodes that end in an error, without one that does not, after which the evaluation ends."""
 Watch = Callable[[int, int, Policy, Result], None]
 """Receives the number of finished episodes, the total, and the policy and result of the episode just finished."""
 
@@ -40,13 +43,40 @@ class Evaluation:
         self.policies = policies
         self._identities = identities
         self._results: dict[tuple[str, int], Result] = {}
+        self.damaged: list[str] = []
+        """Damaged results of earlier calls."""
         for policy in policies:
             for seed in options.seeds:
-                file = Place.of(options.out, policy, seed).result
-                if file.exists():
-                    self._results[policy.label, seed] = Result.read(file)
+                if (result := self._read(Place.of(options.out, policy, seed))) is not None:
+                    self._results[policy.label, seed] = result
         self.resumed = len(self._results)
         self._decision = Decision([each.label for each in policies] if options.until_decided else [], options.margin)
+
+    def _read(self, place: Place) -> Result | None:
+        """The result of an earlier call; None if there is none, or a damaged one: the episode is run again."""
+        if not place.result.exists():
+            return None
+        try:
+            return Result.read(place.result)
+        except DatasetError as error:
+            self.damaged.append(f"{error}; the episode is run again")
+            place.result.unlink()
+            shutil.rmtree(place.episode, ignore_errors=True)  # what damaged the result may have damaged it
+            return None
+
+    @property
+    def broken(self) -> str:
+        """Why the evaluation ends: all episodes of a policy so far were errors, and these are enough; else empty."""
+        for policy in self.policies:
+            found = [result for (label, _), result in self._results.items() if label == policy.label]
+            if found and len(found) >= min(_ENOUGH_ERRORS, len(self.options.seeds)) and all(e.is_error for e in found):
+                text = Counter(each.error for each in found).most_common(1)[0][0]
+                folder = Place.of(self.options.out, policy, 0).result.parent
+                return (
+                    f"{policy.label}: all {len(found)} episodes so far ended in an error, so this is no evaluation: "
+                    f"{text}; after a repair that changes no file, remove {folder} to try again"
+                )
+        return ""
 
     def results(self) -> dict[str, list[Result]]:
         """Label -> the results of the first seeds without a gap."""
@@ -74,9 +104,9 @@ class Evaluation:
         ]
         total = len(seeds) * len(self.policies)
         self._decision.look(self.results())
-        if todo and self._decision.after is None:
-            with self._running(run_episode, todo) as done:
-                for job, result in done:
+        if todo and self._decision.after is None and not self.broken:
+            with self._running(run_episode, todo) as finished:
+                for job, result in map(_result, finished):
                     file = job.place.result
                     if not file.exists():
                         raise DatasetError(
@@ -87,12 +117,12 @@ class Evaluation:
                     self._results[job.policy.label, job.seed] = result
                     watch(len(self._results), total, job.policy, result)
                     self._decision.look(self.results())
-                    if self._decision.after is not None:
+                    if self._decision.after is not None or (result.is_error and self.broken):
                         break
         return self._kept()
 
-    def film(self, results: Mapping[str, Sequence[Result]], most: int, begin: Callable[[int], None]) -> None:
-        """Film failures without a video.
+    def film(self, results: Mapping[str, Sequence[Result]], most: int, begin: Callable[[int], None]) -> list[str]:
+        """Film failures without a video. Returns a note for each that could not be filmed.
 
         Args:
             results: label -> results in the order of their seeds.
@@ -101,35 +131,41 @@ class Evaluation:
         """
         todo = []
         for policy in self.policies:
-            failed = [each.seed for each in results[policy.label] if not each.success][:most]
+            failed = [each.seed for each in results[policy.label] if not (each.success or each.error)][:most]
             if failed and can_film(policy):
                 todo += [self._job(policy, seed) for seed in failed]
         todo = [job for job in todo if not job.place.video.exists()]
+        notes: dict[tuple[str, int], str] = {}
         if todo:
             begin(len(todo))
-            with self._running(_film, todo) as done:
-                for _ in done:
-                    pass
+            with self._running(_film, todo) as finished:
+                for done in finished:
+                    job = done.job.argument
+                    if (error := done.error or done.result()) is not None:
+                        notes[job.policy.label, job.seed] = f"{job.policy.label}, seed {job.seed}: {error}"
+        return [notes[job.policy.label, job.seed] for job in todo if (job.policy.label, job.seed) in notes]
 
     def _job(self, policy: Policy, seed: int) -> EpisodeJob:
-        return EpisodeJob(self.options.out, policy, seed, self._identities[policy.label].document)
+        options = self.options
+        document = self._identities[policy.label].document
+        return EpisodeJob(options.out, policy, seed, document, options.answer_limit, options.episode_limit)
 
     @contextmanager
     def _running[R](
         self, function: Callable[[EpisodeJob, Callable[[int], None]], R], orders: Sequence[EpisodeJob]
-    ) -> Iterator[Iterator[tuple[EpisodeJob, R]]]:
-        """Run jobs in the pool. Yields an iterator over each finished job and its result."""
+    ) -> Iterator[Iterator[Done[R]]]:
+        """Run jobs in the pool. Yields an iterator over the finished ones."""
         jobs = (Job(function, order) for order in orders)
         with (
             closing(installed_plugins().pool(self.options.on, self.options.jobs)) as pool,
             closing(pool.run(jobs)) as finished,
         ):
-            yield map(_result, finished)
+            yield finished
 
     def _check_policy(self, policy: Policy, result: Result) -> None:
         """Refuse results of other weights, e.g. while a training overwrites them."""
-        before = next((r for (label, _), r in self._results.items() if label == policy.label), result)
-        if before.acting != result.acting:
+        acted = (r for (label, _), r in self._results.items() if label == policy.label and r.acting)
+        if result.acting and next(acted, result).acting != result.acting:
             raise ComponentFailed(f"{policy.label}: the policy's weights changed during the evaluation")
 
     def _kept(self) -> dict[str, list[Result]]:
@@ -145,10 +181,15 @@ class Evaluation:
         return {label: results[:decided] for label, results in found.items()}
 
 
-def _film(job: EpisodeJob, progress: Callable[[int], None]) -> None:
-    """Film a finished episode. For the processes of a pool."""
+def _film(job: EpisodeJob, progress: Callable[[int], None]) -> str | None:
+    """Film a finished episode. Returns why it cannot be filmed, or None. For the processes of a pool."""
     hide_messages()
-    film(job.place.video, job.policy, Result.read(job.place.result))
+    attempt = job.attempt("film")
+    if attempt.error:
+        return f"not filmed: {attempt.error}"
+    with attempt:
+        film(job.place.video, job.policy, Result.read(job.place.result), attempt)
+    return None
 
 
 def _result[R](done: Done[R]) -> tuple[Any, R]:
@@ -190,6 +231,7 @@ def opened(options: EvalOptions, policies: Sequence[Policy]) -> Iterator[Evaluat
             _begin(options, settings)
         except OSError as error:
             raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
+        shutil.rmtree(out / SCRATCH, ignore_errors=True)  # of a call that was killed
         try:
             yield Evaluation(options, policies, identities)
         finally:

@@ -22,6 +22,7 @@ from ibrobot_core.app import (
     load_config,
 )
 from ibrobot_eval.episodes import Result, run_to_end, write
+from ibrobot_eval.limits import Attempt, EpisodeTooLong
 from ibrobot_eval.policies import Policy
 
 _CAMERA = "evaluation_film"
@@ -50,8 +51,8 @@ def _filmed(policy: Policy, seed: int | None) -> RobotConfig | None:
     return attrs.evolve(config, recording=None, viewer=None)
 
 
-def film(file: Path, policy: Policy, result: Result) -> None:
-    """Run an episode again, and write a video of it.
+def film(file: Path, policy: Policy, result: Result, attempt: Attempt) -> None:
+    """Run an episode again, within the limits of an attempt, and write a video of it.
 
     Raises:
         ComponentFailed: if it ends differently.
@@ -61,14 +62,25 @@ def film(file: Path, policy: Policy, result: Result) -> None:
     runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=result.seed, episodes=1)))
     session = runtime.session
     images = session.bus.subscribe(f"/camera/{_CAMERA}/image_raw", _DEPTH)
-    run_to_end(runtime)
+    try:
+        run_to_end(runtime, attempt)
+    except EpisodeTooLong as error:
+        raise ComponentFailed(f"not filmed: {error}") from None
     time_s = round(seconds(session.clock.now_ns() - session.episodes.begun_ns), 6)
     if (bool(session.outcome.successes), time_s) != (result.success, result.time_s):
-        raise ComponentFailed("the episode ended differently when it was repeated for its video")
+        ended = f"{'a success' if session.outcome.successes else 'a failure'} after {time_s:.2f} s"
+        raise ComponentFailed(
+            f"not filmed: repeated for its video, the episode was {ended}, not {_ended(result)}: the policy is not "
+            "deterministic, so that the command in the report may not repeat it either"
+        )
     frames = images.drain()
     lasted_s = seconds(frames[-1].received_ns - frames[0].received_ns) if len(frames) > 1 else 1.0
     pictures = [each.message.data.tobytes() for each in frames if isinstance(each.message, CompressedImage)]
     write(file, encode(pictures, len(frames) / lasted_s))
+
+
+def _ended(result: Result) -> str:
+    return f"{'a success' if result.success else 'a failure'} after {result.time_s:.2f} s"
 
 
 def encode(pictures: list[bytes], rate_hz: float) -> bytes:

@@ -50,6 +50,22 @@ class EvalOptions:
     on: str = on_option()
     shard: str = shard_option()
     videos: int = option(20, ge=0, label="Videos", more=True, help="failures of each policy to film for the report")
+    answer_limit: float = option(
+        120.0,
+        gt=0,
+        unit="s",
+        label="Longest answer",
+        more=True,
+        help="an episode in which the policy takes longer for an answer, in real time, is an error",
+    )
+    episode_limit: float = option(
+        3600.0,
+        gt=0,
+        unit="s",
+        label="Longest episode",
+        more=True,
+        help="an episode that takes longer, in real time, is an error",
+    )
     trials: bool = option(
         False, label="Blinded trials", help="run blinded trials, as on a real arm, with a simulated one"
     )
@@ -69,6 +85,11 @@ class EvalOptions:
         """Seeds of the episodes: all, or those of the shard."""
         part = shard_of(self.shard, self.episodes)
         return range(self.seed + part.start, self.seed + part.stop)
+
+
+def outcome_of(success: bool, error: str) -> str:
+    """The outcome of an episode in words."""
+    return "success" if success else f"error: {error}" if error else "failure"
 
 
 @attrs.frozen(kw_only=True)
@@ -93,11 +114,12 @@ class Progress(Event):
     seed: int = option(help="seed of the episode")
     success: bool = option(help="whether it succeeded")
     time_s: float = option(unit="s", help="its duration in simulated time")
+    error: str = option(help="what the policy did wrong besides acting badly; empty if nothing")
     seconds: float = option(unit="s", help="time since the evaluation began")
 
     @override
     def shown(self) -> Shown:
-        outcome = "success" if self.success else "failure"
+        outcome = outcome_of(self.success, self.error)
         text = f"{self.done} of {self.of} episodes; {self.policy}, seed {self.seed}: {outcome}"
         return Shown(text, self.done / self.of)
 

@@ -92,6 +92,10 @@ class Policy:
             found[variation.key] = variation.values[place]
         return found
 
+    def varied_names(self, seed: int) -> dict[str, float]:
+        """Last part of each varied key -> its value in the episode of a seed, for the factors of a result."""
+        return {key.rpartition(".")[2]: value for key, value in self.varied(seed).items()}
+
     def overrides_of(self, seed: int | None) -> tuple[str, ...]:
         """Overrides for the episode of a seed; None for those common to all episodes."""
         varied = self.varied(seed) if seed is not None else {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from ibrobot_eval.options import REPORT
 from ibrobot_eval.policies import Policy
 from ibrobot_eval.statistics import ALPHA, Interval
 
+_MOST_LINES = 5
+"""Number of errors listed at a terminal."""
 LEVEL = f"{100 * (1 - ALPHA):g} %"
 
 
@@ -43,11 +46,14 @@ class Report:
     episodes: tuple[Episode, ...]
     margin: float
     until_decided: bool
+    notes: tuple[str, ...] = ()
+    """What went wrong beside the results, e.g. with videos."""
 
     @classmethod
     def of(
-        cls, results: Mapping[str, Sequence[Result]], episodes: Sequence[Episode], margin: float, *, until_decided: bool
-    ) -> Report:
+        cls, results: Mapping[str, Sequence[Result]], episodes: Sequence[Episode], margin: float, *,
+        until_decided: bool, notes: Sequence[str] = (),
+    ) -> Report:  # fmt: skip
         """Make a report.
 
         Args:
@@ -55,22 +61,25 @@ class Report:
             episodes: the episodes to list.
             margin: a difference below it counts as none.
             until_decided: whether the evaluation ended with a decision.
+            notes: what went wrong beside the results.
         """
         summaries = tuple(Summary.of(label, found) for label, found in results.items())
-        return cls(summaries, tuple(compare(results, margin)), tuple(episodes), margin, until_decided)
+        return cls(summaries, tuple(compare(results, margin)), tuple(episodes), margin, until_decided, tuple(notes))
 
     @classmethod
     def of_simulation(
-        cls, policies: Sequence[Policy], results: Mapping[str, Sequence[Result]], margin: float, *, until_decided: bool
-    ) -> Report:
+        cls, policies: Sequence[Policy], results: Mapping[str, Sequence[Result]], margin: float, *,
+        until_decided: bool, notes: Sequence[str] = (),
+    ) -> Report:  # fmt: skip
         """Make a report on episodes in simulation, each with the command that repeats it."""
         episodes = []
         for each in policies:
             for result in results[each.label]:
                 place = Place.of(Path(), each, result.seed)
                 command = each.command(result.seed)
-                episodes.append(Episode(each.label, result, str(place.episode), str(place.video), command))
-        return cls.of(results, episodes, margin, until_decided=until_decided)
+                recording = "" if result.error and not result.acting else str(place.episode)
+                episodes.append(Episode(each.label, result, recording, str(place.video), command))
+        return cls.of(results, episodes, margin, until_decided=until_decided, notes=notes)
 
     @classmethod
     def read(cls, file: Path) -> Report:
@@ -84,10 +93,11 @@ class Report:
         results: dict[str, list[Result]] = {each["label"]: [] for each in facts["policies"]}
         episodes = []
         for each in facts["episodes"]:
-            result = Result(**{field.name: each[field.name] for field in attrs.fields(Result)})
+            result = Result(**{"error": ""} | {f.name: each[f.name] for f in attrs.fields(Result) if f.name in each})
             results[each["policy"]].append(result)
             episodes.append(Episode(each["policy"], result, each["recording"], each["video"], each["command"]))
-        return cls.of(results, episodes, facts["margin"], until_decided=facts["until_decided"])
+        notes = facts.get("notes", ())
+        return cls.of(results, episodes, facts["margin"], until_decided=facts["until_decided"], notes=notes)
 
     @property
     def factors(self) -> list[str]:
@@ -95,8 +105,17 @@ class Report:
         return list(dict.fromkeys(name for each in self.episodes for name in each.result.factors))
 
     @property
+    def errors(self) -> list[str]:
+        """A line for each error of a policy, with the number of episodes that ended in it, most first."""
+        counts = Counter((each.policy, each.result.error) for each in self.episodes if each.result.is_error)
+        return [
+            f"{policy}: {count} {'episode' if count == 1 else 'episodes'} ended in an error: {error}"
+            for (policy, error), count in counts.most_common()
+        ]
+
+    @property
     def failures(self) -> list[Episode]:
-        """The episodes that failed."""
+        """The episodes that failed, or ended in an error."""
         return [each for each in self.episodes if not each.result.success]
 
     def facts(self) -> dict[str, Any]:
@@ -105,6 +124,7 @@ class Report:
             "margin": self.margin,
             "until_decided": self.until_decided,
             "lines": self.lines(),
+            "notes": list(self.notes),
             "policies": [attrs.asdict(each) for each in self.summaries],
             "comparisons": [{**attrs.asdict(each), "words": each.words} for each in self.comparisons],
             "episodes": [_flat(each) for each in self.episodes],
@@ -114,13 +134,13 @@ class Report:
         """One line for each episode."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        head = ("policy", "seed", "success", "time_s", "interventions", "faults")
+        head = ("policy", "seed", "success", "time_s", "interventions", "faults", "error")
         writer.writerow([*head, *self.factors, "recording", "command"])
         for each in self.episodes:
             result = each.result
             values = (each.policy, result.seed, int(result.success), result.time_s, sum(result.interventions.values()))
             factors = (result.factors.get(name, "") for name in self.factors)
-            writer.writerow([*values, "; ".join(result.faults), *factors, each.recording, each.command])
+            writer.writerow([*values, "; ".join(result.faults), result.error, *factors, each.recording, each.command])
         return text.getvalue()
 
     def as_markdown(self) -> str:
@@ -130,6 +150,9 @@ class Report:
         lines += table(SUMMARY_HEAD, [summary_row(each) for each in self.summaries])
         if self.comparisons:
             lines += ["", *table(COMPARISON_HEAD, [comparison_row(each) for each in self.comparisons]), "", NOTE]
+        for title, found in (("Errors", self.errors), ("Notes", self.notes)):
+            if found:
+                lines += ["", f"## {title}", "", *(f"- {line}" for line in found)]
         if failures := self.failures:
             lines += ["", "## Failures", ""]
             rows = [
@@ -146,10 +169,12 @@ class Report:
         for each in self.summaries:
             time = f", median {each.median_time_s:.1f} s" if each.median_time_s is not None else ""
             lines.append(
-                f"{each.label:{width}}  {each.successes} of {each.episodes} succeeded, "
+                f"{each.label:{width}}  {each.successes} of {each.episodes} succeeded, {_errors_of(each)}"
                 f"{LEVEL} interval {percent(each.wilson)}{time}"
             )
-        return [*lines, *(each.words for each in self.comparisons)]
+        errors = self.errors
+        more = [f"and {len(errors) - _MOST_LINES} other errors"] if len(errors) > _MOST_LINES else []
+        return [*lines, *(each.words for each in self.comparisons), *errors[:_MOST_LINES], *more, *self.notes]
 
 
 def _flat(episode: Episode) -> dict[str, Any]:
@@ -158,9 +183,13 @@ def _flat(episode: Episode) -> dict[str, Any]:
     return {"policy": fields.pop("policy"), **fields.pop("result"), **fields}
 
 
+def _errors_of(each: Summary) -> str:
+    return f"{each.errors} {'error' if each.errors == 1 else 'errors'}, " if each.errors else ""
+
+
 SUMMARY_HEAD = (
     "policy", "successes", "rate", f"{LEVEL} interval (Wilson)", "exact interval", "median time to success",
-    "interventions per episode", "episodes with faults",
+    "interventions per episode", "episodes with faults", "episodes with errors",
 )  # fmt: skip
 COMPARISON_HEAD = (
     "policies", "only the first", "only the second", "difference", f"{LEVEL} interval", "p",
@@ -170,7 +199,7 @@ NOTE = (
     "The difference is the first policy's success rate minus the second's, on the same seeds. The first interval and p "
     "stay valid however often one looks and whenever one stops, and the verdict is read off them. Those for a fixed "
     "number are valid only if the number of episodes was chosen beforehand. With more than two policies all are "
-    "corrected for the number of pairs."
+    "corrected for the number of pairs. Episodes that ended in an error of the policy count as failures."
 )
 
 
@@ -181,7 +210,7 @@ def summary_row(each: Summary) -> tuple[str, ...]:
     interventions = sum(each.interventions.values()) / each.episodes if each.episodes else 0.0
     return (
         each.label, f"{each.successes} of {each.episodes}", rate, percent(each.wilson), percent(each.exact), time,
-        f"{interventions:.1f}", str(each.disturbed),
+        f"{interventions:.1f}", str(each.disturbed), str(each.errors),
     )  # fmt: skip
 
 
