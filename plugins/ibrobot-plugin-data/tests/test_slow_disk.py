@@ -17,6 +17,7 @@ from ibrobot_data.operator import Operator
 from ibrobot_data.recording_worker import RecordingWorker
 
 from ibrobot_core.api import EpisodeEnd, EpisodeStart, SteppedClock, String
+from ibrobot_core.app import ComponentFailed, SessionWorker
 
 if TYPE_CHECKING:
     from fake_runs import Runs
@@ -104,6 +105,12 @@ def with_disk(run: Any, monkeypatch: pytest.MonkeyPatch, stalls: dict[int, float
         monkeypatch.setattr(run.worker.recorder, name, getattr(disk, name))
 
 
+def hangs(worker: Any) -> None:
+    """What `SessionWorker.stop` does after seconds, at once."""
+    worker._end.set()
+    raise ComponentFailed(f"{worker.name} hangs: still working 5 s after the stop")
+
+
 def record(run: Any, episodes: int, messages: int) -> None:
     """Record episodes of as many messages."""
     for number in range(1, episodes + 1):
@@ -152,7 +159,7 @@ def test_the_end_of_a_run_waits_for_a_disk_that_stalls(
 def test_an_episode_that_the_disk_does_not_take_is_not_recorded(
     runs: Runs, monkeypatch: pytest.MonkeyPatch, stopped: list[Any]
 ):
-    monkeypatch.setattr("ibrobot_core.component._STOP_TIMEOUT_S", 0.0)
+    monkeypatch.setattr(SessionWorker, "stop", hangs)
     run = slow(runs, monkeypatch, {2: 1e9})
     stopped.append(run)
     record(run, 1, 5)
@@ -166,7 +173,7 @@ def test_an_episode_that_the_disk_does_not_take_is_not_recorded(
 
 
 def test_an_operator_gives_up_a_slow_disk(runs: Runs, monkeypatch: pytest.MonkeyPatch, stopped: list[Any]):
-    monkeypatch.setattr("ibrobot_core.component._STOP_TIMEOUT_S", 0.0)
+    monkeypatch.setattr(SessionWorker, "stop", hangs)
     keys: queue.SimpleQueue[str] = queue.SimpleQueue()
     keys.put("tab")
     keys.put("f12")
@@ -209,7 +216,7 @@ def test_disks_that_stall_anywhere(runs: Runs, monkeypatch: pytest.MonkeyPatch, 
         whole = episodes if hung is None else hung // (messages + 1)
         with monkeypatch.context() as patch:
             if hung is not None:
-                patch.setattr("ibrobot_core.component._STOP_TIMEOUT_S", 0.0)
+                patch.setattr(SessionWorker, "stop", hangs)
             with_disk(run, patch, stalls)
             before, known = run.worker.saved, len(faults)
             record(run, episodes, messages)

@@ -168,8 +168,8 @@ def _events(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
 @contextmanager
 def _lines(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
     """Yield a function that shows the progress: a bar on a terminal, otherwise one line per episode."""
-    for line in evaluation.damaged:
-        echo(line, err=True)
+    for damage in evaluation.damaged:
+        echo(damage, err=True)
     if evaluation.resumed and not quiet:
         echo(f"continuing: {evaluation.resumed} episodes are done already", err=True)
     if not sys.stderr.isatty():

@@ -150,8 +150,8 @@ def _run(job: EpisodeJob, attempt: Attempt) -> Result:
     factors = json.loads(metadata.get("factors", "{}")) | policy.varied_names(seed)
     acting = json.loads(metadata.get("policy", "{}"))
     success, faults = session.outcome.successes == 1, session.outcome.faults
-    error = too_long or _errors([each.message for each in answers.drain()])
-    result = Result(seed, success, round(time_s, 6), interventions(session), faults, factors, acting, error)
+    went_wrong = too_long or _errors([each.message for each in answers.drain()])
+    result = Result(seed, success, round(time_s, 6), interventions(session), faults, factors, acting, went_wrong)
     place.episode.parent.mkdir(parents=True, exist_ok=True)
     try:
         bags[0].rename(place.episode)
