@@ -30,7 +30,7 @@ def attempt(file, code, answer_s=60.0):
 
 
 @pytest.mark.parametrize("how", HANGS)
-def test_an_attempt_that_hangs_ends_and_is_told(tmp_path, how):
+def test_an_attempt_that_hangs_ends_and_is_reported(tmp_path, how):
     file = tmp_path / "attempts" / "one"
     assert attempt(file, HANGS[how], 0.5) == 1
     assert Attempt(file, 0.5, 60.0).error.startswith('it hung: no step ended within 0.5 s (at "')
