@@ -116,16 +116,23 @@ def run_episode(job: EpisodeJob, progress: Callable[[int], None]) -> Result:
         IbrobotError: e.g. if the policy fails, or the recording is incomplete.
     """
     hide_messages()
-    place, policy, seed = job.place, job.policy, job.seed
-    if document_hash(policy.load()) != job.document:
-        raise ComponentFailed(f"{policy.config}: changed during the evaluation")
+    if document_hash(job.policy.load()) != job.document:
+        raise ComponentFailed(f"{job.policy.config}: changed during the evaluation")
     attempt = job.attempt("episode")
     if attempt.error:
-        result = Result(seed, False, 0.0, {}, (), policy.varied_names(seed), {}, attempt.error)
-        write(place.result, json.dumps(attrs.asdict(result), indent=1) + "\n")
-        return result
+        return _broken(job, attempt.error)
     with attempt:
-        return _run(job, attempt)
+        try:
+            return _run(job, attempt)
+        except EpisodeTooLong as error:
+            return _broken(job, str(error))
+
+
+def _broken(job: EpisodeJob, error: str) -> Result:
+    """Write and return the result of an episode without an end, and thus without a recording."""
+    result = Result(job.seed, False, 0.0, {}, (), job.policy.varied_names(job.seed), {}, error)
+    write(job.place.result, json.dumps(attrs.asdict(result), indent=1) + "\n")
+    return result
 
 
 def _run(job: EpisodeJob, attempt: Attempt) -> Result:
@@ -136,22 +143,18 @@ def _run(job: EpisodeJob, attempt: Attempt) -> Result:
     runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=seed, episodes=1)))
     session = runtime.session
     answers = session.bus.subscribe(MODEL_ANSWERS, _DEPTH)
-    too_long = ""
-    try:
-        run_to_end(runtime, attempt)
-    except EpisodeTooLong as error:
-        too_long = str(error)
+    run_to_end(runtime, attempt)
     if session.state is None or session.state.success is None:
         raise ComponentFailed(f"{config.source}: the scene has no task, so success is not defined")
     time_s = seconds(session.clock.now_ns() - session.episodes.begun_ns)
     bags = list(recordings.glob("*/"))
     outcome = "success" if session.outcome.successes else "failure"
-    metadata = _checked(bags, "unknown" if too_long else outcome, session.outcome.faults)
+    metadata = _checked(bags, outcome, session.outcome.faults)
     factors = json.loads(metadata.get("factors", "{}")) | policy.varied_names(seed)
     acting = json.loads(metadata.get("policy", "{}"))
     success, faults = session.outcome.successes == 1, session.outcome.faults
-    went_wrong = too_long or _errors([each.message for each in answers.drain()])
-    result = Result(seed, success, round(time_s, 6), interventions(session), faults, factors, acting, went_wrong)
+    error = _errors([each.message for each in answers.drain()])
+    result = Result(seed, success, round(time_s, 6), interventions(session), faults, factors, acting, error)
     place.episode.parent.mkdir(parents=True, exist_ok=True)
     try:
         bags[0].rename(place.episode)
@@ -202,6 +205,7 @@ def run_to_end(runtime: Runtime, attempt: Attempt) -> None:
     """
     runtime.start()
     try:
+        attempt.beat()
         while not runtime.step():
             attempt.beat()
     finally:

@@ -27,7 +27,7 @@ class Attempt:
     Args:
         file: a file of this episode; missing if it was never attempted.
         answer_s: longest time between two beats [s].
-        episode_s: longest time of the whole attempt [s].
+        episode_s: longest time of the whole attempt, and until the first beat, since a model may load for long [s].
 
     Attributes:
         error: why this episode must not be attempted again; empty if it may.
@@ -43,7 +43,8 @@ class Attempt:
         text = file.read_text(encoding="utf-8", errors="replace") if file.exists() else ""
         self.error = ""
         if "Timeout (" in text:
-            self.error = f"it hung: no step ended within {answer_s:g} s{_innermost(text)}"
+            until = f"no step ended within {answer_s:g} s" if "ready" in text else f"no start within {episode_s:g} s"
+            self.error = f"it hung: {until}{_innermost(text)}"
         elif text.count("begun") >= DEATHS:
             self.error = f"it ended its process, {text.count('begun')} times"
 
@@ -53,7 +54,7 @@ class Attempt:
         self._log.write("begun\n")
         self._log.flush()
         os.fsync(self._log.fileno())
-        self._arm(time.monotonic())
+        faulthandler.dump_traceback_later(self._episode_s + self._answer_s, exit=True, file=self._log)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
@@ -72,6 +73,9 @@ class Attempt:
         now_s = time.monotonic()
         if now_s >= self._end_s:
             raise EpisodeTooLong(f"it did not end within {self._episode_s:g} s")
+        if not self._armed_s and self._log is not None:
+            self._log.write("ready\n")
+            self._log.flush()
         if now_s - self._armed_s >= _REARM_S:
             self._arm(now_s)
 

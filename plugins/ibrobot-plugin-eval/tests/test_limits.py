@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+from ibrobot_eval import limits
 from ibrobot_eval.limits import Attempt, EpisodeTooLong
 
 HANGS = {
@@ -14,9 +15,9 @@ HANGS = {
 }
 ENDS = {"exits": "os._exit(3)", "aborts": "os.abort()", "is killed": "os.kill(os.getpid(), 9)", "leaves": "sys.exit(0)"}
 PROGRAM = """
-import os, sys
+import os, runpy, sys
 from pathlib import Path
-from ibrobot_eval.limits import Attempt
+Attempt = runpy.run_path(sys.argv[4])["Attempt"]  # alone, since the package takes long to import
 with Attempt(Path(sys.argv[1]), float(sys.argv[2]), 1e6) as attempt:
     attempt.beat()
     exec(sys.argv[3])
@@ -25,7 +26,7 @@ with Attempt(Path(sys.argv[1]), float(sys.argv[2]), 1e6) as attempt:
 
 def attempt(file, code, answer_s=60.0):
     """Attempt an episode in a process of its own; its exit code."""
-    command = [sys.executable, "-c", PROGRAM, file, str(answer_s), code]
+    command = [sys.executable, "-c", PROGRAM, file, str(answer_s), code, limits.__file__]
     return subprocess.run(command, check=False, timeout=300).returncode
 
 
@@ -56,5 +57,12 @@ def test_an_attempt_that_ends_in_order_leaves_nothing(tmp_path):
 
 
 def test_an_episode_has_a_limit(tmp_path):
-    with Attempt(tmp_path / "one", 60.0, 0.0) as attempt, pytest.raises(EpisodeTooLong, match="did not end within 0 s"):
-        attempt.beat()
+    with Attempt(tmp_path / "one", 60.0, 1e-6) as slow, pytest.raises(EpisodeTooLong, match="not end within 1e-06 s"):
+        slow.beat()
+
+
+def test_an_episode_that_never_starts_ends(tmp_path):
+    file = tmp_path / "one"
+    program = PROGRAM.replace("1e6", "0.1").replace("    attempt.beat()\n", "")
+    subprocess.run([sys.executable, "-c", program, file, "0.1", "while True: pass", limits.__file__], check=False)
+    assert Attempt(file, 0.1, 0.1).error.startswith("it hung: no start within 0.1 s (at ")
