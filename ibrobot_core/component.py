@@ -35,8 +35,7 @@ class Component(ABC):
         may_wait: whether its `stop` may take long, e.g. for a slow disk; it, too, stops only after the robot.
     """
 
-    sends_stops = False
-    may_wait = False
+    sends_stops = may_wait = False
 
     def __init__(self, name: str, summary: str, needs: tuple[str, ...] = ()) -> None:
         self.name = name
