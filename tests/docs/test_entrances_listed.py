@@ -48,7 +48,7 @@ SUBSCRIBERS = {
     # Observations of policies, records, pictures, and what is shown, counted or passed on.
     **dict.fromkeys(
         (
-            "ibrobot_core/contract/frames.py", "ibrobot_data/recording_worker.py",
+            "ibrobot_core/contract/frames.py", "ibrobot_data/recording_worker.py", "ibrobot_eval/episodes.py",
             "ibrobot_description/component.py", "ibrobot_eval/cameras.py", "ibrobot_eval/film.py",
             "ibrobot_gym/environment.py", "ibrobot_mujoco/camera.py", "ibrobot_mujoco/viewer.py",
             "ibrobot_planning/tasks/performing.py", "ibrobot_ros/topics.py", "ibrobot_ros2/inference.py",
