@@ -91,12 +91,10 @@ class Recorder(ABC):
 
 def _size(value: Any) -> int:
     """Size of a message, or of a value in a message [bytes]."""
-    if isinstance(value, np.ndarray):
-        return int(value.nbytes)
+    if attrs.has(type(value)):
+        value = [getattr(value, field.name) for field in attrs.fields(type(value))]
+    if isinstance(value, tuple | list):
+        return sum(map(_size, value))
     if isinstance(value, bytes | str):
         return len(value)
-    if isinstance(value, tuple | list):
-        return sum(_size(each) for each in value)
-    if attrs.has(type(value)):
-        return sum(_size(getattr(value, field.name)) for field in attrs.fields(type(value)))
-    return 8
+    return int(value.nbytes) if isinstance(value, np.ndarray) else 8
