@@ -92,6 +92,7 @@ class ControlCore:
             "cancel": self._cancel,
             "counters": self.counters,
             "halt": self._halt,
+            "begin_startup": self.begin_startup,
         }
         self.take_stops: Callable[[], None] = lambda: None
         self.stops = 0
@@ -124,15 +125,19 @@ class ControlCore:
             self._hardware.undo_connect()
             raise
         self.mode = mode
-        behaviour, _, pose = self._config.control.startup.partition(" ")
-        if behaviour == "pose":
+        if self._config.control.startup.startswith("pose"):
             self.phase = Phase.ARRIVING
-            self._move_to(pose)
         else:
             self._switch_mode(mode)
 
+    def begin_startup(self) -> None:
+        """Begin the motion to the startup pose, if there is one, now that everything is there that may stop it."""
+        if self.phase is Phase.ARRIVING:
+            self._move_to(self._config.control.startup.partition(" ")[2])
+
     def arrived(self) -> bool:
-        """Whether the robot has entered its mode. Until then it moves to its startup pose; keep calling `tick`.
+        """Whether the robot has entered its mode. From `begin_startup` on, it moves to its startup pose; keep calling `tick`.
+
 
         Raises:
             HardwareError: after a fault or an emergency stop during the motion, or if it takes too long; the robot is
@@ -144,7 +149,8 @@ class ControlCore:
             raise HardwareError(f"control.startup: {self._config.control.startup}: {self.fault}")
         if self.phase is not Phase.ARRIVING:
             return True
-        assert self._pose.target is not None
+        if self._pose.target is None:
+            return False  # it waits for `begin_startup`
         measured = self._readings.newest
         away = np.abs(measured.position - self._pose.target)
         # The mode starts from the measured positions; those of an old reading would pull the robot back.

@@ -38,7 +38,7 @@ class FollowingError:
         self._soon = max(1, round(ns(_EXCHANGED_S) / period_ns))
         self._others = np.zeros((len(distance), len(distance)), dtype=np.int64)
         """For how many ticks each joint has been where another is commanded, shape (J, J)."""
-        self._home: Vector | None = None
+        self._home: Vector = np.full(len(distance), np.nan)
         """Where the joints were when they were last at their setpoints [rad], shape (J,)."""
 
     @property
@@ -78,9 +78,7 @@ class FollowingError:
             away: distance of each joint from its own, less its lag [rad], shape (J,).
             measured: measured positions [rad], shape (J,).
         """
-        if self._home is None:
-            self._home = measured
-        self._home = np.where(away < _EXCHANGED_RAD / 5, measured, self._home)
+        self._home = np.where((away < _EXCHANGED_RAD / 5) | np.isnan(self._home), measured, self._home)
         strays = away > _EXCHANGED_RAD
         if np.count_nonzero(strays) < 2:
             self._others[:] = 0

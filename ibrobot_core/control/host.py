@@ -96,7 +96,7 @@ class ControlHost(ABC):
 
     @abstractmethod
     def arrive(self) -> None:
-        """Wait until the robot has arrived at its startup pose, and entered its mode.
+        """Have the robot move to its startup pose, and wait until it has arrived, and entered its mode.
 
         Raises:
             IbrobotError: if it has not arrived, e.g. after an emergency stop.
@@ -158,6 +158,7 @@ class InlineControl(ControlHost):
 
     @override
     def arrive(self) -> None:
+        self._core.begin_startup()
         while not self._core.arrived():
             self._clock.advance(self._core.period_ns)
             self.step()
@@ -338,6 +339,7 @@ class ControlClient(ControlHost):
 
     @override
     def arrive(self) -> None:
+        self.call("begin_startup")
         while not self._arrived.wait(_GLANCE_S):
             if self._given_up.is_set():
                 raise ComponentFailed("given up while the robot moved to its startup pose")

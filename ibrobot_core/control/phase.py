@@ -50,8 +50,8 @@ TRANSITIONS: Mapping[Phase, Mapping[Cause, Phase]] = {
 }  # fmt: skip
 """The phase after each cause; a cause that is missing leaves the phase as it is."""
 
-_ALWAYS = frozenset({"estop", "fault", "cancel", "counters", "halt"})
-"""Commands that stop the robot or change nothing."""
+_ALWAYS = frozenset({"estop", "fault", "cancel", "counters", "halt", "begin_startup"})
+"""Commands that stop the robot or change nothing, and one that only `ARRIVING` heeds."""
 _RESETS = frozenset({"reset", "reset_episode"})
 PERMITTED: Mapping[Phase, frozenset[str]] = {
     Phase.ARRIVING: _ALWAYS,

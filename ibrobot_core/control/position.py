@@ -10,7 +10,7 @@ import numpy as np
 from ibrobot_core.control.spline import Spline, smooth_velocities
 from ibrobot_core.descriptors import StreamOptions
 from ibrobot_core.interfaces import Context, Executor, JointReading, Plan
-from ibrobot_core.robot import Vector
+from ibrobot_core.robot import FARTHEST, Vector
 from ibrobot_core.units import ns, seconds
 
 
@@ -61,15 +61,15 @@ class PositionExecutor(Executor):
 
     @override
     def set_plan(self, plan: Plan) -> None:
-        """Replace the plan; one that is not a finite (N, J) with a positive step is counted and ignored."""
+        """Replace the plan; one that is not (N, J) positions within `FARTHEST` with a positive step is only counted."""
         try:
             positions = np.array(plan.positions, dtype=np.float64)
         except (TypeError, ValueError):
             positions = np.empty(0)
         if positions.ndim != 2 or positions.shape[0] == 0 or positions.shape[1] != len(self.joints):
             self._refuse("refused_shape", f"shape {positions.shape}, not (N, {len(self.joints)})")
-        elif not np.isfinite(positions).all():
-            self._refuse("refused_nonfinite", "values that are not finite")
+        elif not (np.abs(positions) <= FARTHEST).all():
+            self._refuse("refused_nonfinite", f"values that are not finite, or beyond {FARTHEST:g}")
         elif plan.step_ns <= 0:
             self._refuse("refused_step", f"step_ns {plan.step_ns}, which must be above 0")
         else:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.robot import FARTHEST, Vector
 
 LONGEST_CHUNK = 1000
 """Largest number of actions in a chunk: a longer plan would occupy a control tick."""
@@ -134,8 +134,8 @@ class TemporalSmoother:
             raise ValueError(f"a chunk must have the shape (N, {self.action_size}) with N >= 1, got {actions.shape}")
         if len(actions) > LONGEST_CHUNK:
             raise ValueError(f"a chunk may have {LONGEST_CHUNK} actions, got {len(actions)}")
-        if not np.isfinite(actions).all():
-            raise ValueError(f"a chunk must be finite, got {_first_not_finite(actions)}")
+        if not (np.abs(actions) <= FARTHEST).all():
+            raise ValueError(f"a chunk must be finite and within {FARTHEST:g}, got {_first_beyond(actions)}")
         length = len(self._positions)
         offset = (start_ns - self._start_ns + self.step_ns // 2) // self.step_ns
         # Observations are never from the future, so a chunk that begins beyond the end means that the plan ran dry.
@@ -208,6 +208,6 @@ def _gains(ratio: float, size: int) -> Vector:
     return np.array(gains)
 
 
-def _first_not_finite(actions: Vector) -> str:
-    row, column = np.argwhere(~np.isfinite(actions))[0]
+def _first_beyond(actions: Vector) -> str:
+    row, column = np.argwhere(~(np.abs(actions) <= FARTHEST))[0]
     return f"{actions[row, column]} in action {row}, element {column}"

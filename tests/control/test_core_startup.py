@@ -14,6 +14,7 @@ def start(make_rig, **control: str | float):
     """Start, without a tick."""
     rig = make_rig({"control": {"startup": "pose rest", **control}})
     rig.core.start("stream")
+    assert "error" not in rig.call("begin_startup")
     rig.hardware.written.append(rig.hardware.read().position)
     return rig
 
@@ -43,6 +44,19 @@ def test_it_arrives_slowly_and_then_the_mode_begins_from_there(rig):
     assert rig.interventions == 0
     rig.plan([-0.7, 0.9, 0.2])
     np.testing.assert_allclose(rig.tick(60).command, [-0.7, 0.9, 0.2])
+
+
+def test_it_waits_until_everything_is_there_that_may_stop_it(make_rig):
+    rig = make_rig({"control": {"startup": "pose rest"}})
+    rig.core.start("stream")
+    held = rig.tick().command
+    np.testing.assert_array_equal(rig.tick(100).command, held)
+    assert not rig.core.arrived()
+    rig.core.begin_startup()
+    arrive(rig)
+    held = rig.tick().command
+    rig.call("begin_startup")  # too late to mean anything
+    np.testing.assert_array_equal(rig.tick(20).command, held)
 
 
 def test_the_mode_begins_from_a_new_reading_after_lost_replies(make_rig):
@@ -155,6 +169,7 @@ def test_a_pose_that_is_late_brakes_before_the_start_fails(make_rig):
     ]
     rig = make_rig({"robot": make_rig({}).config.document["robot"] | {"joints": joints}, **STARTS_AT_REST})
     rig.core.start("stream")
+    rig.core.begin_startup()
     with pytest.raises(HardwareError, match="not reached within 10 s"):
         arrive(rig)
 

@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.api import Context, Executor, GoalRejected, GoalState, GoalStatus, JointReading, Plan, Vector, seconds
+from ibrobot_core.api import Context, Executor, GoalRejected, GoalState, GoalStatus, JointReading, Plan, Vector, ns, seconds
 from ibrobot_testing.contexts import ARM, control_context
 from ibrobot_testing.suite import Suite
 
@@ -21,6 +21,8 @@ class ExecutorSuite(Suite[Executor]):
     """Allowed distance of a held setpoint from the position to hold [rad]."""
     goal_ticks: ClassVar[int] = 2000
     """Maximum number of ticks for a goal."""
+    stale_s: ClassVar[float] = 60.0
+    """Time after the end of a plan at which it is stale, whatever the options [s]."""
 
     @override
     def context(self) -> Context:
@@ -140,6 +142,21 @@ class ExecutorSuite(Suite[Executor]):
             ctx.clock.sleep_until(plan.start_ns + i * plan.step_ns)
             position = executor.update(measure(ctx, position)).copy()
             np.testing.assert_allclose(position, point, atol=self.tolerance_rad, err_msg=f"point {i}")
+
+    def test_a_plan_that_ended_long_ago_is_stale(self) -> None:
+        """`is_stale` or `wants_relax` says so, until the next plan or activation: the loop lets the joints brake."""
+        executor, ctx, start = self.active()
+        if not executor.accepts_plans:
+            pytest.skip("accepts no plans")
+        plan = plan_towards(ctx, start, self.poses(ctx)[1])
+        executor.set_plan(plan)
+        executor.update(tick(ctx, start))
+        assert not (executor.is_stale or executor.wants_relax)
+        ctx.clock.sleep_until(plan.start_ns + len(plan.positions) * plan.step_ns + ns(self.stale_s))
+        executor.update(tick(ctx, start))
+        assert executor.is_stale or executor.wants_relax, f"a plan that ended {self.stale_s:g} s ago is still followed"
+        executor.activate(measure(ctx, start))
+        assert not (executor.is_stale or executor.wants_relax)
 
     def test_refuses_an_impossible_plan(self) -> None:
         """A plan with NaN or a wrong width is counted, and the old setpoint remains."""

@@ -103,6 +103,10 @@ class IgnoresTime(FakeExecutor):
         return super().update(measured) if self._plan is None else self._setpoint.copy()
 
 
+class FollowsForEver(FakeExecutor):
+    is_stale = False
+
+
 class SwallowsRefusals(FakeExecutor):
     def counters(self):
         return {}
@@ -172,6 +176,7 @@ WRONG = {
     GivesItsOwnArray: "keeps_no_hold_of_the_callers_arrays",
     RemembersItsWork: "deactivation_forgets",
     IgnoresTime: "follows_a_plan_by_time",
+    FollowsForEver: "a_plan_that_ended_long_ago_is_stale",
     SwallowsRefusals: "refuses_an_impossible_plan",
     PlaysNaN: "refuses_an_impossible_plan",
     StopsShort: "reaches_its_goal",

@@ -8,6 +8,7 @@ from typing import Any, override
 import numpy as np
 
 from ibrobot_core.api import (
+    NS_PER_S,
     Context,
     EpisodeSetup,
     Executor,
@@ -176,9 +177,13 @@ class _HoldingExecutor(Executor):
 
 
 class FakeExecutor(_HoldingExecutor):
-    """Accepts plans, read at their nearest point, and goals `{"position": …}`, approached at constant speed."""
+    """Accepts plans, read at their nearest point, and goals `{"position": …}`, approached at constant speed.
+
+    A plan is stale a second after its last point.
+    """
 
     accepts_plans = True
+    _is_stale = False
 
     def __init__(self, ctx: Context) -> None:
         super().__init__(ctx)
@@ -187,13 +192,26 @@ class FakeExecutor(_HoldingExecutor):
         self._goal: Vector = self._setpoint
 
     @override
+    def activate(self, measured: JointReading) -> None:
+        super().activate(measured)
+        self._is_stale = False
+
+    @override
     def deactivate(self) -> None:
         super().deactivate()
         self._plan: Plan | None = None
+        self._is_stale = False
+
+    @property
+    @override
+    def is_stale(self) -> bool:
+        return self._is_stale
 
     @override
     def update(self, measured: JointReading) -> Vector:
         plan = self._plan
+        if plan is not None and measured.stamp_ns - plan.start_ns - len(plan.positions) * plan.step_ns > NS_PER_S:
+            self._plan, self._is_stale = None, True
         if plan is not None and measured.stamp_ns >= plan.start_ns:
             index = min((measured.stamp_ns - plan.start_ns) // plan.step_ns, len(plan.positions) - 1)
             self._setpoint = plan.positions[index].copy()
@@ -208,7 +226,7 @@ class FakeExecutor(_HoldingExecutor):
         if plan.positions.shape[1:] != self._setpoint.shape or not np.isfinite(plan.positions).all():
             self._refused += 1
             return
-        self._plan = plan
+        self._plan, self._is_stale = plan, False
 
     @override
     def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
