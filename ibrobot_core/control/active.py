@@ -126,13 +126,5 @@ class ActiveExecutors:
 
     def _report_goals(self, owned: _Owned) -> None:
         while (status := owned.executor.pop_status()) is not None:
-            self._report(
-                {
-                    "event": "goal",
-                    "executor": owned.name,
-                    "goal": status.goal_id,
-                    "state": str(status.state),
-                    "message": status.message,
-                    "result": dict(status.result),
-                }
-            )
+            told = {"state": str(status.state), "message": status.message, "result": dict(status.result)}
+            self._report({"event": "goal", "executor": owned.name, "goal": status.goal_id, **told})

@@ -126,14 +126,9 @@ class InlineControl(ControlHost):
     """Control in the calling thread, for lockstep; `step` runs one tick."""
 
     def __init__(
-        self,
-        config: RobotConfig,
-        registry: Registry,
-        clock: SteppedClock,
-        seed: int,
-        on_state: OnState,
+        self, config: RobotConfig, registry: Registry, clock: SteppedClock, seed: int, on_state: OnState,
         on_event: OnEvent,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(on_state, on_event)
         self._core = build_core(config, registry, clock, seed)
         self._clock = clock

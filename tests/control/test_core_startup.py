@@ -54,7 +54,7 @@ def test_it_waits_until_everything_is_there_that_may_stop_it(make_rig):
     assert not rig.core.arrived()
     rig.core.begin_startup()
     arrive(rig)
-    held = rig.tick().command
+    held = rig.tick(50).command
     rig.call("begin_startup")  # too late to mean anything
     np.testing.assert_array_equal(rig.tick(20).command, held)
 

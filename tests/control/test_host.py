@@ -252,6 +252,7 @@ class TestProcess:
     def test_an_emergency_stop_on_the_way_to_the_startup_pose_brakes_and_ends_it(self, make, reports):
         host = make(startup="pose out")
         host.start()
+        host.call("begin_startup")
         reports.state(lambda state: abs(state.command - state.position).max() > 1e-3)
         host.call("estop")
 
