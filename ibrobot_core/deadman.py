@@ -46,8 +46,8 @@ class Deadman:
         """Whether it was seen released, and then pressed, since then."""
         self._made_ns = 0
         self._reported = False
-        self._ended_ns: int | None = None
-        """When a release or a silence ended the last motion [ns]; None if something else did."""
+        self._braking: tuple[int, int] | None = None
+        """From when until when a motion that a release or a silence ended may slow down [ns]; None after others."""
         self._asked_ns: int | None = None
 
     @property
@@ -76,7 +76,8 @@ class Deadman:
         with self._lock:
             self._reported = True
             if not pressed and self._pressed:
-                self._pressed, self._ended_ns = False, made_ns  # a release ends motion whenever it was made
+                # A release ends motion whenever it was made.
+                self._pressed, self._braking = False, (made_ns, made_ns + ns(self.braking_s))
             if made_ns < self._made_ns or made_ns <= self._since_ns:
                 return
             if self._pressed and made_ns - self._made_ns > self.silence_ns:
@@ -93,13 +94,13 @@ class Deadman:
                 self._disarm(now_ns + _LATE_NS)
             elif self._pressed and abs(now_ns - self._made_ns) > self.silence_ns:
                 self._disarm(now_ns)
-                self._ended_ns = now_ns
+                self._braking = now_ns, now_ns + ns(self.braking_s)
             return self._pressed
 
     def brakes(self, now_ns: int) -> bool:
         """Whether a motion that a release or a silence has ended may still slow down at a time [ns]."""
         with self._lock:
-            return self._ended_ns is not None and 0 <= now_ns - self._ended_ns <= ns(self.braking_s)
+            return self._braking is not None and self._braking[0] <= now_ns <= self._braking[1]
 
     def disarm(self, now_ns: int) -> None:
         """Allow nothing until reports made after `now_ns` [ns] show the deadman released, and then pressed."""
@@ -111,4 +112,4 @@ class Deadman:
         self._since_ns = max(now_ns, self._since_ns)
         self._made_ns = self._since_ns
         self._armed = self._pressed = False
-        self._ended_ns = None
+        self._braking = None

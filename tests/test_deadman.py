@@ -150,3 +150,15 @@ def test_motion_needs_a_release_and_then_a_press_since_the_last_event(events: li
                 seen = []
             if deadman.allows(now_ns):
                 assert seen == ["release", "press"]
+
+
+def test_a_motion_that_slows_down_may_do_so_for_as_long_as_it_needed_at_its_end():
+    """The run updates `braking_s` with the velocity, which falls meanwhile."""
+    deadman = pressed_deadman()
+    deadman.braking_s = 0.15
+    deadman.report(False, T0 + TICK)
+    for tick in range(15):
+        now_ns = T0 + (1 + tick) * TICK
+        deadman.braking_s = 0.15 - tick * 0.01
+        assert deadman.brakes(now_ns), tick
+    assert not deadman.brakes(T0 + 17 * TICK)

@@ -11,6 +11,8 @@ from ibrobot_lerobot_devices.units import Mapped, UnitProblem, columns
 
 _GAIN = 4.0
 """Velocity that makes up for a distance from the setpoint, while that moves [1/s]."""
+_SLOWEST = 2.0
+"""Ratio of the velocity sent to the one measured up to which braking makes up for slow wheels."""
 _NEAR = 0.004
 """A base that stands starts for a setpoint that has left it by so much [m, rad]."""
 _BELIEVED = 5.0
@@ -107,7 +109,11 @@ class Base:
         # While the setpoint brakes, so does the base, however far it is behind.
         fastest = np.where(speed < np.abs(self._ahead), np.abs(self._sent), self._max_velocity)
         wanted = np.clip(wanted, -fastest, fastest)
-        sent = np.clip(wanted, self._sent - self._change, self._sent + self._change)
+        # Wheels that are slower than they are told slow down less, too: what they do stays within the limits.
+        slower = self._change * np.clip(np.abs(self._sent) / np.maximum(np.abs(self.velocity), 1e-9), 1.0, _SLOWEST)
+        forward = self._sent > 0
+        down, up = np.where(forward, slower, self._change), np.where(forward, self._change, slower)
+        sent = np.clip(wanted, self._sent - down, self._sent + up)
         self._ahead, self._sent = ahead, np.where(sent * self._sent < 0, 0.0, sent)
         return dict(zip(self.features, (self._sent / self._factor).tolist(), strict=True))
 

@@ -55,7 +55,9 @@ class CmdVelTeleop(Teleop):
         self._wanted: Vector = np.zeros(len(self._joints))
         """The newest twist [m/s, rad/s]."""
         self._velocity: Vector = np.zeros(len(self._joints))
-        """Of the setpoint [m/s, rad/s]."""
+        """Of the setpoint, if the base keeps up [m/s, rad/s]."""
+        self._pace = 1.0
+        """Share of that velocity at which the setpoint moves, for a base that is behind."""
         self._setpoint: Vector | None = None
         """[m, rad]; None while the base stands."""
         self._set_ns = self._quiet_since_ns = 0
@@ -115,12 +117,14 @@ class CmdVelTeleop(Teleop):
             self._setpoint, self._set_ns = here.copy(), measured.stamp_ns
         elapsed_s = min(seconds(measured.stamp_ns - self._set_ns), _LONGEST_STEP_S)
         change = acceleration * elapsed_s
+        if brakes := not wanted.any():
+            self._velocity = self._pace * self._velocity  # as fast as it really was
         self._velocity = self._velocity + np.clip(wanted - self._velocity, -change, change)
         # A base that falls behind is waited for, along all axes, so that the twist keeps its direction.
         lead = robot.max_lead[self._columns] / 4
         behind = np.sign(self._velocity) * (self._setpoint - here)
-        pace = float(np.clip(2.0 * np.min(1.0 - behind / lead), _LEAST_PACE, 1.0))
-        self._setpoint = self._setpoint + pace * self._velocity * elapsed_s
+        self._pace = 1.0 if brakes else float(np.clip(2.0 * np.min(1.0 - behind / lead), _LEAST_PACE, 1.0))
+        self._setpoint = self._setpoint + self._pace * self._velocity * elapsed_s
         if (np.abs(self._setpoint - here) > 1.5 * lead).any():  # something holds it: it starts anew from where it is
             self._setpoint, self._velocity = here.copy(), np.zeros_like(here)
         self._set_ns = measured.stamp_ns
@@ -130,6 +134,7 @@ class CmdVelTeleop(Teleop):
         return command
 
     def _stop(self) -> None:
+        self._pace = 1.0
         self._wanted, self._velocity, self._setpoint = np.zeros(len(self._joints)), np.zeros(len(self._joints)), None
 
     def _taken(self, message: Message) -> Vector | None:

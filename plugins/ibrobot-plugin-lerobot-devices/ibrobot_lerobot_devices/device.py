@@ -242,7 +242,7 @@ class Device:
 
     def _stand_by_lerobot(self, rest: Mapping[str, float]) -> bool:
         """By LeRobot's own call, if the robot has one, as LeKiwi."""
-        return self._library.stop_base(self._device)
+        return bool(self._library.stop_base(self._device))
 
     def _stand_without_torque(self, rest: Mapping[str, float]) -> bool:
         """By switching off the torque of the wheels."""

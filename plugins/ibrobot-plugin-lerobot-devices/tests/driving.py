@@ -337,7 +337,10 @@ class Drive:
         if self.twists:
             x, y, theta = self.twist.tolist()
             bus.publish("/cmd_vel", Twist(Vector3(x, y, 0.0), Vector3(0.0, 0.0, theta)))
-        positions = operate(self.teleop, self._reading()).positions
+        measured = self._reading()
+        speed = np.minimum(np.abs(measured.velocity), self.robot.max_velocity)  # as a run computes it
+        self.teleop.deadman.braking_s = float(np.max(speed / self.robot.max_acceleration)) + 0.01
+        positions = operate(self.teleop, measured).positions
         if positions and not core.fault:
             mask, row = np.ones(3, dtype=bool), np.array([[positions[name] for name in AXES]])
             core.set_plan(PlanRecord(core.generation, now_ns, core.period_ns, mask, row))
