@@ -10,12 +10,14 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from ibrobot_lerobot_devices import link, standing
+from ibrobot_lerobot_devices.base import Base
 from ibrobot_lerobot_devices.hardware import LeRobotHardware
+from ibrobot_lerobot_devices.units import METRES, Mapped, Scale
 
-from ibrobot_core.api import HardwareError, Severity
+from ibrobot_core.api import HardwareError, Severity, ns
 
 from .conftest import PATIENCE_S, Motors
-from .driving import DIRECTIONS, FAULTS, FEATURES, HOPELESS, Drive, sequence
+from .driving import DIRECTIONS, FAULTS, FEATURES, HOPELESS, READING, Drive, sequence
 from .test_base import ageless, connected, driven
 
 __all__ = ["ageless"]
@@ -184,6 +186,8 @@ class TestDrives:
             assert each.stand.time_s <= (0.5 if each.faulted else 0.3), each
             assert each.stand.back <= 0.001, each
             assert each.moved_s == 0.0, each
+            if event in READING and event != "raises_send" and each.faulted:
+                assert each.stand.time_s == 0.0, "it is sent velocities after the fault"
             assert each.is_reset, each
 
     @pytest.mark.parametrize("direction", DIRECTIONS, ids=[f"{sign}{name}" for name in FEATURES for sign in "+-"])
@@ -201,6 +205,28 @@ class TestDrives:
         assert (-steps <= 1.01 * fastest / 15).all()  # the limits: from full speed in 15 ticks
         assert speeds[17:] == [0.0] * 24
         assert run.reset()
+
+    def test_an_old_action_lets_the_base_stand(self, run: Drive) -> None:
+        world = run.world
+        ahead = {"x.vel": 0.1, "y.vel": 0.0, "theta.vel": 0.0}
+        for age_s, sent in ((0.2, 0.1), (0.3, 0.0)):
+            world.child._device.act(ahead, world.clock.now_ns() - ns(age_s))
+            assert world.wheels.sent[0] == sent
+        run.tick(0.1)
+
+
+def test_a_setpoint_that_comes_to_where_the_base_stands_does_not_move_it() -> None:
+    """A mode or a press begins with the command where the base is, which may be behind the setpoint that was held."""
+    axes = [Mapped("x", "x", METRES, Scale(1.0))]
+    base = Base(axes, {"x": "x.vel"}, ["x.vel"], np.array([0.3]), np.array([2.0]), 0.01)
+    for ahead in (0.1, -0.1):
+        steps = [0.0, 0.0002, 0.0006, *[0.0012] * 5]
+        way = ahead - np.sign(ahead) * np.cumsum(steps + [0.001] * 80 + steps[::-1])
+        for setpoint in way[np.abs(way) <= 0.1]:
+            assert base.drive(np.array([setpoint])) == {"x.vel": 0.0}
+    moved = [base.drive(np.array([at]))["x.vel"] for at in np.arange(0.0, 0.02, 0.001)]
+    assert moved[0] == 0.0
+    assert moved[-1] > 0.05
 
 
 def test_limits() -> None:
