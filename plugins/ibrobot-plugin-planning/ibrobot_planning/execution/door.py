@@ -88,8 +88,8 @@ class GoalDoor(SessionWorker):
         self._begun = threading.Condition()
         """Notified when goals begin or end."""
         self._command: Vector | None = None
-        self._moved_ns = np.zeros(len(self._robot.joints), dtype=np.int64)
-        """When the command of each joint last changed [ns], shape (J,)."""
+        self._moved_ns = np.full(len(self._robot.joints), -ns(1e6), dtype=np.int64)
+        """When the command of each joint last changed [ns], shape (J,); long ago if it has not."""
         self.watched_by: Callable[[str], bool] = lambda goal_id: False
         """Whether its sender stops a goal if the world comes into its way."""
         _DOORS[session] = self
