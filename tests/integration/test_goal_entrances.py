@@ -175,6 +175,17 @@ def test_next_goal_takes_over_from_the_one_under_way(robot: Robot):
     assert moved[55:75].min() > 1e-3, "it does not stop between"
 
 
+def test_goal_is_checked_from_the_motion_under_way(robot: Robot):
+    """A place that the arm is about to pass: to stand there at once takes more than the arm can brake."""
+    _, old = robot.by_ros(goal(point(2, beside(0.8))))
+    for _ in range(95):
+        robot.step()
+    before, now = robot.commands[-2:]
+    verdict, _ = robot.by_ros(goal(point(0.03, (now + (now - before) * 5).tolist())))
+    assert "acceleration of" in verdict.message, verdict
+    assert robot.finish("ros", old) == ""
+
+
 def test_wrong_goal_leaves_the_one_under_way(robot: Robot):
     _, old = robot.by_ros(goal(point(2, beside(0.8))))
     for _ in range(60):
