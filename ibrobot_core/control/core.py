@@ -136,8 +136,9 @@ class ControlCore:
             self._move_to(self._config.control.startup.partition(" ")[2])
 
     def arrived(self) -> bool:
-        """Whether the robot has entered its mode. From `begin_startup` on, it moves to its startup pose; keep calling `tick`.
+        """Whether the robot has entered its mode; keep calling `tick`.
 
+        From `begin_startup` on, it moves to its startup pose.
 
         Raises:
             HardwareError: after a fault or an emergency stop during the motion, or if it takes too long; the robot is

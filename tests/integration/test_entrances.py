@@ -97,16 +97,6 @@ ELSEWHERE: Mapping[tuple[str, str], str] = {
     ),
 }
 """Cells whose entrance cannot be here -> the test that has it, which needs a server, a page, or more of control."""
-PENDING = frozenset(
-    {
-        "/execute_trajectory-numbers", "FollowJointTrajectory-numbers", "FollowJointTrajectory-world",
-        "FollowJointTrajectory-time", "engine monolithic-caller dies", "engine monolithic-numbers",
-        "engine monolithic-silence", "engine process-caller dies", "engine process-numbers", "engine process-silence",
-        "ibrobot replay-silence", "ibrobot-gym-caller dies", "ibrobot-gym-silence", "lerobot-robot-ibrobot-silence",
-        "teleop cmd_vel-time", "teleop lerobot-numbers",
-    }
-)  # fmt: skip
-"""Cells that are not true yet."""
 TOOLS: Mapping[str, Callable[[], Entrance]] = {
     "teleop gamepad": lambda: Operated(entrances.ToolPad()),
     "teleop keyboard": lambda: Operated(entrances.ToolKeys()),
@@ -308,15 +298,7 @@ CHECKS: Mapping[str, Callable[[Entrance, str], None]] = dict(
 @pytest.mark.usefixtures("parts")
 @pytest.mark.parametrize(
     ("name", "column", "cell"),
-    [
-        pytest.param(
-            *cell,
-            id=(name := f"{cell[0]}-{cell[1]}"),
-            marks=[pytest.mark.xfail(reason="not true yet")] if name in PENDING else [],
-        )
-        for cell in CELLS
-        if cell[2] != "-"
-    ],
+    [pytest.param(*cell, id=f"{cell[0]}-{cell[1]}") for cell in CELLS if cell[2] != "-"],
 )
 def test_cell(name: str, column: str, cell: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # for the files of devices

@@ -631,8 +631,9 @@ class Policy(_Stream):
 
 
 class PolicyInProcess(Policy):
-    """A policy in a process of its own."""
+    """A policy in a process of its own, whose last answer may be under way when it dies."""
 
+    ahead_s = Policy.ahead_s + 1 / 30
     overrides = (*Policy.overrides, "control_modes.model_inference.inference.execution_mode=process")
 
     @override

@@ -9,7 +9,18 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.api import Context, Executor, GoalRejected, GoalState, GoalStatus, JointReading, Plan, Vector, ns, seconds
+from ibrobot_core.api import (
+    Context,
+    Executor,
+    GoalRejected,
+    GoalState,
+    GoalStatus,
+    JointReading,
+    Plan,
+    Vector,
+    ns,
+    seconds,
+)
 from ibrobot_testing.contexts import ARM, control_context
 from ibrobot_testing.suite import Suite
 
@@ -151,12 +162,12 @@ class ExecutorSuite(Suite[Executor]):
         plan = plan_towards(ctx, start, self.poses(ctx)[1])
         executor.set_plan(plan)
         executor.update(tick(ctx, start))
-        assert not (executor.is_stale or executor.wants_relax)
+        assert (executor.is_stale, executor.wants_relax) == (False, False)
         ctx.clock.sleep_until(plan.start_ns + len(plan.positions) * plan.step_ns + ns(self.stale_s))
         executor.update(tick(ctx, start))
         assert executor.is_stale or executor.wants_relax, f"a plan that ended {self.stale_s:g} s ago is still followed"
         executor.activate(measure(ctx, start))
-        assert not (executor.is_stale or executor.wants_relax)
+        assert (executor.is_stale, executor.wants_relax) == (False, False)
 
     def test_refuses_an_impossible_plan(self) -> None:
         """A plan with NaN or a wrong width is counted, and the old setpoint remains."""
