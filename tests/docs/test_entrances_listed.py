@@ -26,6 +26,8 @@ STILL_SERVICES = {
     "/record_episode/cancel", "/record_episode/discard", "/record_episode/get_info", "/record_episode/highlight",
     "/record_episode", "/record_episode/progress", "/record_episode/redo", "/record_episode/start",
     "/record_episode/status", "/record_episode/stop",
+    # An operator's answer to a question of a command, from standard input.
+    "answer",
     # Answers with what is planned or known.
     "/act_inference_node/DispatchInfer", "/compute_cartesian_path", "/compute_fk", "/compute_ik",
     "/get_planning_scene", "/plan_kinematic_path", "/planning/plan", "/planning/result", "/task/check", "/task/result",
@@ -84,7 +86,7 @@ STILL_PAGE_COMMANDS = {
     "release", "resign", "smoothing", "time",
 }  # fmt: skip
 """Commands of pages that move nothing."""
-OWN_MOTIONS = {"start": "control.startup", "begin_stop": "control.stop", "_shed": "control.load_shedding"}
+OWN_MOTIONS = {"begin_startup": "control.startup", "begin_stop": "control.stop", "_shed": "control.load_shedding"}
 """Function of control that moves the robot to a pose -> the key of the robot YAML."""
 COMMANDS = {
     "launch": "/planning/go_to",  # `--goal`; its modes have entrances of their own
@@ -99,7 +101,7 @@ COMMANDS = {
     "ui": "page goal",  # it launches runs, and shows their pages
     **dict.fromkeys(
         (
-            "camera", "certs", "config", "config import", "config new", "contract", "convert", "datasets",
+            "camera", "certs", "config", "config copy", "config import", "config new", "contract", "convert", "datasets",
             "datasets info", "description", "doctor", "episodes", "episodes delete", "episodes list", "episodes mark",
             "episodes repair", "episodes trash", "episodes trim", "export", "feetech", "gamepad", "lerobot", "param",
             "plan", "plugins", "serve", "train",
