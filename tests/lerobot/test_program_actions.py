@@ -26,7 +26,7 @@ def test_a_value_that_is_no_finite_number_is_named(value: object) -> None:
         FEATURES.radians({"pan.pos": 1.0, "lift.pos": value})
 
 
-def test_an_unknown_feature_is_named_with_those_that_there_are() -> None:
+def test_an_unknown_feature_is_named_with_the_available_ones() -> None:
     with pytest.raises(ComponentFailed, match=r"no feature .pan.; the features are: pan\.pos, lift\.pos"):
         FEATURES.radians({"pan": 1.0})
 

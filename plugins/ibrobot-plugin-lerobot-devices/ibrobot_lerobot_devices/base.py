@@ -109,7 +109,7 @@ class Base:
         # While the setpoint brakes, so does the base, however far it is behind.
         fastest = np.where(speed < np.abs(self._ahead), np.abs(self._sent), self._max_velocity)
         wanted = np.clip(wanted, -fastest, fastest)
-        # Wheels that are slower than they are told slow down less, too: what they do stays within the limits.
+        # Wheels that are slower than commanded slow down less, too: their own braking stays within the limits.
         slower = self._change * np.clip(np.abs(self._sent) / np.maximum(np.abs(self.velocity), 1e-9), 1.0, _SLOWEST)
         forward = self._sent > 0
         down, up = np.where(forward, slower, self._change), np.where(forward, self._change, slower)

@@ -125,7 +125,7 @@ class CmdVelTeleop(Teleop):
         behind = np.sign(self._velocity) * (self._setpoint - here)
         self._pace = 1.0 if brakes else float(np.clip(2.0 * np.min(1.0 - behind / lead), _LEAST_PACE, 1.0))
         self._setpoint = self._setpoint + self._pace * self._velocity * elapsed_s
-        if (np.abs(self._setpoint - here) > 1.5 * lead).any():  # something holds it: it starts anew from where it is
+        if (np.abs(self._setpoint - here) > 1.5 * lead).any():  # something holds it: it starts again from where it is
             self._setpoint, self._velocity = here.copy(), np.zeros_like(here)
         self._set_ns = measured.stamp_ns
         command = TeleopCommand(dict(zip(self._joints, self._setpoint.tolist(), strict=True)))

@@ -182,7 +182,7 @@ class LeRobotHardware(Hardware):
 
     @override
     def reset_faults(self) -> None:
-        self._base.forget()  # the command begins anew where the base is
+        self._base.forget()  # the command begins again where the base is
         if self._fault is None:
             return
         link, standing = self._link, self._standing

@@ -346,7 +346,7 @@ class Drive:
             core.set_plan(PlanRecord(core.generation, now_ns, core.period_ns, mask, row))
 
     def drive(self, twist: Vector, seconds: float) -> None:
-        """Press the deadman anew, and drive."""
+        """Press the deadman again, and drive."""
         self.twist = np.zeros(3)
         self.tick(0.02)
         self.twist = twist
