@@ -101,8 +101,8 @@ COMMANDS = {
     "ui": "page goal",  # it launches runs, and shows their pages
     **dict.fromkeys(
         (
-            "camera", "certs", "config", "config copy", "config import", "config new", "contract", "convert", "datasets",
-            "datasets info", "description", "doctor", "episodes", "episodes delete", "episodes list", "episodes mark",
+            "camera", "certs", "config", "config copy", "config import", "config new", "contract", "convert",
+            "datasets", "datasets info", "description", "doctor", "episodes", "episodes delete", "episodes list", "episodes mark",
             "episodes repair", "episodes trash", "episodes trim", "export", "feetech", "gamepad", "lerobot", "param",
             "plan", "plugins", "serve", "train",
         ),
