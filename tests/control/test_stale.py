@@ -1,3 +1,4 @@
+# mypy: disable-error-code="union-attr"
 """Stale means brake: what a stream of setpoints leaves behind when it ends, in stepped time."""
 
 from __future__ import annotations

@@ -102,8 +102,8 @@ COMMANDS = {
     **dict.fromkeys(
         (
             "camera", "certs", "config", "config copy", "config import", "config new", "contract", "convert",
-            "datasets", "datasets info", "description", "doctor", "episodes", "episodes delete", "episodes list", "episodes mark",
-            "episodes repair", "episodes trash", "episodes trim", "export", "feetech", "gamepad", "lerobot", "param",
+            "datasets", "datasets info", "description", "doctor", "episodes", "episodes delete", "episodes list",
+            "episodes mark", "episodes repair", "episodes trash", "episodes trim", "export", "feetech", "gamepad", "lerobot", "param",
             "plan", "plugins", "serve", "train",
         ),
         "",

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="misc"
 """The table of entrances to motion in `docs/explanation/safety.md`: it lists all that there are, and each cell is true.
 
 The page is the source: what a cell says is what its check measures. Cells that need what tests here do not have (ROS, a

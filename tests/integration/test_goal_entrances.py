@@ -1,3 +1,4 @@
+# mypy: disable-error-code="attr-defined,return-value"
 """Goals of trajectories, by every entrance: within the limits, clear of the world, or refused with a reason."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="func-returns-value,arg-type,assignment,attr-defined,unused-ignore"
 """The entrances to motion, used as programs, operators and pages use them, each in a run of the simulated arm.
 
 `tests/integration/test_entrances.py` walks the table of `docs/explanation/safety.md` with them. All runs are in

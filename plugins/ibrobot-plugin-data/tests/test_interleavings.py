@@ -216,7 +216,7 @@ class Story:
         }
         if self.run.session.bus.serves("/reset"):  # neither at the start nor at the end
             requests["episode"] = self.episode
-        name = self.draw.choice([*requests, "stop", "reset", "reset", "deadman", "deadman"])
+        name = self.draw.choice([*requests, "intervene", "stop", "reset", "reset", "deadman", "deadman"])
         if name == "deadman":
             Lever.held = not Lever.held
             self.note(f"deadman {'pressed' if Lever.held else 'released'}")

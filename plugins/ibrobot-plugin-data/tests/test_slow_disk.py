@@ -1,3 +1,4 @@
+# mypy: disable-error-code="func-returns-value,assignment,unused-ignore"
 """A disk that stalls, and messages that are lost: what the run says of an episode is what is on the disk."""
 
 from __future__ import annotations

@@ -299,7 +299,7 @@ def serve_next(device: Device, requests: Requests, timeout_s: float | None) -> b
             device.stand()
     if request is not _OVERDUE and request["do"] != "end":
         carry_out(device, request, requests.channel)
-    return request["do"] != "end"
+    return bool(request["do"] != "end")
 
 
 def carry_out(device: Device, request: Mapping[str, Any], channel: Channel) -> None:

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="assignment,unused-ignore"
 """A base whose wheels keep their last velocity, driven by twists through control, in simulated time.
 
 Real are the teleop, the control core, the hardware, the link and what the device process does; the process itself, the

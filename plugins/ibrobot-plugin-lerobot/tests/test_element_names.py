@@ -1,3 +1,4 @@
+# mypy: disable-error-code="arg-type"
 """Names of a dataset's elements, in every form that others write: they are the contract's, or it is refused."""
 
 from __future__ import annotations

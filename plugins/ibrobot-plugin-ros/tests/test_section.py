@@ -1,3 +1,4 @@
+# mypy: disable-error-code="operator"
 """The node beside a run, with a fake in place of ROS."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="misc,return-value"
 """Threads that need types at the same time: the store of types is made once, and no thread sees half of a change."""
 
 from __future__ import annotations
