@@ -103,8 +103,8 @@ COMMANDS = {
         (
             "camera", "certs", "config", "config copy", "config import", "config new", "contract", "convert",
             "datasets", "datasets info", "description", "doctor", "episodes", "episodes delete", "episodes list",
-            "episodes mark", "episodes repair", "episodes trash", "episodes trim", "export", "feetech", "gamepad", "lerobot",
-            "param", "plan", "plugins", "serve", "train",
+            "episodes mark", "episodes repair", "episodes trash", "episodes trim", "export", "feetech", "gamepad",
+            "lerobot", "param", "plan", "plugins", "serve", "train",
         ),
         "",
     ),
