@@ -164,7 +164,7 @@ class Robot:
         self.session = runtime.session
         self.commands: list[Vector] = []
         self.heads: list[Mapping[str, Any]] = []
-        """What ROS clients are told."""
+        """The results and rejections that ROS clients receive."""
         self.actions = Actions(
             self.session, [ARM, "gripper_action"], lambda name: False, lambda name: name, "ros", "GripperCommand"
         )

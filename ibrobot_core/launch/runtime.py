@@ -46,8 +46,9 @@ SET_MODE = Service("/set_mode", SetMode, NoneType, "Enter another control mode."
 RESET = Service("/reset", Reset, str, "Clear faults and the emergency stop; answers with what the robot does now.")
 """The service `/reset`."""
 ESTOP = Service("/estop", NoRequest, NoneType, "Stop the robot at once, and hold until a reset.", urgent=True)
-CHECK_ESTOP = Service("/estop/check", NoRequest, NoneType, "Go the way of a stop, and stop nothing.", urgent=True)
 """The service `/estop`."""
+CHECK_ESTOP = Service("/estop/check", NoRequest, NoneType, "Go the way of a stop, and stop nothing.", urgent=True)
+"""The service `/estop/check`, by which each way of a stop is tried out when a run starts."""
 _CHANGE_S = 2.0
 """How long the end of a run waits for a mode switch or reset under way [s]."""
 _PICTURES = (Image.ros_type, CompressedImage.ros_type)
