@@ -8,7 +8,7 @@ from typing import Any
 
 from ibrobot_core.convert import Converter, Faults, Key
 
-_ANY_JOINT = {"lower": -1e6, "upper": 1e6, "max_velocity": 1.0, "max_acceleration": 1.0, "beyond_model": True}
+_ANY_JOINT = {"lower": -1e6, "upper": 1e6, "max_velocity": 1.0, "max_acceleration": 100.0, "beyond_model": True}
 """The values of a joint with faults: no check of another value depends on them."""
 _ROUNDS = 3
 """Values may only be found faulty once others are left out."""

@@ -196,9 +196,8 @@ def test_a_fault_is_an_exception_with_its_text(tmp_path: Path) -> None:
     try:
         observation = robot.get_observation()
         assert list(observation) == list(robot.observation_features)
-        robot.send_action({**observation, "shoulder_pan.pos": float("nan")})
         with pytest.raises(ComponentFailed, match=r"shoulder_pan\.pos is nan"):
-            robot.get_observation()
+            robot.send_action({**observation, "shoulder_pan.pos": float("nan")})
         assert robot.link._child is not None
         os.kill(robot.link._child.pid, signal.SIGKILL)
         with pytest.raises(ComponentFailed, match="the run has ended: killed by SIGKILL"):

@@ -31,7 +31,7 @@ from ibrobot_data.conversion import ConvertOptions
 from ibrobot_data.plural import plural
 from ibrobot_data.prompt import check_prompt
 from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
-from ibrobot_data.stated import anchored_option, names_option
+from ibrobot_data.stated import listed_joints, names_option
 
 if TYPE_CHECKING:
     from ibrobot_core.app import RobotConfig
@@ -65,7 +65,6 @@ def _writer_flags() -> dict[str, click.Option]:
 @declared(CONVERT)
 @click.option("--to", type=click.Choice(("dataset", "bag")), default="dataset", show_default=True, help="What to make.")
 @click.option("--episodes", "numbers", metavar="N,N-M", help="With --to bag: only these episodes, counted from 0.")
-@anchored_option()
 @names_option("With --to bag: names of a feature's elements in their order, for a dataset that does not have them.")
 @click.option("--type", "type_", help="Dataset writer; by default that of an installed plugin.")
 @click.option("--set", "sets", multiple=True, metavar="OPTION=VALUE", help="Any other option of the dataset writer.")
@@ -73,8 +72,7 @@ def _writer_flags() -> dict[str, click.Option]:
 @click.pass_context
 def convert(
     context: click.Context, options: ConvertOptions, /, *, to: str, numbers: str | None,
-    anchored: tuple[str, ...] | None, names: Mapping[str, list[str]], type_: str | None,
-    sets: tuple[str, ...], as_json: bool, events: bool, **flags: Any,
+    names: Mapping[str, list[str]], type_: str | None, sets: tuple[str, ...], as_json: bool, events: bool, **flags: Any,
 ) -> None:  # fmt: skip
     """Make a dataset for training from recorded episodes, or with --to bag episodes from a dataset.
 
@@ -98,11 +96,11 @@ def convert(
                 from ibrobot_data.config_metadata import metadata_from_config
 
                 unit = options.norm_mode if "norm_mode" in given else None
-                robot, calibration = _stated(options, anchored)
+                robot, calibration = _stated(options)
                 stated = metadata_from_config(robot, unit, calibration, names) if robot is not None else {}
                 report = _to_bags(options, numbers, robot, stated, sets, progress)
             else:
-                report = _to_dataset(options, anchored, type_, (*_overrides(flags), *sets), progress)
+                report = _to_dataset(options, type_, (*_overrides(flags), *sets), progress)
     except KeyboardInterrupt:
         if events:
             why = "interrupted; finished episodes are kept: the same conversion continues with the others"
@@ -124,8 +122,7 @@ convert.params += _writer_flags().values()
 
 
 def _to_dataset(
-    options: ConvertOptions, anchored: Sequence[str] | None, type_: str | None, overrides: Sequence[str],
-    progress: _Progress,
+    options: ConvertOptions, type_: str | None, overrides: Sequence[str], progress: _Progress
 ) -> Report:  # fmt: skip
     from ibrobot_data.run import convert as run
     from ibrobot_data.run import find_episodes
@@ -133,7 +130,7 @@ def _to_dataset(
     installed_plugins().check_pool(options.on)
     type_ = type_ or installed_plugins().default("dataset")
     writer_options = _options("dataset", type_, overrides)
-    robot, calibration = _stated(options, anchored)
+    robot, calibration = _stated(options)
     request = ConversionRequest(
         options.out, writer_options, type_, append=options.append, outcomes=options.outcome,
         jobs=options.jobs, on=options.on, norm_mode=options.norm_mode, missing=options.missing, prompt=options.prompt,
@@ -214,20 +211,18 @@ def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:
     return single_options(installed_plugins().find(kind, type_).options, overrides, type_)
 
 
-def _stated(
-    options: ConvertOptions, anchored: Sequence[str] | None
-) -> tuple[RobotConfig | None, Mapping[str, Mapping[str, Any]] | None]:
+def _stated(options: ConvertOptions) -> tuple[RobotConfig | None, Mapping[str, Mapping[str, Any]] | None]:
     """The robot YAML and the calibration that the options name."""
     from ibrobot_core.api import load_calibration
     from ibrobot_core.app import find_config
     from ibrobot_data.config_metadata import load_contract, with_anchored
 
-    if anchored is not None and (options.calibration is None or options.config is None):
+    if options.anchored is not None and (options.calibration is None or options.config is None):
         raise click.UsageError("--anchored needs --calibration and --config, which has the joints' limits")
     calibration = load_calibration(options.calibration).snapshot() if options.calibration is not None else None
     robot = load_contract(find_config(options.config, installed_plugins())) if options.config is not None else None
     if robot is not None and calibration is not None:
-        calibration = with_anchored(calibration, robot, anchored)
+        calibration = with_anchored(calibration, robot, listed_joints(options.anchored))
     return robot, calibration
 
 

@@ -79,6 +79,13 @@ class ConvertOptions:
     calibration: str | None = option(
         None, names="calibration", label="Calibration", more=True, help="calibration to use instead of the recorded one"
     )
+    anchored: str | None = option(
+        None,
+        label="Joints from 0 to 100",
+        more=True,
+        help="with a calibration: names of joints that range from 0 to 100, separated by commas; by default those of "
+        "the robot YAML's hardware",
+    )
     jobs: int | None = option(
         None, ge=1, label="Episodes at once", more=True, help="episodes in parallel; by default one for each CPU core"
     )

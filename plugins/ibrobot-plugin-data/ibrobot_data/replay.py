@@ -34,7 +34,7 @@ from ibrobot_data.episode import recorded_contract
 from ibrobot_data.playback import Playback, read_playback
 from ibrobot_data.replay_source import ReplaySource
 from ibrobot_data.same_robot import Identity
-from ibrobot_data.stated import anchored_option, names_option
+from ibrobot_data.stated import listed_joints, names_option
 
 _FAR = 0.5
 """Maximum distance of a command from its limits, as a fraction of the joint's range; the safety layer clips it."""
@@ -57,12 +57,16 @@ _MODE = "replay"
 @click.option("--any-robot", is_flag=True, help="Replay even if robot, robot type or calibration differ.")
 @click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of joints in a dataset that does not state it.")
 @click.option("--calibration", metavar="NAME", help="Calibration for such a dataset, if its unit needs one.")
-@anchored_option()
+@click.option(
+    "--anchored",
+    metavar="JOINT,…",
+    help="With --calibration: joints that range from 0 to 100; by default those of the robot YAML's hardware.",
+)
 @names_option("Names of a feature's elements in their order, for a dataset that does not have them.")
 @run_options("overrides", "viewer", "headless", "dry_run", "as_json")
 def replay(
     episode: Path, config: str | None, speed: float, force_contract: bool, any_robot: bool, norm_mode: str | None,
-    calibration: str | None, anchored: tuple[str, ...] | None, names: Mapping[str, list[str]], **options: Any,
+    calibration: str | None, anchored: str | None, names: Mapping[str, list[str]], **options: Any,
 ) -> None:  # fmt: skip
     """Play the commands of a recorded EPISODE, and compare the joints with the recorded ones.
 
@@ -80,7 +84,7 @@ def replay(
         raise click.UsageError("--anchored needs --calibration and CONFIG, which has the joints' limits")
     if robot is not None and numbers is not None:
         with wrong_input():
-            numbers = with_anchored(numbers, robot, anchored)
+            numbers = with_anchored(numbers, robot, listed_joints(anchored))
     given = metadata_from_config(robot, norm_mode, numbers, names) if robot is not None else None
     with wrong_input(), closing(installed_plugins().open_episode(episode, given)) as reader:
         summary = reader.summary()

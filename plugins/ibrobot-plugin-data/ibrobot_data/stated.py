@@ -25,17 +25,6 @@ def names_option(help_text: str) -> Callable[[Any], Any]:
     return click.option("--names", multiple=True, metavar="FEATURE=NAME,…", callback=_parsed, help=help_text)
 
 
-def anchored_option() -> Callable[[Any], Any]:
-    """The option `--anchored`; the command receives joints, or None if it is not given."""
-    return click.option(
-        "--anchored",
-        metavar="JOINT,…",
-        callback=_joints,
-        help="With --calibration: joints that range from 0 to 100; by default those of the robot YAML's hardware.",
-    )
-
-
-def _joints(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[str, ...] | None:
-    if value is None:
-        return None
-    return tuple(joint.strip() for joint in value.split(",") if joint.strip())
+def listed_joints(text: str | None) -> tuple[str, ...] | None:
+    """Joints of a text such as `gripper,jaw`; None if there is no text."""
+    return None if text is None else tuple(joint.strip() for joint in text.split(",") if joint.strip())

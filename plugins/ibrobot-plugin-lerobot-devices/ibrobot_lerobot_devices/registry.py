@@ -80,8 +80,12 @@ def _installed() -> str:
 
 
 def third_parties(installed: Iterable[Distribution]) -> list[str]:
-    """The modules of packages that add devices to LeRobot, also of those with dashes, which LeRobot overlooks."""
-    return sorted({name for each in installed if (name := _module(each)).startswith(_PREFIXES)})
+    """The modules of packages that add devices to LeRobot, also of those with dashes, which LeRobot overlooks.
+
+    Not those of ibrobot itself: LeRobot's way to a robot of ibrobot is no way for ibrobot.
+    """
+    names = {_module(each) for each in installed}
+    return sorted(name for name in names if name.startswith(_PREFIXES) and not name.endswith("_ibrobot"))
 
 
 def _module(distribution: Distribution) -> str:

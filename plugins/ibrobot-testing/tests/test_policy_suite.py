@@ -46,6 +46,12 @@ class ZerosForMissing(FakePolicy):
         return super().preprocess(attrs.evolve(frame, values={"observation.state": state, **frame.values}))
 
 
+class TakesNaN(FakePolicy):
+    def preprocess(self, frame):
+        state = np.nan_to_num(frame.values.get("observation.state", np.zeros(0)))
+        return super().preprocess(attrs.evolve(frame, values={**frame.values, "observation.state": state}))
+
+
 class RandomWithoutSeed(FakePolicy):
     def reset(self, seed):
         self._goal = np.random.default_rng().uniform(-0.5, 0.5, 6)
@@ -198,6 +204,7 @@ WRONG = {
     WantsAWholeHistory: "a_history_of_any_length_is_taken",
     TrustsThePrefixsLength: "a_prefix_of_any_length_is_taken",
     ZerosForMissing: "a_missing_key_is_refused",
+    TakesNaN: "an_observation_that_is_not_finite_is_refused",
     RandomWithoutSeed: "equal_seeds_act_alike",
     RemembersTheLastEpisode: "equal_seeds_act_alike",
     ChangesTheFrame: "inputs_stay_as_they_were",
