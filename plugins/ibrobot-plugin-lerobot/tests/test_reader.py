@@ -134,7 +134,7 @@ def test_only_what_is_asked_for_is_read(tmp_path: Path):
 
 def test_joints_come_in_radians(tmp_path: Path):
     joints = {
-        n: {"id": i, "drive_mode": 0, "homing_offset": 0, "range_min": 1000, "range_max": 3100}
+        n: {"id": i, "drive_mode": 0, "homing_offset": 0, "range_min": 1000, "range_max": 3100, "closed_at": None}
         for i, n in enumerate("abc")
     }
     more = provenance(norm_mode="degrees", calibration=json.dumps({"arm": joints}))

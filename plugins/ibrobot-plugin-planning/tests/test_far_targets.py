@@ -1,4 +1,4 @@
-"""Targets beyond reach, by whatever factor: the ordinary refusal, for every caller."""
+"""Targets beyond reach: the ordinary refusal, for every caller; what no robot means is refused as a request."""
 
 from __future__ import annotations
 
@@ -29,7 +29,11 @@ from .test_plan_command import run as plan_command
 from .test_plan_command import yaml  # noqa: F401 - a fixture
 from .test_tasks import steps, task_robot
 
-FAR = (2.0, 10.0, 1e3, 1e6, 1e12, 1e100, 1e155, 1e200, 1e308)
+FAR = (2.0, 10.0, 1e3)
+BEYOND = (1000.1, 1e6, 1e12, 1e100, 1e155, 1e200, 1e308)
+"""No distance of a request [m]."""
+NO_DISTANCE = "xyz must be numbers from -1000 to 1000"
+MORE = ("", " axis=down", " rpy=3.14159,0,0", " rpy=0,0,0 beyond_reach=keep_axis")
 DOWN = Quaternion(1.0, 0.0, 0.0, 0.0)
 
 
@@ -44,7 +48,7 @@ def tool(tmp_path_factory: pytest.TempPathFactory) -> Tool:
 
 
 @pytest.mark.parametrize("far", FAR)
-@pytest.mark.parametrize("more", ["", " axis=down", " rpy=3.14159,0,0", " rpy=0,0,0 beyond_reach=keep_axis"])
+@pytest.mark.parametrize("more", MORE)
 def test_goal_as_text(run: Runtime, far: float, more: str):
     for place in (f"{far},0,0", f"0.1,{-far},{far}"):
         result = finish(run, run.session.bus.call(GO_TO, f"xyz={place}{more}"))
@@ -77,7 +81,28 @@ def test_task(run: Runtime, far: float):
         run.session.bus.call(RUN, steps(f"move: {{xyz: [{far!r}, 0, 0.1], axis: down}}"))
 
 
-@pytest.mark.parametrize("far", FAR)
+@pytest.mark.parametrize("far", BEYOND)
+def test_what_no_robot_means_is_no_request(run: Runtime, yaml: Path, far: float):  # noqa: F811
+    bus: Any = run.session.bus
+    goal = {"xyz": [far, 0, 0], "axis": [0, 0, -1]}
+    for service, request in (
+        *((GO_TO, f"xyz={far},0,0{more}") for more in MORE),
+        (COMPUTE_IK, {"goal": goal}),
+        (PLAN, {"goals": [goal]}),
+        (CARTESIAN, {"waypoints": [{"xyz": [0.2, 0, far]}], "least_fraction": 0.9}),
+        (MOVE_ACTION, {"goals": [goal]}),
+        (RUN, steps(f"move: {{xyz: [{far!r}, 0, 0.1], axis: down}}")),
+    ):
+        with pytest.raises(IbrobotError, match=NO_DISTANCE):
+            bus.call(service, request)
+    answer = bus.call(PLAN_GOAL, f"xyz=0.1,{-far},0")
+    assert answer.code is PlanCode.INVALID_GOAL_CONSTRAINTS
+    assert NO_DISTANCE in answer.message
+    failed = plan_command(yaml, "--from", "left", "--goal", f"xyz={far},0,0").exception
+    assert NO_DISTANCE in str(failed)
+
+
+@pytest.mark.parametrize("far", (*FAR, *BEYOND))
 def test_cmd_pose(run: Runtime, far: float, caplog: pytest.LogCaptureFixture):
     run.session.bus.publish(CMD_POSE, Pose(Vector3(far, 0, 0), DOWN))
     for _ in range(10):
