@@ -222,12 +222,15 @@ def lerobot(session: nox.Session) -> None:
 
 
 def run_again(session: nox.Session, *command: str) -> None:
-    """Run a command, and once more if it fails, as tests do: beside other sessions, a run in real time may be late."""
+    """Run a command, and once more if it fails, as tests do: beside other sessions, a run in real time may be late.
+
+    A simulation then runs in lockstep, which does not depend on the other sessions.
+    """
     try:
         session.run(*command, external=True)
     except CommandFailed:
         print("RERUN", shlex.join(command), flush=True)
-        session.run(*command, external=True)
+        session.run(*command, *(("--lockstep",) if "--sim" in command else ()), external=True)
 
 
 def check_wheels(session: nox.Session, folder: Path) -> None:
