@@ -11,7 +11,7 @@ import numpy as np
 from ibrobot_ros2.jpeg import to_jpeg
 from numpy.typing import NDArray
 
-from ibrobot_core.api import CameraInfo, CompressedImage, Context, Header, Image, Message, Sensor, SensorError, ns
+from ibrobot_core.api import CameraInfo, CompressedImage, Context, Header, Image, Message, Sensor, SensorError, SteppedClock, ns
 from ibrobot_core.app import Subscription
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.render import Renderer
@@ -24,7 +24,10 @@ _FURTHEST_M = 10.0
 
 
 class MujocoCamera(Sensor):
-    """Renders in the thread of `open` and `read`. Images that are due too soon are counted, not queued."""
+    """Renders in the thread of `open` and `read`. Images that are due too soon are counted, not queued.
+
+    In lockstep, nobody waits for a picture: after the first one, only those are rendered that somebody receives.
+    """
 
     def __init__(self, options: CameraOptions, ctx: Context) -> None:
         self._is_depth = options.stream == "depth"
@@ -35,6 +38,8 @@ class MujocoCamera(Sensor):
         self._options = options
         self._ctx = ctx
         self._period_ns = ns(1.0 / options.fps)
+        self._lockstep = isinstance(ctx.clock, SteppedClock)
+        self._is_first = True
         self._last_slot: int | None = None
         self._renderer: Renderer | None = None
         self._states: Subscription | None = None
@@ -75,7 +80,7 @@ class MujocoCamera(Sensor):
             if state is None:
                 return None
             stamp_ns = stamp_of(state)
-            if self._is_due(stamp_ns):
+            if self._is_due(stamp_ns) and self._is_wanted():
                 self._drawn.follow(state)
                 if self._is_depth:
                     return self._depth_image(stamp_ns, self._renderer.render_depth(self._drawn.data))
@@ -91,6 +96,12 @@ class MujocoCamera(Sensor):
         self.skipped += 0 if last is None else slot - last - 1
         self._last_slot = slot
         return True
+
+    def _is_wanted(self) -> bool:
+        """Whether a picture is needed; the first one shows that the camera works."""
+        first, self._is_first = self._is_first, False
+        bus = self._ctx.bus
+        return first or not self._lockstep or (bus is not None and bus.has_subscribers(self.topic))
 
     def _image(self, stamp_ns: int, pixels: np.ndarray) -> Image | CompressedImage:
         height, width, _ = pixels.shape

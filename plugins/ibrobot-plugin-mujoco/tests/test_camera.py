@@ -61,15 +61,26 @@ def scene_state(stamp_ns: int, cube: tuple[float, float] | None = None) -> Vecto
 STATE = scene_state(0)
 
 
-def publish(ctx: Context, stamp_ns: int) -> None:
+def publish(ctx: Context, stamp_ns: int, cube: tuple[float, float] | None = None) -> None:
     assert ctx.bus is not None
-    ctx.bus.publish(PHYSICS_TOPIC, Float64MultiArray(np.concatenate([divmod(stamp_ns, 1_000_000_000), STATE[2:]])))
+    state = np.concatenate([divmod(stamp_ns, 1_000_000_000), STATE[2:]])
+    if cube is not None:
+        state[8:10] = cube
+    ctx.bus.publish(PHYSICS_TOPIC, Float64MultiArray(state))
+
+
+def watched_context() -> Context:
+    """The context of a camera whose pictures somebody receives."""
+    ctx = host_context("top", robot=ROBOT, simulation=OPTIONS)
+    assert ctx.bus is not None
+    ctx.bus.subscribe("/camera/top/image_raw", 1)
+    return ctx
 
 
 class TestConformance(SensorSuite):
     @override
     def context(self) -> Context:
-        return host_context("top", robot=ROBOT, simulation=OPTIONS)
+        return watched_context()
 
     @override
     def make(self, ctx: Context) -> MujocoCamera:
@@ -84,7 +95,7 @@ class TestConformance(SensorSuite):
 
 @pytest.fixture
 def ctx() -> Context:
-    return host_context("top", robot=ROBOT, simulation=OPTIONS)
+    return watched_context()
 
 
 @pytest.fixture
@@ -93,6 +104,31 @@ def camera(ctx: Context) -> Iterator[MujocoCamera]:
     camera.open()
     yield camera
     camera.close()
+
+
+def test_lockstep_renders_what_somebody_receives() -> None:
+    """The first picture shows that the camera works; later ones are the same whoever came and went before."""
+    pictures = []
+    for watched in ((True, True, True, True), (False, True, False, True), (False, False, False, True)):
+        ctx = host_context("top", robot=ROBOT, simulation=OPTIONS)
+        assert ctx.bus is not None
+        camera = MujocoCamera(SMALL, ctx)
+        camera.open()
+        try:
+            for i, is_watched in enumerate(watched):
+                receiver = ctx.bus.subscribe(camera.topic, 1) if is_watched else None
+                publish(ctx, i * SLOT_NS + 1, cube=(0.2, 0.02 * i))
+                image = camera.read(0)
+                assert (image is not None) == (i == 0 or is_watched)
+                if receiver is not None:
+                    receiver.close()
+            assert isinstance(image, CompressedImage)
+            assert image.header.stamp_ns == 3 * SLOT_NS + 1
+            assert camera.skipped == 0
+            pictures.append(image.data.tobytes())
+        finally:
+            camera.close()
+    assert len(set(pictures)) == 1
 
 
 def test_reading_without_waiting(ctx: Context, camera: MujocoCamera) -> None:
