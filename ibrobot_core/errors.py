@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copyreg
 import errno
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
 from pathlib import Path
+from typing import Any, override
 
 import attrs
 
@@ -22,6 +24,11 @@ class IbrobotError(Exception):
     """
 
     exit_code = 1
+
+    @override
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Worker processes send errors; those whose constructors make the text of other arguments stay as they are.
+        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
 @attrs.frozen

@@ -125,6 +125,8 @@ class ProgramSource(SourceWorker):
     def _act(self, action: Mapping[str, float]) -> None:
         """Command joints; those without a position keep the one that they were sent last, or stay where they are."""
         session, positions = self.session, self._features.radians(action)
+        if not self.active:
+            raise ComponentFailed("the robot takes no actions now: its mode is not entered")
         joints, limits = self._features.joints, session.config.robot
         if not self._sent:
             self._sent = dict(zip(joints, session.measured().position[self._columns].tolist(), strict=True))
