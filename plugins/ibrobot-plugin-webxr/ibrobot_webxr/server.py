@@ -96,11 +96,12 @@ class PageServer:
         app.on_shutdown.append(self._close_pages)
         # Its thread exists from the trial on; one that a stop had to start might not start.
         self._stops = ThreadPoolExecutor(1, "webxr stop")
+        self._server: ServerThread | None = None
         try:
             self._stops.submit(self._call_if_served, CHECK_ESTOP).result(_CHECK_S)
             self._server = ServerThread(self._guard, app, "webxr page", close_s=0.1, beside=self._send_states)
         except BaseException:
-            self._stops.shutdown(wait=False)
+            self.close()
             raise
 
     @property
@@ -110,7 +111,9 @@ class PageServer:
 
     def close(self) -> None:
         """Stop the server. Safe to call twice."""
-        self._server.close()
+        if self._server is not None:
+            self._server.close()
+        self._guard.listener.socket.close()
         self._stops.shutdown(wait=False)
         self._images.close()
         self._status.close()

@@ -23,7 +23,8 @@ def make_session(**changes: Any) -> Session:
     """
     fields = {"robot": make_robot(), "executors": {}, "control_modes": {}, "default_control_mode": "idle"}
     session = Session(RobotConfig(**{**fields, **changes}), Registry(), LaunchRequest(lockstep=True))
-    session.control = cast("Any", SimpleNamespace(report={"loop": {}, "counters": {}}, running=False))
+    control = SimpleNamespace(report={"loop": {}, "counters": {}}, running=True, call=lambda do, **arguments: {})
+    session.control = cast("Any", control)
     return session
 
 
