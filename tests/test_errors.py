@@ -41,7 +41,7 @@ def every_error() -> Iterator[IbrobotError]:
 
 @pytest.mark.parametrize("error", list(every_error()), ids=lambda error: type(error).__name__)
 def test_errors_cross_processes(error: IbrobotError) -> None:
-    for arrived in (pickle.loads(pickle.dumps(error)), copy.copy(error)):
+    for arrived in (pickle.loads(pickle.dumps(error)), copy.copy(error)):  # noqa: S301 - our own
         assert type(arrived) is type(error)
         assert str(arrived) == str(error)
         assert vars(arrived) == vars(error)

@@ -11,7 +11,18 @@ import numpy as np
 from ibrobot_ros2.jpeg import to_jpeg
 from numpy.typing import NDArray
 
-from ibrobot_core.api import CameraInfo, CompressedImage, Context, Header, Image, Message, Sensor, SensorError, SteppedClock, ns
+from ibrobot_core.api import (
+    CameraInfo,
+    CompressedImage,
+    Context,
+    Header,
+    Image,
+    Message,
+    Sensor,
+    SensorError,
+    SteppedClock,
+    ns,
+)
 from ibrobot_core.app import Subscription
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.render import Renderer

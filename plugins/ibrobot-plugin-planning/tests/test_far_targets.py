@@ -102,7 +102,7 @@ def test_what_no_robot_means_is_no_request(run: Runtime, yaml: Path, far: float)
     assert NO_DISTANCE in str(failed)
 
 
-@pytest.mark.parametrize("far", (*FAR, *BEYOND))
+@pytest.mark.parametrize("far", [*FAR, *BEYOND])
 def test_cmd_pose(run: Runtime, far: float, caplog: pytest.LogCaptureFixture):
     run.session.bus.publish(CMD_POSE, Pose(Vector3(far, 0, 0), DOWN))
     for _ in range(10):

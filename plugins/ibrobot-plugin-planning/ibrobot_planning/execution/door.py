@@ -29,7 +29,7 @@ from ibrobot_planning.planners.timing import Motion, motion_of
 from ibrobot_planning.world.engines import find_engines
 
 if TYPE_CHECKING:
-    from ibrobot_planning.world.paths import FreePaths, Margins
+    from ibrobot_planning.planners.paths import FreePaths, Margins
 
 WORLD = "world"
 """The section whose objects are the world."""
@@ -133,7 +133,7 @@ class GoalDoor(SessionWorker):
 
     @cached_property
     def _paths(self) -> FreePaths:
-        from ibrobot_planning.world.paths import FreePaths
+        from ibrobot_planning.planners.paths import FreePaths
 
         return FreePaths(lambda: self._arm, self.session.bus)
 

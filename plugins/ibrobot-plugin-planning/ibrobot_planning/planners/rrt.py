@@ -30,13 +30,13 @@ from ibrobot_planning.goals.joints import checked_start, joint_target
 from ibrobot_planning.goals.tool import Candidate, Tool
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.planners.options import RrtConnectOptions
+from ibrobot_planning.planners.paths import CHECK_S, FreePaths, collisions, outwards, sentence
 from ibrobot_planning.planners.search import Pace, Space, connect, shortened
 from ibrobot_planning.planners.timing import Motion, resting, timed, trajectory_of
 from ibrobot_planning.world.arm import Arm
 from ibrobot_planning.world.checked_arm import checked_arm
 from ibrobot_planning.world.collision import Collisions
 from ibrobot_planning.world.objects import World
-from ibrobot_planning.world.paths import CHECK_S, FreePaths, collisions, outwards, sentence
 
 _RESOLUTIONS_M = (0.05, 0.02, 0.005)
 """Maximum motion of the arm between checks of the search; finer ones follow if the timed motion touches."""
