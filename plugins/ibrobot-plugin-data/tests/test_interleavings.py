@@ -286,7 +286,7 @@ class Story:
         self.before = state
 
 
-@pytest.mark.parametrize("part", range(PARTS))
+@pytest.mark.parametrize("part", [0, 1, *(pytest.param(part, marks=pytest.mark.long) for part in range(2, PARTS))])
 def test_nothing_moves_after_a_stop_until_a_later_reset(runs: Runs, levers: None, part: int) -> None:
     seen: Counter[str] = Counter()
     for seed in range(part, INTERLEAVINGS, PARTS):
