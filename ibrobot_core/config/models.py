@@ -116,6 +116,10 @@ def read_xml(path: Path, root: str = "") -> XmlElement:
         raise ModelError(f"{path}: cannot be read: {error.strerror}") from None
     except expat.ExpatError as error:
         raise ModelError(f"{path}:{error.lineno}: not valid XML: {expat.ErrorString(error.code)}") from None
+    except ModelError:
+        raise
+    except (LookupError, ValueError):
+        raise ModelError(f"{path}:1: declares an unknown encoding: save it as UTF-8") from None
     found = top.children[0]
     if root and found.tag != root:
         raise found.error(f"begins with <{found.tag}>, must be <{root}>")

@@ -32,6 +32,8 @@ class Keymap:
     """Action -> key, in Cartesian jog; empty if it is not available."""
     common: Mapping[str, str]
     """Action -> key, in both."""
+    keyless: tuple[str, ...] = ()
+    """The joints that no key moves: there are default keys for seven, and the options give none."""
 
     def action(self, mode: Mode, key: str) -> str | None:
         """The action of `key` in `mode`."""
@@ -43,6 +45,11 @@ class Keymap:
         lines = [f"joints     {_pairs(self.joints)}"]
         if self.cartesian:
             lines.append(f"Cartesian  {_pairs(self.cartesian)}")
+        if self.keyless:
+            joint = self.keyless[0]
+            lines.append(
+                f"no keys    {', '.join(self.keyless)}: set them under keys, e.g. {joint}+: '1', {joint}-: '2'"
+            )
         lines.append("always     " + "  ".join(f"{key} {action}" for action, key in self.common.items()))
         return "\n".join(lines)
 
@@ -65,18 +72,21 @@ def make_keymap(
         overrides: action -> key, instead of the default.
 
     Raises:
-        TeleopError: if an action is unknown, a joint has no keys, or a key has two actions.
+        TeleopError: if an action is unknown, a joint has a key for one direction alone, or a key has two actions.
     """
     defaults = dict(zip(joints, _JOINT_KEYS, strict=False))
     motions: dict[str, str] = {}
+    keyless: list[str] = []
     for joint in joints:
-        for sign, default in zip("+-", defaults.get(joint, (None, None)), strict=True):
-            key = overrides.get(joint + sign, default)
-            if key is None:
-                raise TeleopError(
-                    f"no default key is left for {joint}{sign}: set one under keys, e.g. {joint}{sign}: '1'"
-                )
-            motions[joint + sign] = key
+        default = defaults.get(joint, ("", ""))
+        keys = {joint + sign: overrides.get(joint + sign, key) for sign, key in zip("+-", default, strict=True)}
+        if any(keys.values()):
+            for action, key in keys.items():
+                if not key:
+                    raise TeleopError(f"no default key is left for {action}: set one under keys, e.g. {action}: '1'")
+            motions |= keys
+        else:
+            keyless.append(joint)
     tool = (
         {a + s: k for a, pair in _CARTESIAN_KEYS.items() for s, k in zip("+-", pair, strict=True)} if cartesian else {}
     )
@@ -86,14 +96,15 @@ def make_keymap(
         **({"toggle": "m"} if cartesian else {}),
         **_COMMON_KEYS,
     }
-    known = {*motions, *tool, *common}
+    known = {*motions, *(joint + sign for joint in keyless for sign in "+-"), *tool, *common}
     for action in overrides:
         if action not in known:
             close = get_close_matches(action, known, 1)
             hint = f"did you mean {close[0]!r}?" if close else f"the actions are: {', '.join(sorted(known))}"
             raise TeleopError(f"keys: no action {action!r}, {hint}")
     keymap = Keymap(
-        *({action: overrides.get(action, key) for action, key in group.items()} for group in (motions, tool, common))
+        *({action: overrides.get(action, key) for action, key in group.items()} for group in (motions, tool, common)),
+        tuple(keyless),
     )
     for group in (keymap.joints, keymap.cartesian):
         _check_single({**group, **keymap.common})
@@ -127,7 +138,7 @@ def keys_of(options: KeyboardOptions, robot: Robot) -> Mapping[str, str]:
 
 
 def check_keys(options: KeyboardOptions, robot: Robot) -> Iterator[OptionFault]:
-    """Check that each joint has keys, that each key has one action, and that Cartesian jog has a model."""
+    """Check that joints have keys for both directions, each key has one action, and Cartesian jog has a model."""
     if options.cartesian and robot.description.mjcf is None:
         yield OptionFault(
             ("cartesian",), "Cartesian jog needs robot.description.mjcf: set it, or cartesian: false", "mjcf"

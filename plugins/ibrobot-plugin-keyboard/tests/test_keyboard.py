@@ -10,6 +10,7 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_keyboard import ibrobot_teleop
+from ibrobot_keyboard.keymap import check_keys
 from ibrobot_keyboard.options import KeyboardOptions
 from ibrobot_keyboard.teleop import KeyboardTeleop
 from ibrobot_testing import TeleopSuite, host_context, make_robot
@@ -260,10 +261,20 @@ def test_keys_that_make_no_sense_are_refused(keys, message):
     assert str(refused.value).startswith(message)
 
 
-def test_more_joints_than_keys_need_keys_of_their_own():
+@pytest.mark.parametrize("count", [8, 9, 14, 16, 30])
+def test_joints_after_the_seventh_have_no_default_keys(count):
+    robot = Robot("long", tuple(Joint(f"j{i}", -1, 1, 1, 1) for i in range(count)))
+    lines = KeyboardTeleop(KeyboardOptions(cartesian=False), host_context(robot=robot)).help().splitlines()
+    assert lines[0].endswith("i/k j6")
+    keyless = ", ".join(f"j{i}" for i in range(7, count))
+    assert lines[1] == f"no keys    {keyless}: set them under keys, e.g. j7+: '1', j7-: '2'"
+    assert list(check_keys(KeyboardOptions(cartesian=False), robot)) == []
+
+
+def test_more_joints_than_keys_can_have_keys_of_their_own():
     robot = Robot("long", tuple(Joint(f"j{i}", -1, 1, 1, 1) for i in range(8)))
-    with pytest.raises(TeleopError, match=r"no default key is left for j7\+: set one under keys, e\.g\. j7\+: '1'"):
-        KeyboardTeleop(KeyboardOptions(cartesian=False), host_context(robot=robot))
+    with pytest.raises(TeleopError, match=r"no default key is left for j7-: set one under keys, e\.g\. j7-: '1'"):
+        KeyboardTeleop(KeyboardOptions(cartesian=False, keys={"j7+": "1"}), host_context(robot=robot))
     options = KeyboardOptions(cartesian=False, keys={"j7+": "1", "j7-": "2"})
     assert "1/2 j7" in KeyboardTeleop(options, host_context(robot=robot)).help()
 

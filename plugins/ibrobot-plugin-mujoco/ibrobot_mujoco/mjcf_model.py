@@ -10,6 +10,9 @@ from pathlib import Path
 import mujoco
 
 from ibrobot_core.api import HardwareError
+from ibrobot_mujoco.chains import chains_of, parents_of
+from ibrobot_mujoco.plausibility import Drive, check_plausible, loads
+from ibrobot_mujoco.urdf_file import several
 from ibrobot_mujoco.urdf_model import (
     EFFORT,
     FINGER,
@@ -19,7 +22,10 @@ from ibrobot_mujoco.urdf_model import (
     DrivenJoint,
     RobotModel,
     add_servos,
+    grips_of,
+    mark_grippers,
     settle,
+    write_model,
 )
 
 _MOVES = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -41,24 +47,23 @@ def complete_model(mjcf: Path, folder: Path, tip: str | None = None) -> RobotMod
     try:
         spec = mujoco.MjSpec.from_file(str(mjcf))
         model = spec.compile()
-    except ValueError as error:
-        raise HardwareError(f"MuJoCo cannot load {mjcf}: {error}") from error
+    except (ValueError, mujoco.FatalError) as error:
+        raise HardwareError(f"MuJoCo cannot load {mjcf}: {' '.join(str(error).split())}") from error
     folder.mkdir(parents=True)
     try:
         _copy_files(spec, mjcf, folder)
         for key in list(spec.keys):  # their sizes are those of the present drives
             spec.delete(key)
-        joints = _drive(spec, model, notes)
+        joints, doubts = _drive(spec, model, notes)
+        chains = chains_of(parents_of(model, [each.name for each in joints]), grips_of(joints))
         tool = _tool(spec, tip, notes)
-        home = settle(spec, joints, notes)
-        path = folder / "model.xml"
-        path.write_text(spec.to_xml(), encoding="utf-8")
-        mujoco.MjModel.from_xml_path(str(path))
+        home = settle(spec, joints, notes, doubts)
+        path = write_model(spec, folder)
     except BaseException:
         shutil.rmtree(folder)
         raise
     name = re.sub(r"\W+", "_", spec.modelname or mjcf.stem)
-    return RobotModel(path, name, joints, home, tuple(notes), tool)
+    return RobotModel(path, name, joints, chains, home, tuple(notes), tuple(doubts), tool)
 
 
 def _copy_files(spec: mujoco.MjSpec, mjcf: Path, folder: Path) -> None:
@@ -73,11 +78,11 @@ def _copy_files(spec: mujoco.MjSpec, mjcf: Path, folder: Path) -> None:
     spec.modelfiledir = str(folder)
 
 
-def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]) -> tuple[DrivenJoint, ...]:
+def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]) -> tuple[tuple[DrivenJoint, ...], list[str]]:
     """The joints that have a drive; position servos for motors, and for all joints if none has a drive."""
     drives = {each.target: each for each in spec.actuators if each.trntype == mujoco.mjtTrn.mjTRN_JOINT}
     moving = [each for each in spec.joints if each.type in _MOVES and (not drives or each.name in drives)]
-    joints, missing, turning = [], [], []
+    driven, missing, turning = [], [], []
     for joint in moving:
         if not joint.name:
             raise HardwareError("the MJCF has a joint without a name")
@@ -88,27 +93,34 @@ def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]) -> tupl
             turn = math.degrees(TURN_RAD) if spec.compiler.degree else TURN_RAD
             joint.limited, joint.range = True, [-turn, turn]
             turning.append(joint.name)
-        gripper = bool(FINGER.search(joint.name)) or joint.type == mujoco.mjtJoint.mjJNT_SLIDE
-        joints.append(DrivenJoint(joint.name, lower, upper, VELOCITY, round(VELOCITY / 0.075, 1), gripper))
+        driven.append(DrivenJoint(joint.name, lower, upper, VELOCITY, VELOCITY / 0.075, False))
         drive = drives.get(joint.name)
         if drive is None or drive.biastype != mujoco.mjtBias.mjBIAS_AFFINE:
             if drive is not None:
                 spec.delete(drive)
-            missing.append(joints[-1])
-    if not any(not each.gripper for each in joints):
+            missing.append(joint.name)
+    if not driven:
         raise HardwareError("the MJCF has no joint that moves an arm")
+    joints = mark_grippers(driven, model)
+    carried = loads(model, {each.name: (each.lower, each.upper) for each in joints})
+    servos = [each for each in joints if each.name in missing]
+    doubts = check_plausible(
+        model, [Drive(each.name, EFFORT, VELOCITY, each.lower, each.upper) for each in servos], carried, {}
+    )
     notes.append(f"The MJCF states no speeds: {VELOCITY:g} rad/s, and braking from it within 75 ms.")
-    if missing:
+    if servos:
         for body in spec.bodies[1:]:
             body.gravcomp = 1
-        add_servos(spec, missing, dict.fromkeys((each.name for each in missing), EFFORT))
-        names = ", ".join(each.name for each in missing)
+        add_servos(spec, model, servos, dict.fromkeys(missing, EFFORT), carried[1])
         notes.append(
-            f"Position servos of 8 Hz and {EFFORT:g} N m, which hold the arm's weight (gravcomp), drive {names}."
+            f"Position servos of 8 Hz and {EFFORT:g} N m, which hold the arm's weight (gravcomp), drive "
+            f"{several(missing)}."
         )
     if turning:
-        notes.append(f"Without end in the MJCF, here one turn to each side: {', '.join(turning)}.")
-    return tuple(joints)
+        notes.append(f"Without end in the MJCF, here one turn to each side: {several(turning)}.")
+    if grips := grips_of(joints):
+        notes.append(f"The gripper, by names and short ways: {several(grips)}.")
+    return tuple(joints), doubts
 
 
 def _tool(spec: mujoco.MjSpec, tip: str | None, notes: list[str]) -> str:

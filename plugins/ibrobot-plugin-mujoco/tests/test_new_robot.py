@@ -81,7 +81,8 @@ def test_joints_that_mimic_follow(tmp_path: Path) -> None:
 def test_what_a_urdf_does_not_say_is_a_stated_guess(small: Path, tmp_path: Path) -> None:
     done = new(tmp_path / "arm.yaml", "--urdf", small)
     assert done.returncode == 0, done.stderr
-    assert "note: The URDF states no effort or no speed for turn: 20 N m and 1 rad/s." in done.stdout
+    assert "note: The URDF states no effort for turn: 20 N m (or N)." in done.stdout
+    assert "note: The URDF states no speed for turn: 1 rad/s (or m/s)." in done.stdout
     assert "note: Without end in the URDF, here one turn to each side: turn." in done.stdout
     assert "note: The tool is the frame of the link hand; --tip LINK sets another one." in done.stdout
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm_model/model.xml"))
@@ -93,14 +94,14 @@ def test_what_a_urdf_does_not_say_is_a_stated_guess(small: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     ("text", "arguments", "message"),
     [
-        ("<robot", (), "small.urdf cannot be read"),
+        ("<robot", (), "small.urdf:1: not valid XML"),
         ("<mujoco/>", (), "its first element is <mujoco>, must be <robot>"),
         (SMALL.replace("SHAPE", '<mesh filename="none.stl"/>'), (), "none.stl, which does not exist"),
         (SMALL.replace("SHAPE", '<mesh filename="package://far/a.stl"/>'), (), "give --package far=FOLDER"),
         (SMALL.replace("SHAPE", BOX), ("--tip", "elbow"), "no link 'elbow'; it has: base, upper, hand"),
         (SMALL.replace("SHAPE", BOX), ("--package", "far=/nowhere"), "expected NAME=FOLDER"),
         (SMALL.replace("SHAPE", BOX).replace("continuous", "fixed"), (), "no joint that moves an arm"),
-        (SMALL.replace("SHAPE", BOX).replace('value="1"', 'value="-1"'), (), "MuJoCo cannot load the URDF"),
+        (SMALL.replace("SHAPE", BOX).replace('value="1"', 'value="-1"'), (), "its mass is -1 kg"),
     ],
 )
 def test_a_wrong_file_leaves_nothing_behind(
