@@ -6,11 +6,11 @@ import json
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import attrs
 import pluggy
@@ -65,6 +65,11 @@ RECORDS = "records"
 """The key in `OFFICIAL` for the section whose component records episodes."""
 EXTRAS = Path(__file__).with_name("official_extras.json")
 """Extra of `ibrobot` -> the packages that it installs. `python tests/house/official_plugins.py` writes it."""
+
+_CLASSES = {"str": str, "Path": Path, "builtins.type[Any]": type}
+"""Annotation -> class, for the fields of descriptors that commands read even if they use nothing of the plugin."""
+_NOT_THEIRS: Mapping[str, object] = {"reads": False, "takes": "", "without_section": False, "questions": ()}
+"""Function of a descriptor that is asked about any file or robot -> its answer for what is not the plugin's."""
 
 _log = logging.getLogger("ibrobot.plugins")
 
@@ -130,8 +135,7 @@ class Registry:
         Raises:
             PluginError: if no installed plugin provides it; names the package to install, or the broken plugin.
         """
-        entry = self.entries.get((kind, type_))
-        if entry is None:
+        if (entry := self.entries.get((kind, type_))) is None:
             raise self.not_found(kind, type_)
         return entry.descriptor
 
@@ -151,10 +155,9 @@ class Registry:
 
     def sections(self, config: RobotConfig) -> Iterator[tuple[descriptors.SectionDescriptor, Any]]:
         """The plugins' sections for a robot with their options; None for a section that the file lacks."""
-        for name in self.types("section"):
-            descriptor = self.find("section", name)
+        for descriptor in self.of_kind("section"):
             assert isinstance(descriptor, descriptors.SectionDescriptor)
-            section = config.plugin_sections.get(name)
+            section = config.plugin_sections.get(descriptor.type)
             if section is not None or descriptor.without_section(config):
                 yield descriptor, None if section is None else section.options
 
@@ -201,7 +204,7 @@ class Registry:
                 descriptor.find(options)
         except MissingDependency as missing:
             return missing
-        except Exception as error:  # noqa: BLE001 - contained: a plugin's fault must not hide the other checks
+        except BaseException as error:  # noqa: BLE001 - contained: a plugin's fault must not hide the other checks
             package = self.entries[kind, type_].package
             return MissingDependency(f"its check failed: {_reason(error)}", remedy=f"report it to {package}")
         return None
@@ -292,8 +295,8 @@ class Registry:
         checks: list[descriptors.Check] = []
         for name, manager in self.managers.items():
             try:
-                checks += [check for result in manager.hook.ibrobot_doctor() for check in result]
-            except Exception as error:  # noqa: BLE001 - contained: a plugin's fault must not hide the other checks
+                checks += _offered(manager, "ibrobot_doctor")
+            except BaseException as error:  # noqa: BLE001 - contained: a plugin's fault must not hide the other checks
                 found = f"its doctor check failed: {_reason(error)}"
                 checks.append(descriptors.Check(f"plugin {name}", False, found, "report it"))
         return checks
@@ -303,7 +306,7 @@ class Registry:
         for name, manager in self.managers.items():
             try:
                 getattr(manager.hook, event)(**facts)
-            except Exception as error:  # noqa: BLE001 - contained: an observer must not stop the robot
+            except BaseException as error:  # noqa: BLE001 - contained: an observer must not stop the robot
                 _log.error("plugin %r failed in %s: %s", name, event, _reason(error))
 
 
@@ -330,7 +333,10 @@ def example_type(kind: str) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
+    try:
+        lines = str(error).strip().splitlines()
+    except Exception:  # noqa: BLE001 - contained: a plugin's error may be as broken as the plugin
+        lines = []
     if isinstance(error, pluggy.PluginValidationError):
         return f"{lines[0]}: {lines[-1]}"  # the last line has the cause
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
@@ -343,6 +349,34 @@ def _check_names(plugin: Any) -> None:
         if name.startswith("ibrobot_") and name not in known and hasattr(getattr(plugin, name), "ibrobot_impl"):
             close = get_close_matches(name, known, 1)
             raise ValueError(f"unknown hook {name!r}" + (f", did you mean {close[0]!r}?" if close else ""))
+
+
+def _offered(manager: pluggy.PluginManager, hook: str) -> list[Any]:
+    """What a plugin yields for a hook: objects of the class in the hook's annotation, with names that are texts."""
+    names = {"Iterable": list, "descriptors": descriptors}
+    (expected,) = get_args(get_type_hints(getattr(hookspecs, hook), names)["return"])
+    found = [each for result in getattr(manager.hook, hook)() for each in result]
+    for each in found:
+        if not isinstance(each, expected):
+            raise TypeError(f"expected a {expected.__name__}, got {each!r}")
+        for field in attrs.fields(type(each)):
+            if not isinstance(value := getattr(each, field.name), _CLASSES.get(field.type, object)):
+                raise TypeError(f"{expected.__name__}.{field.name} must be a {field.type}, not {value!r}")
+    ((plugin, _),) = manager.list_name_plugin()
+    return [attrs.evolve(each, **_contained(each, f"plugin {plugin!r} failed in %s of {hook}: %s")) for each in found]
+
+
+def _contained(offer: Any, message: str) -> dict[str, Callable[..., Any]]:
+    """The functions of an offer that are asked about any file or robot. If they raise, it is not theirs."""
+
+    def ask(name: str, *arguments: Any) -> Any:
+        try:
+            return getattr(offer, name)(*arguments)
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - contained: other plugins' are asked, too
+            _log.error(message, name, _reason(error))
+            return _NOT_THEIRS[name]
+
+    return {name: partial(ask, name) for name in _NOT_THEIRS if hasattr(offer, name)}
 
 
 def _add(registry: Registry, plugin: str, package: str, version: str, load: Callable[[], Any]) -> None:
@@ -358,33 +392,23 @@ def _add(registry: Registry, plugin: str, package: str, version: str, load: Call
         manager.register(loaded, plugin)
         manager.check_pending()
         for stage in (*KINDS.values(), *_UNTYPED):
-            offers[stage] = [each for result in getattr(manager.hook, stage)() for each in result]
-            wrong = [each for each in offers[stage] if not isinstance(each, descriptors.Descriptor)]
-            if wrong and stage in KINDS.values():
-                raise TypeError(f"expected a Descriptor, got {wrong[0]!r}")
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
+            offers[stage] = _offered(manager, stage)
+    except BaseException as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
         registry.failures.append(Failure(plugin, package, stage, _reason(error)))
         return
-    for kind, descriptor in ((kind, each) for kind, hook in KINDS.items() for each in offers[hook]):
-        other = registry.entries.get((kind, descriptor.type))
-        if other is not None:
-            reason = f"{kind} type {descriptor.type!r} is offered by {other.package} already"
+    for kind, each in ((kind, each) for kind, hook in KINDS.items() for each in offers[hook]):
+        entry = Entry(kind, each, plugin, package, version)
+        if (other := registry.entries.setdefault((kind, each.type), entry)) is not entry:
+            reason = f"{kind} type {each.type!r} is offered by {other.package} already"
             registry.failures.append(Failure(plugin, package, KINDS[kind], reason))
-            continue
-        registry.entries[kind, descriptor.type] = Entry(kind, descriptor, plugin, package, version)
-    registry.readers += offers["ibrobot_readers"]
-    registry.decoders += offers["ibrobot_decoders"]
-    registry.configs += offers["ibrobot_configs"]
-    registry.panels += offers["ibrobot_panels"]
-    registry.guides += offers["ibrobot_guides"]
-    registry.reports += offers["ibrobot_reports"]
-    for command in offers["ibrobot_commands"]:
-        if command.name in registry.commands:
-            reason = f"command {command.name!r} is offered by {registry.command_packages[command.name]} already"
+    for name in ("readers", "decoders", "configs", "panels", "guides", "reports"):
+        getattr(registry, name).extend(offers[f"ibrobot_{name}"])
+    for each in offers["ibrobot_commands"]:
+        if registry.commands.setdefault(each.name, each) is each:
+            registry.command_packages[each.name] = package
+        else:
+            reason = f"command {each.name!r} is offered by {registry.command_packages[each.name]} already"
             registry.failures.append(Failure(plugin, package, "ibrobot_commands", reason))
-            continue
-        registry.commands[command.name] = command
-        registry.command_packages[command.name] = package
     registry.managers[plugin] = manager
 
 

@@ -38,8 +38,7 @@ class LazyGroup(click.Group):
     @override
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         registry = installed_plugins()
-        found = registry.commands.get(cmd_name)
-        if found is None:
+        if (found := registry.commands.get(cmd_name)) is None:
             if any(cmd_name in offers.get("command", ()) for offers in official_plugins().values()):
                 raise registry.not_found("command", cmd_name)
             return None

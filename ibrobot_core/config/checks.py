@@ -46,8 +46,7 @@ class Checks:
 
     def run(self) -> None:
         """Run all checks."""
-        robot = self.sections.plain.get("robot")
-        if robot is not None:
+        if (robot := self.sections.plain.get("robot")) is not None:
             self._robot(robot)
             self._hardware(robot)
             self._executors(robot)
@@ -379,8 +378,7 @@ class Checks:
             self.document.add((*key, "executors", i), message)
 
     def _default_mode(self) -> None:
-        name = self.sections.plain.get("default_control_mode")
-        if name is not None:
+        if (name := self.sections.plain.get("default_control_mode")) is not None:
             self.document.refer(("default_control_mode",), name, self.document.names("control_modes"), "control mode")
         simulation = self.sections.simulation
         if simulation is not None and (name := simulation.component.default_control_mode) is not None:

@@ -212,8 +212,7 @@ class ContractChecks:
                 message = f"executor {other.executor!r} has its commands on {spec.topic}; give each its own topic"
                 self.document.add((*key, "topic"), message)
                 break
-        part = self.sections.executors.get(spec.executor)
-        if part is None:
+        if (part := self.sections.executors.get(spec.executor)) is None:
             return spec
         if not streams(part):
             message = f"executor {spec.executor!r} takes goals; an action needs one for setpoints, e.g. type position"

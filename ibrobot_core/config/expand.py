@@ -20,8 +20,7 @@ def expand(text: str) -> str:
 
     def replace(match: re.Match[str]) -> str:
         name, default = match.groups()
-        value = os.environ.get(name, default)
-        if value is None:
+        if (value := os.environ.get(name, default)) is None:
             raise ValueError(f"environment variable {name} is not set; set it, or give a default: ${{{name}:value}}")
         return value
 

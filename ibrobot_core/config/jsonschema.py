@@ -70,8 +70,7 @@ class _Schemas:
         }
 
     def _of_union(self, kind: Any) -> Schema:
-        component = component_of(kind)
-        if component is not None:  # without null, editors mark errors in it more precisely
+        if (component := component_of(kind)) is not None:  # without null, editors mark errors in it more precisely
             return self._of_component(component)
         return {"anyOf": [self.of_type(member) for member in get_args(kind)]}
 

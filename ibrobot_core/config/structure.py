@@ -312,8 +312,7 @@ class SectionParser:
         found = {}
         for name in self.document.names(section):
             self._check_name((section, name), name)
-            part = self._component((section, name), kind, name=name)
-            if part is not None:
+            if (part := self._component((section, name), kind, name=name)) is not None:
                 found[name] = part
         return found
 

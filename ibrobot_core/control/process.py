@@ -92,8 +92,7 @@ class ControlProcess:
 
     def _cycle(self, deadline: int, late: int, periods: int) -> None:
         self._note_silences(late)
-        plan = self._memory.read_plan()
-        if plan is not None:
+        if (plan := self._memory.read_plan()) is not None:
             self._core.set_plan(plan)
         self._memory.write_state(self._core.tick(deadline, late, periods))
         self._punctuality.tick(deadline, late, periods - 1)
