@@ -83,8 +83,7 @@ class Ownership(AbstractContextManager["Ownership"]):
     def _acquire(self, shared: bool) -> bool:
         """Lock the file; returns whether that succeeded."""
         while True:
-            descriptor = _open(self._file, shared)
-            if descriptor is None:
+            if (descriptor := _open(self._file, shared)) is None:
                 return True
             try:
                 fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)

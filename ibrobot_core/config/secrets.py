@@ -24,8 +24,7 @@ _NAMES = re.compile(r"(?i)(.*_)?(password|passwd|passphrase|secret|token|api_?ke
 def note(document: Document, kind: type, value: Mapping[str, Any], key: Key) -> None:
     """Register the secret options of a class in the section at `key`, so that no error shows them."""
     for name, field in fields(kind).items():
-        item = value.get(name)
-        if item is None:
+        if (item := value.get(name)) is None:
             continue
         if field.metadata.get("secret"):
             document.secrets.add((*key, name))

@@ -25,8 +25,7 @@ def check_policy(contract: Contract, spec: PolicySpec, norm_mode: str = "radians
     """
     faults = []
     for key, wanted in spec.observations.items():
-        feature = contract.observations.get(key)
-        if feature is None:
+        if (feature := contract.observations.get(key)) is None:
             has = ", ".join(contract.observations) or "none"
             faults.append(_fault(key, f"{tuple(wanted)}", f"has no such observation; it has: {has}"))
         elif not _fits(wanted, feature.shape):

@@ -53,8 +53,7 @@ class _Part:
         self.stream.add(stamp_ns, received_ns, message)
 
     def at(self, t_ns: int) -> _Array | None:
-        sample = self.stream.at(t_ns)
-        if sample is None:
+        if (sample := self.stream.at(t_ns)) is None:
             return None
         if sample is not self._sample:
             self._value = self._decode(sample.value)

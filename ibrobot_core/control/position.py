@@ -87,8 +87,7 @@ class PositionExecutor(Executor):
     def update(self, measured: JointReading) -> Vector:
         now_ns, before_ns, before = measured.stamp_ns, self._stamp_ns, self._setpoint
         self._stamp_ns = now_ns
-        plan = self._plan
-        if plan is not None:
+        if (plan := self._plan) is not None:
             last_ns = plan.start_ns + (len(plan.positions) - 1) * plan.step_ns
             if now_ns - last_ns >= self._stale_ns:
                 self._plan = None

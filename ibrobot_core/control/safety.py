@@ -80,8 +80,7 @@ class SafetyLayer:
         Raises:
             HardwareError: if a position is not finite.
         """
-        position = _vector(measured, len(self._names))
-        if position is None:
+        if (position := _vector(measured, len(self._names))) is None:
             raise HardwareError(f"measured positions must be {len(self._names)} numbers, got {measured!r}")
         if not np.isfinite(position).all():
             joint = int(np.argmin(np.isfinite(position)))

@@ -278,8 +278,7 @@ class Dispatcher:
         size = self._spec.chunk_size
         delay = self._steps(self._latency.upper_ns)
         # While the arm holds, at least half of the chunk must be left to move it.
-        prefix = self._smoother.ahead(t_ns, min(max(delay, 1), (size + 1) // 2))
-        if prefix is None:
+        if (prefix := self._smoother.ahead(t_ns, min(max(delay, 1), (size + 1) // 2))) is None:
             return None, 0
         return prefix[:size], min(delay, len(prefix), size)
 

@@ -225,8 +225,7 @@ class EngineClient(InferenceClient):
     def _run(self) -> None:
         while True:
             with self._taking:  # keeps requests and resets in the order submitted
-                work = self._next()
-                if work is None:
+                if (work := self._next()) is None:
                     return
                 if isinstance(work, int):
                     self._reset(work)

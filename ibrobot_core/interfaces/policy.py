@@ -47,8 +47,7 @@ class Frame:
         Raises:
             PolicyError: if it is missing, has another shape, is not finite, or if an image does not have 8-bit pixels.
         """
-        value = self.values.get(key)
-        if value is None:
+        if (value := self.values.get(key)) is None:
             raise PolicyError(f"the policy needs {key}, which the frame at {self.stamp_ns} ns lacks")
         if value.shape != shape:
             raise PolicyError(f"the policy needs {key} of shape {shape}, got {value.shape}")

@@ -40,8 +40,7 @@ class SensorWorker(SessionWorker):
     @override
     def work(self, timeout_s: float) -> None:
         assert self._sensor is not None
-        message = self._sensor.read(timeout_s)
-        if message is None:
+        if (message := self._sensor.read(timeout_s)) is None:
             return
         self.session.bus.publish(self._sensor.topic, message)
         now_ns = self.session.clock.now_ns()
