@@ -173,6 +173,14 @@ class Rig:
             state = self.core.tick()
         return state
 
+    def tick_until(self, ready: Callable[[], bool]) -> None:
+        """Ticks until something is so, at most a minute of simulated time."""
+        for _ in range(6000):
+            if ready():
+                return
+            self.tick()
+        raise AssertionError("it does not become so")
+
     def plan(self, end: list[float], seconds: float = 0.5, joints: tuple[bool, ...] = (True, True, True)) -> None:
         """Send a straight plan from the robot's setpoint to `end` [rad], shape (J,)."""
         assert self.core.state is not None

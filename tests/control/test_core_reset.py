@@ -236,16 +236,15 @@ def into(make_rig, phase: Phase):
     if phase is Phase.FAILED:
         rig.call("fault", fault="a cable is loose")
     elif phase is not Phase.ARRIVING:
-        while not rig.core.arrived():
-            rig.tick()
+        rig.call("begin_startup")
+        rig.tick_until(rig.core.arrived)
     if phase is Phase.FAULTED:
         rig.call("fault", fault="a cable is loose")
     if phase in {Phase.SHEDDING, Phase.SHED}:
         rig.plan([0.4, 0.4, 0.9])
         rig.tick(50)
         rig.hardware.conditions = (HOT,)
-        while rig.core.phase is not phase:
-            rig.tick()
+        rig.tick_until(lambda: rig.core.phase is phase)
         rig.hardware.conditions = ()
     if phase is Phase.STOPPING:
         rig.core.begin_stop()
@@ -263,6 +262,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
     "fault": {"fault": "the leader is gone"},
     "estop": {},
     "halt": {"unmoved": False},
+    "begin_startup": {},
 }
 CAUSES = {
     "estop": Cause.EMERGENCY_STOP,

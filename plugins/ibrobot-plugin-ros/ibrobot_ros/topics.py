@@ -127,7 +127,7 @@ class Topics:
 
     def take_subscribers(self, name: str, count: int) -> None:
         """Note how many subscribers a topic has in ROS."""
-        self._subscribers[name] = count
+        self._subscribers[name] = self.counts[f"subscribers {name}"] = count
 
     def tell(self, what: str) -> None:
         """Log a warning once."""
@@ -163,12 +163,14 @@ class Topics:
                 head = {"op": "publisher", "topic": name, "type": type_name, "fields": _fields(type_name), "qos": qos}
                 frames.append((head, b""))
         if type_name in LARGE and not self._subscribers.get(name):
+            self.counts[f"sent {topic}"] += 0  # it is listed
             return frames
         if backlog > BACKLOG:
             self.counts[f"dropped {topic}"] += 1
             return frames
         try:
             frames.append(({"op": "message", "topic": name}, encode(received.message).tobytes()))
+            self.counts[f"sent {topic}"] += 1
         except IbrobotError as error:
             self.counts[f"refused {topic}"] += 1
             self.tell(f"{topic}: {error}")

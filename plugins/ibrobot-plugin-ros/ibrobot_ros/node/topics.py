@@ -62,6 +62,8 @@ class Topics:
         self._node = node
         self._wire = wire
         self._publishers: dict[str, Any] = {}
+        self._subscribers: dict[str, int] = {}
+        """Topic -> the number of subscribers that the run knows of."""
         self._inputs: list[_Input] = []
         self._watched_s = 0.0
         self._reported: set[str] = set()
@@ -71,7 +73,7 @@ class Topics:
         topic = head["topic"]
 
         def matched(event: Any) -> None:
-            self._wire.send({"op": "matched", "topic": topic, "subscribers": event.current_count})
+            self._tell_subscribers(topic, event.current_count)
 
         self._try(
             topic,
@@ -121,11 +123,14 @@ class Topics:
             publisher.wait_for_all_acked(Duration(seconds=left_s))
 
     def watch(self) -> None:
-        """Report, once a second, what was dropped, and publishers of another type."""
+        """Report, once a second, the numbers of subscribers, what was dropped, and publishers of another type."""
         now_s = time.monotonic()
         if now_s - self._watched_s < _WATCH_S:
             return
         self._watched_s = now_s
+        for topic, publisher in self._publishers.items():
+            # Not every match is an event: without this, pictures would wait for one that never comes.
+            self._tell_subscribers(topic, publisher.get_subscription_count())
         for each in self._inputs:
             dropped, each.dropped = each.dropped, 0
             if dropped:
@@ -135,6 +140,11 @@ class Topics:
                     self._report(
                         each.topic, f"node {publisher.node_name} publishes {publisher.topic_type}, not {each.type_name}"
                     )
+
+    def _tell_subscribers(self, topic: str, count: int) -> None:
+        if self._subscribers.get(topic, 0) != count:
+            self._subscribers[topic] = count
+            self._wire.send({"op": "matched", "topic": topic, "subscribers": count})
 
     def _report(self, topic: str, what: str) -> None:
         if f"{topic} {what}" not in self._reported:
