@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from hashlib import blake2b
+from statistics import median_low
 from typing import Any
 
 import attrs
@@ -20,8 +21,10 @@ LARGEST_CANARY = 0.5
 """Largest share of the robots that a canary may ask for."""
 SETTLED_S = 5.0
 """A robot leaves a working server only for one with at least this uptime [s]."""
-_AVOIDED_S = 5.0
-"""Time for which a robot prefers all other servers to one that failed [s]."""
+_AVOIDED_S, _LONGEST_AVOIDED_S = 5.0, 60.0
+"""Time for which a robot prefers all other servers to one that failed [s]; it doubles with each further failure."""
+_SLOW_FACTOR, _SLOW_MS = 3.0, 50.0
+"""A server is slow if its answers take this many times as long as those of the others, and this much longer."""
 _OFFER_SIZE, _TEXT_SIZE, _IDENTITY_SIZE = 1 << 20, 128, 1100
 
 
@@ -56,6 +59,10 @@ class Offer:
     uptime_s: float = attrs.field(validator=_number)
     identity: str = attrs.field(default="", validator=_text)
     """Its version, and what computes its answers."""
+    failing: bool = attrs.field(default=False, validator=instance_of(bool))
+    """Whether its model fails all requests."""
+    latency_ms: float = attrs.field(default=0.0, validator=_number)
+    """Median time from a request to its answer, as the server measures it; 0: unknown."""
 
     @classmethod
     def read(cls, server: str, payload: Payload) -> Offer:
@@ -68,8 +75,9 @@ class Offer:
             if len(payload) > _OFFER_SIZE:
                 raise ValueError(f"{len(payload)} bytes")
             document = json.loads(bytes(payload))
-            given = {field.name: document[field.name] for field in attrs.fields(cls)[1:-1]}
-            return cls(server, **given, identity=document.get("identity", ""))
+            fields = [field for field in attrs.fields(cls) if field.name != "server"]
+            needed = [field for field in fields if field.default is attrs.NOTHING or field.name in document]
+            return cls(server, **{field.name: document[field.name] for field in needed})
         except (ValueError, TypeError, LookupError, RecursionError) as error:
             raise PolicyError(
                 f"{server} is not an ibrobot server: {bytes(payload[:40])!r}…: {type(error).__name__}: {error}"
@@ -97,15 +105,34 @@ def drawn_canary(canaries: Iterable[Offer], robot: str) -> str:
     return ""
 
 
+def good(offers: Sequence[Offer]) -> list[Offer]:
+    """The servers whose models work, and that are not much slower than the others; all of them if none is."""
+    working = [offer for offer in offers if not offer.failing] or list(offers)
+    return [offer for offer in working if not is_slow(offer, working)] or working
+
+
+def is_slow(offer: Offer, offers: Iterable[Offer]) -> bool:
+    """Whether a server's answers take much longer than those of the others.
+
+    It is compared with the median of the others, the lower one of two.
+    """
+    others = [each.latency_ms for each in offers if each.server != offer.server and each.latency_ms > 0]
+    if not others:
+        return False
+    usual_ms = median_low(others)
+    return offer.latency_ms > max(_SLOW_FACTOR * usual_ms, usual_ms + _SLOW_MS)
+
+
 def ranked(offers: Sequence[Offer], robot: str) -> list[Offer]:
-    """The servers in the order in which a new robot should try them: its own order, but those without room last.
+    """The servers in the order in which a new robot should try them.
 
     Each robot has an order of its own (rendezvous hashing), so that the robots of a dead server spread over the others
-    even if all choose at once, before any server has counted them. A server with fewer robots than an equal share has
-    room.
+    even if all choose at once, before any server has counted them. Servers without room come later, and those that
+    fail or are slow last. A server with fewer robots than an equal share has room.
     """
     own = sorted(offers, key=lambda offer: _draw(robot, offer.server))
-    return sorted(own, key=lambda offer: offer.robots >= _share(offers, 1))
+    best = good(offers)
+    return sorted(own, key=lambda offer: (offer not in best, offer.robots >= _share(best, 1)))
 
 
 def _share(offers: Sequence[Offer], more: int = 0) -> int:
@@ -122,12 +149,14 @@ class Choice:
     """
 
     robot: str
-    _avoided: dict[str, float] = attrs.field(factory=dict, init=False)
+    _avoided: dict[str, tuple[float, float]] = attrs.field(factory=dict, init=False)
+    """Until when a server is avoided [s], and how long the pause was [s]."""
 
     def avoid(self, server: str, now_s: float) -> None:
         """Try other servers first from now on, for a while."""
-        self._avoided = {server: until_s for server, until_s in self._avoided.items() if until_s > now_s}
-        self._avoided[server] = now_s + _AVOIDED_S
+        kept = {name: each for name, each in self._avoided.items() if each[0] + _LONGEST_AVOIDED_S > now_s}
+        pause_s = min(_LONGEST_AVOIDED_S, 2 * kept[server][1]) if server in kept else _AVOIDED_S
+        self._avoided = {**kept, server: (now_s + pause_s, pause_s)}
 
     def order(self, groups: Sequence[Sequence[Offer]], now_s: float) -> list[Offer]:
         """The servers in the order to try.
@@ -142,16 +171,16 @@ class Choice:
     def reconsider(self, current: str, groups: Sequence[Sequence[Offer]], now_s: float) -> str:
         """The server of a robot that begins an episode: its present one, unless another suits it better.
 
-        It leaves if its server has more than an equal share of the robots, or another group is preferred, but only for
-        a server that has been up for a while.
+        It leaves if its server fails, is slow, or has more than an equal share of the robots, or if another group is
+        preferred, but only for a server that has been up for a while.
         """
         settled = [[each for each in group if current == each.server or each.uptime_s >= SETTLED_S] for group in groups]
         home = next((group for group in settled if group), [])
-        mine = [offer for offer in home if offer.server == current]
-        if not home or (mine and mine[0].robots <= _share(home)):
+        best = good(home)
+        if not home or any(offer.server == current and offer.robots <= _share(best) for offer in best):
             return current
-        best = self.order([home], now_s)[0]
-        return current if self._avoids(best, now_s) else best.server
+        first = self.order([home], now_s)[0]
+        return current if self._avoids(first, now_s) else first.server
 
     def _avoids(self, offer: Offer, now_s: float) -> bool:
-        return self._avoided.get(offer.server, -math.inf) > now_s
+        return offer.server in self._avoided and self._avoided[offer.server][0] > now_s

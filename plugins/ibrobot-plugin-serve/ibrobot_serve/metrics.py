@@ -22,9 +22,14 @@ def probes(service: InferenceService) -> Probes:
     """Answers of a service's monitoring port."""
     return Probes(
         lambda: generate_latest(ServiceCollector(service)),
-        lambda: "the model hangs" if service.state == "hangs" else "",
-        lambda: "the server is stopping" if service.state == "draining" else "",
+        lambda: "the model hangs" if service.state == "hangs" else _failing(service),
+        lambda: "the server is stopping" if service.state == "draining" else _failing(service),
     )
+
+
+def _failing(service: InferenceService) -> str:
+    error = service.failing
+    return f"the model fails all requests: {error}" if error else ""
 
 
 class ServiceCollector(Collector):

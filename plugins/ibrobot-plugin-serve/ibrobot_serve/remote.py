@@ -26,7 +26,7 @@ from ibrobot_core.api import (
     TransportError,
 )
 from ibrobot_core.app import WireError
-from ibrobot_serve.fleet import Choice, Offer, drawn_canary, ranked
+from ibrobot_serve.fleet import Choice, Offer, drawn_canary, good, ranked
 from ibrobot_serve.options import DistributedOptions
 from ibrobot_serve.weights import check_weights
 from ibrobot_serve.wire import (
@@ -48,6 +48,8 @@ _OFFER_TIMEOUT_S = 0.3
 """Maximum time that a robot waits for the offers of servers [s]."""
 _REASON_TIMEOUT_S = 2.0
 _RETRY_S = 0.2
+_REVIEW_S = 5.0
+"""How often a robot compares its server with the others within an episode [s]."""
 _PARALLEL = 8
 """Maximum number of concurrent requests to a server with a stateless model."""
 
@@ -56,12 +58,22 @@ class _OtherServerError(PolicyError):
     """This server did not answer, but another may."""
 
 
+class _UnavailableError(_OtherServerError):
+    """It cannot be reached, or takes no robots."""
+
+
+class _ModelError(PolicyError):
+    """The model failed on this request: a fault of the request, or of this server."""
+
+
 class RemoteEngine(Engine):
     """The model on a server; the robot's side has no weights.
 
-    A robot keeps its server until it dies, fails, or stops accepting robots; it may also change at the start of an
-    episode, if another server has more room. While no server is reachable, requests fail and the arm holds. Each
-    request contains everything that a server needs. The transport reconnects by itself.
+    A robot keeps its server until it dies, fails, is much slower than others, or stops accepting robots; it may also
+    change at the start of an episode, if another server has more room. A request on which the model fails is sent to
+    the other servers: if one answers, the fault was the server's, and the robot leaves it. While no server is
+    reachable, requests fail and the arm holds. Each request contains everything that a server needs. The transport
+    reconnects by itself.
 
     Args:
         policy: the robot's side; must have the fingerprint of the server's policy.
@@ -103,6 +115,13 @@ class RemoteEngine(Engine):
         """Hash of the weights of the servers, except canaries; None before the first was chosen."""
         self._reconsider = False
         """Whether an episode has begun since the server was chosen."""
+        self._review_s = 0.0
+        """When to compare the server with the others [s]."""
+        self._left: set[str] = set()
+        """Fingerprints of the canaries that this robot has left."""
+        self._sent = 0
+        self._failed = False
+        """Whether the last request failed because of the model."""
         self._log = logging.getLogger("ibrobot.inference")
         self._end_watch: Callable[[], None] | None = None
 
@@ -149,23 +168,47 @@ class RemoteEngine(Engine):
 
     @override
     def run(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
+        with self._choosing:
+            self._sent += 1
+            number = self._sent
         tried: set[str] = set()
+        failed: dict[str, Offer] = {}
+        """Servers whose model failed on this request -> their offers."""
         failure: PolicyError | None = None
         while True:
             try:
                 session = self._session_for(tried)
-            except (TransportError, ContractError) as error:
-                raise failure or PolicyError(str(error)) from None
-            except PolicyError as error:
+            except (TransportError, ContractError, PolicyError) as error:
+                if failed:
+                    self._stay(*failed.values())
+                if failure is None and not isinstance(error, PolicyError):
+                    raise PolicyError(str(error)) from None
                 raise failure or error from None
             try:
-                return self._ask(session, tensors, request_id, deadline_ns)
-            except _OtherServerError as error:
-                failure = error
-                tried.add(session.server)
-                self._leave(session, str(error))
-                if time.monotonic_ns() >= deadline_ns:
+                outputs = self._ask(session, tensors, request_id, deadline_ns)
+            except _ModelError as error:
+                failure = failure if failed else error
+                # A newer request means that nobody needs this one. A policy with a history loses it when it moves.
+                if number != self._sent or (self._policy.spec.stateful and not self._failed):
+                    self._failed = True
                     raise
+                failed[session.server] = session
+                self._set_aside(session)
+            except _OtherServerError as error:
+                late = time.monotonic_ns() >= deadline_ns
+                failure = failure if failed else error
+                if not failed or not late:
+                    self._leave(session, str(error), forever=late or not isinstance(error, _UnavailableError))
+            else:
+                self._failed = False
+                for offer in failed.values():
+                    self._leave(offer, f"{failure}; server {session.server} answered the same request")
+                return outputs
+            tried.add(session.server)
+            if failure is not None and time.monotonic_ns() >= deadline_ns:
+                for offer in failed.values():  # there was no time to try others: they come first next time
+                    self._leave(offer, str(failure))
+                raise failure
 
     @override
     def close(self) -> None:
@@ -178,6 +221,7 @@ class RemoteEngine(Engine):
 
         Raises:
             PolicyError: for a fault of this request.
+            _ModelError: if the model failed.
             _OtherServerError: for a fault of this server.
         """
         left_ns = deadline_ns - time.monotonic_ns()
@@ -196,15 +240,17 @@ class RemoteEngine(Engine):
         try:
             name = server_name(self._model, session.server)
             answer = self._decoder.decode(self._transport.request(name, frame, left_ns / NS_PER_S))
-        except (TransportError, WireError) as error:
+        except TransportError as error:
+            raise _UnavailableError(str(error)) from None
+        except WireError as error:
             raise _OtherServerError(str(error)) from None
         finally:
             self._buffers.append(buffer)
         self.stats.pace_ms = answer.pace_ns / 1e6
         if answer.kind is WireKind.REFUSAL:
-            raise _OtherServerError(f"the server of {self._model}: {answer.text}")
+            raise _UnavailableError(f"the server of {self._model}: {answer.text}")
         if answer.kind is WireKind.FAILURE:
-            raise PolicyError(f"the server of {self._model}: {answer.text}")
+            raise _ModelError(f"the server of {self._model}: {answer.text}")
         if answer.id != request_id or answer.fingerprint != session.fingerprint:
             raise _OtherServerError(
                 f"the server of {self._model} answered request {answer.id} with policy {answer.fingerprint!r}; "
@@ -218,13 +264,28 @@ class RemoteEngine(Engine):
         self.stats.model_ms = answer.latency_ms - self.stats.queue_ms
         return answer.tensors
 
-    def _leave(self, session: Offer, why: str) -> None:
-        """Choose another server for the next request, if there is one."""
+    def _leave(self, session: Offer, why: str, *, forever: bool = True) -> None:
+        """Choose another server for the next request, if there is one; leave a canary `forever`, or for a while."""
         with self._choosing:
             self._choice.avoid(session.server, time.monotonic())
+            if session.canary and forever:
+                self._left.add(session.fingerprint)
             if self._session is session:
                 self._session = None
-                self._log.warning("model %s: server %s failed: %s", self._model, session.server, why)
+            self._log.warning("model %s: server %s failed: %s", self._model, session.server, why)
+
+    def _set_aside(self, session: Offer) -> None:
+        """Try the present request at another server, before a verdict on this one."""
+        with self._choosing:
+            if self._session is session:
+                self._session = None
+
+    def _stay(self, first: Offer, *others: Offer) -> None:
+        """Keep the server that was asked first: a request that fails at all servers is wrong itself."""
+        self._failed = True
+        with self._choosing:
+            if self._session is None:
+                self._begin(first)
 
     def _session_for(self, tried: Set[str]) -> Offer:
         """The present session, or a new one with a server that was not tried.
@@ -240,21 +301,42 @@ class RemoteEngine(Engine):
             if session is not None and offer_name(self._model, session.server) not in offered:
                 session = None
             if session is not None and session.server not in tried:
-                return self._reconsidered(session, offered) if self._reconsider else session
+                return self._reconsidered(session, offered)
             groups = self._groups([offer for offer in self._offers(offered) if offer.server not in tried])
             return self._begin(self._choice.order(groups, time.monotonic())[0])
 
     def _reconsidered(self, session: Offer, offered: frozenset[str]) -> Offer:
-        """The session of a new episode."""
+        """The session of a new episode, or of one in which another server has become better.
+
+        Within an episode, a robot leaves a server only because the server fails or is slow, and not if the policy has a
+        history.
+        """
+        now_s = time.monotonic()
+        if not self._reconsider and (self._policy.spec.stateful or now_s < self._review_s):
+            return session
+        self._review_s = now_s + _REVIEW_S
         try:
             offers = self._offers(offered)
-            server = self._choice.reconsider(session.server, self._groups(offers), time.monotonic())
+            groups = self._groups(offers)
+            mine = next((offer for offer in offers if offer.server == session.server), None)
+            if not self._reconsider:  # robots begin to try a canary with an episode
+                groups = [[offer for offer in group if not offer.canary or session.canary] for group in groups]
+            poor = mine is not None and mine not in good([mine, *(each for group in groups for each in group)])
+            server = session.server
+            if self._reconsider or poor:
+                server = self._choice.reconsider(session.server, groups, now_s)
         except (TransportError, PolicyError, ContractError) as error:
             self._log.info("model %s: stays at server %s: %s", self._model, session.server, error)
             return session
         self._reconsider = False
         if server == session.server:
             return session
+        if poor and mine is not None:
+            self._choice.avoid(mine.server, now_s)
+            if mine.canary:
+                self._left.add(mine.fingerprint)
+            state = "its model fails" if mine.failing else f"its answers take {mine.latency_ms:.0f} ms"
+            self._log.warning("model %s: leaves server %s: %s", self._model, mine.server, state)
         return self._begin(next(offer for offer in offers if offer.server == server))
 
     def _begin(self, offer: Offer) -> Offer:
@@ -268,6 +350,7 @@ class RemoteEngine(Engine):
         self._last_server, self.stats.weights = offer.server, offer.weights
         self.stats.server = f"{offer.server}: {offer.identity}"
         self._session = offer
+        self._review_s = time.monotonic() + _REVIEW_S
         return offer
 
     def _offers(self, names: frozenset[str]) -> list[Offer]:
@@ -302,14 +385,18 @@ class RemoteEngine(Engine):
             raise ContractError(self._differences(offers[0], whole_fingerprint(ours, offers[0].weights)))
         canaries = [offer for offer in same if offer.canary] if self._takes_canaries else []
         drawn = drawn_canary(canaries, self._robot)
-        trying = [offer for offer in canaries if offer.fingerprint == drawn]
+        tried = [offer for offer in canaries if offer.fingerprint == drawn]
         others = [offer for offer in same if not offer.canary]
+        best = good([*tried, *others])
+        trying = [offer for offer in tried if offer in best and drawn not in self._left]
         try:
             groups = [trying, self._of_one_weights(others)]
         except PolicyError:
             if not trying:
                 raise
             groups = [trying]
+        if not any(groups):  # a canary that this robot has left is better than no server
+            groups = [tried]
         if not any(groups):
             raise PolicyError(f"the only servers of {self._model} are canaries, which this robot does not try")
         return groups

@@ -21,6 +21,7 @@ from ibrobot_core.api import NS_PER_S, IbrobotError, Payload, PictureCodec, Poli
 from ibrobot_core.app import WireError, check_finite, copied_tensors
 from ibrobot_serve.fair_queue import FairQueue
 from ibrobot_serve.pacing import Pacing
+from ibrobot_serve.results import Results
 from ibrobot_serve.wire import (
     WIRE_LIMITS,
     WireDecoder,
@@ -90,6 +91,8 @@ class _Outcome:
     expired: bool = False
     refused: bool = False
     """Whether another server may take the request."""
+    model: bool = False
+    """Whether the model failed, on a request that passes the policy's check."""
     queued_ns: int = 0
 
 
@@ -105,8 +108,8 @@ class _Ticket:
     def answer(self, outputs: Tensors, begun_ns: int) -> None:
         self.outcomes.put(_Outcome(outputs, queued_ns=begun_ns - self.arrived_ns))
 
-    def fail(self, error: str, *, expired: bool = False) -> None:
-        self.outcomes.put(_Outcome(None, error, expired))
+    def fail(self, error: str, *, expired: bool = False, model: bool = False) -> None:
+        self.outcomes.put(_Outcome(None, error, expired, model=model))
 
     def refuse(self, why: str) -> None:
         self.outcomes.put(_Outcome(None, why, refused=True))
@@ -149,6 +152,7 @@ class InferenceService:
         self._fingerprint = whole_fingerprint(policy.fingerprint(), self._weights)
         self._queue: FairQueue[_Ticket] = FairQueue(self._options.queue)
         self._pacing = Pacing()
+        self._results = Results()
         self._lock = threading.Lock()
         self._all = RobotCounts()
         self._robots: OrderedDict[str, RobotCounts] = OrderedDict()
@@ -215,11 +219,18 @@ class InferenceService:
 
     @property
     def state(self) -> str:
-        """The state in `…/health`: `ready`, `draining`, or `hangs`."""
+        """The state in `…/health`: `ready`, `draining`, `hangs`, or `fails`."""
         work = self._work
         if work is not None and time.monotonic_ns() - work[0] > self._options.hang_timeout_s * NS_PER_S:
             return "hangs"
-        return "draining" if self._draining else "ready"
+        if self._draining:
+            return "draining"
+        return "fails" if self.failing else "ready"
+
+    @property
+    def failing(self) -> str:
+        """The newest error of a model that fails all its requests; empty for one that works."""
+        return self._results.failing(time.monotonic_ns())
 
     def statistics(self) -> dict[str, Any]:
         """The answer of `…/health`."""
@@ -229,7 +240,8 @@ class InferenceService:
             batches = {str(size): count for size, count in sorted(self._batches.items())}
             return {
                 "model": self._model, "server": self.id, "canary": self._options.canary, "state": self.state,
-                "fingerprint": self._fingerprint, "weights": self._weights, "spec": attrs.asdict(self._policy.spec),
+                "error": self.failing, "fingerprint": self._fingerprint, "weights": self._weights,
+                "spec": attrs.asdict(self._policy.spec),
                 "uptime_s": round((time.monotonic_ns() - self._begun_ns) / NS_PER_S, 1), "waiting": len(self._queue),
                 "malformed": self._malformed, "pace_ms": round(pace_ms, 1), **self._all.summary(),
                 "batches": batches, "robots": robots,
@@ -246,6 +258,7 @@ class InferenceService:
         offer = {
             "fingerprint": self._fingerprint, "weights": self._weights, "spec": attrs.asdict(self._policy.spec),
             "robots": robots, "canary": self._options.canary, "uptime_s": (now_ns - self._begun_ns) / NS_PER_S,
+            "failing": self._results.offered_failing(now_ns), "latency_ms": self._results.latency_ns(now_ns) / 1e6,
             "identity": f"ibrobot-plugin-serve {version('ibrobot-plugin-serve')}, {self._policy.identity()[:1024]}",
         }  # fmt: skip
         return json.dumps(offer).encode()
@@ -316,13 +329,19 @@ class InferenceService:
             )  # fmt: skip
             return self._encoder.encode(answer)
 
-        error, reply = outcome.error, None
+        error, reply, broken = outcome.error, None, outcome.model
         if outcome.outputs is not None:
             try:
                 check_finite("infer", outcome.outputs)
                 reply = encoded(WireKind.ANSWER, outcome.outputs)
             except (PolicyError, WireError) as invalid:
-                error = f"the policy's outputs: {invalid}"
+                error, broken = f"the policy's outputs: {invalid}", True
+        if reply is not None:
+            self._results.answer(message.robot, now_ns)
+        elif broken:
+            self._results.fail(message.robot, now_ns, error)
+        if reply is not None or outcome.expired:
+            self._results.took(now_ns - arrived_ns, now_ns)
         with self._lock:
             for counts in (self._all, self._counts(message.robot)):
                 counts.requests += 1
@@ -391,7 +410,7 @@ class InferenceService:
                 raise PolicyError(f"{len(outputs)} outputs for a batch of {len(live)}")
         except Exception as error:  # noqa: BLE001 - contained: the request is refused
             if len(live) == 1:
-                live[0].fail(self._error_text(error))
+                live[0].fail(self._error_text(error), model=self._checked(live[0].message.tensors))
             else:  # one faulty request must not fail the others
                 for ticket in live:
                     self._infer([ticket])
@@ -421,8 +440,16 @@ class InferenceService:
             try:
                 self._policy.reset(message.seed)
             except Exception as error:  # noqa: BLE001 - contained: the robot gets the error
-                ticket.fail(f"the policy's reset failed: {self._error_text(error)}")
+                ticket.fail(f"the policy's reset failed: {self._error_text(error)}", model=True)
                 return False
+        return True
+
+    def _checked(self, tensors: Tensors) -> bool:
+        """Whether a request has the tensors that the policy needs: then a failure is the model's."""
+        try:
+            self._policy.check(tensors)
+        except Exception:  # noqa: BLE001 - any error means that it has not
+            return False
         return True
 
     def _error_text(self, error: Exception) -> str:

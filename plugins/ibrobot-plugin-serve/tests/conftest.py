@@ -3,5 +3,6 @@
 from fake_runs import runs, site
 
 from .client_requests import broken, model
+from .served_fleet import fleet
 
-__all__ = ["broken", "model", "runs", "site"]
+__all__ = ["broken", "fleet", "model", "runs", "site"]
