@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -78,7 +79,7 @@ def unit() -> configparser.SectionProxy:
 COMMANDS = {
     "container": [*containerfile("ENTRYPOINT "), *containerfile("CMD ")],
     "pod": [*containerfile("ENTRYPOINT "), *POD["containers"][0]["args"]],
-    "unit": shlex.split(unit()["ExecStart"].removeprefix("/usr/bin/env ")),
+    "unit": ["ibrobot", *shlex.split(unit()["ExecStart"])[1:]],
 }
 
 
@@ -99,11 +100,61 @@ def test_server_has_time_to_drain() -> None:
     assert unit()["KillSignal"] == "SIGTERM"
 
 
+def of(kind: str) -> list[dict[str, Any]]:
+    """The objects of a kind."""
+    return [each for each in OBJECTS if each["kind"] == kind]
+
+
+def test_each_server_has_an_address_outside_the_cluster() -> None:
+    (servers,) = of("StatefulSet")
+    pods = {f"{servers['metadata']['name']}-{number}" for number in range(servers["spec"]["replicas"])}
+    outside = [each["spec"] for each in of("Service") if each["spec"].get("type") in ("LoadBalancer", "NodePort")]
+    assert {each["selector"]["statefulset.kubernetes.io/pod-name"] for each in outside} == pods
+    assert {each["ports"][0]["port"] for each in outside} == {POD["containers"][0]["ports"][0]["containerPort"]}
+
+
+def test_servers_are_spread_over_nodes() -> None:
+    (spread,) = POD["topologySpreadConstraints"]
+    (servers,) = of("StatefulSet")
+    assert spread["topologyKey"] == "kubernetes.io/hostname"
+    assert spread["labelSelector"]["matchLabels"] == servers["spec"]["selector"]["matchLabels"]
+
+
+def test_claim_of_the_model_lets_pods_on_all_nodes_read_it() -> None:
+    claims = {each["metadata"]["name"]: each["spec"]["accessModes"] for each in of("PersistentVolumeClaim")}
+    (used,) = [volume["persistentVolumeClaim"] for volume in POD["volumes"] if "persistentVolumeClaim" in volume]
+    assert claims == {used["claimName"]: ["ReadOnlyMany"]}
+    assert used["readOnly"]
+
+
+def test_image_has_a_tag_and_is_not_pulled_at_every_start() -> None:
+    (container,) = POD["containers"]
+    _, _, tag = container["image"].rpartition("/")[2].partition(":")
+    assert tag not in ("", "latest")
+    assert container["imagePullPolicy"] == "IfNotPresent"
+    assert f"-t ibrobot-serve:{tag} " in CONTAINERFILE
+
+
+def test_unit_runs_the_program_of_the_virtual_environment_that_it_names() -> None:
+    """Without the variables of a shell, as systemd does."""
+    program = Path(shlex.split(unit()["ExecStart"])[0])
+    environment = program.parents[1]
+    assert f"python3 -m venv {environment}" in UNIT.read_text()
+    assert not environment.is_relative_to("/home"), "ProtectHome"
+    here = Path(sysconfig.get_path("scripts")) / program.relative_to(environment / "bin")
+    command = [here, "serve", "--help"]
+    done = subprocess.run(command, env={"PATH": "/usr/bin"}, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "MODEL_DIR" in done.stdout
+
+
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
 def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
     right, wrong = tmp_path / "ibrobot-serve@pick.service", tmp_path / "wrong@pick.service"
-    right.write_text(UNIT.read_text())
-    wrong.write_text(UNIT.read_text().replace("Restart=always", "Restart=allways"))
+    # `verify` wants to find the program.
+    text = UNIT.read_text().replace("/opt/ibrobot/bin", sysconfig.get_path("scripts"))
+    right.write_text(text)
+    wrong.write_text(text.replace("Restart=always", "Restart=allways"))
     done = subprocess.run(
         ["systemd-analyze", "verify", right, wrong], capture_output=True, text=True, timeout=60, check=False
     )

@@ -16,6 +16,7 @@ from typing import Any
 
 VERSION = "v1.34.0-local-strict"
 KINDS = (
+    "io.k8s.api.core.v1.PersistentVolumeClaim",
     "io.k8s.api.apps.v1.StatefulSet",
     "io.k8s.api.core.v1.Service",
     "io.k8s.api.policy.v1.PodDisruptionBudget",
