@@ -376,7 +376,7 @@ def _contained(offer: Any, message: str) -> dict[str, Callable[..., Any]]:
             _log.error(message, name, _reason(error))
             return _NOT_THEIRS[name]
 
-    return {name: partial(ask, name) for name in _NOT_THEIRS if hasattr(offer, name)}
+    return {name: partial(ask, name) for name in _NOT_THEIRS if name in attrs.fields_dict(type(offer))}
 
 
 def _add(registry: Registry, plugin: str, package: str, version: str, load: Callable[[], Any]) -> None:

@@ -69,6 +69,7 @@ def test_each_is_a_failure_with_its_package_and_its_hook(bad: Site) -> None:
     }
 
 
+@pytest.mark.integration
 def test_commands_that_use_none_of_them_work(bad: Site) -> None:
     listed = _ibrobot("plugins", "--json")
     assert listed.returncode == 0, listed.stderr
@@ -96,6 +97,7 @@ def test_an_event_reaches_others_whatever_one_raises(site: Site, deed: str, capl
     assert f"plugin 'bad__ibrobot_mode_changed__{deed}' failed in ibrobot_mode_changed: " in caplog.text
 
 
+@pytest.mark.integration
 def test_a_question_about_any_robot_or_file_that_raises_is_answered_by_others(
     site: Site, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

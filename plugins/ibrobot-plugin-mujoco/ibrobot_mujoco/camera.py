@@ -35,9 +35,9 @@ _FURTHEST_M = 10.0
 
 
 class MujocoCamera(Sensor):
-    """Renders in the thread of `open` and `read`. Images that are due too soon are counted, not queued.
+    """Renders in the thread of `open` and `read`. Images that are due too soon are counted and skipped.
 
-    In lockstep, nobody waits for a picture: after the first one, only those are rendered that somebody receives.
+    In lockstep, only the first picture and those with a receiver are rendered.
     """
 
     def __init__(self, options: CameraOptions, ctx: Context) -> None:

@@ -70,7 +70,7 @@ def publish(ctx: Context, stamp_ns: int, cube: tuple[float, float] | None = None
 
 
 def watched_context() -> Context:
-    """The context of a camera whose pictures somebody receives."""
+    """The context of a camera whose pictures have a receiver."""
     ctx = host_context("top", robot=ROBOT, simulation=OPTIONS)
     assert ctx.bus is not None
     ctx.bus.subscribe("/camera/top/image_raw", 1)
@@ -106,7 +106,7 @@ def camera(ctx: Context) -> Iterator[MujocoCamera]:
     camera.close()
 
 
-def test_lockstep_renders_what_somebody_receives() -> None:
+def test_lockstep_renders_what_a_receiver_gets() -> None:
     """The first picture shows that the camera works; later ones are the same whoever came and went before."""
     pictures = []
     for watched in ((True, True, True, True), (False, True, False, True), (False, False, False, True)):
