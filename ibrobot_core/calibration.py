@@ -132,9 +132,8 @@ class Calibration:
     def __attrs_post_init__(self) -> None:
         owners: dict[int, str] = {}
         for name, joint in self.joints.items():
-            if joint.id in owners:
-                raise ValueError(f"{name}: id: servo {joint.id} belongs to {owners[joint.id]} already")
-            owners[joint.id] = name
+            if (owner := owners.setdefault(joint.id, name)) != name:
+                raise ValueError(f"{name}: id: servo {joint.id} belongs to {owner} already")
         if len(different := {joint.zero_at for joint in self.joints.values()}) > 1:
             raise ValueError(f"zero_at: must be the same for all joints, not {' and '.join(sorted(different))}")
 
@@ -156,6 +155,24 @@ class Calibration:
     def snapshot(self) -> dict[str, dict[str, Any]]:
         """The fields of `JointCalibration` by joint, without `closed_at`, which the hardware sets."""
         return {name: {**joint.numbers(), "zero_at": joint.zero_at} for name, joint in self.joints.items()}
+
+    def check_ranges(self, limits: Mapping[str, tuple[float, float]], closed_ends: Mapping[str, float | None]) -> None:
+        """Check that each range fits the limits of its joint: it has half of them, and is at most twice as large.
+
+        Args:
+            limits: joint -> lower and upper limit [rad].
+            closed_ends: joint -> its lower limit if it is anchored at its closed end, see `JointCalibration.zero`.
+
+        Raises:
+            CalibrationError: if one does not.
+        """
+        for name, (lower, upper) in limits.items():
+            first, last = self.joints[name].ends(closed_ends.get(name)) if name in self.joints else (lower, upper)
+            if min(last, upper) - max(first, lower) < (upper - lower) / 2 or last - first > 2 * (upper - lower):
+                raise CalibrationError(
+                    f"{self.path}: {name}: its range, {first:.2f} to {last:.2f} rad, does not fit its limits, "
+                    f"{lower:g} to {upper:g} rad: check that it is that of this arm, or calibrate again"
+                )
 
     def fingerprint(self) -> str:
         """SHA-256 of the numbers, 64 hexadecimal digits."""

@@ -90,6 +90,7 @@ def check(
 
 def _uncalibrated(config: RobotConfig) -> Iterator[Problem]:
     """What is wrong with the calibrations that a run needs at its start; this machine may not be the robot's."""
+    limits = {joint.name: (joint.lower, joint.upper) for joint in config.robot.joints}
     mode = config.control_modes[config.default_control_mode]
     used = {*mode.devices.values(), *(mode.inference.devices.values() if mode.inference is not None else ())}
     parts: list[tuple[str, HardwareConfig | TeleopConfig]] = [
@@ -99,7 +100,7 @@ def _uncalibrated(config: RobotConfig) -> Iterator[Problem]:
     for path, part in parts:
         try:
             if part.calibration is not None:
-                load_calibration(part.calibration)
+                load_calibration(part.calibration).check_ranges(limits, config.closed_ends)
         except CalibrationError as error:
             yield Problem(config.source, 0, path, str(error))
 

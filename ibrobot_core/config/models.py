@@ -93,8 +93,7 @@ def read_xml(path: Path, root: str = "") -> XmlElement:
         ModelError: if it cannot be read, is not valid XML or has another root.
     """
     parser = expat.ParserCreate()
-    top = XmlElement("", {}, path, 0)
-    opened = [top]
+    opened = [XmlElement("", {}, path, 0)]
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         element = XmlElement(tag, attributes, path, parser.CurrentLineNumber)
@@ -116,11 +115,9 @@ def read_xml(path: Path, root: str = "") -> XmlElement:
         raise ModelError(f"{path}: cannot be read: {error.strerror}") from None
     except expat.ExpatError as error:
         raise ModelError(f"{path}:{error.lineno}: not valid XML: {expat.ErrorString(error.code)}") from None
-    except ModelError:
-        raise
-    except (LookupError, ValueError):
-        raise ModelError(f"{path}:1: declares an unknown encoding: save it as UTF-8") from None
-    found = top.children[0]
+    except (LookupError, ValueError) as error:
+        raise error if isinstance(error, ModelError) else ModelError(f"{path}:1: unknown encoding: use UTF-8") from None
+    found = opened[0].children[0]
     if root and found.tag != root:
         raise found.error(f"begins with <{found.tag}>, must be <{root}>")
     return found
@@ -136,10 +133,9 @@ def read_urdf(path: Path) -> DescriptionModel:
     found = {}
     for joint in root.children:
         if joint.tag == "joint" and joint.attributes.get("type") in ("revolute", "prismatic"):
-            for limit in joint.children:
-                if limit.tag == "limit":
-                    lower, upper = (limit.numbers(name, "0", 1)[0] for name in ("lower", "upper"))
-                    found[joint.attributes.get("name", "")] = Limits(lower, upper, f"{path.name}:{limit.line}")
+            for limit in (each for each in joint.children if each.tag == "limit"):
+                lower, upper = (limit.numbers(name, "0", 1)[0] for name in ("lower", "upper"))
+                found[joint.attributes.get("name", "")] = Limits(lower, upper, f"{path.name}:{limit.line}")
     links = _names(root.children, "link")
     return DescriptionModel(found, links, "link", links=links)
 
@@ -152,10 +148,8 @@ def read_mjcf(path: Path) -> DescriptionModel:
     """
     root = read_xml(path, "mujoco")
     _include(root, path.parent)
-    compiler: dict[str, str] = {}
-    for element in root.children:
-        if element.tag == "compiler":
-            compiler.update(element.attributes)
+    compilers = [element.attributes for element in root.children if element.tag == "compiler"]
+    compiler = {name: value for each in compilers for name, value in each.items()}
     classes = _default_classes(root)
     found: dict[str, Limits] = {}
     for joint, class_ in _mjcf_joints(root):
@@ -171,9 +165,8 @@ def read_mjcf(path: Path) -> DescriptionModel:
             lower, upper = attrs.evolve(joint, attributes=given).numbers("range", "0 0", 2)
             turn = math.pi / 180 if kind == "hinge" and compiler.get("angle", "degree") == "degree" else 1.0
             found[name] = Limits(lower * turn, upper * turn, f"{joint.file.name}:{joint.line}")
-    joints = _names((joint for joint, _ in _mjcf_joints(root)), "joint")
     sites, bodies = _names(root.below(), "site"), _names(root.below(), "body")
-    return DescriptionModel(found, sites, "site", joints, bodies)
+    return DescriptionModel(found, sites, "site", _names((joint for joint, _ in _mjcf_joints(root)), "joint"), bodies)
 
 
 READERS: Mapping[str, Callable[[Path], DescriptionModel]] = {"mjcf": read_mjcf, "urdf": read_urdf}
@@ -227,8 +220,7 @@ def _mjcf_joints(root: XmlElement) -> Iterator[tuple[XmlElement, str]]:
     waiting = [(world, world.attributes.get("childclass", "main")) for world in reversed(worlds)]
     while waiting:
         element, class_ = waiting.pop()
-        for child in element.children:
-            if child.tag == "joint":
-                yield child, child.attributes.get("class", class_)
+        joints = (child for child in element.children if child.tag == "joint")
+        yield from ((child, child.attributes.get("class", class_)) for child in joints)
         inner = [child for child in element.children if child.tag in _PLACES]
         waiting += [(child, child.attributes.get("childclass", class_)) for child in reversed(inner)]

@@ -346,6 +346,44 @@ def test_config_check_names_a_missing_calibration(
         assert f" {part}: " in line
 
 
+def calibration_of(ranges: dict[str, tuple[int, int]]) -> str:
+    """LeRobot's calibration of an SO-101, with some other ranges."""
+    usual = {
+        "shoulder_pan": (800, 3300), "shoulder_lift": (900, 3200), "elbow_flex": (950, 3150),
+        "wrist_flex": (950, 3150), "wrist_roll": (0, 4095), "gripper": (2040, 3300),
+    }  # fmt: skip
+    return json.dumps(
+        {
+            joint: {"id": servo, "drive_mode": 0, "homing_offset": 0, "range_min": least, "range_max": most}
+            for servo, (joint, (least, most)) in enumerate((usual | ranges).items(), 1)
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    ("joint", "ends"),
+    [
+        *((joint, (2000, 2300)) for joint in ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "gripper")),
+        ("wrist_roll", (0, 1500)),
+        ("gripper", (0, 4095)),
+    ],
+)
+@pytest.mark.parametrize(("deep", "code", "begin"), [((), 0, "note: "), (("--deep",), 2, "error: ")])
+def test_config_check_names_a_range_that_does_not_fit(
+    folder: Path, terminal: Terminal, joint: str, ends: tuple[int, int], deep: tuple[str, ...], code: int, begin: str
+) -> None:
+    follower = "hardware.calibration=follower.json", "teleoperation.leader.calibration=follower.json"
+    options = [part for each in follower for part in ("--set", each.replace("=", f"={folder}/"))]
+    (folder / "follower.json").write_text(calibration_of({}))
+    assert terminal.run("config", "check", "so101", *options, "--deep")[0] == 0
+    (folder / "follower.json").write_text(calibration_of({joint: ends}))
+    found, out, err = terminal.run("config", "check", "so101", *options, *deep)
+    lines = [line for line in (out + err).splitlines() if "does not fit its limits" in line]
+    assert found == code
+    assert lines[0].startswith(begin)
+    assert f"hardware: {folder}/follower.json: {joint}: its range, " in lines[0]
+
+
 def test_recording_that_would_never_end_is_refused(folder: Path, terminal: Terminal) -> None:
     planned = ("--sim", "--mode", "moveit_planning", "--auto", "--lockstep")
     code, _, err = terminal.run("record", "so101_blind", *planned)

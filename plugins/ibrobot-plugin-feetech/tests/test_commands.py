@@ -16,7 +16,7 @@ from ibrobot_feetech.commands.ranges import Range, doubtful
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 from ibrobot_testing import terminal as terminal_module
 
-from ibrobot_core.api import load_calibration
+from ibrobot_core.api import CalibrationError, load_calibration
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 MIDDLES = {1: 2500, 2: 300, 3: 2048, 4: 3900, 5: 1000, 6: 100}
@@ -301,6 +301,99 @@ def test_an_arm_of_lerobot_is_imported_with_its_0_or_with_the_pose(home, tmp_pat
     one_of_two = run(feetech, ["import", str(file), "--name", "left", "--prefix", "left_"])
     assert one_of_two.exit_code == 0, one_of_two.output
     assert load_calibration("left").numbers() == {f"left_{joint}": each for joint, each in numbers.items()}
+
+
+def numbers_of(prefix="", first=1, **changes):
+    """A calibration of an arm, with joints' ranges as SO-101s have them."""
+    spans = {"shoulder_pan": 2500, "shoulder_lift": 2300, "elbow_flex": 2200, "wrist_flex": 2200, "wrist_roll": 3600}
+    ends = {joint: (2048 - span // 2, 2048 + span // 2) for joint, span in spans.items()} | {"gripper": (2040, 3300)}
+    ends |= changes
+    return {
+        f"{prefix}{joint}": {
+            "id": servo, "drive_mode": 0, "homing_offset": 0, "range_min": ends[joint][0], "range_max": ends[joint][1]
+        }
+        for servo, joint in enumerate(JOINTS, first)
+    }  # fmt: skip
+
+
+WHEELS = {
+    f"base_{side}_wheel": {"id": servo, "drive_mode": 0, "homing_offset": 0, "range_min": 0, "range_max": 4095}
+    for servo, side in enumerate(("left", "back", "right"), 7)
+}
+FILES = {
+    "LeKiwi": numbers_of("arm_") | WHEELS,
+    "XLeRobot": numbers_of("left_arm_") | numbers_of("right_arm_", 11) | WHEELS,
+    "two arms": numbers_of("left_") | numbers_of("right_", 7),
+    "one": numbers_of(),
+}
+"""Files with one arm or more, and other servos."""
+
+
+@pytest.mark.parametrize(
+    ("file", "prefix", "theirs", "robot"),
+    [
+        ("LeKiwi", "arm_", "arm_", None),
+        ("LeKiwi", "arm_", "arm_", "so101"),
+        ("XLeRobot", "left_arm_", "left_arm_", None),
+        ("XLeRobot", "right_arm_", "right_arm_", None),
+        ("XLeRobot", "right_arm_", "right_arm_", "so101"),
+        ("two arms", "left_", "left_", None),
+        ("two arms", "right_", "right_", None),
+        ("two arms", "right_", "right_", "so101"),
+        ("one", "left_", "", None),
+        ("one", "", "", "so101"),
+    ],
+)
+def test_one_arm_of_a_file_is_imported(home, tmp_path, file, prefix, theirs, robot):
+    path = tmp_path / "theirs.json"
+    path.write_text(json.dumps(FILES[file]))
+    named = ["--prefix", prefix] if prefix else []
+    done = CliRunner().invoke(
+        feetech, ["import", str(path), "--name", "mine", *named, *(["--robot", robot] if robot else [])]
+    )
+    assert done.exit_code == 0, done.output
+    ours = "" if robot else prefix
+    assert load_calibration("mine").numbers() == {f"{ours}{joint}": FILES[file][f"{theirs}{joint}"] for joint in JOINTS}
+    left_out = [name for name in FILES[file] if not name.startswith(theirs)]
+    assert ("left out: " + ", ".join(left_out) in done.output) == bool(left_out)
+    assert "check: " not in done.output
+
+
+@pytest.mark.parametrize(
+    ("file", "hint"),
+    [
+        ("LeKiwi", "give --prefix arm_"),
+        ("XLeRobot", "give --prefix left_arm_ or --prefix right_arm_"),
+        ("two arms", "give --prefix left_ or --prefix right_"),
+    ],
+)
+def test_a_file_whose_joints_have_prefixes_names_them(home, tmp_path, file, hint):
+    path = tmp_path / "theirs.json"
+    path.write_text(json.dumps(FILES[file]))
+    for prefix in ("", "middle_"):
+        with pytest.raises(CalibrationError, match=hint):
+            CliRunner().invoke(
+                feetech, ["import", str(path), "--name", "mine", "--prefix", prefix], catch_exceptions=False
+            )
+    assert not list(home.rglob("mine*"))
+
+
+@pytest.mark.parametrize("joint", JOINTS)
+def test_a_joint_that_was_hardly_moved_is_refused(home, tmp_path, joint):
+    path = tmp_path / "theirs.json"
+    path.write_text(json.dumps(numbers_of(**{joint: (2000, 2040)})))
+    with pytest.raises(CalibrationError, match=f"theirs.json: {joint}: it moved by only 40 ticks"):
+        CliRunner().invoke(feetech, ["import", str(path), "--name", "mine"], catch_exceptions=False)
+    assert not list(home.rglob("mine*"))
+
+
+@pytest.mark.parametrize("joint", [each for each in JOINTS if each != "wrist_roll"])
+def test_a_range_that_does_not_fit_the_limits_is_shown(home, tmp_path, joint):
+    path = tmp_path / "theirs.json"
+    path.write_text(json.dumps(numbers_of(**{joint: (0, 4095)})))
+    done = CliRunner().invoke(feetech, ["import", str(path), "--name", "mine"])
+    assert done.exit_code == 0, done.output
+    assert f"check: {joint}: it moved by 360 deg, its limits are " in done.output
 
 
 def test_zero_in_the_middle_of_the_range_asks_for_limits_about_zero():

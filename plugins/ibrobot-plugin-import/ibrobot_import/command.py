@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import attrs
 import click
@@ -154,7 +156,7 @@ def _types(sections: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
 
 
 def write(found: Imported, source: Path, out: Path) -> str:
-    """Write the new file, and check it; a file that does not pass is not left behind.
+    """Check the new file under another name, and write it if it passes.
 
     Returns:
         What could not be checked, since a plugin is not installed; empty if all was.
@@ -162,23 +164,32 @@ def write(found: Imported, source: Path, out: Path) -> str:
     Raises:
         ConfigError: if `out` exists or cannot be written, or with the lines of `source` whose values are wrong.
     """
+    if os.path.lexists(out):
+        raise ConfigError([Problem(out, 0, "", "exists already, and is not overwritten")])
+    draft = out.with_name(f".{out.stem}.{uuid4().hex}.yaml")
     try:
-        with out.open("x", encoding="utf-8") as file:
-            file.write(found.draft.text)
-    except FileExistsError:
-        raise ConfigError([Problem(out, 0, "", "exists already, and is not overwritten")]) from None
+        draft.write_text(found.draft.text, encoding="utf-8")
+        note = _check(found, draft, source, out)
+        draft.rename(out)
     except OSError as error:
         raise ConfigError([Problem(out, 0, "", f"cannot be written: {error.strerror}")]) from error
+    finally:
+        draft.unlink(missing_ok=True)
+    return note
+
+
+def _check(found: Imported, draft: Path, source: Path, out: Path) -> str:
+    """What could not be checked; see `write`."""
     try:
         if found.alone:
-            contract_alone(read_document(out), out.absolute().parent)
+            contract_alone(read_document(draft), out.absolute().parent)
         else:
-            load_config(out, sim=True)
-            load_config(out)
+            load_config(draft, sim=True)
+            load_config(draft)
     except ConfigError as error:
         if packages := _lacking(found):
-            return f"{error}; not all could be checked: {install_command(packages)}, then ibrobot config check {out}"
-        out.unlink()
+            at_out = ConfigError(attrs.evolve(each, file=str(out)) for each in error.problems)
+            return f"{at_out}; not all could be checked: {install_command(packages)}, then ibrobot config check {out}"
         raise ConfigError(_at_the_source(each, found.draft, source) for each in error.problems) from None
     return ""
 

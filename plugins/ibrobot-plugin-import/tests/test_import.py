@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 from click.testing import CliRunner
+from ibrobot_import import command
 from ibrobot_import.command import convert_file, import_, write
 from ibrobot_import.draft import scalar
 from ibrobot_import.source import Fate
@@ -288,3 +289,13 @@ def test_wrong_calibration_is_refused(tmp_path: Path) -> None:
     path.write_text(json.dumps(numbers))
     with pytest.raises(Exception, match="gripper: range_min: must be 0 to 4095, not 9000"):
         convert_file(path)
+
+
+def test_an_interrupted_import_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "load_config", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write(convert_file(FILES / "ib_robot_arm.yaml"), FILES / "ib_robot_arm.yaml", tmp_path / "new.yaml")
+    assert list(tmp_path.iterdir()) == []

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import attrs
 
 from ibrobot_core.api import HardwareError, did_you_mean
-from ibrobot_core.app import load_config
+from ibrobot_core.app import ConfigError, dump_yaml, load_config, parse_yaml
 from ibrobot_lerobot_devices.link import INSTALL, DeviceLink, DeviceProblem
 from ibrobot_lerobot_devices.registry import registry
 from ibrobot_lerobot_devices.stand_in import NEEDS_TORCH
@@ -101,8 +103,10 @@ def describe_robot(type_: str, id_: str) -> NewRobot:
 
 
 def _facts(type_: str, config: Mapping[str, Any], *, torch: bool) -> Mapping[str, Any]:
-    """What LeRobot's object says about itself."""
-    link = DeviceLink("robot", type_, config, torch=torch, only_make=True)
+    """What LeRobot's object says about itself, with the variables of the environment as a run reads them."""
+    expanded = parse_yaml(json.dumps(config), f"the config of {type_}")
+    expanded.raise_problems()
+    link = DeviceLink("robot", type_, expanded.root, torch=torch, only_make=True)
     try:
         return link.start(_START_S)
     finally:
@@ -145,6 +149,16 @@ def _limits(mapped: Mapped, motor: Mapping[str, Any]) -> tuple[float, float]:
     return (first, last)
 
 
+def _word(name: str) -> str:
+    """A name within a line of YAML."""
+    plain = re.fullmatch("[A-Za-z_][A-Za-z0-9_.-]*", name) and dump_yaml([name]) == f"- {name}\n"
+    return name if plain else json.dumps(name, ensure_ascii=False)
+
+
+def _list(names: Iterable[str]) -> str:
+    return f"[{', '.join(map(_word, names))}]"
+
+
 def robot_yaml(found: NewRobot) -> str:
     """The robot YAML of a robot of LeRobot's."""
     names = [each.joint for each in found.mapped]
@@ -152,9 +166,9 @@ def robot_yaml(found: NewRobot) -> str:
     arm = [name for name in names if name not in gripper] or names
     gripper = [name for name in gripper if name not in arm]
     members = {"arm": arm, "gripper": gripper, "base": found.axes}
-    groups = ", ".join(f"{name}: [{', '.join(each)}]" for name, each in members.items() if each)
+    groups = ", ".join(f"{name}: {_list(each)}" for name, each in members.items() if each)
     joints = "\n".join(
-        f"    - {{name: {name}, lower: {found.limits[name][0]:.4f}, upper: {found.limits[name][1]:.4f}, "
+        f"    - {{name: {_word(name)}, lower: {found.limits[name][0]:.4f}, upper: {found.limits[name][1]:.4f}, "
         "max_velocity: 1.5, max_acceleration: 15.0}"
         for name in names
     )
@@ -175,9 +189,9 @@ def robot_yaml(found: NewRobot) -> str:
     )
     extra = f", units: {json.dumps(dict(found.units))}" if found.units else ""
     extra += ", torch: true" if found.torch else ""
-    extra += f", anchored: [{', '.join(gripper)}]" if gripper and gripper != ["gripper"] else ""
+    extra += f", anchored: {_list(gripper)}" if gripper and gripper != ["gripper"] else ""
     options = f"config: {_leader_config(found)}{_leader_options(found, gripper)}"
-    leader = f"{{type: lerobot, teleop: {found.leader}, {options}}}"
+    leader = f"{{type: lerobot, teleop: {_word(found.leader)}, {options}}}"
     devices = f"  leader: {leader}\n" if found.leader else ""
     mode = f"  teleop:\n    executors: [{', '.join(streams)}]\n    teleop: leader\n" if found.leader else ""
     if found.axes:
@@ -190,13 +204,13 @@ def robot_yaml(found: NewRobot) -> str:
 # Check all joints before the first motion: {limits}; max_velocity and
 # max_acceleration are guesses, too. LeRobot reports no torque, temperature or voltage.
 robot:
-  name: {found.type}
-  robot_type: {found.type}
+  name: {_word(found.type)}
+  robot_type: {_word(found.type)}
   joints:                                 # order here = order in every vector
 {joints}
   groups: {{{groups}}}
 
-hardware: {{type: lerobot, robot: {found.type}, config: {json.dumps(dict(found.config))}{extra}}}
+hardware: {{type: lerobot, robot: {_word(found.type)}, config: {json.dumps(dict(found.config))}{extra}}}
 
 executors:
 {executors}
@@ -209,7 +223,7 @@ control_modes:
 {devices}contract:
   rate_hz: 30
   observations:
-    - {{key: observation.state, topic: /joint_states, select: [{", ".join(f"position.{name}" for name in names)}]}}
+    - {{key: observation.state, topic: /joint_states, select: {_list(f"position.{name}" for name in names)}}}
   actions:
 {actions}
 
@@ -225,18 +239,28 @@ def _leader_config(found: NewRobot) -> str:
 def _leader_options(found: NewRobot, gripper: list[str]) -> str:
     """The options of the leader beside its config."""
     extra = f", units: {json.dumps(dict(found.units))}" if found.units else ""
-    return extra + (f", scaled: [{', '.join(gripper)}]" if gripper and gripper != ["gripper"] else "")
+    return extra + (f", scaled: {_list(gripper)}" if gripper and gripper != ["gripper"] else "")
 
 
 def write_robot(out: Path, type_: str, id_: str) -> NewRobot:
-    """Write the robot YAML, and check it.
+    """Write the robot YAML, and check it before it has its name.
 
     Raises:
-        HardwareError: if the file exists already, or LeRobot does not know the robot.
+        ConfigError: if the YAML has a fault.
+        HardwareError: if the file exists already or cannot be written, or LeRobot does not know the robot.
     """
     if out.exists():
         raise HardwareError(f"{out} exists already, and is not overwritten")
     found = describe_robot(type_, id_)
-    out.write_text(robot_yaml(found), encoding="utf-8")
-    load_config(out)
+    draft = out.with_name(f".{out.stem}.{uuid4().hex}.yaml")
+    try:
+        draft.write_text(robot_yaml(found), encoding="utf-8")
+        load_config(draft)
+        draft.rename(out)
+    except ConfigError as error:
+        raise ConfigError(attrs.evolve(each, file=str(out)) for each in error.problems) from None
+    except OSError as error:
+        raise HardwareError(f"{out} cannot be written: {error.strerror}") from error
+    finally:
+        draft.unlink(missing_ok=True)
     return found

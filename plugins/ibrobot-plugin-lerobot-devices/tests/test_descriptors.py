@@ -7,18 +7,20 @@ import math
 from pathlib import Path
 from typing import Any
 
+import attrs
 import ibrobot_lerobot_devices
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ibrobot_lerobot_devices import link, registry
+from ibrobot_lerobot_devices import link, new_robot, registry
 from ibrobot_lerobot_devices.commands import lerobot
+from ibrobot_lerobot_devices.link import DeviceLink
 from ibrobot_lerobot_devices.options import CameraOptions, CmdVelOptions, RobotOptions, TeleopOptions
 from ibrobot_testing.contexts import make_robot
 from ibrobot_testing.descriptor import check_descriptor
 
 from ibrobot_core.api import HardwareError
-from ibrobot_core.app import load_config
+from ibrobot_core.app import ConfigError, load_config, parse_yaml
 
 from .conftest import JOINTS, Motors
 
@@ -130,6 +132,49 @@ class TestNew:
         assert config.robot.joint_names == ("gripper", "x", "y", "theta")
         assert config.control_modes["drive"].devices == {"base": "cmd_vel"}
         assert config.executors["base_position"].joints == ("x", "y", "theta")
+
+    @pytest.mark.parametrize("port", [None, "/dev/serial/mine"])
+    def test_lerobot_gets_the_port_and_not_its_variable(
+        self, port: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        made: list[dict[str, object]] = []
+
+        class Link(DeviceLink):
+            def __init__(self, kind: str, type_: str, config: dict[str, object], **more: Any) -> None:
+                made.append(dict(config))
+                super().__init__(kind, type_, config, **more)
+
+        monkeypatch.setattr(new_robot, "DeviceLink", Link)
+        monkeypatch.delenv("IBROBOT_FOLLOWER_PORT", raising=False)
+        if port is not None:
+            monkeypatch.setenv("IBROBOT_FOLLOWER_PORT", port)
+        out = tmp_path / "arm.yaml"
+        CliRunner().invoke(lerobot, ["new", str(out), "fake_arm"], catch_exceptions=False)
+        assert [each["port"] for each in made] == [port or "/dev/ttyACM0"]
+        assert "${IBROBOT_FOLLOWER_PORT:/dev/ttyACM0}" in out.read_text(), "the YAML keeps the variable"
+
+    @pytest.mark.parametrize("name", ["{}", "0{}", "1e{}", "on{}", "a b{}", "m,{}", "é{}", "#{}"])
+    def test_names_of_joints_are_texts(self, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        names = [name.format(i) for i in range(1, 6)] + ["gripper"]
+        known = new_robot.describe_robot("fake_arm", "fake_arm")
+        pairs = zip(known.mapped, names, strict=True)
+        mapped = [attrs.evolve(each, joint=joint, feature=joint) for each, joint in pairs]
+        limits = dict(zip(names, known.limits.values(), strict=True))
+        made = attrs.evolve(known, mapped=mapped, limits=limits, leader="")
+        document = parse_yaml(new_robot.robot_yaml(made), "made.yaml")
+        document.raise_problems()
+        assert [each["name"] for each in document.root["robot"]["joints"]] == names
+        assert document.root["robot"]["groups"]["arm"] == names[:-1]
+        (observed,) = document.root["contract"]["observations"]
+        assert observed["select"] == [f"position.{each}" for each in names]
+
+    def test_a_faulty_yaml_is_not_left_behind(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(new_robot, "robot_yaml", lambda found: "robot: {name: 1}")
+        out = tmp_path / "arm.yaml"
+        before = set(tmp_path.iterdir())
+        with pytest.raises(ConfigError, match=f"{out}:1: robot"):
+            CliRunner().invoke(lerobot, ["new", str(out), "fake_arm"], catch_exceptions=False)
+        assert set(tmp_path.iterdir()) == before
 
     def test_an_existing_file_is_not_overwritten(self, tmp_path: Path) -> None:
         out = tmp_path / "arm.yaml"

@@ -349,7 +349,7 @@ WRONG = {
     "document type": (("<robot", "<!DOCTYPE robot><robot"), "has a document type"),
     "network": (('<box size="0.04 0.04 0.1"/>', '<mesh filename="https://x/y.stl"/>'), "download it"),
     "no mesh": (('<box size="0.04 0.04 0.1"/>', "<mesh/>"), "link 'a': <mesh> has no filename"),
-    "encoding": (('version="1.0"', 'version="1.0" encoding="big5"'), "declares an unknown encoding"),
+    "encoding": (('version="1.0"', 'version="1.0" encoding="big5"'), "made.urdf:1: unknown encoding: use UTF-8"),
 }
 
 

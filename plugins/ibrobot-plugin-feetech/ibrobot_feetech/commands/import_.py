@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import attrs
 import click
 
-from ibrobot_core.api import HardwareError, calibration_path, load_calibration
+from ibrobot_core.api import Calibration, CalibrationError, HardwareError, calibration_path, load_calibration
 from ibrobot_core.app import Declined, echo
 from ibrobot_feetech.calibration import ZERO_AT, save_calibration
 from ibrobot_feetech.commands.calibrate import backup
 from ibrobot_feetech.commands.dialogue import TerminalGuide
-from ibrobot_feetech.commands.joints import joints_of
+from ibrobot_feetech.commands.joints import Joint, joints_of
+from ibrobot_feetech.commands.ranges import Range, doubtful, impossible
 from ibrobot_feetech.commands.zero import zero_text
 from ibrobot_feetech.usb import usb_port
 
@@ -34,20 +37,75 @@ def import_calibration(
 ) -> None:  # fmt: skip
     """Import a calibration, and set where its 0 rad is.
 
-    FILE is a path or a name. The command does not access any servo.
+    FILE is a path or a name. With --prefix, the joints in FILE may have the prefix or not; those of other parts, such
+    as a second arm or wheels, are left out. The command shows what does not fit the joints' limits, and does not access
+    any servo.
     """
     path = calibration_path(name or file)
-    found = load_calibration(file, [joint.name for joint in joints_of(robot, name)], zero_at=zero_at)
+    wanted = joints_of(robot, name, "" if robot else prefix)
+    found, left_out = _load(file, wanted, prefix, zero_at)
+    doubts = _doubts(found, wanted)
     if path.exists() and not yes and not TerminalGuide().confirm(f"{path} exists already. Overwrite it?", flag="--yes"):
         raise Declined
     adapter = found.adapter if port is None else _adapter(port)
-    joints = {f"{prefix}{joint}": numbers for joint, numbers in found.joints.items()}
-    made = attrs.evolve(found, joints=joints, robot=arm or found.robot, adapter=adapter)
+    made = attrs.evolve(found, robot=arm or found.robot, adapter=adapter)
     if kept := backup(path):
         echo(f"the old file is kept: {kept}")
     save_calibration(made, path, overwrite=True)
     echo(f"saved: {path}")
     echo(zero_text(made))
+    if left_out:
+        echo(f"left out: {', '.join(left_out)}")
+    for doubt in doubts:
+        echo(f"check: {doubt}")
+
+
+def _load(file: str, wanted: Sequence[Joint], prefix: str, zero_at: str | None) -> tuple[Calibration, list[str]]:
+    """The wanted joints of a calibration, under their names here, and the names of those left out.
+
+    Raises:
+        CalibrationError: if it is invalid or lacks a joint; names the prefix that its joints have, if they have one.
+    """
+    plain = [joint.name.removeprefix(prefix) for joint in wanted]
+    names = [f"{prefix}{each}" for each in plain]
+    try:
+        found = load_calibration(file, names, zero_at=zero_at)
+    except CalibrationError as error:
+        try:
+            found, names = load_calibration(file, plain, zero_at=zero_at), plain
+        except CalibrationError:
+            raise CalibrationError(f"{error}{_hint(file, plain)}") from None
+    ours = dict(zip(names, (joint.name for joint in wanted), strict=True))
+    left_out = [name for name in found.joints if name not in ours]
+    joints = {ours[name]: numbers for name, numbers in found.joints.items() if name in ours}
+    return attrs.evolve(found, joints=joints), left_out
+
+
+def _hint(file: str, plain: Sequence[str]) -> str:
+    """The prefixes with which a file has the joints."""
+    try:
+        known = load_calibration(file).joints
+    except CalibrationError:
+        return ""
+    prefixes = [name.removesuffix(plain[0]) for name in known if name.endswith(plain[0])]
+    fitting = [each for each in prefixes if each and all(f"{each}{name}" in known for name in plain)]
+    return f"; give --prefix {' or --prefix '.join(fitting)}" if fitting else ""
+
+
+def _doubts(found: Calibration, joints: Sequence[Joint]) -> list[str]:
+    """What does not fit the limits of the joints.
+
+    Raises:
+        CalibrationError: if a joint was hardly moved.
+    """
+    doubts = []
+    for joint in joints:
+        numbers = found.joints[joint.name]
+        measured = Range(numbers.range_min, numbers.range_min, numbers.range_max)
+        if fault := impossible(joint.name, measured):
+            raise CalibrationError(f"{found.path}: {fault}")
+        doubts.append(doubtful(joint, measured, found.zero_at))
+    return [each for each in doubts if each is not None]
 
 
 def _adapter(port: str) -> str:
