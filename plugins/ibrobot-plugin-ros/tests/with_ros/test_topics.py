@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,7 +41,7 @@ from ibrobot_core.api import (
     Vector3,
 )
 
-from .conftest import until
+from .conftest import DOMAIN, HERE, PYTHON, until
 
 HEADER = Header(1_700_000_000_123_456_789, "base")
 POSE = Pose(Vector3(1.0, 2.0, 3.0), Quaternion(0.1, 0.2, 0.3, 0.9))
@@ -187,3 +190,50 @@ def test_a_type_with_other_fields_is_left_out(start, peer, caplog, monkeypatch):
         expected = f"{topic}: not in ROS: std_msgs/msg/Bool has other fields in this ROS: data"
         until(lambda expected=expected: expected in caplog.text)
     assert not {"/lamp", "/light"} & set(peer.ask("topics"))
+
+
+NO_EVENTS = """\
+import rclpy.event_handler as handler
+
+def without(*, matched=None, kind=handler.PublisherEventCallbacks, **others):
+    return kind(**others)
+
+handler.PublisherEventCallbacks = without
+"""
+
+
+@pytest.mark.parametrize("events", [True, False], ids=["events", "lost events"])
+@pytest.mark.parametrize("first", ["run", "subscriber"])
+def test_pictures_reach_a_plain_subscriber_in_an_environment_of_its_own(start, tmp_path, monkeypatch, first, events):
+    """Also if no event tells the node that it is there."""
+    if not events:
+        (tmp_path / "patches").mkdir()
+        (tmp_path / "patches/sitecustomize.py").write_text(NO_EVENTS)
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "patches"), os.environ["PYTHONPATH"]]))
+    picture = Image(HEADER, 48, 64, "rgb8", 192, np.zeros(48 * 192, np.uint8))
+    root = Path(PYTHON).absolute().parent.parent
+    environment = {
+        "PATH": os.environ["PATH"], "HOME": str(tmp_path), "AMENT_PREFIX_PATH": str(root),
+        "LD_LIBRARY_PATH": str(root / "lib"), "ROS_DOMAIN_ID": str(DOMAIN),
+    }  # fmt: skip
+    command = [PYTHON, str(HERE / "stranger.py"), "/camera/top/image_raw", "5"]
+    run = start() if first == "run" else None
+    if run is not None:
+        run.session.bus.publish("/camera/top/image_raw", picture)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as stranger:
+        try:
+            assert stranger.stdout is not None
+            assert stranger.stdout.readline() == "ready\n"
+            run = run or start()
+            bus = run.session.bus
+
+            def ended() -> bool:
+                bus.publish("/camera/top/image_raw", picture)
+                return stranger.poll() is not None
+
+            until(ended)
+            assert stranger.stdout.read() == "(64, 48)\n"
+        finally:
+            stranger.kill()
+    assert run.ros.counts["subscribers /camera/top/image_raw"] >= 1
+    assert run.ros.counts["sent /camera/top/image_raw"] >= 5
