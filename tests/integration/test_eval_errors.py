@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import random
+import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
-from multiprocessing import forkserver
+from multiprocessing import forkserver, set_forkserver_preload
 from pathlib import Path
 from typing import Any, override
 
@@ -14,7 +15,7 @@ import pytest
 from command_line import run_here
 from ibrobot_testing.site import Site, made_up_site
 
-from ibrobot_core.app import Done, Job, Pool, Registry
+from ibrobot_core.app import Done, Job, Pool, Registry, installed_plugins
 
 pytestmark = pytest.mark.integration
 
@@ -45,9 +46,20 @@ control: {rate_hz: 50, stop: hold}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _forkserver() -> None:
-    """The process that starts those of the pool outlives a test."""
+def _forkserver() -> Iterator[None]:
+    """The process that starts those of the pool outlives a test, and has imported what they need.
+
+    One that earlier tests have started has imported what they had, or nothing: its processes take seconds to begin, and
+    longer on a busy machine.
+    """
+    server = forkserver._forkserver  # type: ignore[attr-defined]  # nothing public ends one
+    server._stop()
+    installed_plugins()
+    needed = ("ibrobot_core.cli.main", "ibrobot_eval.evaluation", "ibrobot_testing.fakes")
+    set_forkserver_preload([*needed, *(name for name in sys.modules if name.startswith("ibrobot_"))])
     forkserver.ensure_running()
+    yield
+    server._stop()
 
 
 class Here(Pool):
@@ -175,6 +187,63 @@ def test_a_film_that_differs_is_a_note(site: Site) -> None:
     assert report["notes"] == notes
     assert len(notes) + len(list(Path("out/videos").rglob("*.mp4"))) == min(5, len(failed))
     assert all(note in text for note in notes)
+
+
+CODE = ("Python", "ibrobot-core", "lerobot", "mujoco", "numpy", "ray", "torch")
+
+
+@pytest.fixture
+def code(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """The installed code, as the test changes it."""
+    made = dict.fromkeys(CODE, "1.0")
+    monkeypatch.setattr("ibrobot_eval.episodes.installed_code", lambda providers: dict(made))
+    return made
+
+
+@pytest.mark.usefixtures("here", "site")
+@pytest.mark.parametrize("package", CODE)
+def test_code_that_changed_between_calls_is_refused(code: dict[str, str], package: str) -> None:
+    evaluate("good", episodes=1)
+    code[package] = "1.1"
+    refused, _, text = evaluate("good", episodes=2)
+    assert refused == 2
+    assert f"out: was begun with other settings: versions {package} 1.0, now 1.1; choose a new folder" in text
+
+
+@pytest.mark.usefixtures("site")
+@pytest.mark.parametrize("package", CODE)
+def test_code_that_changes_during_an_evaluation_ends_it(
+    code: dict[str, str], package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Changing(Here):
+        """Finds other code after an episode."""
+
+        @override
+        def run[R](
+            self, jobs: Iterable[Job[R]], watch: Callable[[int], None] = lambda count: None
+        ) -> Generator[Done[R]]:
+            for done in super().run(jobs, watch):
+                code[package] = "1.1"
+                yield done
+
+    monkeypatch.setattr(Registry, "pool", lambda *_: Changing())
+    ended, _, text = evaluate("good", episodes=2)
+    assert ended not in (0, 2)
+    assert f"the installed code changed during the evaluation: {package} 1.1, not 1.0" in text
+    assert len(list(Path("out/results/policy").iterdir())) == 1, "the episode before it is kept"
+
+
+@pytest.mark.usefixtures("here")
+def test_source_of_an_editable_plugin_counts(site: Site) -> None:
+    direct = {"url": site.folder.as_uri(), "dir_info": {"editable": True}}
+    (site.folder / "bad_policies-1.0.dist-info/direct_url.json").write_text(json.dumps(direct))
+    evaluate("good", episodes=1)
+    assert evaluate("good", episodes=2)[0] == 0
+    with (site.folder / "bad_policies.py").open("a") as file:
+        file.write("\nSUPERFLUOUS = True\n")
+    refused, _, text = evaluate("good", episodes=3)
+    assert refused == 2
+    assert "versions bad-policies 1.0 (source " in text
 
 
 @pytest.mark.usefixtures("here")

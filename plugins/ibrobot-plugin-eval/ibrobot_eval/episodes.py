@@ -11,6 +11,7 @@ from pathlib import Path
 from uuid import uuid4
 
 import attrs
+from ibrobot_provenance import differing_code, installed_code
 
 from ibrobot_core.api import (
     MODEL_ANSWERS,
@@ -93,6 +94,8 @@ class EpisodeJob:
     seed: int
     document: str
     """Hash of the robot YAML with which the evaluation began."""
+    code: Mapping[str, str]
+    """The installed code with which it began."""
     answer_s: float
     """Longest time of a step, e.g. of an answer of the policy [s]."""
     episode_s: float
@@ -118,6 +121,8 @@ def run_episode(job: EpisodeJob, progress: Callable[[int], None]) -> Result:
     hide_messages()
     if document_hash(job.policy.load()) != job.document:
         raise ComponentFailed(f"{job.policy.config}: changed during the evaluation")
+    if changed := differing_code(job.code, code_here()):
+        raise ComponentFailed(f"the installed code changed during the evaluation: {'; '.join(changed)}")
     attempt = job.attempt("episode")
     if attempt.error:
         return _broken(job, attempt.error)
@@ -172,6 +177,11 @@ def _errors(answers: Sequence[Message]) -> str:
     asked = [each for each in answers if isinstance(each, ModelAnswer)]
     failed = [each.error for each in asked if each.error]
     return f"{len(failed)} of {len(asked)} requests to the policy failed: {failed[0]}" if failed else ""
+
+
+def code_here() -> dict[str, str]:
+    """The installed code on which episodes depend."""
+    return installed_code([*installed_plugins().versions(), "ibrobot-plugin-eval"])
 
 
 def hide_messages() -> None:

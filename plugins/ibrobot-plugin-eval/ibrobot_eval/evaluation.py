@@ -15,7 +15,7 @@ import attrs
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import ComponentFailed, Done, Job, installed_plugins, owned
 from ibrobot_eval.comparison import Decision
-from ibrobot_eval.episodes import SCRATCH, EpisodeJob, Place, Result, hide_messages, run_episode, write
+from ibrobot_eval.episodes import SCRATCH, EpisodeJob, Place, Result, code_here, hide_messages, run_episode, write
 from ibrobot_eval.film import can_film, film
 from ibrobot_eval.options import SETTINGS, EvalOptions
 from ibrobot_eval.policies import Identity, Policy, identify
@@ -38,8 +38,12 @@ class Evaluation:
         resumed: number of episodes that earlier calls have finished.
     """
 
-    def __init__(self, options: EvalOptions, policies: Sequence[Policy], identities: Mapping[str, Identity]) -> None:
+    def __init__(
+        self, options: EvalOptions, policies: Sequence[Policy], identities: Mapping[str, Identity],
+        code: Mapping[str, str],
+    ) -> None:  # fmt: skip
         self.options = options
+        self._code = code
         self.policies = policies
         self._identities = identities
         self._results: dict[tuple[str, int], Result] = {}
@@ -148,7 +152,7 @@ class Evaluation:
     def _job(self, policy: Policy, seed: int) -> EpisodeJob:
         options = self.options
         document = self._identities[policy.label].document
-        return EpisodeJob(options.out, policy, seed, document, options.answer_limit, options.episode_limit)
+        return EpisodeJob(options.out, policy, seed, document, self._code, options.answer_limit, options.episode_limit)
 
     @contextmanager
     def _running[R](
@@ -212,7 +216,7 @@ def opened(options: EvalOptions, policies: Sequence[Policy]) -> Iterator[Evaluat
     out = options.out
     registry = installed_plugins()
     identities = {policy.label: identify(policy, registry) for policy in policies}
-    settings = {
+    settings: dict[str, Any] = {
         "format": _FORMAT,
         "seed": options.seeds[0],
         "until_decided": options.until_decided,
@@ -223,7 +227,7 @@ def opened(options: EvalOptions, policies: Sequence[Policy]) -> Iterator[Evaluat
             each.label: {"mode": each.mode, "model": each.model, **attrs.asdict(identities[each.label])}
             for each in policies
         },
-        "versions": registry.versions(),
+        "versions": code_here(),
         ASKED: [attrs.asdict(each) for each in policies],
     }
     with owned(out, "is being evaluated", DatasetError):
@@ -233,7 +237,7 @@ def opened(options: EvalOptions, policies: Sequence[Policy]) -> Iterator[Evaluat
             raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
         shutil.rmtree(out / SCRATCH, ignore_errors=True)  # of a call that was killed
         try:
-            yield Evaluation(options, policies, identities)
+            yield Evaluation(options, policies, identities, settings["versions"])
         finally:
             shutil.rmtree(out / SCRATCH, ignore_errors=True)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import platform
 import signal
 import socket
 import threading
@@ -17,6 +16,7 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # before Ray reads it
 os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")  # `uv run` would make Ray build an environment per job
 
 import ray
+from ibrobot_provenance import differing_code, installed_code
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import ComponentFailed, Done, Job, Pool, installed_plugins
@@ -31,8 +31,8 @@ _AHEAD = 2
 
 
 def _versions() -> dict[str, str]:
-    """Versions that must be equal on all machines."""
-    return {"Python": platform.python_version(), **installed_plugins().versions()}
+    """Code that must be equal on all machines."""
+    return installed_code(installed_plugins().versions())
 
 
 class _Counts:
@@ -53,9 +53,7 @@ class _Counts:
 def _do(job: Job[Any], number: int, counts: Any, folder: str, versions: Mapping[str, str]) -> Any:
     """Run a job as a Ray task. Returns its progress and its outcome."""
     here = socket.gethostname()
-    mine = _versions()
-    differ = [name for name, version in versions.items() if mine.get(name) != version]
-    if wrong := [f"{name} {mine.get(name)}, not {versions[name]}" for name in differ]:
+    if wrong := differing_code(versions, _versions()):
         return 0, (None, ComponentFailed(f"machine {here} has other versions than this one: {'; '.join(wrong)}"))
     try:
         os.chdir(folder)

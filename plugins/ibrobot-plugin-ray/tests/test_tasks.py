@@ -61,10 +61,15 @@ def test_machine_without_the_folder_is_named(here: Path) -> None:
     assert "missing: No such file or directory; run the command in a folder that all machines share" in str(error)
 
 
-def test_machine_with_other_versions_is_named(here: Path) -> None:
-    _, (_, error) = do(Job(square, Order(1)), here, Python="2.7")
-    assert "has other versions than this one: Python 3." in str(error)
-    assert "not 2.7" in str(error)
+@pytest.mark.parametrize("name", ["Python", "ray", "numpy", "mujoco", "ibrobot-core", "ibrobot-plugin-processes"])
+def test_machine_with_other_code_is_named(here: Path, name: str) -> None:
+    _, (_, error) = do(Job(square, Order(1)), here, **{name: "0.7"})
+    assert f"has other versions than this one: {name} {pool._versions()[name]}, not 0.7" in str(error)
+
+
+def test_machine_without_a_package_is_named(here: Path) -> None:
+    _, (_, error) = do(Job(square, Order(1)), here, torch="2.9")
+    assert "torch missing, not 2.9" in str(error)
 
 
 def test_counts_are_those_of_the_running_jobs() -> None:
