@@ -97,7 +97,7 @@ def test_results_of_refused_goals_say_why(start, peer, caplog):
 
 def test_tolerances_end_a_goal_with_their_codes(start, peer):
     start()
-    far = to(1.5, 1.5, 1.5, at=0.6)
+    far = to(1.5, 1.5, 1.5, at=2.0)
     path = peer.ask("follow", action=ACTION, joints=ARM, points=far, path_tolerance=[("pan", 1e-9)])
     assert (path["status"], path["error_code"]) == ("ABORTED", -4), path
     goal = peer.ask(
