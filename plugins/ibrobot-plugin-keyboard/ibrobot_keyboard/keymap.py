@@ -102,10 +102,10 @@ def make_keymap(
             close = get_close_matches(action, known, 1)
             hint = f"did you mean {close[0]!r}?" if close else f"the actions are: {', '.join(sorted(known))}"
             raise TeleopError(f"keys: no action {action!r}, {hint}")
-    keymap = Keymap(
-        *({action: overrides.get(action, key) for action, key in group.items()} for group in (motions, tool, common)),
-        tuple(keyless),
-    )
+    groups = [
+        {action: overrides.get(action, key) for action, key in group.items()} for group in (motions, tool, common)
+    ]
+    keymap = Keymap(groups[0], groups[1], groups[2], tuple(keyless))
     for group in (keymap.joints, keymap.cartesian):
         _check_single({**group, **keymap.common})
     return keymap

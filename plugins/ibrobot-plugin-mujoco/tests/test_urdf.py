@@ -8,6 +8,7 @@ from pathlib import Path
 from shutil import rmtree
 from subprocess import CompletedProcess
 from tempfile import TemporaryDirectory
+from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -92,9 +93,12 @@ def test_arms_in_one_file_are_groups_of_their_own(naming: str, names: list[str],
 
 @pytest.mark.parametrize(("naming", "count", "fingers", "torso"), make.SEVERAL)
 def test_each_joint_belongs_to_the_chain_that_it_moves(naming: str, count: int, fingers: int, torso: int) -> None:
-    root = ElementTree.fromstring(make.several(naming, count, fingers, torso))
-    moved_by = {each.find("child").get("link"): each.get("name") for each in root.iter("joint")}  # type: ignore[union-attr]
-    parents = {each.get("name"): moved_by.get(each.find("parent").get("link")) for each in root.iter("joint")}  # type: ignore[union-attr]
+    links = {
+        each.attrib["name"]: (each.find("parent"), each.find("child"))
+        for each in ElementTree.fromstring(make.several(naming, count, fingers, torso)).iter("joint")
+    }
+    moved_by = {child.attrib["link"]: name for name, (_, child) in links.items() if child is not None}
+    parents = {name: moved_by.get(parent.attrib["link"]) for name, (parent, _) in links.items() if parent is not None}
     grips = [name for name in parents if name.startswith("finger")]
     chains = chains_of(parents, grips)
     arms = [each for each in chains if "torso_1" not in each.joints]
@@ -130,7 +134,7 @@ def test_a_hand_alone_is_an_arm(tmp_path: Path, new: New) -> None:
 # Sizes, masses and units
 
 
-def mesh_robot(file: str, scale: str = "", **more: float) -> str:
+def mesh_robot(file: str, scale: str = "", **more: Any) -> str:
     shape = f'<mesh filename="{file}"{scale}/>'
     return make.robot(make.link("a", shape, **more) + make.joint("j1", "base", "a") + make.chain(2, "a", "k{}"))
 
@@ -187,7 +191,7 @@ def test_a_mesh_in_another_unit_is_shown(factor: float, tmp_path: Path, new: New
     assert "# - CHECK: " in (tmp_path / "arm.yaml").read_text()
 
 
-def lever(**more: float) -> str:
+def lever(**more: Any) -> str:
     return make.robot(make.link("a", **more) + make.joint("j1", "base", "a") + make.chain(2, "a", "k{}"))
 
 
