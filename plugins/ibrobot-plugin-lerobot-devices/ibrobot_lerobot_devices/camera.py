@@ -76,17 +76,23 @@ class LeRobotCamera(Sensor):
         height, width, *channels = answer["shape"]
         pixels = np.frombuffer(answer["content"], np.uint8)
         image = Image(
-            Header(stamp_ns, self._frame_id), height, width, self._encoding(answer["type"], channels),
+            Header(stamp_ns, self._frame_id), height, width, self._encoding(answer, channels),
             pixels.size // height, pixels,
         )  # fmt: skip
+        if self._as_jpeg and image.encoding == _DEPTH:
+            raise self._error("LeRobot gives depth, which cannot be a JPEG; use encoding: raw")
         return to_jpeg(image, self._options.jpeg_quality) if self._as_jpeg else image
 
-    def _encoding(self, kind: str, channels: list[int]) -> str:
-        if kind == "uint16":
-            return _DEPTH
-        if channels in ([], [1]):
-            return "mono8"
-        return "bgr8" if self._options.config.get("color_mode") == "bgr" else "rgb8"
+    def _encoding(self, answer: Mapping[str, Any], channels: list[int]) -> str:
+        """The encoding of what the camera gives, whatever the YAML says."""
+        match answer["type"], channels:
+            case "uint16", [] | [1]:
+                return _DEPTH
+            case "uint8", [] | [1]:
+                return "mono8"
+            case "uint8", [3]:
+                return f"{answer['color']}8"
+        raise self._error(f"LeRobot gives pictures of shape {answer['shape']} and type {answer['type']}")
 
     def _error(self, text: object) -> SensorError:
         return SensorError(f"camera {self._ctx.name}: {text}")
