@@ -28,7 +28,7 @@ def ibrobot(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 def test_a_robot_without_motors_holds_its_pose(tmp_path: Path) -> None:
     """lerobot-robot-dummy: all joints are always at 0."""
-    done = ibrobot(tmp_path, "config", "new", "dummy.yaml", "--lerobot", "dummy_follower")
+    done = ibrobot(tmp_path, "config", "new", "dummy.yaml", "--lerobot", "dummy_follower", "--unit", "degrees")
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.startswith("dummy.yaml: dummy_follower, 7 joints\n")
     done = ibrobot(

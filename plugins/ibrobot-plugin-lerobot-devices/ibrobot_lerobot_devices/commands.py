@@ -11,8 +11,9 @@ import click
 
 from ibrobot_core.api import HardwareError, did_you_mean
 from ibrobot_core.app import Declined, echo, wrong_input
-from ibrobot_lerobot_devices.link import INSTALL, DeviceLink, DeviceProblem
+from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem
 from ibrobot_lerobot_devices.registry import registry
+from ibrobot_lerobot_devices.units import OTHERS, UNITS
 
 _KINDS = {"robot": "robots: hardware", "teleoperator": "teleoperators: teleop", "camera": "cameras: peripherals"}
 _START_S = 60.0
@@ -56,15 +57,30 @@ def _show(fields: Mapping[str, Any], indent: str) -> None:
 @click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
 @click.argument("robot")
 @click.option("--id", "id_", metavar="ID", help="LeRobot's id of it, the name of its calibration.  [default: ROBOT]")
-def new(out: Path, robot: str, id_: str | None) -> None:
+@click.option(
+    "--unit",
+    "units",
+    multiple=True,
+    metavar="[NAME=]UNIT",
+    help=f"Unit of the joint or axis NAME, or of all joints, where LeRobot does not say it: {', '.join(UNITS)}.",
+)
+def new(out: Path, robot: str, id_: str | None, units: tuple[str, ...]) -> None:
     """Write a robot YAML for ROBOT, e.g. koch_follower, to OUT."""
     from ibrobot_lerobot_devices.new_robot import write_robot
 
+    given: dict[str, str] = {}
+    for each in units:
+        name, equals, unit = each.rpartition("=")
+        if unit not in UNITS:
+            raise click.BadParameter(f"{unit!r}{did_you_mean(unit, UNITS, 'it is one of')}", param_hint="--unit")
+        given[name if equals else OTHERS] = unit
     with wrong_input():
-        found = write_robot(out, robot, id_ or robot)
+        found = write_robot(out, robot, id_ or robot, given)
     echo(f"{out}: {found.type}, {len(found.mapped)} joints")
     if not found.measured:
         echo(f"note: limits of joints are guesses, since LeRobot has no calibration {id_ or robot}: check them")
+    if found.unknown_leader:
+        echo(f"note: the file has no leader: {found.unknown_leader}")
     echo(f"try it: ibrobot launch {out}")
 
 
@@ -99,4 +115,4 @@ def _registry() -> Mapping[str, Any]:
     try:
         return registry()
     except DeviceProblem as problem:
-        raise HardwareError(f"{problem}: {INSTALL}") from None
+        raise HardwareError(str(problem)) from None

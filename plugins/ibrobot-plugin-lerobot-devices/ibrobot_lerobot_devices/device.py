@@ -31,6 +31,10 @@ _AGAIN_S = 0.05
 _NICE = -10
 _PICTURE_MS = 200
 """Longest time to wait for a picture before an answer without one [ms]."""
+_EARLY = 0.9
+"""How early a picture may be taken, as a share of the camera's period."""
+_LOOK_S = 0.004
+"""Time between looks for a new picture, at a camera that does not wait for one [s]."""
 READY, ANSWER, DONE, TRAFFIC = "ready", "answer", "done", "traffic"
 """Events: it is connected; a reading or why there is none; a request is carried out; what its ports received."""
 STAND = "stand"
@@ -118,6 +122,37 @@ class Requests:
                 os._exit(1)
 
 
+@attrs.define
+class Pictures:
+    """Finds the new ones among the pictures that a camera gives, which may be the same one again."""
+
+    fps: float | None
+    _pixels: Any = None
+    """Of the newest one, shape (H, W) or (H, W, C)."""
+    _taken_s: float | None = None
+
+    def is_new(self, pixels: Any, taken_s: float | None) -> bool:
+        """Whether a picture is another one than the one before, and not the same one again.
+
+        Equal pixels are a new picture only if the camera says that it took them, at least one period later: some
+        say for each request that they have just taken what they give.
+
+        Args:
+            pixels: shape (H, W) or (H, W, C); kept, so nobody may write to them.
+            taken_s: when it was taken [s]; None if the camera does not say it.
+        """
+        import numpy as np
+
+        if taken_s is not None and taken_s == self._taken_s:
+            return False
+        if self._pixels is not None and np.array_equal(pixels, self._pixels):
+            since_s = None if taken_s is None or self._taken_s is None else taken_s - self._taken_s
+            if self.fps is None or since_s is None or since_s < _EARLY / self.fps:
+                return False
+        self._pixels, self._taken_s = pixels, taken_s
+        return True
+
+
 class Device:
     """A connected device of LeRobot's, of any kind.
 
@@ -133,6 +168,8 @@ class Device:
         self._order = order
         self._pictures = pictures
         self._device: Any = None
+        self._seen = Pictures(None)
+        self._color = ""
         self._acted: dict[str, float] = {}
         """The last action."""
         self._until_s: float | None = None
@@ -156,7 +193,9 @@ class Device:
         """Make and connect the device; return what it says about itself."""
         found = self.make()
         if self._order["kind"] == "camera":
+            self._color = self._library.color_order(self._device)
             self._device.connect()
+            self._seen = Pictures(self._library.fps(self._device))
             return found
         device = self._device
         device.connect(calibrate=False)
@@ -175,15 +214,24 @@ class Device:
         return self._library.numbers(get())
 
     def picture(self) -> dict[str, Any]:
-        """Send the newest picture, once it is there, through the pipe; return its shape and type."""
+        """Send the next new picture, once it is there, through the pipe; return its shape, type and colours."""
         import numpy as np
 
-        pixels = np.ascontiguousarray(self._device.async_read(timeout_ms=_PICTURE_MS))
-        age_s = self._library.picture_age_s(self._device)
+        deadline_s = time.monotonic() + _PICTURE_MS / 1000
+        while True:
+            pixels = np.array(self._device.async_read(timeout_ms=_PICTURE_MS), order="C")
+            taken_s = self._library.taken_s(self._device)
+            if self._seen.is_new(pixels, taken_s):
+                break
+            if time.monotonic() >= deadline_s:
+                raise TimeoutError("the camera gives the same picture again")
+            time.sleep(_LOOK_S)
+        age_s = 0.0 if taken_s is None else max(0.0, time.perf_counter() - taken_s)
         made_ns = time.monotonic_ns() - round(age_s * 1e9)
         content = memoryview(pixels).cast("B")
         return {
-            "shape": list(pixels.shape), "type": str(pixels.dtype), "made_ns": made_ns, "size": content.nbytes,
+            "shape": list(pixels.shape), "type": str(pixels.dtype),
+            "color": self._color, "made_ns": made_ns, "size": content.nbytes,
             "content": content,
         }  # fmt: skip
 

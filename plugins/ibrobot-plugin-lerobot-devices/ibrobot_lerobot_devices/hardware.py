@@ -227,7 +227,7 @@ class LeRobotHardware(Hardware):
         robot, order = self._ctx.robot, self._ctx.robot.indices(self.joints)
         limits = dict(zip(self.joints, zip(robot.lower[order], robot.upper[order], strict=True), strict=True))
         actions, choices = found["action_features"], self._options.choices()
-        axes = map_axes(actions, choices, self.joints)
+        axes = map_axes(actions, found["motors"], choices, self.joints)
         rolled = [each.joint for each in axes]
         turned = [joint for joint in self.joints if joint not in rolled]
         mapped = map_joints(actions, found["motors"], choices, turned, limits)

@@ -8,7 +8,6 @@ import inspect
 import logging
 import pkgutil
 import re
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib.metadata import distributions, version
@@ -17,7 +16,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ibrobot_core.api import did_you_mean
 from ibrobot_lerobot_devices.registry import KEEPS_TORQUE, third_parties
-from ibrobot_lerobot_devices.units import POSITION, bases
+from ibrobot_lerobot_devices.units import AXES, POSITION, RADIANS, bases, driven
 
 Kind = Literal["robot", "teleoperator", "camera"]
 KINDS: tuple[Kind, ...] = ("robot", "teleoperator", "camera")
@@ -165,7 +164,10 @@ def _words(hint: Any) -> list[str]:
 
 
 def motors(device: Any) -> dict[str, dict[str, Any]]:
-    """Feature -> its motor's unit, resolution and calibration, for every motor bus of a device and within it."""
+    """Feature -> its unit, and the resolution and calibration of its motor, for every motor bus in a device.
+
+    A base's axis has `rate`, its unit per second. What names of features mean is known of LeRobot's own code alone.
+    """
     found: dict[str, dict[str, Any]] = {}
     for prefix, bus in buses(device):
         for name, motor in getattr(bus, "motors", {}).items():
@@ -181,7 +183,19 @@ def motors(device: Any) -> dict[str, dict[str, Any]]:
                     "reversed": bool(getattr(bus, "apply_drive_mode", False) and calibration.drive_mode),
                 }
             found[f"{prefix}{name}"] = row
+    if _moves_by_lerobot(device):
+        features = list(device.action_features)
+        for name in bases(features, (".q",)):
+            found.setdefault(name, {"unit": RADIANS})
+        for name in driven(features):
+            found.setdefault(name, {})["rate"] = AXES.get(name)
     return found
+
+
+def _moves_by_lerobot(device: Any) -> bool:
+    """Whether LeRobot's own code, and not that of another package, sends or reads the positions of a device."""
+    function = getattr(type(device), "send_action", None) or getattr(type(device), "get_action", None)
+    return str(getattr(function, "__module__", "")).startswith("lerobot.")
 
 
 def buses(device: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -239,10 +253,29 @@ def numbers(values: Mapping[str, Any]) -> dict[str, float]:
     return found
 
 
-def picture_age_s(camera: Any) -> float:
-    """The age of a camera's newest picture [s]; 0 if LeRobot does not say when it was taken."""
-    taken_s = getattr(camera, "latest_timestamp", None)  # by time.perf_counter
-    return max(0.0, time.perf_counter() - taken_s) if isinstance(taken_s, float) else 0.0
+def taken_s(camera: Any) -> float | None:
+    """When a camera's newest picture was taken, by `time.perf_counter` [s]; None if LeRobot does not say it."""
+    found = getattr(camera, "latest_timestamp", None)
+    return found if isinstance(found, float) else None
+
+
+def fps(camera: Any) -> float | None:
+    """How many pictures a second a camera takes; None if LeRobot does not say it."""
+    found = getattr(camera, "fps", None) or getattr(getattr(camera, "config", None), "fps", None)
+    return float(found) if isinstance(found, int | float) and found > 0 else None
+
+
+def color_order(camera: Any) -> str:
+    """The order of colours in a camera's pictures: `rgb` or `bgr`; `rgb`, as LeRobot's own, if it does not say it.
+
+    Raises:
+        DeviceError: if it is another one.
+    """
+    found = getattr(camera, "color_mode", None) or getattr(getattr(camera, "config", None), "color_mode", None) or "rgb"
+    order = str(getattr(found, "value", found)).lower()
+    if order not in ("rgb", "bgr"):
+        raise DeviceError(f"gives pictures with color_mode {order!r}; ibrobot takes rgb and bgr")
+    return order
 
 
 def _plain(features: Mapping[str, Any]) -> list[str]:

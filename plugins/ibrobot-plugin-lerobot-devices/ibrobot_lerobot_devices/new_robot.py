@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -14,20 +14,24 @@ import attrs
 
 from ibrobot_core.api import HardwareError, did_you_mean
 from ibrobot_core.app import ConfigError, dump_yaml, load_config, parse_yaml
-from ibrobot_lerobot_devices.link import INSTALL, DeviceLink, DeviceProblem
+from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem
 from ibrobot_lerobot_devices.registry import registry
 from ibrobot_lerobot_devices.stand_in import NEEDS_TORCH
 from ibrobot_lerobot_devices.units import (
     AXES,
+    DEGREES,
     METRES,
     OTHERS,
+    PERCENT,
     POSITION,
+    SYMMETRIC,
+    UNITS,
     Choices,
     Mapped,
-    UnitProblem,
     bases,
     driven,
     map_joints,
+    unit_of,
 )
 
 _START_S = 60.0
@@ -52,22 +56,25 @@ class NewRobot:
     measured: bool
     """Whether the limits are those of its calibration."""
     leader: str
-    """A teleoperator with the same joints; empty if LeRobot has none of that name."""
+    """A teleoperator with the same joints; empty if LeRobot has none of that name, or does not say its units."""
+    unknown_leader: str
+    """Why there is no leader although LeRobot has one of that name; else empty."""
     torch: bool
     """Whether it needs torch."""
     axes: tuple[str, ...]
     """The axes of its base."""
 
 
-def describe_robot(type_: str, id_: str) -> NewRobot:
+def describe_robot(type_: str, id_: str, units: Mapping[str, str]) -> NewRobot:
     """What LeRobot says about a robot without its device.
 
     Args:
         type_: LeRobot's type.
         id_: LeRobot's id of the robot, which is the name of its calibration.
+        units: the units that LeRobot does not say, as the option `units` of the hardware.
 
     Raises:
-        HardwareError: if it has no joints, or cannot be made.
+        HardwareError: if it has no joints, cannot be made, or a unit is not known.
     """
     try:
         found = registry()
@@ -76,37 +83,61 @@ def describe_robot(type_: str, id_: str) -> NewRobot:
         config = {**_required(found["robot"][type_]["fields"], ""), "id": id_}
         torch = False
         try:
-            facts = _facts(type_, config, torch=torch)
+            facts = _facts("robot", type_, config, torch=torch)
         except DeviceProblem as problem:
             if NEEDS_TORCH not in str(problem):
                 raise
             torch = True
-            facts = _facts(type_, config, torch=torch)
+            facts = _facts("robot", type_, config, torch=torch)
     except DeviceProblem as problem:
-        raise HardwareError(f"{problem}; LeRobot is installed by {INSTALL}") from None
+        raise HardwareError(f"{type_}: {problem}") from None
     joints = list(bases(facts["action_features"], POSITION))
     if not joints:
         raise HardwareError(f"LeRobot's {type_} has no joints: {', '.join(facts['action_features'])}")
-    units: dict[str, str] = {}
-    try:
-        mapped = _map(facts, joints, units)
-    except UnitProblem:
-        units = {OTHERS: "degrees"}
-        mapped = _map(facts, joints, units)
+    wheels = driven(facts["action_features"])
+    axes = tuple(name for name in wheels if name in AXES and wheels[name] in facts["observation_features"])
+    if unknown := _unknown(facts, units, axes):
+        others = ", or --unit UNIT for all joints" if set(unknown) & set(joints) else ""
+        raise HardwareError(
+            f"LeRobot does not say the unit of {type_}'s {', '.join(unknown)}: look it up, and give it, e.g. "
+            f"--unit {unknown[0]}=UNIT{others}; units are {', '.join(UNITS)}"
+        )
+    strange = sorted(set(units) - {*joints, *axes, OTHERS})
+    if strange:
+        raise HardwareError(f"{type_} has no {strange[0]!r}{did_you_mean(strange[0], [*joints, *axes], 'it has')}")
+    mapped = _map(facts, joints, units)
     measured = all("range_min" in facts["motors"].get(name, {}) for name in joints)
     limits = {each.joint: _limits(each, facts["motors"].get(each.feature, {})) for each in mapped}
     leader = type_.replace("follower", "leader")
-    known = leader if leader in found["teleoperator"] else ""
-    wheels = driven(facts["action_features"])
-    axes = tuple(name for name in wheels if name in AXES and wheels[name] in facts["observation_features"])
-    return NewRobot(type_, config, mapped, units, limits, measured, known, torch, axes)
+    known, why = "", ""
+    if leader in found["teleoperator"]:
+        why = _why_not_led(leader, {**_required(found["teleoperator"][leader]["fields"], ""), "id": leader}, torch)
+        known = "" if why else leader
+    return NewRobot(type_, config, mapped, units, limits, measured, known, why, torch, axes)
 
 
-def _facts(type_: str, config: Mapping[str, Any], *, torch: bool) -> Mapping[str, Any]:
+def _unknown(facts: Mapping[str, Any], units: Mapping[str, str], axes: Collection[str]) -> list[str]:
+    """The joints, and those of the axes, whose unit neither LeRobot nor `units` says."""
+    features = {**bases(facts["action_features"], POSITION), **driven(facts["action_features"])}
+    wanted = {base: name for base, name in features.items() if base in axes or name.endswith(POSITION)}
+    return [base for base, name in wanted.items() if not unit_of(name, facts["motors"], units)]
+
+
+def _why_not_led(leader: str, config: Mapping[str, Any], torch: bool) -> str:
+    """Why a leader cannot be in the file; empty if it can."""
+    try:
+        unknown = _unknown(_facts("teleoperator", leader, config, torch=torch), {}, ())
+    except DeviceProblem as problem:
+        return f"{leader}: {problem}"
+    lack = f"LeRobot does not say the unit of {leader}'s {', '.join(unknown)}; add it with its option units"
+    return lack if unknown else ""
+
+
+def _facts(kind: str, type_: str, config: Mapping[str, Any], *, torch: bool) -> Mapping[str, Any]:
     """What LeRobot's object says about itself, with the variables of the environment as a run reads them."""
     expanded = parse_yaml(json.dumps(config), f"the config of {type_}")
     expanded.raise_problems()
-    link = DeviceLink("robot", type_, expanded.root, torch=torch, only_make=True)
+    link = DeviceLink(kind, type_, expanded.root, torch=torch, only_make=True)
     try:
         return link.start(_START_S)
     finally:
@@ -135,7 +166,7 @@ def _map(facts: Mapping[str, Any], joints: list[str], units: Mapping[str, str]) 
 
 def _limits(mapped: Mapped, motor: Mapping[str, Any]) -> tuple[float, float]:
     """The ends of the calibrated range [rad], or a guess."""
-    if "range_min" not in motor:
+    if "range_min" not in motor or mapped.unit not in (DEGREES, PERCENT, SYMMETRIC):
         return (0.0 if "gripper" in mapped.joint else -_GUESS, _GUESS)
     match mapped.unit:
         case "degrees":
@@ -190,7 +221,8 @@ def robot_yaml(found: NewRobot) -> str:
     extra = f", units: {json.dumps(dict(found.units))}" if found.units else ""
     extra += ", torch: true" if found.torch else ""
     extra += f", anchored: {_list(gripper)}" if gripper and gripper != ["gripper"] else ""
-    options = f"config: {_leader_config(found)}{_leader_options(found, gripper)}"
+    scaled = f", scaled: {_list(gripper)}" if gripper and gripper != ["gripper"] else ""
+    options = f"config: {_leader_config(found)}{scaled}"
     leader = f"{{type: lerobot, teleop: {_word(found.leader)}, {options}}}"
     devices = f"  leader: {leader}\n" if found.leader else ""
     mode = f"  teleop:\n    executors: [{', '.join(streams)}]\n    teleop: leader\n" if found.leader else ""
@@ -236,22 +268,17 @@ def _leader_config(found: NewRobot) -> str:
     return text.replace("FOLLOWER_PORT", "LEADER_PORT").replace(_PORT, "/dev/ttyACM1").replace("follower", "leader")
 
 
-def _leader_options(found: NewRobot, gripper: list[str]) -> str:
-    """The options of the leader beside its config."""
-    extra = f", units: {json.dumps(dict(found.units))}" if found.units else ""
-    return extra + (f", scaled: {_list(gripper)}" if gripper and gripper != ["gripper"] else "")
-
-
-def write_robot(out: Path, type_: str, id_: str) -> NewRobot:
-    """Write the robot YAML, and check it before it has its name.
+def write_robot(out: Path, type_: str, id_: str, units: Mapping[str, str]) -> NewRobot:
+    """Write the robot YAML, and check it before it has its name; see `describe_robot`.
 
     Raises:
         ConfigError: if the YAML has a fault.
-        HardwareError: if the file exists already or cannot be written, or LeRobot does not know the robot.
+        HardwareError: if the file exists already or cannot be written, LeRobot does not know the robot, or a unit is
+            not known.
     """
     if out.exists():
         raise HardwareError(f"{out} exists already, and is not overwritten")
-    found = describe_robot(type_, id_)
+    found = describe_robot(type_, id_, units)
     draft = out.with_name(f".{out.stem}.{uuid4().hex}.yaml")
     try:
         draft.write_text(robot_yaml(found), encoding="utf-8")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import attrs
 
 from ibrobot_core.api import OptionFault, did_you_mean, replace_file
-from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem, is_installed
+from ibrobot_lerobot_devices.link import INSTALL, DeviceLink, DeviceProblem, is_installed
 from ibrobot_lerobot_devices.options import GRIPPER
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def registry() -> Mapping[str, Any]:
         DeviceProblem: if LeRobot is not installed, or cannot be imported.
     """
     if not is_installed():
-        raise DeviceProblem("LeRobot is not installed here")
+        raise DeviceProblem(f"LeRobot is not installed here: {INSTALL}")
     return _registry(_installed())
 
 

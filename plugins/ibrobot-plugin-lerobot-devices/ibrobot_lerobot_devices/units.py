@@ -20,7 +20,7 @@ METRES = "metres"
 UNITS = (DEGREES, RADIANS, SYMMETRIC, PERCENT, METRES)
 """LeRobot's units of joints: `range_…` are shares of the calibrated range; bases have metres."""
 AXES = {"x": METRES, "y": METRES, "theta": DEGREES}
-"""The axes of a base, with the units per second in which LeRobot's robots are driven along and about them."""
+"""The axes of a base, with the units per second in which LeRobot's own robots are driven along and about them."""
 _DRIVEN = {DEGREES: math.pi / 180, RADIANS: 1.0, METRES: 1.0}
 
 OTHERS = "*"
@@ -76,21 +76,42 @@ def driven(features: Sequence[str]) -> dict[str, str]:
     return {base: name for base, name in bases(features, VELOCITY).items() if base not in positions}
 
 
-def map_axes(features: Sequence[str], choices: Choices, wanted: Sequence[str]) -> list[Mapped]:
+def unit_of(feature: str, motors: Mapping[str, Mapping[str, Any]], units: Mapping[str, str]) -> str:
+    """The unit of a feature that is a position or an axis of a base; empty if neither LeRobot nor `units` says it.
+
+    Args:
+        feature: its name, with its end.
+        motors: what LeRobot says, by feature without its end; see `library.motors`.
+        units: LeRobot's name -> unit.
+    """
+    (base,) = bases([feature], POSITION) or bases([feature], VELOCITY)
+    known = motors.get(base, {})
+    if not feature.endswith(POSITION):
+        unit = units.get(base) or known.get("rate") or ""
+        return unit if unit in _DRIVEN else ""
+    unit = units.get(base) or known.get("unit") or units.get(OTHERS, "")
+    return unit if unit in UNITS else ""
+
+
+def map_axes(
+    features: Sequence[str], motors: Mapping[str, Mapping[str, Any]], choices: Choices, wanted: Sequence[str]
+) -> list[Mapped]:
     """Those of the joints `wanted` that are axes of a base, in that order; `features` are names of LeRobot's.
 
     Raises:
         UnitProblem: if the unit of an axis is not known.
     """
-    by_joint = {choices.joints.get(base, base): base for base in driven(features)}
+    axes = driven(features)
+    by_joint = {choices.joints.get(base, base): base for base in axes}
     found = []
     for joint in wanted:
         if (base := by_joint.get(joint)) is None:
             continue
-        unit = choices.units.get(base) or AXES.get(base, "")
-        if unit not in _DRIVEN:
+        unit = unit_of(axes[base], motors, choices.units)
+        if not unit:
             raise UnitProblem(
-                f"give the unit of the base's {base!r}, e.g. units: {{{base}: metres}}, for metres a second"
+                f"LeRobot does not say the unit of the base's {base!r}: give it as units: {{{base}: UNIT}}, with "
+                "metres, radians or degrees, each a second"
             )
         turned = -1.0 if joint in choices.inverted else 1.0
         found.append(Mapped(base, joint, unit, Scale(turned * _DRIVEN[unit])))
@@ -127,11 +148,11 @@ def map_joints(
                 "as joints: {LEROBOT'S: JOINT}"
             )
         motor = motors.get(base, {})
-        unit = choices.units.get(base) or motor.get("unit") or (RADIANS if positions[base].endswith(".q") else "")
-        unit = unit or choices.units.get(OTHERS, "")
-        if unit not in UNITS:
+        unit = unit_of(positions[base], motors, choices.units)
+        if not unit:
             raise UnitProblem(
-                f"LeRobot does not say the unit of {base!r}: give it as units: {{{base}: degrees}}, or {{'*': degrees}}"
+                f"LeRobot does not say the unit of {base!r}: give it as units: {{{base}: UNIT}}, or {{'*': UNIT}} for "
+                f"all, with one of {', '.join(UNITS)}"
             )
         found.append(Mapped(base, joint, unit, _scale(unit, motor, joint, choices, limits[joint])))
     return found
@@ -140,13 +161,13 @@ def map_joints(
 def _scale(unit: str, motor: Mapping[str, Any], joint: str, choices: Choices, limits: tuple[float, float]) -> Scale:
     turned = -1.0 if joint in choices.inverted else 1.0
     by_share = joint in choices.scaled and unit in (SYMMETRIC, PERCENT)
-    if "resolution" in motor and unit != RADIANS and not by_share:
+    if "resolution" in motor and unit not in (RADIANS, METRES) and not by_share:
         return _by_calibration(unit, motor, joint, choices, limits[0])
     lower, upper = limits
     match unit:
         case "degrees":
             return Scale(turned * math.pi / 180)
-        case "radians":
+        case "radians" | "metres":
             return Scale(turned)
         case "range_0_100":
             half = (upper - lower) / 100

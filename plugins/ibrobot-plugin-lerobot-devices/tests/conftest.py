@@ -56,6 +56,12 @@ def install(folder: Path, name: str, version: str = "1.0") -> None:
     invalidate_caches()
 
 
+def install_package(folder: Path, name: str) -> None:
+    """A package of others, from the folder `packages` here, that adds to LeRobot."""
+    shutil.copy(FAKE.parent / "packages" / f"{name}.py", folder)
+    install(folder, name)
+
+
 @pytest.fixture
 def ageless(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a stepped clock, the real age of an answer would be one of another clock."""

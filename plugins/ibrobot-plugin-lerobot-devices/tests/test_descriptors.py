@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+import click
 import ibrobot_lerobot_devices
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from ibrobot_testing.descriptor import check_descriptor
 from ibrobot_core.api import HardwareError
 from ibrobot_core.app import ConfigError, load_config, parse_yaml
 
-from .conftest import JOINTS, Motors
+from .conftest import JOINTS, Motors, install_package
 
 
 @pytest.mark.parametrize(
@@ -112,6 +113,12 @@ class TestCommands:
             )
 
 
+def new(out: Path, *arguments: str) -> str:
+    """The output of `ibrobot lerobot new`."""
+    ran = CliRunner().invoke(lerobot, ["new", str(out), *arguments], catch_exceptions=False, standalone_mode=False)
+    return ran.output
+
+
 class TestNew:
     def test_a_new_robot_has_the_joints_and_ranges_of_lerobot(self, tmp_path: Path) -> None:
         out = tmp_path / "arm.yaml"
@@ -156,7 +163,7 @@ class TestNew:
     @pytest.mark.parametrize("name", ["{}", "0{}", "1e{}", "on{}", "a b{}", "m,{}", "é{}", "#{}"])
     def test_names_of_joints_are_texts(self, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         names = [name.format(i) for i in range(1, 6)] + ["gripper"]
-        known = new_robot.describe_robot("fake_arm", "fake_arm")
+        known = new_robot.describe_robot("fake_arm", "fake_arm", {})
         pairs = zip(known.mapped, names, strict=True)
         mapped = [attrs.evolve(each, joint=joint, feature=joint) for each, joint in pairs]
         limits = dict(zip(names, known.limits.values(), strict=True))
@@ -175,6 +182,37 @@ class TestNew:
         with pytest.raises(ConfigError, match=f"{out}:1: robot"):
             CliRunner().invoke(lerobot, ["new", str(out), "fake_arm"], catch_exceptions=False)
         assert set(tmp_path.iterdir()) == before
+
+    @pytest.mark.parametrize(
+        ("type_", "unknown"),
+        [("strange_follower", "pan, lift, tilt"), ("strange_base", "grip, x, y, theta")],
+    )
+    def test_without_a_unit_there_is_no_file(self, lerobot: Path, tmp_path: Path, type_: str, unknown: str) -> None:
+        install_package(lerobot, "lerobot_robot_strange")
+        out = tmp_path / "arm.yaml"
+        with pytest.raises(HardwareError, match=f"does not say the unit of {type_}'s {unknown}: .* --unit "):
+            new(out, type_)
+        assert not out.exists()
+
+    @pytest.mark.parametrize("unit", ["radians", "degrees"])
+    def test_a_stated_unit_is_what_the_robot_is_sent(self, lerobot: Path, tmp_path: Path, unit: str) -> None:
+        install_package(lerobot, "lerobot_robot_strange")
+        out = tmp_path / "arm.yaml"
+        output = new(out, "strange_follower", "--unit", unit, "--unit", "tilt=range_0_100")
+        assert "note: the file has no leader: LeRobot does not say the unit of strange_leader's pan, lift" in output
+        (device,) = load_config(out).hardware.values()
+        assert device.options.units == {"*": unit, "tilt": "range_0_100"}
+        assert "strange_leader" not in out.read_text()
+
+    @pytest.mark.parametrize("unit", ["pan=degree", "x=metres", "=degrees", "turns"])
+    def test_a_wrong_unit_is_named(self, lerobot: Path, tmp_path: Path, unit: str) -> None:
+        install_package(lerobot, "lerobot_robot_strange")
+        out = tmp_path / "arm.yaml"
+        with pytest.raises(
+            (HardwareError, click.BadParameter), match=f"'{unit.rpartition('=')[2]}'|has no '(x|)'|say the"
+        ):
+            new(out, "strange_follower", "--unit", unit)
+        assert not out.exists()
 
     def test_an_existing_file_is_not_overwritten(self, tmp_path: Path) -> None:
         out = tmp_path / "arm.yaml"

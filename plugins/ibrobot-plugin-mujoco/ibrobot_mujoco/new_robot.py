@@ -30,6 +30,13 @@ _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
 @click.option("--mjcf", type=_FILE, help="Instead of a URDF: an MJCF of the arm, whose drives stay.")
 @click.option("--lerobot", metavar="ROBOT", help="Instead of a URDF: a robot of LeRobot's, e.g. koch_follower.")
 @click.option(
+    "--unit",
+    "units",
+    multiple=True,
+    metavar="[NAME=]UNIT",
+    help="With --lerobot: unit of the joint or axis NAME, or of all joints, where LeRobot does not say it.",
+)
+@click.option(
     "--tip", metavar="LINK", help="Link, body or site whose frame is the tool's.  [default: found by its name]"
 )
 @click.option(
@@ -44,8 +51,8 @@ _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
 )
 @click.pass_context
 def new(
-    context: click.Context, out: Path, urdf: Path | None, mjcf: Path | None, lerobot: str | None, tip: str | None,
-    packages: tuple[str, ...], arguments: tuple[str, ...],
+    context: click.Context, out: Path, urdf: Path | None, mjcf: Path | None, lerobot: str | None,
+    units: tuple[str, ...], tip: str | None, packages: tuple[str, ...], arguments: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Write a robot YAML for an arm in a URDF or an MJCF, or of LeRobot's.
 
@@ -54,8 +61,10 @@ def new(
     """
     if sum(each is not None for each in (urdf, mjcf, lerobot)) != 1:
         raise click.UsageError("give one of --urdf, --mjcf and --lerobot")
+    if units and lerobot is None:
+        raise click.UsageError("--unit is of --lerobot")
     if lerobot is not None:
-        context.invoke(_command_of_lerobot(), out=out, robot=lerobot, id_=None)
+        context.invoke(_command_of_lerobot(), out=out, robot=lerobot, id_=None, units=units)
         return
     source = urdf or mjcf
     assert source is not None

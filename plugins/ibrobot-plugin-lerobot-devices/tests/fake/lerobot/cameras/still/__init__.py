@@ -4,6 +4,7 @@
 
 import time
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,12 +13,21 @@ import numpy as np
 from lerobot.cameras import CameraConfig
 
 
+class Order(StrEnum):
+    """Orders of colours."""
+
+    RGB = "rgb"
+    BGR = "bgr"
+
+
 class Still:
     """The camera."""
 
     def __init__(self, config: Any) -> None:
         self.config = config
         self.latest_timestamp: float | None = None
+        if config.color_mode is not None:
+            self.color_mode = Order(config.color_mode.lower()) if config.as_enum else config.color_mode
         self._seen = ""
 
     def connect(self) -> None:
@@ -27,12 +37,15 @@ class Still:
     def async_read(self, timeout_ms: float = 200) -> Any:
         deadline_s = time.monotonic() + timeout_ms / 1e3
         while (content := Path(self.config.path).read_text()) == self._seen or not content:
+            if self._seen and not self.config.waits:
+                break
             if time.monotonic() > deadline_s:
                 raise TimeoutError("Timed out waiting for frame")
             time.sleep(0.001)
         self._seen = content
         self.latest_timestamp = float(content.split()[1])
-        return np.full((self.config.height, self.config.width, 3), (int(content.split()[0]) % 250, 20, 30), np.uint8)
+        shape = (self.config.height, self.config.width, self.config.channels)
+        return np.full(shape, (int(content.split()[0]) % 250, 20, 30, 255)[: self.config.channels], self.config.kind)
 
     def disconnect(self) -> None:
         """There is nothing to release."""
@@ -47,3 +60,8 @@ class StillConfig(CameraConfig):
     path: str = field(kw_only=True)
     width: int = 32
     height: int = 24
+    channels: int = 3
+    kind: str = "uint8"
+    color_mode: str | None = "rgb"
+    as_enum: bool = False
+    waits: bool = True
