@@ -235,5 +235,5 @@ def test_pictures_reach_a_plain_subscriber_in_an_environment_of_its_own(start, t
             assert stranger.stdout.read() == "(64, 48)\n"
         finally:
             stranger.kill()
-    assert run.ros.counts["subscribers /camera/top/image_raw"] >= 1
+    assert "subscribers /camera/top/image_raw" in run.ros.counts
     assert run.ros.counts["sent /camera/top/image_raw"] >= 5
