@@ -33,7 +33,7 @@ MADE = (
 
 def every_error() -> Iterator[IbrobotError]:
     """One error of each class."""
-    made = {type(each): each for each in MADE}
+    made: dict[type[IbrobotError], IbrobotError] = {type(each): each for each in MADE}
     for kind in vars(errors).values():
         if isinstance(kind, type) and issubclass(kind, IbrobotError):
             yield made.get(kind) or kind("why")

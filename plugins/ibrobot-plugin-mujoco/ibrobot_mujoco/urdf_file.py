@@ -269,8 +269,8 @@ class _Reader:
         elif limits is not None and limits[0] == limits[1] and mimic is None:
             self.still.append(name)
             type_ = "fixed"
-        place, (parent, child) = f"{element.file}:{element.line}", ends
-        return UrdfJoint(name, type_, place, parent, child, xyz, rpy, direction, limits, effort, velocity, mimic)
+        place = f"{element.file}:{element.line}"
+        return UrdfJoint(name, type_, place, *ends, xyz, rpy, direction, limits, effort, velocity, mimic)
 
     def _tree(
         self, links: Mapping[str, Link], found: Mapping[str, tuple[XmlElement, UrdfJoint]], root: XmlElement

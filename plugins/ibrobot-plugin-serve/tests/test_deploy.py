@@ -142,7 +142,7 @@ def test_unit_runs_the_program_of_the_virtual_environment_that_it_names() -> Non
     assert f"python3 -m venv {environment}" in UNIT.read_text()
     assert not environment.is_relative_to("/home"), "ProtectHome"
     here = Path(sysconfig.get_path("scripts")) / program.relative_to(environment / "bin")
-    command = [here, "serve", "--help"]
+    command = [str(here), "serve", "--help"]
     done = subprocess.run(command, env={"PATH": "/usr/bin"}, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     assert "MODEL_DIR" in done.stdout

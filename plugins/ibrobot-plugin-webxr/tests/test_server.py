@@ -208,6 +208,7 @@ def test_a_page_that_opens_while_the_host_pauses_keeps_control(
 ) -> None:
     monkeypatch.setattr("ibrobot_webxr.server._SILENT_S", 0.5)
     browser.log_in().connect()
+    assert page._server is not None
     page._server.loop.call_soon_threadsafe(time.sleep, 0.8)
     assert browser.state()["control"] == "you"
 
@@ -373,6 +374,7 @@ def test_a_stop_needs_no_thread_that_is_not_there_yet(ctx: Context, monkeypatch:
     try:
         with monkeypatch.context() as patch:
             patch.setattr(threading.Thread, "start", _refuse)
+            assert server._server is not None
             asyncio.run_coroutine_threadsafe(server._stop(), server._server.loop).result(30.0)
         assert called.is_set()
     finally:

@@ -45,7 +45,7 @@ YIELDED: Mapping[str, object] = {
     "number": 3,
     "none": None,
     "text": "good_arm",
-    "kind": HardwareDescriptor if _where == "ibrobot_hardware" else HardwareDescriptor("x", _nothing, "x"),
+    "kind": HardwareDescriptor if _where == "ibrobot_hardware" else HardwareDescriptor("x", _nothing, "x"),  # type: ignore[arg-type]
     "other": SensorDescriptor("x", _nothing, "x"),  # type: ignore[arg-type]
 }
 WITHOUT_NAME: Mapping[str, Callable[[], object]] = {
