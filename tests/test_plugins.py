@@ -62,7 +62,8 @@ def test_every_failure_is_reported_with_its_cause(registry: Registry) -> None:
         "plugin 'fake_import' (fake-import) failed to import: ImportError: no library",
         "plugin 'fake_misspelt' (fake-misspelt) has a wrong hook: "
         "ValueError: unknown hook 'ibrobot_hardwear', did you mean 'ibrobot_hardware'?",
-        "plugin 'fake_nothing' (fake-nothing) failed in ibrobot_policies: TypeError: expected a PolicyDescriptor, got 'act'",
+        "plugin 'fake_nothing' (fake-nothing) failed in ibrobot_policies: "
+        "TypeError: expected a PolicyDescriptor, got 'act'",
         "plugin 'fake_raising' (fake-raising) failed in ibrobot_sensors: RuntimeError: no driver",
         "plugin 'fake_twin' (fake-twin) failed in ibrobot_hardware: "
         "hardware type 'good_arm' is offered by fake-good already",
