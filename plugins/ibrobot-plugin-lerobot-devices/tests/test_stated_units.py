@@ -56,7 +56,7 @@ def mapped(module: str, feature: str, bus: str | None, given: dict[str, str]) ->
     return map_axes([feature], motors, choices, [base])[0]
 
 
-def test_a_device_has_the_unit_that_somebody_states_or_does_not_move() -> None:
+def test_a_device_has_the_unit_that_a_person_states_or_does_not_move() -> None:
     refused = 0
     for module, feature, bus, given in CASES:
         unit = expected_unit(MODULES[module], feature, bus, given)
