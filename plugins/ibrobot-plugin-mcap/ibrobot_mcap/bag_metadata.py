@@ -25,6 +25,8 @@ class BagInfo:
     """Topic -> number of messages, including copies in later files."""
     types: Mapping[str, str] = attrs.field(factory=dict)
     """Topic -> type."""
+    encodings: Mapping[str, str] = attrs.field(factory=dict)
+    """Topic -> serialisation, where it is stated."""
     custom: Mapping[str, str] = attrs.field(factory=dict)
     """`custom_data`."""
     compressed: str = ""
@@ -60,14 +62,18 @@ def parse_bag_info(text: str, path: Path) -> BagInfo:
         content: Mapping[str, Any] = document.get(INFORMATION, document)
         counts: dict[str, int] = {}
         types: dict[str, str] = {}
+        encodings: dict[str, str] = {}
         for each in content.get(_PER_TOPIC) or ():
             topic = _text(each["topic_metadata"]["name"])
             counts[topic] = counts.get(topic, 0) + _count(each["message_count"])
             types[topic] = _text(each["topic_metadata"]["type"])
+            if stated := each["topic_metadata"].get("serialization_format"):
+                encodings[topic] = _text(stated)
         return BagInfo(
             tuple(Path(_text(name)).name for name in content.get("relative_file_paths") or ()),
             counts,
             types,
+            encodings,
             {_text(key): _text(value) for key, value in dict(content.get("custom_data") or {}).items()},
             _compressed(content),
         )

@@ -40,7 +40,7 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
             for item in reader.messages():
                 times[item.topic].take(item)
         except RecorderError as error:
-            problems.append(str(error))
+            problems += str(error).splitlines()
     contract = Contract.of_episode(summary.metadata)
     absent = [topic for topic in (contract.topics if contract is not None else ()) if topic not in times]
     problems += [f"no message of {topic}, which is in its contract" for topic in absent]

@@ -44,7 +44,7 @@ class MessageCompressed(Source):
         self._path, self._source = path, source
         self.finished, self.custom, self.types = source.finished, source.custom, source.types
         self.counts, self.stated, self.repeated = source.counts, source.stated, source.repeated
-        self.definitions = source.definitions
+        self.definitions, self.encodings = source.definitions, source.encodings
         self.latched, self.start_ns, self.end_ns = source.latched, source.start_ns, source.end_ns
 
     @override

@@ -83,7 +83,8 @@ def draft(reader: Rosbag2Reader) -> str:
     cameras = [topic for topic in topics if isinstance(topic.first, Image)]
     vectors = [topic for topic in topics if topic not in cameras and any(_numbers(topic.first))]
     if not cameras and not vectors:
-        raise RecorderError(f"{summary.path}: has no topic with images or numbers")
+        reasons = "".join(f"; {topic} cannot be read: {why}" for topic, why in reader.unreadable.items())
+        raise RecorderError(f"{summary.path}: has no topic with images or numbers that can be read{reasons}")
     actions = [topic for topic in vectors if topic.is_command]
     states = [topic for topic in vectors if topic not in actions]
     rate_hz = round(min((topic.rate_hz for topic in cameras), default=30.0)) or 1

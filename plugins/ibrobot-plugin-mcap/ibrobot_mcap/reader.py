@@ -7,6 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from functools import cached_property
 from pathlib import Path
 from typing import override
 
@@ -28,7 +29,7 @@ from ibrobot_mcap.compressed import Expanded, MessageCompressed
 from ibrobot_mcap.damage import reading
 from ibrobot_mcap.metadata import DROPPED, METADATA, MISSING, OUTCOME, RECORD, RECORD_KEY, Topic
 from ibrobot_mcap.options import COMPRESSIONS
-from ibrobot_mcap.sources import McapSource, Raw, Source
+from ibrobot_mcap.sources import CDR, McapSource, Raw, Source
 from ibrobot_mcap.sqlite_source import SqliteSource
 
 _SOURCES: Mapping[str, Callable[[Sequence[Path]], Source]] = {".mcap": McapSource, ".db3": SqliteSource}
@@ -67,6 +68,8 @@ class Rosbag2Reader(EpisodeReader):
                 """Its files."""
             info = info or self._recorded() or BagInfo()
             self._codec = Codec(self.source.definitions)
+            stated = {topic: each for topic, each in info.encodings.items() if each != CDR}
+            self._encodings = {**stated, **self.source.encodings}
             self._types = {topic: self._delivered(topic, type_) for topic, type_ in self.source.types.items()}
         except BaseException:
             self.close()
@@ -119,7 +122,10 @@ class Rosbag2Reader(EpisodeReader):
                 f"{self._path}: is damaged: messages are missing in the middle: {missing}; "
                 "`ibrobot episodes repair` keeps what can be read"
             )
-        for raw in source.messages(frozenset(source.types if topics is None else topics), stamp_ns):
+        unreadable = {topic: why for topic, why in self.unreadable.items() if topics is None or topic in topics}
+        if unreadable and topics is not None:
+            raise self._unreadable(unreadable)
+        for raw in source.messages(frozenset(source.types if topics is None else topics) - unreadable.keys(), stamp_ns):
             try:
                 message = self._codec.decode(raw.type, raw.data)
                 if isinstance(message, CompressedImage):
@@ -127,6 +133,30 @@ class Rosbag2Reader(EpisodeReader):
             except (CodecError, ContractError) as error:
                 raise RecorderError(f"{self._path}: {raw.topic} at {raw.received_ns} ns: {error}") from error
             yield Recorded(raw.topic, message, raw.received_ns, raw.published_ns)
+        if unreadable:
+            raise self._unreadable(unreadable)
+
+    @cached_property
+    def unreadable(self) -> Mapping[str, str]:
+        """Topic with messages -> why they cannot be read, e.g. the type of its messages is not defined.
+
+        `messages` of all topics raises an error about them after it has yielded those of the others.
+        """
+        found: dict[str, str] = {}
+        for topic, type_ in self.source.types.items():
+            if not self.source.counts.get(topic, 0):
+                continue
+            if (encoding := self._encodings.get(topic)) is not None:
+                found[topic] = f"its messages are serialised as {encoding!r}; ibrobot reads {CDR!r}, as ROS 2 writes it"
+                continue
+            try:
+                self._codec.type_hash(type_)
+            except CodecError as error:
+                found[topic] = str(error)
+        return found
+
+    def _unreadable(self, topics: Mapping[str, str]) -> RecorderError:
+        return RecorderError("\n".join(f"{self._path}: {topic} cannot be read: {why}" for topic, why in topics.items()))
 
     @override
     def digest(self) -> str:
@@ -143,6 +173,8 @@ class Rosbag2Reader(EpisodeReader):
     def stored(self, topic: str) -> Topic:
         """A stored topic (compressed images are `CompressedImage`), with the bag's definition of its type."""
         source, type_ = self.source, self.source.types[topic]
+        if topic in self._encodings:
+            raise self._unreadable({topic: f"its messages are serialised as {self._encodings[topic]!r}, not {CDR!r}"})
         definition = source.definitions.get(type_, "")
         try:
             type_hash = self._codec.type_hash(type_)
@@ -162,7 +194,7 @@ class Rosbag2Reader(EpisodeReader):
 
     def _delivered(self, topic: str, type_: str) -> str:
         """The type in which `messages` delivers a topic; that of compressed images depends on the first one."""
-        if type_ != CompressedImage.ros_type:
+        if type_ != CompressedImage.ros_type or topic in self._encodings:
             return type_
         first = next(self.source.messages({topic}), None)
         if first is None:

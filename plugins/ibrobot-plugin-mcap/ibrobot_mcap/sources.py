@@ -14,6 +14,9 @@ from mcap.records import Channel
 
 from ibrobot_mcap.scan import Entry, McapFile
 
+CDR = "cdr"
+"""The serialisation of ROS 2, as bags name it."""
+
 
 @attrs.frozen
 class Raw:
@@ -38,6 +41,8 @@ class Source(ABC):
     """Topic -> number of messages."""
     stated: Mapping[str, int] = {}
     """Topic -> number of messages in the files' statistics; empty if they have none."""
+    encodings: Mapping[str, str] = {}
+    """Topic -> serialisation of its messages, for those that are not all CDR."""
     definitions: Mapping[str, str]
     """Type -> definition, if the bag has it."""
     compression: str = ""
@@ -98,7 +103,7 @@ class McapSource(Source):
         )
         self.compression = next((file.compression(block) for file in self._files for block in file.blocks), "")
         types: dict[str, str] = {}
-        self.definitions = {}
+        self.definitions, self.encodings = {}, {}
         for file in self._files:
             for schema in file.schemas.values():
                 if schema.encoding in ("ros2msg", "ros2idl"):
@@ -106,6 +111,8 @@ class McapSource(Source):
             for channel in file.channels.values():
                 schema_of = file.schemas.get(channel.schema_id)
                 types[channel.topic] = schema_of.name if schema_of else "?"
+                if channel.message_encoding != CDR:
+                    self.encodings = {**self.encodings, channel.topic: channel.message_encoding}
         counts, copies, stated = Counter(dict.fromkeys(types, 0)), Counter[str](), Counter[str]()
         for number, file in enumerate(self._files):
             stated.update(_by_topic(file, file.stated))

@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 from ibrobot_core.api import RecorderError
 from ibrobot_mcap.damage import reading
-from ibrobot_mcap.sources import Raw, Source
+from ibrobot_mcap.sources import CDR, Raw, Source
 
 
 class SqliteSource(Source):
@@ -49,9 +49,9 @@ class SqliteSource(Source):
         for key, name, type_, format_, profiles in file.execute(
             f"SELECT id, name, type, serialization_format, {qos} FROM topics ORDER BY id"
         ):
-            if format_ != "cdr":
-                raise RecorderError(f"{path}: {name!r} is serialised as {format_!r}; only cdr is supported")
             topics[_of(int, key)] = _of(str, name)
+            if format_ != CDR:
+                self.encodings = {**self.encodings, name: _of(str, format_)}
             self.types = {**self.types, name: _of(str, type_)}
             if "transient_local" in _of(str, profiles):
                 latched.add(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import struct
 from io import BytesIO
 from typing import Any
@@ -13,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_mcap import ibrobot_readers
 from ibrobot_mcap.checks import problems_of
+from ibrobot_mcap.draft import draft
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
 from ibrobot_mcap.scan import McapFile
 from ibrobot_ros2 import definition, encode
@@ -325,8 +327,127 @@ def foreign_file(path, type_name, text, payloads, encoding="ros2msg"):
 def test_a_type_that_cannot_be_read_is_reported_by_topic(tmp_path):
     foreign_file(tmp_path / "file.mcap", "odd_msgs/msg/Odd", "wstring text\n", [b"\x00\x01\x00\x00"])
     assert summary(tmp_path / "file.mcap").topics["/it"].count == 1
-    with pytest.raises(RecorderError, match=rf"/it at {stamp(0)} ns: odd_msgs/msg/Odd: "):
+    with pytest.raises(RecorderError, match=r"/it cannot be read: odd_msgs/msg/Odd: "):
         read(tmp_path / "file.mcap")
+
+
+PART = "=" * 80 + "\n"
+INFO = """MSG: service_msgs/ServiceEventInfo
+uint8 event_type
+builtin_interfaces/Time stamp
+char[16] client_gid
+int64 sequence_number
+"""
+TIME = "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+EVENT = "service_msgs/ServiceEventInfo info\n{0}_Request[<=1] request\n{0}_Response[<=1] response\n"
+EVENTS = {
+    "short names": PART.join([EVENT.format("sum_msgs/Add"), INFO, TIME, "MSG: sum_msgs/Add_Request\nint64 a\nint64 b\n",
+                              "MSG: sum_msgs/Add_Response\nint64 sum\n"]),
+    "names of services": PART.join([EVENT.format("sum_msgs/srv/Add"), INFO, TIME,
+                                    "MSG: sum_msgs/srv/Add_Request\nint64 a\nint64 b\n",
+                                    "MSG: sum_msgs/srv/Add_Response\nint64 sum\n"]),
+    "text of the service": "int64 a\nint64 b\n---\nint64 sum\n",
+    "text and parts": PART.join(["int64 a\nint64 b\n---\nint64 sum\n", INFO, TIME]),
+}  # fmt: skip
+"""The forms in which a bag may define the events of a service."""
+EVENT_CDR = b"\0\1\0\0" + struct.pack("<B3xiI16s4xqI4xqqI", 1, 5, 6, b"g" * 16, 9, 1, 2, 3, 0)
+
+
+def bag_beside_joints(path, topic, type_name, encoding, payload, *, text="", schema="ros2msg", joints_count=3):
+    """An MCAP file with a foreign topic among joint states."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("", "another writer")
+        known = writer.register_schema(JointState.ros_type, "ros2msg", definition(JointState.ros_type).encode())
+        other = writer.register_schema(type_name, schema, text.encode()) if type_name else 0
+        theirs = writer.register_channel(topic, encoding, other)
+        ours = writer.register_channel(JOINTS, "cdr", known)
+        for index in range(joints_count):
+            writer.add_message(theirs, stamp(index), payload, stamp(index))
+            writer.add_message(ours, stamp(index), bytes(encode(joints(index))), stamp(index))
+        writer.finish()
+
+
+@pytest.mark.parametrize("form", EVENTS)
+def test_events_of_services_are_read_among_other_topics(tmp_path, form):
+    path = tmp_path / "file.mcap"
+    bag_beside_joints(path, "/add/_service_event", "sum_msgs/srv/Add_Event", "cdr", EVENT_CDR, text=EVENTS[form])
+    found = read(path)
+    assert len(found) == 6
+    event = found[0].message
+    assert (event.info.event_type, event.info.stamp_ns, event.info.sequence_number) == (1, 5_000_000_006, 9)
+    assert [(each.a, each.b) for each in event.request] == [(2, 3)]
+    assert event.response == ()
+
+
+SERIALISATIONS = ("json", "protobuf", "ros1", "cbor", "flatbuffer", "cdr_v2", "")
+UNDEFINED = (
+    *((encoding, JointState.ros_type, "ros2msg", definition(JointState.ros_type)) for encoding in SERIALISATIONS),
+    *((encoding, "", "", "") for encoding in SERIALISATIONS),
+    ("json", "foxglove.CompressedImage", "jsonschema", "{}"),
+    ("protobuf", "foxglove.CompressedImage", "protobuf", "x"),
+    ("ros1", "sensor_msgs/JointState", "ros1msg", "Header header\nstring[] name\n"),
+    ("cdr", "odd_msgs/msg/Odd", "ros2msg", "wstring text\n"),
+    ("cdr", "odd_msgs/msg/Odd", "ros2msg", "other_msgs/Missing it\n"),
+    ("cdr", "sum_msgs/srv/Add_Event", "ros2msg", EVENT.format("sum_msgs/Add")),
+    ("cdr", "sum_msgs/srv/Add_Event", "ros2msg", ""),
+    ("cdr", "odd_msgs/msg/Odd", "unknown", ""),
+)
+
+
+@pytest.mark.parametrize(("encoding", "type_name", "schema", "text"), UNDEFINED)
+def test_a_topic_that_cannot_be_read_leaves_the_others(tmp_path, encoding, type_name, schema, text):
+    path, payload = tmp_path / "file.mcap", bytes(encode(joints(7)))
+    bag_beside_joints(path, "/it", type_name, encoding, payload, text=text, schema=schema)
+    with reading(path) as reader:
+        assert reader.summary().topics["/it"].count == 3
+        assert [each.message for each in reader.messages({JOINTS})] == [joints(index) for index in range(3)]
+        found = []
+        why = (
+            f"serialised as '{encoding}'; ibrobot reads 'cdr'"
+            if encoding != "cdr"
+            else "not defined|definition|odd_msgs"
+        )
+        with pytest.raises(RecorderError, match=f"file.mcap: /it cannot be read: .*({why})"):
+            found.extend(reader.messages())
+        assert [each.message for each in found] == [joints(index) for index in range(3)]
+        with pytest.raises(RecorderError, match="/it cannot be read: "):
+            next(reader.messages({"/it"}))
+        assert draft(reader).count("topic: ") == 1
+    assert [each for each in problems_of(path, 5.0) if "/it cannot be read" in each]
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+def test_a_bag_that_states_another_serialisation_is_not_decoded_as_cdr(tmp_path, storage):
+    folder = tmp_path / "bag"
+    file = unchecked_bag(folder, storage)
+    if storage is StoragePlugin.SQLITE3:
+        database = sqlite3.connect(file)
+        with database:
+            database.execute("UPDATE topics SET serialization_format = 'json'")
+        database.close()
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("serialization_format: cdr", "serialization_format: json"))
+    for path in (folder, *([file] if storage is StoragePlugin.SQLITE3 else [])):
+        assert summary(path).topics[JOINTS].count == 20
+        with pytest.raises(RecorderError, match=f"{JOINTS} cannot be read: its messages are serialised as 'json'"):
+            read(path, {JOINTS})
+
+
+@pytest.mark.parametrize("encoding", ["ros1", "json", "protobuf"])
+def test_a_draft_says_what_it_cannot_read(tmp_path, encoding):
+    bag_beside_joints(tmp_path / "a.mcap", "/it", "", encoding, b"x", joints_count=0)
+    bag_beside_joints(tmp_path / "b.mcap", JOINTS, JointState.ros_type, encoding, b"x")
+    with reading(tmp_path / "a.mcap") as reader, pytest.raises(RecorderError, match=r"that can be read$"):
+        draft(reader)
+    with (
+        reading(tmp_path / "b.mcap") as reader,
+        pytest.raises(
+            RecorderError,
+            match=f"no topic with images .*; {JOINTS} cannot be read: its messages are serialised as '{encoding}'",
+        ),
+    ):
+        draft(reader)
 
 
 def png(array):

@@ -6,6 +6,7 @@ import threading
 from importlib.resources import files
 from typing import Any
 
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -16,6 +17,8 @@ _SEPARATOR = "=" * 80 + "\n"
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 _EVENT_TEXT = "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number\n"
 """The events of services as ROS defines them: rosbags has characters where ROS has numbers, so its hash differs."""
+EVENT = "service_msgs/ServiceEventInfo info\n{name}_Request[<=1] request\n{name}_Response[<=1] response\n"
+"""The definition of the events of a service."""
 
 DEFINING = threading.RLock()
 """Held while a store of types changes: by `define`, and by what makes several changes. Readers do not need it."""
@@ -40,13 +43,51 @@ def parse_definition(type_name: str, text: str) -> dict[str, Any]:
     """
     try:
         if not is_idl(text):
-            return dict(get_types_from_msg(text, type_name))
+            return _of_services(get_types_from_msg(_with_event(type_name, text), type_name))
         found: dict[str, Any] = {}
         for part in text.split(_SEPARATOR)[1:]:
             found.update(get_types_from_idl(part.partition("\n")[2]))
         return found
     except TypesysError as error:
         raise CodecError(f"{type_name}: its definition cannot be read: {error}") from error
+
+
+def _with_event(type_name: str, text: str) -> str:
+    """The definition of a service's events, for a text that begins with the request and the response of its `.srv`."""
+    own, *others = text.split(_SEPARATOR)
+    request, divider, response = f"\n{own}".partition("\n---\n")
+    if not type_name.endswith("_Event"):
+        return text
+    if not text.strip():
+        raise CodecError(f"{type_name}: its definition is empty")
+    if not divider:
+        return text
+    name = type_name.removesuffix("_Event")
+    parts = [EVENT.format(name=name), *others]
+    parts += [
+        f"MSG: {name}_{part}\n{fields.lstrip()}" for part, fields in (("Request", request), ("Response", response))
+    ]
+    if not any(each.startswith("MSG: service_msgs/") for each in others):
+        parts.append(f"MSG: {_EVENT_INFO}\n{_EVENT_TEXT}")
+    return _SEPARATOR.join(part if part.endswith("\n") else f"{part}\n" for part in parts)
+
+
+def _of_services(types: dict[str, Any]) -> dict[str, Any]:
+    """The types with those of services named as in ROS: rosbags takes every type for that of a message."""
+    return {
+        name.replace("/srv/msg/", "/srv/"): (constants, [(field, renamed(desc)) for field, desc in fields])
+        for name, (constants, fields) in types.items()
+    }
+
+
+def renamed(desc: Any) -> Any:
+    """A field whose type is named as in ROS."""
+    kind, inner = desc
+    if kind == Nodetype.NAME:
+        return kind, inner.replace("/srv/msg/", "/srv/")
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return kind, (renamed(inner[0]), inner[1])
+    return desc
 
 
 def make_typestore() -> Typestore:

@@ -22,13 +22,12 @@ from rosbags.typesys import TypesysError, get_types_from_msg
 from rosbags.typesys.store import Typestore
 
 from ibrobot_ros2.convert import dtype_of
-from ibrobot_ros2.definitions import DEFINING, CodecError, known, register, standard_types, type_hash
+from ibrobot_ros2.definitions import DEFINING, EVENT, CodecError, known, register, renamed, standard_types, type_hash
 
 FOLDER = files(__package__) / "interfaces"
 """The texts of services, actions and messages that ROS 2 nodes often have: PACKAGE/KIND/NAME.KIND."""
 _EMPTY = "uint8 structure_needs_at_least_one_member\n"
 """What ROS 2 puts into a message without fields."""
-_EVENT = "service_msgs/ServiceEventInfo info\n{name}_Request[<=1] request\n{name}_Response[<=1] response\n"
 _PARTS = "{name}_Request request_message\n{name}_Response response_message\n{name}_Event event_message\n"
 _UUID = "unique_identifier_msgs/UUID goal_id\n"
 _LITTLE_ENDIAN = b"\x00\x01"
@@ -134,7 +133,7 @@ def fields_of(type_name: str) -> list[str]:
 def _service(name: str, request: str, response: str) -> ServiceType:
     _define(f"{name}_Request", request)
     _define(f"{name}_Response", response)
-    _define(f"{name}_Event", _EVENT.format(name=name))
+    _define(f"{name}_Event", EVENT.format(name=name))
     _define(name, _PARTS.format(name=name))
     return ServiceType(name, f"{name}_Request", f"{name}_Response", type_hash(name))
 
@@ -173,17 +172,7 @@ def _define(name: str, text: str) -> None:
         (constants, fields) = next(iter(get_types_from_msg(text or _EMPTY, f"{package}/msg/X").values()))
     except TypesysError as error:
         raise CodecError(f"{name}: its definition cannot be read: {error}") from error
-    register(store, {name: (constants, [(field, _renamed(desc)) for field, desc in fields])})
-
-
-def _renamed(desc: Any) -> Any:
-    """A field whose type is named as in ROS: rosbags takes every type for that of a message."""
-    kind, inner = desc
-    if kind == Nodetype.NAME:
-        return kind, inner.replace("/srv/msg/", "/srv/")
-    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        return kind, (_renamed(inner[0]), inner[1])
-    return desc
+    register(store, {name: (constants, [(field, renamed(desc)) for field, desc in fields])})
 
 
 def _to_ros(store: Typestore, type_name: str, value: Any, where: str) -> Any:

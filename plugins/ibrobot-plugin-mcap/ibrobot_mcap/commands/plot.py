@@ -53,7 +53,9 @@ class PlotData:
         with opened(episode) as reader:
             self.summary = summary = reader.summary()
             start_ns, span_ns = summary.start_ns, max(1, summary.end_ns - summary.start_ns)
-            for item in reader.messages():
+            for topic, why in reader.unreadable.items():
+                echo(f"note: {topic} is not shown: {why}", err=True)
+            for item in reader.messages(reader.source.types.keys() - reader.unreadable.keys()):
                 at_s = (item.received_ns - start_ns) / NS_PER_S
                 self.stamps[item.topic].append(item.received_ns)
                 message = item.message
