@@ -38,6 +38,14 @@ class Drawer(TableScene[DrawerOptions]):
     placed = ("handle_x", "handle_y", "drawer_yaw", "drawer_damping")
     colours: ClassVar = {"drawer_colour": (f"{DRAWER}_front", f"{DRAWER}_handle")}
 
+    _touched = False
+    """Whether the robot has touched the drawer in this episode."""
+
+    @override
+    def begin(self, world: World, rng: np.random.Generator) -> Vector:
+        self._touched = False
+        return super().begin(world, rng)
+
     @override
     def add(self, spec: mujoco.MjSpec) -> None:
         cabinet = spec.worldbody.add_body(name=CABINET, mocap=True, pos=[0.4, 0, 0])
@@ -114,6 +122,7 @@ class Drawer(TableScene[DrawerOptions]):
 
     @override
     def success(self, world: World) -> bool:
-        """Whether the drawer is open, and does not move."""
+        """Whether the robot has touched the drawer, it is open, and does not move."""
         joint = world.data.joint(DRAWER)
-        return bool(joint.qpos[0] >= self.options.opened and abs(joint.qvel[0]) <= REST_SPEED)
+        self._touched = self._touched or self.touched(world, DRAWER)
+        return self._touched and bool(joint.qpos[0] >= self.options.opened and abs(joint.qvel[0]) <= REST_SPEED)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, override
 
 import mujoco
 import numpy as np
 
-from ibrobot_core.api import HardwareError, Robot
+from ibrobot_core.api import HardwareError, Robot, Vector
 from ibrobot_mujoco.scenes.options import HandoverOptions
 from ibrobot_mujoco.scenes.solids import FRICTION, hue
-from ibrobot_mujoco.scenes.table import REST_SPEED, TableScene
+from ibrobot_mujoco.scenes.table import REST_SPEED, TableScene, touching
 from ibrobot_mujoco.spans import ends
 from ibrobot_mujoco.world import World
 
@@ -24,6 +25,17 @@ _HALF_WAY_M = 0.05
 """Distance of the bar from the plane between both arms, on the side of the arm that gets it [m]."""
 
 
+class _Stage(enum.Enum):
+    """What has happened to the bar."""
+
+    LIES = enum.auto()
+    """No hand holds it, or something else touches it."""
+    LEFT = enum.auto()
+    """The left hand held it last, alone."""
+    BOTH = enum.auto()
+    """Both held it after that."""
+
+
 class Handover(TableScene[HandoverOptions]):
     """Observation: the pose of the bar."""
 
@@ -31,11 +43,17 @@ class Handover(TableScene[HandoverOptions]):
     placed = ("bar_x", "bar_y", "bar_yaw")
     colours: ClassVar = {"bar_colour": (BAR,)}
 
+    _stage = _Stage.LIES
+
     def __init__(self, options: HandoverOptions, robot: Robot) -> None:
         super().__init__(options, robot)
         if list(robot.description.arms) != ["left_", "right_"]:
             known = ", ".join(robot.description.arms) or "none"
             raise HardwareError(f"scene handover needs robot.description.arms left_ and right_, got {known}")
+        grips = [name for name, grips in zip(robot.joint_names, robot.grips, strict=True) if grips]
+        self._grips = [next((name for name in grips if name.startswith(arm)), "") for arm in robot.description.arms]
+        if not all(self._grips):
+            raise HardwareError("scene handover needs a joint of each arm, left_… and right_…, with grips: true")
 
     @override
     def add(self, spec: mujoco.MjSpec) -> None:
@@ -57,8 +75,31 @@ class Handover(TableScene[HandoverOptions]):
         return x, y, yaw
 
     @override
+    def begin(self, world: World, rng: np.random.Generator) -> Vector:
+        self._stage = _Stage.LIES
+        return super().begin(world, rng)
+
+    @override
     def success(self, world: World) -> bool:
-        """Whether the right arm alone holds the bar, above the table and on its own side."""
+        """Whether the right hand holds the bar, above the table and on its own side, and got it from the left hand.
+
+        The left hand alone held it first, then both, then the right one alone, and it lay nowhere in between. To hold
+        is to have it between both jaws, while nothing else touches it.
+        """
+        around = touching(world, BAR)
+        left, right = (jaws <= around for jaws in self._jaws_of(world))
+        if around - self._bodies_of(world) or not (left or right):
+            self._stage = _Stage.LIES
+        elif left and not self.touched(world, BAR, "right_"):
+            self._stage = _Stage.LEFT
+        elif self._stage is _Stage.LEFT and right:
+            self._stage = _Stage.BOTH if left else _Stage.LIES
+        alone = self._stage is _Stage.BOTH and around == self._jaws_of(world)[1]
         _, y, z = world.pose(BAR)[:3]
-        lifted = bool(z > _LIFTED_M and y < -_HALF_WAY_M and world.speed(BAR) <= REST_SPEED)
-        return lifted and self.touched(world, BAR, "right_") and not self.touched(world, BAR, "left_")
+        return alone and bool(z > _LIFTED_M and y < -_HALF_WAY_M and world.speed(BAR) <= REST_SPEED)
+
+    def _jaws_of(self, world: World) -> list[set[int]]:
+        """The bodies of the jaws of both hands, the left one first."""
+        model = world.model
+        moving = [int(model.jnt_bodyid[model.joint(name).id]) for name in self._grips]
+        return [{jaw, int(model.body_parentid[jaw])} for jaw in moving]

@@ -46,5 +46,7 @@ class PickCube(TableScene[PickCubeOptions]):
 
     @override
     def success(self, world: World) -> bool:
-        """Whether the cube lies in the bin, below the rim, and the robot does not touch it."""
-        return is_in_bin(world.pose(CUBE)[:3], self._centre) and self.at_rest(world, CUBE)
+        """Whether the robot has carried the cube, it lies in the bin below the rim, and the robot does not touch it."""
+        return (
+            CUBE in self.carried(world) and is_in_bin(world.pose(CUBE)[:3], self._centre) and self.at_rest(world, CUBE)
+        )

@@ -11,10 +11,12 @@ import numpy as np
 
 from ibrobot_core.api import Vector
 from ibrobot_mujoco.scenes.options import PushOptions
-from ibrobot_mujoco.scenes.table import TableScene
+from ibrobot_mujoco.scenes.table import TableScene, height
 from ibrobot_mujoco.world import World
 
 BLOCK, GOAL = "block", "goal"
+_LIFTED_M, _LIES_M = 0.003, 0.001
+"""Height of the block's lowest corner above which it is lifted, and below which it lies on the table [m]."""
 
 
 class Push(TableScene[PushOptions]):
@@ -25,6 +27,14 @@ class Push(TableScene[PushOptions]):
     placed = ("block_x", "block_y", "block_yaw", "goal_x", "goal_y")
     sizes: ClassVar = {"block_size": (BLOCK,)}
     colours: ClassVar = {"block_colour": (BLOCK,)}
+
+    _lifted = False
+    """Whether the block was lifted, and has not been put down beside the goal since."""
+
+    @override
+    def begin(self, world: World, rng: np.random.Generator) -> Vector:
+        self._lifted = False
+        return super().begin(world, rng)
 
     @override
     def add(self, spec: mujoco.MjSpec) -> None:
@@ -59,6 +69,14 @@ class Push(TableScene[PushOptions]):
 
     @override
     def success(self, world: World) -> bool:
-        """Whether the block is at rest on the goal, and the robot does not touch it."""
+        """Whether the block is at rest on the goal, where it came over the table, and the robot does not touch it.
+
+        A block that was lifted has to be pushed from where it then lies beside the goal.
+        """
         away = world.pose(BLOCK)[:2] - world.data.mocap_pos[0, :2]
-        return float(np.hypot(*away)) < self.options.goal_tolerance and self.at_rest(world, BLOCK)
+        on_goal, lowest = float(np.hypot(*away)) < self.options.goal_tolerance, height(world, BLOCK)
+        if lowest > _LIFTED_M:
+            self._lifted = True
+        elif not on_goal and lowest < _LIES_M:
+            self._lifted = False
+        return on_goal and not self._lifted and self.at_rest(world, BLOCK)

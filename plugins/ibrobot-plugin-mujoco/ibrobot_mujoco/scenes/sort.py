@@ -59,8 +59,8 @@ class Sort(TableScene[SortOptions]):
 
     @override
     def success(self, world: World) -> bool:
-        """Whether every cube lies in the bin of its colour, and the robot touches none."""
-        return all(
+        """Whether the robot has carried every cube, each lies in the bin of its colour, and the robot touches none."""
+        return self.carried(world) == set(self.moving) and all(
             is_in_bin(world.pose(cube)[:3], self._centres[int(number)]) and self.at_rest(world, cube)
             for cube, number in zip(self.moving, self._bins, strict=True)
         )

@@ -31,9 +31,10 @@ class Stack(TableScene[StackOptions]):
 
     @override
     def success(self, world: World) -> bool:
-        """Whether the cube lies on the other one, both at rest, and the robot touches neither."""
+        """Whether the robot has carried the cube, it lies on the other one, both rest, untouched."""
+        carried = CUBE in self.carried(world)
         cube, base = world.pose(CUBE)[:3], world.pose(BASE)[:3]
         sizes = [2 * float(world.model.geom(name).size[0]) for name in (CUBE, BASE)]
         over = float(np.hypot(*(cube - base)[:2])) < sizes[1] / 2
         lies = over and abs(cube[2] - sizes[1] - sizes[0] / 2) < _GAP
-        return bool(lies) and all(self.at_rest(world, body) for body in self.moving)
+        return carried and bool(lies) and all(self.at_rest(world, body) for body in self.moving)

@@ -22,6 +22,8 @@ CLEARANCE = 0.03
 """Minimum distance between an object's initial pose and everything except the table [m]."""
 REST_SPEED = 0.05
 """Speed below which an object counts as at rest [m/s]."""
+CARRIED_M = 0.01
+"""Height of a body's lowest corner above the table from which it counts as carried if only the robot touches it [m]."""
 _TRIES = 1000
 _CAMERA = tuple(f"camera_{axis}" for axis in ("x", "y", "z", "roll", "pitch", "yaw"))
 _SHAPES = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
@@ -34,6 +36,8 @@ type Draw = Callable[[], tuple[float, float, float, float]]
 
 class TableScene[O: SceneOptions](Scene[mujoco.MjSpec, World]):
     """A table without a task; the base class of this package's scenes.
+
+    A task is a history, not only a final state: `success` is asked in every tick of control, and notes what happens.
 
     Attributes:
         moving: the bodies that move; their poses, position [m] and quaternion wxyz, begin the observation.
@@ -57,6 +61,8 @@ class TableScene[O: SceneOptions](Scene[mujoco.MjSpec, World]):
         self._look |= dict(zip(_CAMERA, (shift,) * 3 + (turn,) * 3, strict=True))
         self._distractors = [f"distractor{i + 1}" for i in range(options.distractors)]
         self._of_robot: dict[str, frozenset[int]] = {}
+        self._carried: set[str] = set()
+        """Bodies of `moving` that the robot has carried in this episode."""
         self._originals: tuple[mujoco.MjModel, mujoco.MjModel] | None = None
         """A model that factors modify, and a copy of it as it was compiled."""
         self.factors = (*self.placed, *self._look, "distractors")
@@ -82,6 +88,7 @@ class TableScene[O: SceneOptions](Scene[mujoco.MjSpec, World]):
 
     @override
     def begin(self, world: World, rng: np.random.Generator) -> Vector:
+        self._carried = set()
         look_rng, aside = rng.spawn(2)
         drawn = zip(self._look.items(), look_rng.random(len(self._look)).tolist(), strict=True)
         look = {name: float(low + u * (high - low)) for (name, (low, high)), u in drawn}
@@ -134,12 +141,26 @@ class TableScene[O: SceneOptions](Scene[mujoco.MjSpec, World]):
 
     def touched(self, world: World, body: str, arm: str = "") -> bool:
         """Whether the robot touches a body, or only one of its arms: that with the prefix `arm`."""
-        model = world.model
+        return not self._bodies_of(world, arm).isdisjoint(touching(world, body))
+
+    def carried(self, world: World) -> set[str]:
+        """The bodies of `moving` that the robot has carried so far: it alone touched them, clear of the table.
+
+        What was only pushed, hit or dropped is not among them. Call it in each tick.
+        """
+        robot = self._bodies_of(world)
+        for body in self.moving:
+            around = touching(world, body)
+            if body not in self._carried and around and around <= robot and height(world, body) > CARRIED_M:
+                self._carried.add(body)
+        return self._carried
+
+    def _bodies_of(self, world: World, arm: str = "") -> frozenset[int]:
+        """The bodies of the robot, or of one of its arms."""
         if arm not in self._of_robot:
-            self._of_robot[arm] = bodies_of(model, [name for name in self._robot.joint_names if name.startswith(arm)])
-        pairs = model.geom_bodyid[world.data.contact.geom]
-        others = pairs[(pairs == model.body(body).id).any(axis=1)].ravel()
-        return not self._of_robot[arm].isdisjoint(others.tolist())
+            joints = [name for name in self._robot.joint_names if name.startswith(arm)]
+            self._of_robot[arm] = bodies_of(world.model, joints)
+        return self._of_robot[arm]
 
     def at_rest(self, world: World, body: str) -> bool:
         """Whether a body is at rest, and the robot does not touch it."""
@@ -190,6 +211,19 @@ class TableScene[O: SceneOptions](Scene[mujoco.MjSpec, World]):
         return all(
             mujoco.mj_geomDistance(model, data, geom, other, apart, None) >= apart for geom in mine for other in others
         )
+
+
+def touching(world: World, body: str) -> set[int]:
+    """The bodies that touch a body."""
+    own = world.model.body(body).id
+    pairs = world.model.geom_bodyid[world.data.contact.geom]
+    return set(pairs[(pairs == own).any(axis=1)].ravel().tolist()) - {own}
+
+
+def height(world: World, body: str) -> float:
+    """Height of the lowest corner of a box, whose geom has the name of its body, above the table [m]."""
+    position, turn = world.data.geom(body).xpos, world.data.geom(body).xmat
+    return float(position[2] - np.abs(turn[6:]) @ world.model.geom(body).size)
 
 
 def _polar(
