@@ -83,7 +83,8 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     alignment of the contract. Actions are joint positions [rad], shape (A,). Observations have the
     keys that LeRobot's tools know: `agent_pos`, the state; `environment_state`, the scene's ground truth; `pixels`, the
     pictures by camera. An episode ends with success (reward 1, `info["is_success"]`), or is truncated after
-    `contract.max_duration_s`.
+    `contract.max_duration_s`, or by a fault for which the robot stops, e.g. of a joint that presses against something.
+    `info["fault"]` has the fault; `reset` clears it.
 
     Args:
         config: a robot YAML, or the name of a shipped one.
@@ -128,6 +129,12 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._longest_ns = ns(self._config.contract.max_duration_s)
         self._max_episode_steps = math.ceil(self._config.contract.max_duration_s * self._config.contract.rate_hz) + 1
         self._session: Session | None = None
+        self._generation = 0
+        """Generation of the episode; it changes when the robot is stopped or reset."""
+        self._ended_by = ""
+        """The fault that has ended the episode; empty for none."""
+        self._seen: Observation = {}
+        """The newest observation."""
         self._rendered: Subscription | None = None
         self._picture: NDArray[np.uint8] | None = None
         self.observation_space = self._spaces()
@@ -174,6 +181,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._tick()
             if session.clock.now_ns() - self._begun_ns > ns(_PATIENCE_S):
                 raise HardwareError(f"not all observations have arrived within {_PATIENCE_S:g} s")
+        self._generation, self._ended_by = session.generation, ""
         return frame
 
     def _tick(self) -> None:
@@ -192,7 +200,8 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._start()
         number = int(self.np_random.integers(2**31)) if seed is None else seed
         frame = self._begin(number)
-        return self._observation(frame), {"seed": number, **self._info(success=False)}
+        self._seen = self._observation(frame)
+        return self._seen, {"seed": number, **self._info(success=False)}
 
     @override
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -200,28 +209,42 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         Raises:
             ValueError: for an action that is not finite.
+            ResetNeeded: after a fault that has ended the episode, until `reset`.
         """
         session, source = self._session, self._source
         if session is None:
             raise gymnasium.error.ResetNeeded("call reset first")
+        if self._ended_by:
+            raise gymnasium.error.ResetNeeded(f"a fault has ended the episode, call reset: {self._ended_by}")
         wanted = np.asarray(action, dtype=np.float64)
         if not np.isfinite(wanted).all():
             raise ValueError(f"an action must be finite, got {wanted.tolist()}")
-        command = np.clip(wanted, *self._limits)
-        before = source.frame
-        source.act(command)
+        before, fault = source.frame, self._fault()
+        if not fault:
+            source.act(np.clip(wanted, *self._limits))
         success = truncated = False
-        while source.frame is before and not success and not truncated:
+        while source.frame is before and not (success or truncated or fault):
             self._tick()
-            state = session.state
-            success = state is not None and state.generation == session.generation and bool(state.success)
+            state, fault = session.state, self._fault()
+            success = state is not None and state.generation == self._generation and bool(state.success)
             truncated = not success and session.clock.now_ns() - self._begun_ns > self._longest_ns
-        assert source.frame is not None
-        return self._observation(source.frame), float(success), success, truncated, self._info(success=success)
+        if source.frame is not None and source.frame is not before:
+            self._seen = self._observation(source.frame)
+        self._ended_by = "" if success else fault
+        truncated = truncated or bool(self._ended_by)
+        return self._seen, float(success), success, truncated, self._info(success=success)
+
+    def _fault(self) -> str:
+        """The fault or emergency stop since which the robot follows no action, also if it was reset; else empty."""
+        session = self._session
+        assert session is not None
+        if session.stopped_by or session.generation == self._generation:
+            return session.stopped_by
+        return session.outcome.faults[-1] if session.outcome.faults else "the run was reset"
 
     def _info(self, *, success: bool) -> dict[str, Any]:
         assert self._session is not None
-        return {"is_success": success, "factors": dict(self._session.factors)}
+        return {"is_success": success, "factors": dict(self._session.factors), "fault": self._ended_by}
 
     def _observation(self, frame: Frame) -> Observation:
         found: Observation = {}

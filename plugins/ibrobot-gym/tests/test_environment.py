@@ -117,3 +117,61 @@ def test_vector_of_environments_has_the_episodes_of_single_ones() -> None:
             observation, info = environment.reset(seed=3 + i)
             np.testing.assert_array_equal(observations["environment_state"][i], observation["environment_state"])
             assert infos["factors"]["cube_x"][i] == info["factors"]["cube_x"]
+
+
+FAULTS = {
+    "a joint that does not follow": "{{kind: freeze_joint, joint: {joint}, at: 0.3}}",
+    "a bus that cannot be read": "{{kind: read_error, at: 0.3}}",
+    "a bus that is silent": "{{kind: silent, at: 0.3}}",
+}
+
+
+def ended(environment: gymnasium.Env[Any, Any], target: Any, steps: int = 400) -> tuple[int, Any]:
+    """Step to the end of an episode; the number of steps, and what the last one returned."""
+    for number in range(steps):
+        result = environment.step(target)
+        if result[2] or result[3]:
+            return number + 1, result
+    raise AssertionError(f"the episode goes on after {steps} steps")
+
+
+@pytest.mark.parametrize("joint", ["shoulder_pan", "wrist_flex"])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_fault_truncates_the_episode_and_stands_in_info(fault: str, joint: str) -> None:
+    overrides = (f"simulation.faults=[{FAULTS[fault].format(joint=joint)}]",)
+    with made("PickCube-v0", overrides=overrides) as environment:
+        actions = environment.action_space
+        assert isinstance(actions, Box)
+        observation, info = environment.reset(seed=0)
+        assert info["fault"] == ""
+        target = np.clip(observation["agent_pos"] + 0.4, actions.low, actions.high)
+        steps, (_, reward, terminated, truncated, info) = ended(environment, target)
+        assert (reward, terminated, truncated) == (0.0, False, True)
+        assert steps < 30 * 5, "as long as the fault takes to be noticed"
+        assert info["fault"]
+        with pytest.raises(gymnasium.error.ResetNeeded, match="a fault has ended the episode, call reset: "):
+            environment.step(target)
+        observation, info = environment.reset(seed=0)
+        assert info["fault"] == ""
+        assert environment.step(target)[3] is False, "it is another episode"
+
+
+@pytest.mark.parametrize("reset", [False, True])
+@pytest.mark.parametrize("after", [0, 1, 5])
+def test_stop_ends_the_episode_even_if_it_was_reset(after: int, reset: bool) -> None:
+    with made("PickCube-v0") as environment:
+        observation, _ = environment.reset(seed=0)
+        target = observation["agent_pos"]
+        for _ in range(after):
+            observation, *_ = environment.step(target)
+        session = environment.unwrapped._session  # type: ignore[attr-defined]
+        session.emergency_stop()
+        if reset:
+            environment.unwrapped._runtime.reset()  # type: ignore[attr-defined]
+        seen, _, terminated, truncated, info = environment.step(target)
+        assert (terminated, truncated) == (False, True)
+        assert "emergency stop" in info["fault"]
+        np.testing.assert_array_equal(seen["agent_pos"], observation["agent_pos"])
+        if reset:
+            environment.reset(seed=1)
+            assert not environment.step(target)[3]
