@@ -238,9 +238,8 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """The fault or emergency stop since which the robot follows no action, also if it was reset; else empty."""
         session = self._session
         assert session is not None
-        if session.stopped_by or session.generation == self._generation:
-            return session.stopped_by
-        return session.outcome.faults[-1] if session.outcome.faults else "the run was reset"
+        again = session.generation != self._generation
+        return session.stopped_by or ("the robot was reset within the episode" if again else "")
 
     def _info(self, *, success: bool) -> dict[str, Any]:
         assert self._session is not None
