@@ -99,7 +99,7 @@ def _check_command(text: str) -> None:
             parameter.type_cast_value(context, value)
 
 
-def _check_span(text: str) -> None:
+def check_span(text: str) -> None:
     """That the command and the options exist; `list|show` are two commands, and arguments may be left out."""
     words = text.replace("…", " ").replace("\\|", "|").split()[1:]
     alternatives = next((word for word in words if re.fullmatch(r"[a-z]+(\|[a-z]+)+", word)), "")
@@ -118,21 +118,21 @@ def test_every_command_line_parses(snippet: Snippet) -> None:
 
 @pytest.mark.parametrize("snippet", [s for page in PAGES for s in _spans(page)], ids=str)
 def test_every_command_in_the_text_exists(snippet: Snippet) -> None:
-    _check_span(snippet.text)
+    check_span(snippet.text)
 
 
-def _all_options(command: click.Command, context: click.Context) -> Iterator[str]:
+def all_options(command: click.Command, context: click.Context) -> Iterator[str]:
     for parameter in command.params:
         yield from (*parameter.opts, *parameter.secondary_opts)
     if isinstance(command, click.Group):
         for name in command.list_commands(context):
             inner = command.get_command(context, name)
             assert inner is not None
-            yield from _all_options(inner, click.Context(inner, parent=context))
+            yield from all_options(inner, click.Context(inner, parent=context))
 
 
 def test_every_option_in_the_text_exists() -> None:
-    known = {*_all_options(cli, click.Context(cli)), *OF_OTHERS, "--help"}
+    known = {*all_options(cli, click.Context(cli)), *OF_OTHERS, "--help"}
     named = [
         (option, f"{page.relative_to(ROOT)}:{line}")
         for page in PAGES

@@ -99,7 +99,9 @@ def convert(source: Source) -> dict[str, Any]:
     if root["robot"].value is None:
         root["name"].refuse("a contract alone has no name")
         root["version"].refuse("contracts have a fingerprint instead")
-        root["robot_type"].refuse("a contract alone has no robot; `ibrobot convert` takes --robot-type")
+        root["robot_type"].refuse(
+            "a contract alone has no robot; a dataset has the type of the robot that was recorded"
+        )
         root["recording"].refuse("bags of IB-Robot are read as they are")
         root["process"].refuse("tensors do not pass through topics")
         return {"contract": contract_section(root, None)}

@@ -25,11 +25,11 @@ _CAMERA = {
     "rotation": "this camera is not turned here",
 }
 _DATASET = {
-    "repo_id": "`ibrobot record --dataset`, and `hf upload` after `ibrobot convert`",
+    "repo_id": "`ibrobot record --dataset`, and `ibrobot datasets push` after `ibrobot convert`",
     "single_task": "`ibrobot record --prompt`",
     "num_episodes": "`ibrobot record --episodes`",
     "root": "`ibrobot convert --out`; recordings are bags below recording.root",
-    "push_to_hub private tags": "`hf upload`, after `ibrobot convert`",
+    "push_to_hub private tags": "`ibrobot datasets push`, after `ibrobot convert`",
     "reset_time_s": "the operator begins each episode",
     "video vcodec": "an option of `ibrobot convert`",
 }
@@ -38,6 +38,15 @@ _RECORD = {
     "play_sounds": "`ibrobot record` says when to begin",
     "resume": "a recording goes on in its dataset",
 }
+_CLIENT = {
+    "server_address": "`ibrobot serve` runs a policy for other machines; `transport` and `inference` say where it is",
+    "policy_type policy_device": "the checkpoint says what it is, and the model's option `device` where it runs",
+    "actions_per_chunk chunk_size_threshold aggregate_fn_name": "`inference` says how chunks follow one another",
+    "task": "`inference: {prompt: …}` of a mode",
+    "client_device": "actions are plain numbers in a run",
+    "debug_visualize_queue_size": "the panel of a run shows its plan",
+}
+"""Keys of the client of LeRobot's asynchronous inference."""
 _STEP = "the robot's joints have max_velocity and max_acceleration, which always hold"
 
 
@@ -85,6 +94,7 @@ def convert(source: Source) -> dict[str, Any]:
             }
     if record:
         _record(root, sections)
+        root.refuse_all(_CLIENT)
     return sections
 
 
@@ -215,13 +225,15 @@ def _record(root: Node, sections: dict[str, Any]) -> None:
     dataset = root["dataset"]
     contract = sections["contract"]
     default = contract.pop("rate_hz")
-    times = {"rate_hz": dataset["fps"].number() or default, "max_duration_s": dataset["episode_time_s"].number()}
+    rate = dataset["fps"].number() or root["fps"].number()  # of a client, it stands at the top
+    times = {"rate_hz": rate or default, "max_duration_s": dataset["episode_time_s"].number()}
     sections["contract"] = times | contract
     dataset.refuse_all(_DATASET)
     root.refuse_all(_RECORD)
     dataset.refuse("an option of LeRobot's writer; `ibrobot convert` has its own")
     policy = root["policy"]
-    path = policy["path"] if policy["path"].value is not None else policy["pretrained_path"]
+    places = (policy["path"], policy["pretrained_path"], root["pretrained_name_or_path"])
+    path = next((each for each in places if each.value is not None), policy["path"])
     if path.value is not None and (where := path.text()) is not None:
         model = {"type": From("lerobot", "added"), "path": where, "norm_mode": _norm_mode(root["robot"])}
         sections["models"] = {"policy": model}

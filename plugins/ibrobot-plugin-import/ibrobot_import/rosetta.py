@@ -132,7 +132,7 @@ def _contract_alone(root: Node) -> dict[str, Any]:
             node.refuse("there is one action vector, `action`")
             continue
         actions += _sources(key, node, _action)
-    root["robot_type"].refuse("a contract alone has no robot; `ibrobot convert` takes --robot-type")
+    root["robot_type"].refuse("a contract alone has no robot; a dataset has the type of the robot that was recorded")
     values = {
         "rate_hz": root["fps"].number(),
         "observations": observations,

@@ -73,7 +73,7 @@ class Source:
 
     def verdicts(self, program: str) -> list[Verdict]:
         """The verdict of each value in the order of the lines; values without one are unknown to `program`."""
-        unknown = (Fate.REFUSED, f"not known as a key of {program}")
+        unknown = (Fate.REFUSED, f"without a counterpart here; ibrobot does not know it as a key of {program}")
         found = []
         for leaf in _leaves(self.document.root, ()):
             fate, reason = self._fates.get(leaf, unknown)

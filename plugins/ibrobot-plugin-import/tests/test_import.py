@@ -25,6 +25,7 @@ COUNTS = {
     "ib_robot_contract.yaml": (12, 0, 7),
     "ib_robot_two_arms.yaml": (16, 9, 1),
     "lerobot_calibration.json": (30, 0, 0),
+    "lerobot_client.yaml": (8, 2, 9),
     "lerobot_record.json": (10, 4, 8),
     "lerobot_robot.yaml": (12, 4, 4),
     "lerobot_two_arms.yaml": (9, 4, 2),
@@ -83,7 +84,7 @@ def test_servos_of_ib_robot_become_joints() -> None:
         "calibration": "${HOME}/.calibrate/bench.json",
     }
     assert refused["robot.peripherals.laser.port"] == "there is no plugin here for a lidar with driver ldlidar"
-    assert refused["robot.left_over"] == "not known as a key of IB-Robot"
+    assert refused["robot.left_over"] == "without a counterpart here; ibrobot does not know it as a key of IB-Robot"
 
 
 def test_modes_of_ib_robot() -> None:
@@ -187,7 +188,16 @@ def test_recording_of_lerobot() -> None:
     assert new["models"]["policy"] == {"type": "lerobot", "path": "outputs/act", "norm_mode": "degrees"}
     assert new["teleoperation"]["leader"]["port"] == "/dev/ttyACM1"
     assert refused["dataset.single_task"] == "`ibrobot record --prompt`"
-    assert refused["strange"] == "not known as a key of LeRobot"
+    assert refused["strange"] == "without a counterpart here; ibrobot does not know it as a key of LeRobot"
+
+
+def test_client_of_lerobots_policy_server() -> None:
+    new, refused = imported("lerobot_client.yaml")
+    assert (new["contract"]["rate_hz"], new["models"]["policy"]["type"]) == (20, "lerobot")
+    assert new["models"]["policy"]["path"] == "outputs/train/act/checkpoints/last/pretrained_model"
+    assert new["control_modes"]["model_inference"]["inference"]["model"] == "policy"
+    assert [key for key, why in refused.items() if "does not know it" in why] == []
+    assert "ibrobot serve" in refused["server_address"]
 
 
 def test_two_arms_of_lerobot() -> None:

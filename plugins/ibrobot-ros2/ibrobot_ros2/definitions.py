@@ -73,7 +73,7 @@ def _with_event(type_name: str, text: str) -> str:
 
 
 def _of_services(types: dict[str, Any]) -> dict[str, Any]:
-    """The types with those of services named as in ROS: rosbags takes every type for that of a message."""
+    """The types, of which those of services are named as in ROS: rosbags takes every type for that of a message."""
     return {
         name.replace("/srv/msg/", "/srv/"): (constants, [(field, renamed(desc)) for field, desc in fields])
         for name, (constants, fields) in types.items()
