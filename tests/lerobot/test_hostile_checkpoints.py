@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import LeRobotPolicy
-from ibrobot_lerobot.untrusted import BASE_MODELS, check_step_name, check_type, names_a_model
+from ibrobot_lerobot.policy_types import check_type
+from ibrobot_lerobot.untrusted import BASE_MODELS, check_step_name, names_a_model
 from ibrobot_testing.contexts import host_context
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors

@@ -12,12 +12,12 @@ from safetensors import SafetensorError, safe_open
 
 from ibrobot_core.api import Contract, ContractError, PolicyError, PolicySpec
 from ibrobot_lerobot import layout
+from ibrobot_lerobot.policy_types import OTHER, POLICY_TYPES, check_type
 from ibrobot_lerobot.untrusted import (
     MAX_ACTIONS,
     MAX_HISTORY,
     check_models,
     check_steps,
-    check_type,
     check_values,
     own_file,
     read_json,
@@ -35,8 +35,6 @@ NOTE = "ibrobot.json"
 TRAINING = "train_config.json"
 RENAME = "rename_observations_processor"
 
-_WITHOUT_PROMPT = frozenset({"act", "diffusion", "vqbet", "tdmpc", "gaussian_actor"})
-_REAL_TIME_CHUNKING = frozenset({"evo1", "groot", "molmoact2", "pi0", "pi05", "smolvla"})
 _CHUNK_SIZES = ("chunk_size", "action_chunk_size", "action_horizon", "n_action_steps")
 _SHORTER_CHUNKS = frozenset({"diffusion", "multi_task_dit"})
 """Policies that predict a horizon and return `n_action_steps` of it."""
@@ -79,14 +77,15 @@ class Checkpoint:
     def spec(self, n_action_steps: int | None) -> PolicySpec:
         """Inputs and outputs of the policy, with chunks of at most `n_action_steps`."""
         contract, norm_mode = self._trained()
+        known = POLICY_TYPES.get(self.type, OTHER)
         return PolicySpec(
             observations={key: self.inputs[name][1] for key, name in self.names.items()},
             actions=contract.action_joints if contract is not None else None,
             action_size=self.action_size,
             chunk_size=min(self.chunk_size, n_action_steps or self.chunk_size),
             rate_hz=contract.rate_hz if contract is not None else None,
-            prompt=self.type not in _WITHOUT_PROMPT,
-            prefix=self.type in _REAL_TIME_CHUNKING,
+            prompt=known.prompt,
+            prefix=known.prefix,
             history=self.n_obs_steps - 1,
             contract=contract.canonical() if contract is not None else None,
             norm_mode=norm_mode,

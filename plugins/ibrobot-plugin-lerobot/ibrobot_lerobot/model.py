@@ -21,6 +21,7 @@ from ibrobot_core.app import check_finite
 from ibrobot_lerobot.checkpoint import ACTION, Checkpoint
 from ibrobot_lerobot.draws import Draw, Draws, NotByRequest
 from ibrobot_lerobot.options import LeRobotPolicyOptions
+from ibrobot_lerobot.policy_types import import_others
 from ibrobot_lerobot.steps import Steps
 
 _IMAGES, _IMAGE = "observation.images", "observation.image"
@@ -171,6 +172,7 @@ class PolicyModel:
 
     def _load(self, options: LeRobotPolicyOptions) -> Any:
         path = self._checkpoint.path
+        import_others(path, self._checkpoint.type)
         try:
             config = PreTrainedConfig.from_pretrained(path)
             config.pretrained_path = path  # the file may have another path

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import PolicyError
 from ibrobot_lerobot.checkpoint import POSTPROCESSOR, PREPROCESSOR, Checkpoint
+from ibrobot_lerobot.policy_types import import_others
 from ibrobot_lerobot.untrusted import check_step_name
 
 _DEVICE = {"device_processor": {"device": "cpu"}}
@@ -37,6 +38,7 @@ class LeRobotSteps:
             file: _DEVICE if any(step.get("registry_name") == "device_processor" for step in each["steps"]) else {}
             for file, each in checkpoint.processors.items()
         }
+        import_others(checkpoint.path, checkpoint.type)
         try:
             config = PreTrainedConfig.from_pretrained(checkpoint.path)
             config.pretrained_path = checkpoint.path  # the file may have another path

@@ -27,9 +27,8 @@ _STATE_FILE = re.compile(r"\w[\w.-]*\.safetensors", re.ASCII)
 _LEROBOTS_CLASS = re.compile(r"lerobot(\.[A-Za-z_]\w*)+", re.ASCII)
 _TRAINING = ("optimizer_", "scheduler_")
 """Prefixes of keys whose numbers are not sizes."""
-_REMOTE_CODE_TYPES = frozenset({"gaussian_actor", "groot", "pi0_fast", "wall_x"})
 _REMOTE_CODE_STEPS = re.compile(r"action_tokenizer_processor|groot_.*|reward_classifier_processor|.*_encoder")
-"""Steps and policies for which LeRobot sets `trust_remote_code`."""
+"""Steps for which LeRobot sets `trust_remote_code`."""
 _NAMES_A_MODEL = re.compile(
     r"(.*_)?(tokenizer|vlm_base|vlm_model|base_model|(model|tokenizer|encoder|processor|vlm|base|backbone)_name"
     r"|(name_or|checkpoint|model|pretrained|tokenizer)_path|(model|encoder|assets|hub|tokenizer)_(id|repo)|\w*_dir)"
@@ -214,19 +213,6 @@ def names_a_model(key: str, value: str) -> bool:
     if not value or key in _NOT_LOADED or _PROSE.fullmatch(key):
         return False
     return bool(_NAMES_A_MODEL.fullmatch(key) or _LOOKS_LIKE_A_PATH.match(value))
-
-
-def check_type(path: Path, kind: Any) -> str:
-    """Check the type of a policy.
-
-    Raises:
-        PolicyError: if LeRobot would run foreign code for it.
-    """
-    if not isinstance(kind, str):
-        raise PolicyError(f"{path}: type is {kind!r}, must be the name of a LeRobot policy")
-    if kind in _REMOTE_CODE_TYPES:
-        raise PolicyError(f"{path}: policies of type {kind!r} run downloaded code and are not supported")
-    return kind
 
 
 def whole(path: Path, name: str, value: Any, most: int) -> int:

@@ -173,7 +173,9 @@ ATTACKS = {
     ),
     "trust_remote_code": Attack(_config(trust_remote_code=True), r"trust_remote_code"),
     "trust_remote_code_below": Attack(_config(a={"b": [{"trust_remote_code": 1}]}), r"a.b.0.trust_remote_code"),
-    "policy_that_runs_remote_code": Attack(_config(type="groot"), r"policies of type 'groot' run downloaded code"),
+    "policy_that_runs_remote_code": Attack(
+        _config(type="groot"), r"policies of type 'groot' are not supported: LeRobot runs downloaded code"
+    ),
     "type_that_is_no_text": Attack(_config(type=["act"]), r"type is \['act'\]"),
     "tokenizer_in_a_folder": Attack(
         _step(PRE, lambda canary: {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "/tmp/x"}}),

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from ibrobot_lerobot.checkpoint import read_checkpoint
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import LeRobotPolicy
+from ibrobot_lerobot.policy_types import POLICY_TYPES
 from ibrobot_testing.contexts import ARM, GRIPPER, START_NS, host_context
 from safetensors.numpy import save_file
 
@@ -430,7 +431,7 @@ def _without_chunk(path: Path) -> None:
     config = json.loads(file.read_text())
     for name in ("chunk_size", "n_action_steps"):
         config.pop(name, None)
-    file.write_text(json.dumps({**config, "type": "lingbot_va", "frame_chunk_size": 4}))
+    file.write_text(json.dumps({**config, "type": "other", "frame_chunk_size": 4}))
 
 
 @pytest.mark.parametrize("kind", ["groot", "pi0_fast", "wall_x"])
@@ -439,17 +440,17 @@ def test_policy_that_runs_downloaded_code_is_refused_before_it_asks_for_allowanc
     with pytest.raises(PolicyError) as found:
         make(path)
     assert str(found.value) == (
-        f"{path}/config.json: policies of type '{kind}' run downloaded code and are not supported"
+        f"{path}/config.json: policies of type '{kind}' are not supported: {POLICY_TYPES[kind].why}"
     )
 
 
 def test_policy_without_the_length_of_its_chunks_is_refused_in_one_sentence(tmp_path: Path) -> None:
-    path = write(tmp_path / "lingbot")
+    path = write(tmp_path / "other")
     _without_chunk(path)
     with pytest.raises(PolicyError) as found:
         make(path)
     assert str(found.value) == (
-        f"{path}/config.json: policies of type 'lingbot_va' are not supported: none of chunk_size, action_chunk_size, "
+        f"{path}/config.json: policies of type 'other' are not supported: none of chunk_size, action_chunk_size, "
         "action_horizon, n_action_steps gives the length of their action chunks"
     )
 

@@ -120,14 +120,14 @@ class Gr00tConnection(Connection):
             if time.monotonic() >= deadline_s:
                 raise PolicyError(f"no answer within {timeout_s:g} s")
 
-    def _batch(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """A batch of one request, and of one tick if the version has this dimension."""
+    def _batch(self, values: Mapping[str, Any], *, nested: bool = False) -> dict[str, Any]:
+        """A batch of one request, and of one tick if the version has this dimension: texts have it below a modality."""
         batch: dict[str, Any] = {}
         for name, value in values.items():
             if isinstance(value, dict):
-                batch[name] = self._batch(value)
+                batch[name] = self._batch(value, nested=True)
             elif isinstance(value, str):
-                batch[name] = [value] if self._flat else [[value]]
+                batch[name] = [[value]] if nested and not self._flat else [value]
             else:
                 batch[name] = value[None] if self._flat else value[None, None]
         return batch

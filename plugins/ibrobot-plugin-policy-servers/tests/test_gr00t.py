@@ -99,6 +99,18 @@ def test_request_and_actions_are_those_of_version_1_6(policy: ServedPolicy, serv
     assert seen["language"] == {"annotation.human.task_description": [["pick up the cube"]]}
 
 
+def test_a_text_with_a_key_of_its_own_is_a_list_in_version_1_6(server: Gr00tServer, options: Gr00tOptions) -> None:
+    policy = make(attrs.evolve(options, prompt=("annotation.human.task_description",)))
+    policy.load()
+    try:
+        chunk(policy, frame(40))
+    finally:
+        policy.close()
+    seen = server.requests[-1]["data"]["observation"]
+    assert seen["annotation.human.task_description"] == ["pick up the cube"]
+    assert seen["state"]["joints"].shape == (1, 1, SIZE)
+
+
 def test_request_and_actions_are_those_of_version_1_5(server: Gr00tServer, options: Gr00tOptions) -> None:
     flat = attrs.evolve(
         options,
