@@ -538,9 +538,9 @@ class ControlCore:
             self._begin_again(self._readings.first())
         return {"cleared": cleared}
 
-    def _refuse_after(self, stops: int, what: str = "reset") -> None:
+    def _refuse_after(self, stops: int) -> None:
         if self.stops > stops:
-            raise HardwareError(f"{what}: refused, an emergency stop came after it was requested")
+            raise HardwareError("reset: refused, an emergency stop came after it was requested")
 
     def _begin_again(self, measured: JointReading) -> None:
         """Enter the mode at `measured`, without faults.
@@ -558,9 +558,12 @@ class ControlCore:
         self._advance(Cause.RESET)
         self._enter()
 
-    def _goal(self, executor: str, goal_id: str, goal: Mapping[str, Any], stops: int | None = None) -> None:
-        """Pass a goal to an executor; `stops` as for a reset: a goal requested before an emergency stop is refused."""
-        self._refuse_after(self.stops if stops is None else stops, f"goal {goal_id}")
+    def _goal(
+        self, executor: str, goal_id: str, goal: Mapping[str, Any], stops: int = -1, generation: int = -1
+    ) -> None:  # fmt: skip
+        """Pass a goal to an executor; one requested before an emergency stop, or in another generation, is refused."""
+        if generation not in (-1, self.generation) or self.stops > stops >= 0:
+            raise HardwareError(f"goal {goal_id}: refused, a stop, a reset or another mode came after it was requested")
         self._executors.set_goal(executor, goal_id, goal, self._at_tick)
         self._commanded_ns = self._clock.now_ns()
 

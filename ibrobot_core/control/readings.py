@@ -79,6 +79,8 @@ class Readings:
             self.counts["read_errors"] += 1
             self.newest = attrs.evolve(self.newest, stale=True)
             return str(error)
+        if measured.stamp_ns > self._clock.now_ns():  # a clock that is ahead would hide silence and jumps
+            measured = attrs.evolve(measured, stamp_ns=self._clock.now_ns())
         wrong = self._implausible(measured)
         if wrong:
             self.counts["implausible_states"] += 1
@@ -89,9 +91,8 @@ class Readings:
             self._answered_ns = measured.stamp_ns
             return None
         self.counts["stale_states"] += 1
-        if not self.silent:
-            return None
-        return f"{wrong or 'the joints do not answer'}: no state for {self._age_ns / 1e6:.0f} ms"
+        why = wrong or "the joints do not answer"
+        return f"{why}: no state for {self._age_ns / 1e6:.0f} ms" if self.silent else None
 
     @property
     def silent(self) -> bool:
@@ -106,5 +107,6 @@ class Readings:
         """Why no joint can have moved like that; empty if it can, and for a stale reading of finite positions."""
         if measured.stale and np.isfinite(measured.position).all():
             return ""
-        since_ns = measured.stamp_ns - self._answered_ns
+        # Silence beyond the timeout is a fault: the next reset believes what is measured, and nothing before it.
+        since_ns = min(measured.stamp_ns - self._answered_ns, self._timeout_ns)
         return self._plausibility.jump(self.newest.position, measured.position, since_ns)

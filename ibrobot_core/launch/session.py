@@ -348,9 +348,11 @@ class Session:
         if self.faults or self.held:
             raise HardwareError(f"refused before a reset: {(*self.faults, f'holding: {self.to_go_on()}')[0]}")
 
+        requested = {"stops": -1 if stops is None else stops, "generation": self.generation}
+
         def send(checked: Mapping[str, Any]) -> None:
             plain = trajectory_goal(checked["trajectory"]) if "trajectory" in checked else {}
-            self.control.call("goal", executor=executor, goal_id=goal_id, goal={**checked, **plain}, stops=stops)
+            self.control.call("goal", executor=executor, goal_id=goal_id, goal={**checked, **plain}, **requested)
 
         send(goal) if self.goal_door is None else self.goal_door(executor, goal_id, goal, send)
 

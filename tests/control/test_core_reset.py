@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import attrs
 import numpy as np
 import pytest
 
@@ -163,6 +164,40 @@ class TestReadings:
         state = rig.tick()
         np.testing.assert_allclose(state.command, rig.hardware._position)
         assert rig.core.fault == ""
+
+    @pytest.mark.parametrize("stop", [False, True], ids=["fault", "STOP"])
+    @pytest.mark.parametrize("lie", [-3.0, -0.8, 0.8, 1.0, 1.5, 3.0])
+    def test_a_lie_is_not_believed_however_long_it_lasts(self, make_rig, lie, stop):
+        """The arm follows its command, and each reading is off by the lie: believed once, it would drive the arm."""
+        rig = make_rig({}).start()
+        before = rig.tick(10)
+        if stop:
+            rig.call("estop")
+        for _ in range(300):
+            rig.hardware._position = before.command + np.array([0.0, lie, 0.0])
+            state = rig.tick()
+            np.testing.assert_allclose(state.command, before.command, atol=1e-9)
+
+        assert rig.core.fault
+
+    @pytest.mark.parametrize("ahead_s", [0.0, 0.5, 3600.0])
+    def test_silence_is_noticed_whatever_the_clock_of_the_hardware(self, make_rig, ahead_s):
+        rig = make_rig({}).start()
+        read = rig.hardware.read
+        last = [read()]
+
+        def stamped():
+            reading = attrs.evolve(read(), stamp_ns=rig.clock.now_ns() + int(ahead_s * 1e9))
+            return attrs.evolve(reading, stale=True, stamp_ns=last[0].stamp_ns) if rig.silent else reading
+
+        rig.silent = False
+        rig.hardware.read = stamped
+        rig.tick(5)
+        last[0] = stamped()
+        rig.silent = True
+        rig.tick(30)
+
+        assert "the joints do not answer: no state for" in rig.core.fault
 
     def test_an_arm_that_is_struck_is_believed(self, make_rig):
         rig = make_rig({}).start()

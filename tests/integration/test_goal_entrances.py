@@ -107,6 +107,14 @@ REFUSED: dict[str, tuple[Goal, TrajectoryCode, str]] = {
         "velocity is nan",
     ),
     "goal time of a year": (goal(point(2, beside(0.1)), goal_time=3e7), INVALID, "goal_time is"),
+    **{
+        f"point at time 0 elsewhere, in {ahead_s} s": (
+            goal(point(0, beside(0.5)), point(4, beside(0.1)), stamp=ahead_s),
+            INVALID,
+            "the trajectory begins with",
+        )
+        for ahead_s in (0.1, 0.6, 2.0, 60.0)
+    },
     "an hour old": (goal(point(2, beside(0.1)), stamp=-3600.0), OLD, "it was to begin 3600.000 s ago"),
     "in an hour": (goal(point(2, beside(0.1)), stamp=3600.0), INVALID, "at most 300 s are accepted"),
     "unknown joint": (
@@ -137,6 +145,7 @@ ACCEPTED = {
     "fast": goal(point(0.35, beside(0.45), velocities=REST)),
     "begins a moment ago": goal(point(0, HERE), point(1.5, beside(0.3)), stamp=-0.2),
     "begins in half a second": goal(point(1.5, beside(0.3)), stamp=0.5),
+    "begins where it is in two seconds": goal(point(0, HERE), point(1.5, beside(0.3)), stamp=2.0),
     "unchecked path": goal(point(1.5, beside(0.3)), path_tolerance=[tolerance("shoulder_pan", -1.0)]),
 }
 
@@ -232,7 +241,7 @@ def test_goal_older_than_a_stop_is_refused(robot: Robot):
     assert robot.actions.take_goal(robot, {**head, "goal": 91}, stops)
     end = robot.ended(91)
     assert end is not None
-    assert "an emergency stop came after" in end["values"]["error_string"]
+    assert "a stop, a reset or another mode came after" in end["values"]["error_string"]
     assert robot.by_ros(goal(point(2, beside(0.1))))[0].accepted
     robot.drop()
 
@@ -269,3 +278,23 @@ def test_goals_of_grippers_are_plausible(robot: Robot, command: dict[str, float]
     fields = {"command": {"position": 0.5, "max_effort": 0.0, **command}}
     head = {"goal": 95, "executor": "gripper_action", "fields": fields}
     assert not robot.actions.take_goal(robot, head, robot.session.stops), "their results have no place for a reason"
+
+
+def test_goal_under_check_is_not_followed_after_a_fault_and_its_reset(robot: Robot, monkeypatch: pytest.MonkeyPatch):
+    take = robot.session.goal_door
+    assert take is not None
+
+    def slowly(*arguments: Any) -> None:
+        robot.session.control.call("fault", fault="a leader was lost")
+        for _ in range(100):
+            robot.runtime.step()
+        robot.session.bus.call("/reset", {"stops": robot.session.stops})
+        take(*arguments)
+
+    monkeypatch.setattr(robot.session, "goal_door", slowly)
+    verdict, _ = robot.by_ros(goal(point(2, beside(0.4))))
+    before = robot.command.copy()
+    for _ in range(300):
+        robot.step()
+    assert "a reset or another mode came after it" in verdict.message
+    np.testing.assert_allclose(robot.command, before, atol=1e-3)

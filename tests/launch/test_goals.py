@@ -60,6 +60,6 @@ def test_goal_older_than_a_stop_is_refused(runtime: Any):
     for _ in range(50):
         runtime.step()
     runtime.reset()
-    with pytest.raises(HardwareError, match="an emergency stop came after it was requested"):
+    with pytest.raises(HardwareError, match="a stop, a reset or another mode came after it was requested"):
         session.send_goal("arm_trajectory", "one", GOAL, stops)
     session.send_goal("arm_trajectory", "two", GOAL, session.stops)

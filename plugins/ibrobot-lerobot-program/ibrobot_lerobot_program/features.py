@@ -85,7 +85,7 @@ class RobotFeatures:
                 raise ComponentFailed(f"action: no feature {name!r}; the features are: {', '.join(known)}")
             try:
                 found[name] = float(value)  # type: ignore[arg-type]  # also of arrays and tensors
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 found[name] = math.nan
             if isinstance(value, str | bool) or not math.isfinite(found[name]):
                 raise ComponentFailed(f"action: {name} is {value!r}: give a finite number, as observations have")

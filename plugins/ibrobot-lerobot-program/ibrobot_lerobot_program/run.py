@@ -15,7 +15,7 @@ from typing import Any, override
 
 import numpy as np
 
-from ibrobot_core.api import Contract, IbrobotError, Vector
+from ibrobot_core.api import Contract, IbrobotError, Vector, ns
 from ibrobot_core.app import (
     CONTROL,
     Channel,
@@ -68,6 +68,7 @@ class ProgramSource(SourceWorker):
     """
 
     urgent = True
+    autonomous = True
 
     def __init__(
         self, session: RunAccess, mode: ControlMode, channel: Channel, pictures: int, features: RobotFeatures
@@ -81,6 +82,10 @@ class ProgramSource(SourceWorker):
         self._sampler: FrameSampler | None = None
         self._sent: dict[str, float] = {}
         """Joint -> the position that was sent last [rad]; empty before the first action of the mode."""
+        self._sent_ns = 0
+        """When it was sent [ns]."""
+        executors = session.config.executors
+        self._stale_ns = ns(min(executors[name].options.stale_timeout for name in mode.executors))
         self._refused = ""
         """Why an action was refused since the last answer."""
 
@@ -123,18 +128,20 @@ class ProgramSource(SourceWorker):
                 self._channel.send({"event": ANSWER, "error": error_text(error)})
 
     def _act(self, action: Mapping[str, float]) -> None:
-        """Command joints; those without a position keep the one that they were sent last, or stay where they are."""
+        """Command joints; those without a position keep the one that they were sent last, unless it is stale."""
         session, positions = self.session, self._features.radians(action)
         if not self.active:
             raise ComponentFailed("the robot takes no actions now: its mode is not entered")
         joints, limits = self._features.joints, session.config.robot
-        if not self._sent:
+        now_ns = session.clock.now_ns()
+        if not self._sent or now_ns - self._sent_ns >= self._stale_ns:  # the arm has braked since
             self._sent = dict(zip(joints, session.measured().position[self._columns].tolist(), strict=True))
         self._sent |= positions
+        self._sent_ns = now_ns
         wanted = np.clip(
             [self._sent[joint] for joint in joints], limits.lower[self._columns], limits.upper[self._columns]
         )
-        session.send_plan(session.clock.now_ns(), self._contract.step_ns, joints, wanted[None])
+        session.send_plan(now_ns, self._contract.step_ns, joints, wanted[None])
 
     def _observe(self) -> None:
         """Send positions, as measured now, and the newest pictures."""

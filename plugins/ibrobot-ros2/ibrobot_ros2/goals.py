@@ -330,7 +330,12 @@ class Actions:
                 raise _Invalid(why, TrajectoryCode.OLD_HEADER_TIMESTAMP)
             return message
         points = [attrs.evolve(each, time_from_start_ns=each.time_from_start_ns - late_ns) for each in message.points]
-        if points and points[0].time_from_start_ns > -late_ns:
+        if points and message.points[0].time_from_start_ns <= 0:
+            # It must be where the robot is, which the door checks of a point at time 0, and is waited at.
+            first = points[0]
+            still = {"velocities": 0.0 * first.velocities, "accelerations": 0.0 * first.accelerations}
+            points = [attrs.evolve(first, time_from_start_ns=0, **still), *points]
+        elif points:
             state = self._session.state
             assert state is not None
             command = dict(zip(self._session.config.robot.joint_names, state.command.tolist(), strict=True))

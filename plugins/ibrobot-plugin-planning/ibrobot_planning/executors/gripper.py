@@ -134,7 +134,8 @@ class GripperExecutor(Executor):
     @override
     def update(self, measured: JointReading) -> Vector:
         if measured.stamp_ns > self._stamp_ns:
-            squeezes = self._max_effort > 0 and abs(measured.effort[0]) >= self._max_effort
+            # Written so that an effort that is no longer measured stops it.
+            squeezes = self._max_effort > 0 and not abs(measured.effort[0]) < self._max_effort
             self._step = 0.0 if squeezes else self._next_step()
             self._setpoint += self._step
         passed_ns = min(measured.stamp_ns - self._stamp_ns, self._longest_ns)

@@ -17,6 +17,8 @@ CHECK_S = 0.001
 """Time between checks of a timed motion."""
 _STRIDE = 2
 """Every second one of these times is checked in the present world."""
+_PART_S = 5.0
+"""Part of a long motion that is checked at a time: a change of the world is looked for in between [s]."""
 _WORSE_M = 1e-4
 """Allowed decrease of a distance while the arm leaves a contact [m]."""
 
@@ -73,14 +75,21 @@ class FreePaths:
         if made is None:
             return "a trajectory without velocities and accelerations cannot be checked"
         checks = collisions(self._arm(), world, trajectory.joint_names, others, margins)
-        positions = made.sampled(CHECK_S)[0][round(seconds(from_ns) / CHECK_S) :: _STRIDE]
-        # Contacts at the start may open.
-        leaving = outwards(checks, positions) or 0 if len(positions) else 0
-        hit = leaving + checks.first_hit_on_path(positions[leaving:])
-        if hit < len(positions):
-            return sentence(checks.contacts(positions[hit]))
-        self.note(trajectory, world)
-        return ""
+        begin = begun = min(round(seconds(from_ns) / CHECK_S) * CHECK_S, made.duration)
+        while True:
+            positions = made.sampled(_STRIDE * CHECK_S, begin, begin + _PART_S)[0]
+            leaving = 0
+            if begin == begun:  # contacts at the start may open
+                leaving = outwards(checks, positions) or 0
+            hit = leaving + checks.first_hit_on_path(positions[leaving:])
+            if hit < len(positions):
+                return sentence(checks.contacts(positions[hit]))
+            begin += _PART_S
+            if begin >= made.duration:
+                self.note(trajectory, world)
+                return ""
+            if from_ns and self.snapshot(margins) != world:
+                return ""  # it is under way: the next check, which follows at once, begins with what comes first
 
 
 def collisions(

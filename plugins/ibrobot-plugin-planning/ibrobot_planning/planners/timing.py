@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cache, cached_property
 from itertools import pairwise
@@ -64,16 +65,19 @@ class Motion:
             self.times * factor, self.positions, self.velocities / factor, self.accelerations / (factor * factor)
         )
 
-    def sampled(self, step: float) -> Vector:
+    def sampled(self, step: float, begin: float = 0.0, end: float = math.inf) -> Vector:
         """Positions, velocities and accelerations of the quintic through the points, as an executor follows it.
 
         Args:
             step: time between samples [s].
+            begin: time of the first sample [s].
+            end: time of the last sample, if the motion is not over before [s].
 
         Returns:
             Shape (3, M, J), the end included.
         """
-        times = np.append(np.arange(0.0, self.duration, step), self.duration)
+        end = min(end, self.duration)
+        times = np.append(np.arange(min(begin, end), end, step), end)
         at = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         h = np.diff(self.times)[at][:, None]
         u = (times - self.times[at])[:, None] / h

@@ -91,6 +91,7 @@ class Performance:
         """The episode to record with the next policy."""
         self._recording = False
         """Whether an episode of the task is being recorded."""
+        self._stops = session.stops
         self._held: str | None = None
         """What the gripper holds."""
         self._arm = self._perform()
@@ -155,6 +156,8 @@ class Performance:
             raise Cancelled
         if self._session.faults:
             raise StepFailed(f"the robot stopped: {self._session.faults[-1]}")
+        if self._session.stops != self._stops:  # it was reset between two polls
+            raise StepFailed("the robot stopped: an emergency stop")
 
     def _enter(self, mode: str) -> None:
         if self._session.mode != mode:
