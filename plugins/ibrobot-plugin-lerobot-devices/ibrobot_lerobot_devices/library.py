@@ -87,8 +87,7 @@ def make(kind: Kind, wanted: str, config: Mapping[str, Any]) -> Any:
     try:
         decoded = draccus.decode(getattr(package, base), {"type": wanted, **given})
     except Exception as error:  # of draccus and of what the dataclass checks
-        why = f": {error.__cause__}" if error.__cause__ is not None else ""
-        raise DeviceError(f"LeRobot's {wanted} refuses its config: {error}{why}") from error
+        raise DeviceError(f"LeRobot's {wanted} refuses its config: {_cause(error)}") from error
     utils = importlib.import_module(f"{name}.utils")
     try:
         if kind == "camera":
@@ -96,6 +95,13 @@ def make(kind: Kind, wanted: str, config: Mapping[str, Any]) -> Any:
         return getattr(utils, f"make_{kind}_from_config")(decoded)
     except Exception as error:  # also of a library that is not installed
         raise DeviceError(f"LeRobot cannot make {wanted}: {error}") from error
+
+
+def _cause(error: BaseException) -> BaseException:
+    """What an error began with: draccus repeats the whole config before it."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return error
 
 
 def _keep_torque(kind: type[Any], given: dict[str, Any]) -> None:

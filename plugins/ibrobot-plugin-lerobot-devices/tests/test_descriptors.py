@@ -214,6 +214,14 @@ class TestNew:
             new(out, "strange_follower", "--unit", unit)
         assert not out.exists()
 
+    def test_a_robot_that_cannot_be_made_is_an_error_without_advice_to_install(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(new_robot, "_required", lambda fields, prefix: {"port": "nowhere", "gain": -1})
+        with pytest.raises(HardwareError) as error:
+            new(tmp_path / "arm.yaml", "fake_arm")
+        assert str(error.value) == "fake_arm: LeRobot's fake_arm refuses its config: gain must not be negative"
+
     def test_an_existing_file_is_not_overwritten(self, tmp_path: Path) -> None:
         out = tmp_path / "arm.yaml"
         out.write_text("mine")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -182,6 +183,9 @@ def check_weights(checkpoint: Checkpoint) -> None:
     path = checkpoint.path
     if (path / WEIGHTS).exists():
         file, head = own_file(path, WEIGHTS), _ACTION_HEADS.get(checkpoint.type, "")
+        size, memory = file.stat().st_size, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        if size > memory:
+            raise PolicyError(f"{file}: has {size / 1e9:.0f} GB, more than this machine's memory")
         try:
             with safe_open(file, framework="numpy") as weights:  # reads only the header
                 size = weights.get_slice(head).get_shape()[0] if head in weights.keys() else checkpoint.action_size  # noqa: SIM118

@@ -265,6 +265,14 @@ def _statistics_of_another_robot(path: Path) -> None:
     save_file({**STATISTICS, "action.mean": np.zeros(7, np.float32)}, path / "policy_postprocessor.safetensors")
 
 
+def test_weights_larger_than_the_memory_are_not_read(tmp_path: Path) -> None:
+    path = write(tmp_path / "act")
+    with (path / "model.safetensors").open("wb") as file:
+        file.truncate(1 << 43)
+    with pytest.raises(PolicyError, match=r"model.safetensors: has 8796 GB, more than this machine's memory"):
+        make(path).check_weights()
+
+
 @pytest.mark.parametrize(("size", "fits"), [(6, True), (7, False)])
 def test_weights_are_compared_with_the_configuration_without_torch(tmp_path: Path, size: int, fits: bool) -> None:
     policy = make(write(tmp_path / "act"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import threading
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -21,6 +22,8 @@ from ibrobot_onnx.options import PROVIDERS, OnnxPolicyOptions
 ACTION = "action"
 SEED = "seed"
 """Seed of a request's noise, shape (2,): the episode's seed and the tick."""
+_FIRST_S = 60.0
+"""Longest time that a first run may take [s]; a policy that drives a robot answers in a second."""
 _SAMPLE, _TIME, _CONDITION = "sample", "time", "condition"
 """Inputs of the graph of a denoising step; the last one is the output of the graph that encodes observations."""
 
@@ -60,6 +63,9 @@ class OnnxPolicy(Policy):
                     f"{path}: is missing; copy it from the folder of `ibrobot export` (a robot with distributed "
                     "inference does not need it)"
                 )
+            size, memory = path.stat().st_size, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+            if size > memory:
+                raise PolicyError(f"{path}: has {size / 1e9:.0f} GB, more than this machine's memory")
 
     @override
     def load(self) -> None:
@@ -70,8 +76,11 @@ class OnnxPolicy(Policy):
             digest.update(graph)
             sessions.append(_session(self._options, self._options.path / name, graph))
         zeros = {key: np.zeros(shape, dtype) for key, (dtype, shape) in self._expected.items()}
-        [chunk] = self._run(sessions, [zeros])
+        [chunk] = self._first_run(sessions, zeros)
         manifest = self._manifest
+        if chunk.dtype.kind not in "fiu":
+            kind = "text" if chunk.dtype.kind in "OSU" else str(chunk.dtype)
+            raise PolicyError(f"{self._options.path}: the graph returns {kind}; actions are numbers")
         least = manifest.first + manifest.chunk_size
         if chunk.ndim != 2 or chunk.shape[0] < least or chunk.shape[1] != manifest.action_size:
             raise PolicyError(
@@ -140,22 +149,52 @@ class OnnxPolicy(Policy):
         chunk = np.asarray(tensors[ACTION], np.float64)[first : first + self.spec.chunk_size]
         return chunk * manifest.scale + manifest.offset
 
-    def _run(self, sessions: Sequence[Any], batch: Sequence[Tensors]) -> list[NDArray[Any]]:
-        """Outputs of the network, each of shape (N, A), before they are unnormalised."""
+    def _first_run(self, sessions: Sequence[Any], zeros: Tensors) -> list[NDArray[Any]]:
+        """The outputs for a request of zeros.
+
+        Raises:
+            PolicyError: if it takes too long, e.g. in a loop of the graph.
+        """
+        import onnxruntime
+
+        settings = onnxruntime.RunOptions()
+        timer = threading.Timer(_FIRST_S, setattr, (settings, "terminate", True))
+        timer.start()
+        try:
+            return self._run(sessions, [zeros], settings)
+        except PolicyError as error:
+            if settings.terminate:
+                raise PolicyError(
+                    f"{self._options.path}: its first run takes more than {_FIRST_S:g} s; such a graph cannot "
+                    "drive a robot"
+                ) from error
+            raise
+        finally:
+            timer.cancel()
+            timer.join()
+
+    def _run(self, sessions: Sequence[Any], batch: Sequence[Tensors], settings: Any = None) -> list[NDArray[Any]]:
+        """Outputs of the network, each of shape (N, A), before they are unnormalised.
+
+        Args:
+            sessions: those of the graphs.
+            batch: the requests.
+            settings: ONNX Runtime's options of a run.
+        """
         manifest = self._manifest
         inputs = {key: np.stack([tensors[key] for tensors in batch]) for key in manifest.observations}
         noise = manifest.noise
         if noise is None:
-            return list(_outputs(sessions[0], inputs))
+            return list(_outputs(sessions[0], inputs, settings))
         draws = [np.random.default_rng(np.asarray(tensors[SEED])) for tensors in batch]
         if not manifest.steps:
-            return list(_outputs(sessions[0], {**inputs, NOISE: _drawn(noise, draws)}))
+            return list(_outputs(sessions[0], {**inputs, NOISE: _drawn(noise, draws)}, settings))
         encode, denoise = sessions
-        condition = _outputs(encode, inputs)
+        condition = _outputs(encode, inputs, settings)
         x = _drawn(noise, draws)
         for step in manifest.steps:
             times = np.full(len(batch), step.time, np.int64)
-            y = _outputs(denoise, {_SAMPLE: x, _TIME: times, _CONDITION: condition})
+            y = _outputs(denoise, {_SAMPLE: x, _TIME: times, _CONDITION: condition}, settings)
             estimate = step.estimate_x * x + step.estimate_y * y
             if manifest.clip is not None:
                 estimate = estimate.clip(-manifest.clip, manifest.clip)
@@ -224,10 +263,10 @@ def _session(options: OnnxPolicyOptions, path: Path, graph: bytes) -> Any:
     return session
 
 
-def _outputs(session: Any, inputs: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+def _outputs(session: Any, inputs: Mapping[str, NDArray[Any]], settings: Any) -> NDArray[Any]:
     """The only output of a graph, for a batch."""
     try:
-        outputs = session.run(None, dict(inputs))
+        outputs = session.run(None, dict(inputs), settings)
     except Exception as error:  # as above
         raise PolicyError(f"ONNX Runtime: {_first_line(error)}") from error
     if len(outputs) != 1 or not isinstance(outputs[0], np.ndarray):

@@ -221,6 +221,57 @@ def test_graph_with_weights_that_are_not_finite_does_not_load(tmp_path: Path, va
         loaded(folder)
 
 
+def test_a_graph_that_returns_text_is_refused(tmp_path: Path) -> None:
+    folder = exported(tmp_path / "exported")
+    inputs = [_value(STATE, SIZE), _value(CAMERA, *IMAGE, dtype=TensorProto.UINT8)]
+    rows = np.full((1, CHUNK, SIZE), "0.5").astype(object)
+    save(
+        folder / "policy.onnx",
+        [helper.make_node("Identity", ["rows"], ["action"])],
+        inputs,
+        _value("action", CHUNK, SIZE, dtype=TensorProto.STRING),
+        rows=rows,
+    )
+    with pytest.raises(PolicyError, match="the graph returns text; actions are numbers"):
+        loaded(folder)
+
+
+def test_a_graph_that_does_not_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ibrobot_onnx.policy._FIRST_S", 0.05)
+    folder = exported(tmp_path / "exported")
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["go"], ["goes"]), helper.make_node("Identity", ["before"], ["after"])],
+        "body",
+        [
+            helper.make_tensor_value_info("turn", TensorProto.INT64, []),
+            helper.make_tensor_value_info("go", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("before", TensorProto.FLOAT, ["batch", CHUNK, SIZE]),
+        ],
+        [
+            helper.make_tensor_value_info("goes", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("after", TensorProto.FLOAT, ["batch", CHUNK, SIZE]),
+        ],
+    )
+    nodes = [
+        helper.make_node("Unsqueeze", [STATE, "ones"], ["row"]),
+        helper.make_node("Add", ["row", "zeros"], ["rows"]),
+        helper.make_node("Loop", ["turns", "begin", "rows"], ["action"], body=body),
+    ]
+    inputs = [_value(STATE, SIZE), _value(CAMERA, *IMAGE, dtype=TensorProto.UINT8)]
+    constants = {"turns": np.array(2**62), "begin": np.array(True), "ones": np.array([1])}
+    zeros = np.zeros((1, CHUNK, SIZE), np.float32)
+    save(folder / "policy.onnx", nodes, inputs, _value("action", CHUNK, SIZE), zeros=zeros, **constants)
+    with pytest.raises(PolicyError, match=r"its first run takes more than 0\.05 s"):
+        loaded(folder)
+
+
+def test_a_graph_larger_than_the_memory_is_not_read(tmp_path: Path) -> None:
+    folder = exported(tmp_path / "exported")
+    os.truncate(folder / "policy.onnx", 1 << 43)
+    with pytest.raises(PolicyError, match=r"policy.onnx: has 8796 GB, more than this machine's memory"):
+        loaded(folder)
+
+
 def test_scale_that_overflows_does_not_load(tmp_path: Path) -> None:
     folder = exported(tmp_path / "exported", scale=[1.7e308] * SIZE, offset=[1.7e308] * SIZE, noise=NOISE)
     with pytest.raises(PolicyError, match="postprocess of its first run"):

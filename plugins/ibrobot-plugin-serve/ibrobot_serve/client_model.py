@@ -39,6 +39,12 @@ class ClientModel:
         self._turn = threading.Lock()
         self._log = logging.getLogger("ibrobot.serve")
 
+    @property
+    def trained(self) -> dict[str, Any]:
+        """The joints of its actions and their rate, as far as its training data say them."""
+        known = {"actions": self.spec.actions and list(self.spec.actions), "rate_hz": self.spec.rate_hz}
+        return {name: value for name, value in known.items() if value is not None}
+
     @contextmanager
     def contained(self) -> Iterator[None]:
         """Count a request that fails, and let only `PolicyError` pass.

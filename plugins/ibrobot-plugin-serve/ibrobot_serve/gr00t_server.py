@@ -113,8 +113,9 @@ class Gr00tServer:
         actions, took_ms = self._model.chunk({self._places[place]: value for place, value in values.items()}, prompt)
         if not nested:
             return {f"action.{_ACTION}": actions}
-        spec = self._model.spec
-        told = {"joints": list(spec.actions or ()), "rate_hz": spec.rate_hz, "infer_ms": took_ms}
+        trained = self._model.trained
+        told = {"joints" if name == "actions" else name: value for name, value in trained.items()}
+        told["infer_ms"] = took_ms
         return [{_ACTION: actions[None]}, told]
 
     def _described(self) -> dict[str, Any]:

@@ -43,11 +43,10 @@ class OpenpiServer:
             "fingerprint": policy.fingerprint(),
             "weights": policy.weights(),
             "observations": {each: list(shape) for each, shape in spec.observations.items()},
-            "actions": list(spec.actions or ()),
+            "action_size": spec.action_size,
             "horizon": spec.chunk_size,
-            "rate_hz": spec.rate_hz,
             "prompt": spec.prompt,
-        }
+        } | model.trained
         self._connections: set[ServerConnection] = set()
         self._server = serve(
             self._handle, host, port, process_request=self._admit, compression=None, max_size=MAX_MESSAGE,

@@ -54,6 +54,18 @@ def test_chunks_are_those_of_the_policy(server: OpenpiServer, model: ClientModel
     assert answer["server_timing"]["infer_ms"] > 0
 
 
+def test_what_a_model_does_not_know_is_not_stated(model: ClientModel) -> None:
+    """A folder without the dataset's note has neither joints nor a rate, and an empty list says that it moves none."""
+    model.spec = attrs.evolve(model.spec, actions=None, rate_hz=None)
+    server = OpenpiServer(model, "127.0.0.1", 0)
+    try:
+        (metadata,) = asked(server)
+    finally:
+        server.close()
+    assert not {"actions", "rate_hz"} & metadata.keys()
+    assert metadata["action_size"] == 6
+
+
 @pytest.mark.parametrize(
     ("request_", "message"),
     [

@@ -35,4 +35,7 @@ def decode(kind: type[Any], raw: dict[str, Any]) -> Any:
     known = {field.name for field in dataclasses.fields(chosen)}
     if strange := set(given) - known:
         raise ValueError(f"the fields {sorted(strange)} are not valid")
-    return chosen(**given)
+    try:
+        return chosen(**given)
+    except Exception as error:
+        raise ValueError(f"Couldn't instantiate class {chosen.__name__} using init args {given}") from error

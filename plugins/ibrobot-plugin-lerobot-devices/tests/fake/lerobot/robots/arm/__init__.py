@@ -72,3 +72,7 @@ class ArmConfig(RobotConfig):
     disable_torque_on_disconnect: bool = True
     gain: int | None = None
     cameras: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.gain is not None and self.gain < 0:
+            raise ValueError("gain must not be negative")
