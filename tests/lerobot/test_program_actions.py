@@ -40,15 +40,17 @@ class Source(ProgramSource):
 
     def __init__(self) -> None:
         self.plans: list[tuple[tuple[str, ...], list[float]]] = []
+        self.now_ns = 0
         session: Any = SimpleNamespace(
             measured=lambda: SimpleNamespace(position=np.array([0.5, 0.25])),
             config=SimpleNamespace(robot=ROBOT),
-            clock=SimpleNamespace(now_ns=lambda: 0),
+            clock=SimpleNamespace(now_ns=lambda: self.now_ns),
             send_plan=lambda start, step, joints, rows: self.plans.append((joints, rows[0].tolist())),
         )
         self.session = session
         self._features, self._columns, self._sent = FEATURES, ROBOT.indices(FEATURES.joints), {}
         self._contract: Any = SimpleNamespace(step_ns=1)
+        self._sent_ns, self._stale_ns, self.active = 0, 250_000_000, True
 
 
 def test_joints_without_a_position_keep_their_last_one() -> None:
@@ -58,3 +60,22 @@ def test_joints_without_a_position_keep_their_last_one() -> None:
     source._act({"pan.pos": 90.0})
     joints = ("pan", "lift")
     assert source.plans == [(joints, [0.1, 0.5]), (joints, [0.1, 0.0]), (joints, [2.0, 0.0])]
+
+
+def test_joints_without_a_position_do_not_go_on_after_a_silence() -> None:
+    source = Source()
+    source._act({"pan.pos": 90.0})
+    source.now_ns = 240_000_000
+    source._act({"lift.pos": -10.0})
+    source.now_ns += 250_000_000
+    source._act({"lift.pos": -10.0})
+    joints = ("pan", "lift")
+    assert source.plans == [(joints, [2.0, 0.5]), (joints, [2.0, 0.0]), (joints, [0.25, 0.0])]
+
+
+def test_actions_are_refused_outside_the_mode() -> None:
+    source = Source()
+    source.active = False
+    with pytest.raises(ComponentFailed, match="its mode is not entered"):
+        source._act({"pan.pos": 1.0})
+    assert source.plans == []
