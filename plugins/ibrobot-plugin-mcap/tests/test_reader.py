@@ -402,7 +402,7 @@ def test_a_topic_that_cannot_be_read_leaves_the_others(tmp_path, encoding, type_
     with reading(path) as reader:
         assert reader.summary().topics["/it"].count == 3
         assert [each.message for each in reader.messages({JOINTS})] == [joints(index) for index in range(3)]
-        found = []
+        found: list[Any] = []
         why = (
             f"serialised as '{encoding}'; ibrobot reads 'cdr'"
             if encoding != "cdr"
