@@ -114,7 +114,7 @@ def command() -> list[str]:
 def test_operator_judges_blind_and_goes_on_after_a_crash(folder: Path, terminals: list[Terminal]) -> None:
     first = Terminal(folder)
     terminals.append(first)
-    first.see("detect a difference of success rates")
+    first.see("detect a difference between the success rates")
     first.see(r"trial 1 \(start 1 of 2\).*Enter begin the trial")
     first.judge(1, "s", early="f")
     first.see("trial 1: success")

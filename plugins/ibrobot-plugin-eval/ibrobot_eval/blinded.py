@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 import shlex
 import shutil
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import override
 
 import attrs
+import numpy as np
 
 from ibrobot_core.api import IbrobotError, seconds
 from ibrobot_core.app import (
@@ -34,12 +36,16 @@ from ibrobot_eval.episodes import SCRATCH, Result, interventions, recorded_in
 from ibrobot_eval.operators import QUIT, Operator, Quit
 from ibrobot_eval.options import EvalOptions
 from ibrobot_eval.policies import Policy
-from ibrobot_eval.report import Episode, Report
-from ibrobot_eval.statistics import decided_by
+from ibrobot_eval.report import Episode, Report, p_value
+from ibrobot_eval.statistics import ALPHA, decided_by, drift, level_of
 from ibrobot_eval.trials import FAILURE, OUTCOMES, SEALED, SUCCESS, VOID, Order, Trial
 
-NEEDED = {0.1: 770, 0.2: 164, 0.3: 69}
-"""Difference of success rates -> trials of each policy that detect it with a power of 80 %, by `decided_by`."""
+DIFFERENCES = (0.1, 0.2, 0.3)
+"""Differences of success rates for which the power is stated."""
+POWER = 0.8
+_NEEDED = {2: (770, 164, 69), 3: (931, 203, 87), 4: (1026, 228, 97), 5: (1095, 245, 105), 6: (1149, 258, 111)}
+"""Policies -> trials for each of `DIFFERENCES`, computed in advance, since that takes seconds."""
+_MOST_TRIALS = 6400
 LOG = "trials.log"
 _POLL_S = 0.05
 STARTS = "starts"
@@ -50,17 +56,57 @@ _OUTCOME = "outcome"
 _STOP = Choice(key="esc", text="emergency stop", urgent=True)
 
 
-def power(trials: int) -> list[str]:
-    """Statistical power of this number of trials of each policy, in words for the operator."""
-    needed = ", ".join(f"{100 * difference:g} points: {number}" for difference, number in NEEDED.items())
-    found = []
-    for difference in NEEDED:
-        chance = decided_by(0.5 + difference / 2, 0.5 - difference / 2, trials)[-1]
+def trials_needed(difference: float, policies: int) -> int | None:
+    """Trials of each policy that tell a pair with this difference of rates apart in 80 %; None above 6400.
+
+    Rates are those around 50 %, for which most trials are needed.
+    """
+    if difference in DIFFERENCES and policies in _NEEDED:
+        return _NEEDED[policies][DIFFERENCES.index(difference)]
+    most = 100
+    while most <= _MOST_TRIALS:
+        chances = decided_by(0.5 + difference / 2, 0.5 - difference / 2, most, level_of(math.comb(policies, 2)))
+        if chances[-1] >= POWER:
+            return int(np.argmax(chances >= POWER))
+        most *= 2
+    return None
+
+
+def power(trials: int, policies: int) -> list[str]:
+    """Statistical power of this number of trials of each policy, in words for the operator; none for one policy."""
+    if policies < 2:
+        return []
+    needed, found = [], []
+    for difference in DIFFERENCES:
+        chance = decided_by(0.5 + difference / 2, 0.5 - difference / 2, trials, level_of(math.comb(policies, 2)))[-1]
+        number = trials_needed(difference, policies)
+        needed.append(f"{100 * difference:g} points: {number or f'more than {_MOST_TRIALS}'}")
         found.append(f"{100 * difference:g} points: {100 * chance:.0f} %")
+    of = "both" if policies == 2 else f"two of the {policies}"
     return [
-        f"trials of each policy that detect a difference of success rates with a probability of 80 %: {needed}",
+        f"trials of each policy that detect a difference between the success rates of {of} policies with a probability "
+        f"of {100 * POWER:g} %: {', '.join(needed)}",
         f"probability with {trials} trials of each policy: {', '.join(found)}",
+        "these numbers are for rates around 50 %, e.g. 55 and 45 %; near 0 and 100 % fewer trials are enough",
     ]
+
+
+def drift_over(results: Mapping[str, Sequence[Result]]) -> str:
+    """What the trials say of a drift of success rates over time, in words; empty for fewer than four of a policy."""
+    outcomes = [[each.success for each in found] for found in results.values()]
+    half = min(map(len, outcomes), default=0) // 2
+    if half < 2:
+        return ""
+    p = drift(outcomes)
+    if p > ALPHA:
+        return f"no drift of the success rates over the trials was found (p {p_value(p)})"
+    early = np.mean([success for found in outcomes for success in found[:half]])
+    late = np.mean([success for found in outcomes for success in found[half:]])
+    return (
+        f"the success rates drifted over the trials (p {p_value(p)}): {100 * early:.0f} % in the first half, "
+        f"{100 * late:.0f} % in the second; the comparison allows for it, since each start has a trial of each policy, "
+        "but the rates are those of no one state of robot, scene and operator"
+    )
 
 
 class Blinding:
@@ -153,7 +199,8 @@ class Blinded:
         self._order.check_sealed()
         with self._operator.present(), _blind_log(self._out, self._blinding):
             if not self._order.trials:
-                for line in power(self._options.episodes):
+                sealed = f"do not open {self._out / SEALED} and {self._out / SCRATCH}: recordings there name the policy"
+                for line in (*power(self._options.episodes, len(self._policies)), sealed):
                     self._operator.say(line)
             try:
                 while not self._enough():
@@ -172,7 +219,8 @@ class Blinded:
             for trial in trials
         ]
         options = self._options
-        return Report.of(results, episodes, options.margin, until_decided=options.until_decided)
+        notes = [note for note in (drift_over(results),) if note]
+        return Report.of(results, episodes, options.margin, until_decided=options.until_decided, notes=notes)
 
     def _enough(self) -> bool:
         options = self._options

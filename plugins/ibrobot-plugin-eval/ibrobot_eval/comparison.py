@@ -15,9 +15,11 @@ from ibrobot_eval.statistics import (
     Interval,
     PairedTest,
     Pairs,
+    agreeing,
     clopper_pearson,
+    corrected,
     episodes_to_decide,
-    holm,
+    level_of,
     mcnemar_exact,
     tango,
     wilson,
@@ -111,7 +113,7 @@ def compare(results: Mapping[str, Sequence[Result]], margin: float) -> list[Comp
         margin: a difference below it counts as none.
     """
     couples = list(itertools.combinations(results, 2))
-    level = ALPHA / max(1, len(couples))
+    level = level_of(len(couples))
     tests, courses = [], []
     for first, second in couples:
         test, looks = PairedTest(level), [(0, 0.0, -1.0, 1.0)]
@@ -120,19 +122,19 @@ def compare(results: Mapping[str, Sequence[Result]], margin: float) -> list[Comp
             looks.append((test.pairs.episodes, test.pairs.difference, test.interval.low, test.interval.high))
         tests.append(test)
         courses.append((*looks[: -1 : len(looks) // _POINTS + 1], looks[-1]))
-    p_values = holm([test.p_value for test in tests])
-    fixed_p_values = holm([mcnemar_exact(test.pairs) for test in tests])
     found = []
-    for couple, test, course, p_value, fixed_p in zip(couples, tests, courses, p_values, fixed_p_values, strict=True):
-        pairs, verdict = test.pairs, _verdict(test, p_value, margin)
+    for couple, test, course in zip(couples, tests, courses, strict=True):
+        pairs, verdict = test.pairs, _verdict(test, level, margin)
+        p_value, fixed_p = (corrected(p, len(couples)) for p in (test.p_value, mcnemar_exact(pairs)))
         more = episodes_to_decide(pairs, margin, level) if verdict == UNDECIDED and pairs.episodes else None
-        fixed = (tango(pairs, level), fixed_p)
-        found.append(Comparison(*couple, pairs, *fixed, test.interval, p_value, verdict, more, margin, course))
+        interval = agreeing(test.interval, verdict in (BETTER, WORSE), test.sign)
+        fixed = agreeing(tango(pairs, level), fixed_p <= ALPHA, pairs.difference)
+        found.append(Comparison(*couple, pairs, fixed, fixed_p, interval, p_value, verdict, more, margin, course))
     return found
 
 
-def _verdict(test: PairedTest, p_value: float, margin: float) -> str:
-    if p_value <= ALPHA:
+def _verdict(test: PairedTest, level: float, margin: float) -> str:
+    if test.p_value <= level:
         return BETTER if test.sign > 0 else WORSE
     within = -margin < test.interval.low and test.interval.high < margin
     return SAME if within else UNDECIDED
@@ -149,7 +151,8 @@ class Decision:
 
     def __init__(self, labels: Sequence[str], margin: float) -> None:
         couples = list(itertools.combinations(labels, 2))
-        self._tests = {couple: PairedTest(ALPHA / len(couples)) for couple in couples}
+        self._level = level_of(len(couples))
+        self._tests = {couple: PairedTest(self._level) for couple in couples}
         self._margin = margin
         self._episodes = 0
         self.after: int | None = None
@@ -164,7 +167,5 @@ class Decision:
             for (first, second), test in self._tests.items():
                 test.add(results[first][self._episodes].success, results[second][self._episodes].success)
             self._episodes += 1
-            adjusted = holm([test.p_value for test in self._tests.values()])
-            verdicts = [_verdict(t, p, self._margin) for t, p in zip(self._tests.values(), adjusted, strict=True)]
-            if UNDECIDED not in verdicts:
+            if all(_verdict(test, self._level, self._margin) != UNDECIDED for test in self._tests.values()):
                 self.after = self._episodes

@@ -9,7 +9,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_eval.statistics import wilson
+from ibrobot_eval.statistics import clopper_pearson
 
 WIDTH = 720
 _LEFT, _RIGHT, _TOP, _BOTTOM = 48, 12, 8, 34
@@ -111,7 +111,7 @@ def rates(rows: Sequence[tuple[str, int, int]]) -> str:
     parts = _below(axis, _TOP, height - _BOTTOM, "success rate [%], with 95 % interval")
     for number, (label, successes, episodes) in enumerate(rows):
         y = _TOP + 30 * number + 15
-        interval = wilson(successes, episodes)
+        interval = clopper_pearson(successes, episodes)
         parts += [
             _text(left - 10, y + 4, label, "end"),
             _line(axis(100 * interval.low), y, axis(100 * interval.high), y, "range"),
@@ -242,7 +242,7 @@ def by_factor(points: Sequence[tuple[float, bool]], name: str, title: str) -> st
         successes, count = sum(success for _, success in part), len(part)
         low, high, y = part[0][0], part[-1][0], up(100 * successes / count)
         x = across((low + high) / 2)
-        interval = wilson(successes, count)
+        interval = clopper_pearson(successes, count)
         parts.append(_line(x, up(100 * interval.low), x, up(100 * interval.high), "range"))
         parts.append(_line(across(low), y, across(high), y, "estimate"))
         parts.append(mark(x, y, True, f"{successes} of {count}"))

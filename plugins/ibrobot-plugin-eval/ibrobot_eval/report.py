@@ -47,7 +47,7 @@ class Report:
     margin: float
     until_decided: bool
     notes: tuple[str, ...] = ()
-    """What went wrong beside the results, e.g. with videos."""
+    """What else is to be known, e.g. of videos that were not made, or of a drift over time."""
 
     @classmethod
     def of(
@@ -61,7 +61,7 @@ class Report:
             episodes: the episodes to list.
             margin: a difference below it counts as none.
             until_decided: whether the evaluation ended with a decision.
-            notes: what went wrong beside the results.
+            notes: what else is to be known.
         """
         summaries = tuple(Summary.of(label, found) for label, found in results.items())
         return cls(summaries, tuple(compare(results, margin)), tuple(episodes), margin, until_decided, tuple(notes))
@@ -170,7 +170,7 @@ class Report:
             time = f", median {each.median_time_s:.1f} s" if each.median_time_s is not None else ""
             lines.append(
                 f"{each.label:{width}}  {each.successes} of {each.episodes} succeeded, {_errors_of(each)}"
-                f"{LEVEL} interval {percent(each.wilson)}{time}"
+                f"{LEVEL} interval {percent(each.exact)}{time}"
             )
         errors = self.errors
         more = [f"and {len(errors) - _MOST_LINES} other errors"] if len(errors) > _MOST_LINES else []
@@ -188,7 +188,7 @@ def _errors_of(each: Summary) -> str:
 
 
 SUMMARY_HEAD = (
-    "policy", "successes", "rate", f"{LEVEL} interval (Wilson)", "exact interval", "median time to success",
+    "policy", "successes", "rate", f"{LEVEL} interval (exact)", "Wilson's interval", "median time to success",
     "interventions per episode", "episodes with faults", "episodes with errors",
 )  # fmt: skip
 COMPARISON_HEAD = (
@@ -199,7 +199,8 @@ NOTE = (
     "The difference is the first policy's success rate minus the second's, on the same seeds. The first interval and p "
     "stay valid however often one looks and whenever one stops, and the verdict is read off them. Those for a fixed "
     "number are valid only if the number of episodes was chosen beforehand. With more than two policies all are "
-    "corrected for the number of pairs. Episodes that ended in an error of the policy count as failures."
+    "corrected for the number of pairs, by Bonferroni's method, so that an interval excludes 0 exactly if its p is at "
+    "most 0.05. Episodes that ended in an error of the policy count as failures."
 )
 
 
@@ -209,7 +210,7 @@ def summary_row(each: Summary) -> tuple[str, ...]:
     time = f"{each.median_time_s:.2f} s" if each.median_time_s is not None else "none"
     interventions = sum(each.interventions.values()) / each.episodes if each.episodes else 0.0
     return (
-        each.label, f"{each.successes} of {each.episodes}", rate, percent(each.wilson), percent(each.exact), time,
+        each.label, f"{each.successes} of {each.episodes}", rate, percent(each.exact), percent(each.wilson), time,
         f"{interventions:.1f}", str(each.disturbed), str(each.errors),
     )  # fmt: skip
 

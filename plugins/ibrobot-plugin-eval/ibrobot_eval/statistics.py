@@ -7,7 +7,7 @@ Sources:
   Medical Research Methodology 13 (2013).
 - The score interval of a paired difference: Tango, "Equivalence test and confidence interval for the difference in
   proportions for the paired-sample design", Statistics in Medicine 17 (1998).
-- Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6 (1979).
+- Permutation tests: Good, "Permutation, parametric and bootstrap tests of hypotheses" (2005).
 - Betting against a mean: Waudby-Smith and Ramdas, "Estimating means of bounded random variables by betting", JRSS B 86
   (2024). On mixtures of bets as martingales, whose inverse is a p-value at all times: Robbins,
   "Statistical methods related to the law of the iterated logarithm", Annals of Mathematical Statistics 41 (1970);
@@ -18,7 +18,7 @@ Sources:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 
 import attrs
@@ -34,6 +34,7 @@ _TOLERANCE = 1e-6
 """Accuracy of the ends of intervals."""
 _MOST = 100_000
 """Maximum number of episodes in projections."""
+_SHUFFLES = 9_999
 
 Array = NDArray[np.float64]
 
@@ -97,7 +98,8 @@ def mcnemar_exact(pairs: Pairs) -> float:
 def tango(pairs: Pairs, alpha: float = ALPHA) -> Interval:
     """The score interval of the difference of two success rates on the same episodes, of Tango.
 
-    Valid for one look, after a number of episodes fixed beforehand; its level is close to nominal.
+    Valid for one look, after a number of episodes fixed beforehand; its level is close to nominal. `agreeing` fits it
+    to the exact test of McNemar.
     """
     from scipy.optimize import brentq
     from scipy.stats import norm
@@ -130,13 +132,51 @@ def tango(pairs: Pairs, alpha: float = ALPHA) -> Interval:
     return Interval(-1.0 if low == -edge else low, 1.0 if high == edge else high)
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Correct p-values for their number, by Holm's method."""
-    if not p_values:
-        return []
-    from statsmodels.stats.multitest import multipletests
+def level_of(pairs: int) -> float:
+    """The level of each of several tests, by which at most `ALPHA` of all evaluations have a wrong statement.
 
-    return [float(p) for p in multipletests(p_values, method="holm")[1]]
+    Bonferroni's: it holds for tests and intervals alike, so that both say the same of each pair.
+    """
+    return ALPHA / max(1, pairs)
+
+
+def corrected(p_value: float, pairs: int) -> float:
+    """A p-value, corrected for the number of tests: at most `ALPHA` exactly if it is at most `level_of(pairs)`."""
+    return min(1.0, p_value * max(1, pairs))
+
+
+def agreeing(interval: Interval, decided: bool, difference: float) -> Interval:
+    """An interval of a difference that excludes zero exactly if a test has decided.
+
+    An exact test and an interval, or two ways of rounding, may disagree at the edge. Where the test has not decided,
+    zero is added, which makes the interval only safer. Where it has, the differences up to zero are cut off: the test
+    refutes all of them at least as strongly as zero.
+    """
+    if not decided:
+        return Interval(min(interval.low, 0.0), max(interval.high, 0.0))
+    if difference > 0:
+        return Interval(max(interval.low, _EDGE), max(interval.high, _EDGE))
+    return Interval(min(interval.low, -_EDGE), min(interval.high, -_EDGE))
+
+
+def drift(outcomes: Iterable[Sequence[bool]], shuffles: int = _SHUFFLES) -> float:
+    """p-value of a trend of success rates over time, whatever the rates of the policies.
+
+    A permutation test: how often the outcomes of each policy in random order have a trend as strong as theirs.
+
+    Args:
+        outcomes: of each policy, in the order of time.
+        shuffles: number of random orders, the same in each call.
+    """
+    rng = np.random.default_rng(0)
+    total, shuffled = 0.0, np.zeros(shuffles)
+    for policy in outcomes:
+        values = np.array(policy, dtype=float)
+        times = np.arange(len(values)) - (len(values) - 1) / 2
+        total += float(times @ values)
+        shuffled += rng.permuted(np.tile(values, (shuffles, 1)), axis=1) @ times
+    as_strong = int((np.abs(shuffled) >= abs(total) - _EDGE).sum())
+    return (as_strong + 1) / (shuffles + 1)
 
 
 @cache

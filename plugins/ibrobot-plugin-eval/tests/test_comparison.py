@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from ibrobot_eval.comparison import BETTER, SAME, UNDECIDED, WORSE, Decision, Summary, compare
 
 from .made_results import result, results, spread
@@ -75,3 +77,17 @@ def test_summary_counts_successes_interventions_and_faults():
     assert (found.successes, found.episodes, found.median_time_s, found.disturbed) == (2, 3, 3.0, 1)
     assert found.interventions == {"position": 2, "velocity": 4}
     assert Summary.of("a", made[2:]).median_time_s is None
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(2, 5), st.integers(1, 40), st.integers(0, 2**32 - 1))
+def test_intervals_p_values_and_verdicts_of_a_table_agree(policies, episodes, seed):
+    rng = np.random.default_rng(seed)
+    outcomes = rng.random((policies, episodes)) < rng.random((policies, 1))
+    for each in compare({str(i): results(*row.tolist()) for i, row in enumerate(outcomes)}, 0.1):
+        decided = each.verdict in (BETTER, WORSE)
+        assert decided == (each.p_value <= 0.05) == (each.interval.low > 0 or each.interval.high < 0)
+        assert (each.verdict == BETTER) == (each.interval.low > 0)
+        assert (each.mcnemar_p <= 0.05) == (each.fixed_interval.low > 0 or each.fixed_interval.high < 0)
+        if each.verdict == SAME:
+            assert -0.1 < each.interval.low <= each.interval.high < 0.1

@@ -9,10 +9,12 @@ from ibrobot_eval.statistics import (
     ALPHA,
     PairedTest,
     Pairs,
+    agreeing,
     clopper_pearson,
+    corrected,
     decided_by,
     episodes_to_decide,
-    holm,
+    level_of,
     log_capital,
     mcnemar_exact,
     tango,
@@ -84,9 +86,18 @@ def test_tango_covers_about_nominally():
     assert missed / 2000 <= 0.065
 
 
-def test_holm_multiplies_by_the_number_of_remaining_comparisons():
-    assert holm([0.01, 0.04, 0.02]) == pytest.approx([0.03, 0.04, 0.04])
-    assert holm([]) == []
+@given(st.floats(0, 1), st.integers(0, 50))
+def test_corrected_p_and_level_decide_alike(p_value, pairs):
+    level = level_of(pairs)
+    assert (p_value <= level) == (corrected(p_value, pairs) <= ALPHA) or p_value == pytest.approx(level)
+
+
+@given(COUNTS, st.sampled_from([1, 3, 10, 45, 500]))
+def test_interval_of_a_fixed_number_excludes_zero_exactly_if_mcnemar_decides(pairs, tests):
+    decided = corrected(mcnemar_exact(pairs), tests) <= ALPHA
+    found = agreeing(tango(pairs, level_of(tests)), decided, pairs.difference)
+    assert (found.low > 0 or found.high < 0) == decided
+    assert found.low <= pairs.difference <= found.high
 
 
 @given(st.floats(-0.9, 0.9), st.integers(0, 30), st.integers(0, 30), st.integers(0, 30))

@@ -2,12 +2,16 @@ import json
 from collections import Counter
 
 import attrs
+import numpy as np
 import pytest
-from ibrobot_eval.blinded import NEEDED, Blinding, power
-from ibrobot_eval.statistics import decided_by
+from ibrobot_eval.blinded import Blinding, drift_over, power, trials_needed
+from ibrobot_eval.comparison import compare
+from ibrobot_eval.statistics import ALPHA, decided_by, drift
 from ibrobot_eval.trials import FAILURE, OPENED, ORDER, SUCCESS, VOID, Order, Trial
 
 from ibrobot_core.api import IbrobotError
+
+from .made_results import result, results
 
 LABELS = ("scripted", "learned", "third")
 
@@ -111,13 +115,63 @@ def test_damaged_order_is_an_error(tmp_path):
         Order(tmp_path, LABELS)
 
 
-def test_stated_numbers_of_trials_have_a_power_of_80_percent():
-    for difference in (0.2, 0.3):
-        power_of = decided_by(0.5 + difference / 2, 0.5 - difference / 2, NEEDED[difference])
-        assert power_of[-2] < 0.8 <= power_of[-1]
-    lines = power(69)
-    assert "10 points: 770, 20 points: 164, 30 points: 69" in lines[0]
-    assert "30 points: 80 %" in lines[1]
+@pytest.mark.parametrize("difference", [0.2, 0.3])
+@pytest.mark.parametrize("policies", range(2, 11))
+def test_stated_numbers_of_trials_have_a_power_of_80_percent(policies, difference):
+    number = trials_needed(difference, policies)
+    level = ALPHA / (policies * (policies - 1) / 2)
+    power_of = decided_by(0.5 + difference / 2, 0.5 - difference / 2, number, level)
+    assert power_of[-2] < 0.8 <= power_of[-1]
+    lines = power(number, policies)
+    assert f"{100 * difference:g} points: {number}" in lines[0]
+    assert f"{100 * difference:g} points: 80 %" in lines[1]
+    assert "for rates around 50 %" in lines[2]
+
+
+def test_power_grows_with_the_number_of_policies():
+    assert [trials_needed(0.3, policies) for policies in (2, 3, 5)] == [69, 87, 105]
+    assert power(20, 1) == []
+
+
+def test_stated_number_of_trials_finds_a_difference_among_three_policies():
+    rng, rates = np.random.default_rng(0), np.array([0.65, 0.5, 0.35])
+    number, found = trials_needed(0.3, 3), 0
+    for _ in range(200):
+        outcomes = rng.random((number, 3)) < rates
+        made = compare({name: results(*column) for name, column in zip("abc", outcomes.T, strict=True)}, 0.1)
+        found += next(each for each in made if (each.first, each.second) == ("a", "c")).verdict == "better"
+    assert found / 200 > 0.72, "80 %, but for chance"
+
+
+def trials(*outcomes):
+    return [result(number, success) for number, success in enumerate(outcomes)]
+
+
+@pytest.mark.parametrize("sign", [True, False])
+@pytest.mark.parametrize("policies", [1, 2, 4])
+def test_drift_is_said(policies, sign):
+    found = drift_over({f"p{i}": trials(*[sign] * 10, *[not sign] * 10) for i in range(policies)})
+    rates = "100 % in the first half, 0 % in the second" if sign else "0 % in the first half, 100 % in the second"
+    assert found.startswith("the success rates drifted over the trials (p < 0.001): ")
+    assert rates in found
+
+
+def test_no_drift_is_said_too():
+    assert drift_over({"a": trials(*[True, False] * 10)}).startswith("no drift of the success rates over the trials")
+    assert drift_over({"a": trials(*[True] * 20), "b": trials(*[False] * 20)}).endswith("was found (p 1.000)")
+    assert drift_over({"a": trials(True, False), "b": trials(False, False)}) == "", "too few trials"
+
+
+def test_drift_is_seldom_found_where_there_is_none():
+    rng = np.random.default_rng(0)
+    found = [drift((rng.random((2, 12)) < np.array([[0.3], [0.8]])).tolist(), 399) <= ALPHA for _ in range(400)]
+    assert np.mean(found) <= 0.08
+
+
+def test_drift_that_all_policies_have_is_found_whatever_their_rates():
+    rng = np.random.default_rng(1)
+    rates = np.linspace(0.9, 0.2, 30) * np.array([[1.0], [0.6]])
+    assert np.mean([drift((rng.random((2, 30)) < rates).tolist(), 399) <= ALPHA for _ in range(50)]) > 0.7
 
 
 def test_blinding_replaces_names_but_not_parts_of_words():

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import signal
 import socket
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
@@ -69,8 +71,16 @@ def _do(job: Job[Any], number: int, counts: Any, folder: str, versions: Mapping[
             told_s = now_s
             counts.tell.remote(number, done)
 
-    outcome = job.run(progress)
-    return done, outcome
+    value, error = job.run(progress)
+    return done, (value, _placed(error, here))
+
+
+def _placed(error: IbrobotError | None, machine: str) -> IbrobotError | None:
+    """An error that names the machine of the files with tracebacks that its text names."""
+    logs = rf"{re.escape(tempfile.gettempdir())}/[^\s)]+\.log"
+    if error is None or not re.search(logs, str(error)):
+        return error
+    return ComponentFailed(re.sub(logs, rf"\g<0> on machine {machine}", str(error)), error.exit_code)
 
 
 class RayPool(Pool):
@@ -156,7 +166,9 @@ def _outcome(reference: Any) -> tuple[int, tuple[Any, IbrobotError | None]]:
     try:
         found: tuple[int, tuple[Any, IbrobotError | None]] = ray.get(reference)
     except ray.exceptions.RayTaskError as error:  # before the job began
-        return 0, (None, ComponentFailed(f"a machine of the cluster cannot run it: {error.cause or error}"))
+        found_ip = re.search(r"ip=([^,)\s]+)", str(error))
+        machine = f"machine {found_ip[1]}" if found_ip else "a machine"
+        return 0, (None, ComponentFailed(f"{machine} of the cluster cannot run it: {error.cause or error}"))
     except ray.exceptions.RayError as error:
         lines = str(error).strip().splitlines() or [""]
         reason = f"its process was lost {RETRIES + 1} times: {type(error).__name__}: {lines[0]}"

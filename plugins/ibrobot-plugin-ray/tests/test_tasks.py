@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
+import socket
 from pathlib import Path
 from typing import Any
 
 import pytest
 from ibrobot_ray import pool
-from ibrobot_testing.pool_jobs import Order, fail_if_odd, process, square
+from ibrobot_testing.pool_jobs import Order, divide, fail_if_odd, process, square
 
 from ibrobot_core.app import Job
 
@@ -70,6 +72,12 @@ def test_machine_with_other_code_is_named(here: Path, name: str) -> None:
 def test_machine_without_a_package_is_named(here: Path) -> None:
     _, (_, error) = do(Job(square, Order(1)), here, torch="2.9")
     assert "torch missing, not 2.9" in str(error)
+
+
+def test_traceback_of_a_bug_names_its_machine(here: Path) -> None:
+    _, (_, error) = do(Job(divide, Order(0)), here)
+    assert "ZeroDivisionError" in str(error)
+    assert re.search(rf"its traceback is in \S+\.log on machine {re.escape(socket.gethostname())}\)$", str(error))
 
 
 def test_counts_are_those_of_the_running_jobs() -> None:
