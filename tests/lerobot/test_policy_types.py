@@ -11,7 +11,6 @@ from pkgutil import iter_modules
 
 import lerobot.policies
 import pytest
-from checkpoints import CONFIGS, STATE, TOP, act, features, save
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import LeRobotPolicy
 from ibrobot_lerobot.policy_types import POLICY_TYPES
@@ -19,6 +18,9 @@ from ibrobot_testing.contexts import host_context
 from lerobot.configs import PreTrainedConfig
 
 from ibrobot_core.errors import PolicyError
+
+sys.path.insert(0, str(Path(__file__).parent))
+from checkpoints import CONFIGS, STATE, TOP, act, features, save
 
 pytestmark = pytest.mark.lerobot
 PAGE = Path(__file__).parents[2] / "docs/how-to/run-a-policy.md"
