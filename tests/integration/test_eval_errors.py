@@ -52,7 +52,7 @@ def _forkserver() -> Iterator[None]:
     One that earlier tests have started has imported what they had, or nothing: its processes take seconds to begin, and
     longer on a busy machine.
     """
-    server = forkserver._forkserver  # type: ignore[attr-defined]  # nothing public ends one
+    server: Any = forkserver._forkserver  # nothing public ends one
     server._stop()
     installed_plugins()
     needed = ("ibrobot_core.cli.main", "ibrobot_eval.evaluation", "ibrobot_testing.fakes")

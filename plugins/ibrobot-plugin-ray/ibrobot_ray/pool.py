@@ -71,8 +71,8 @@ def _do(job: Job[Any], number: int, counts: Any, folder: str, versions: Mapping[
             told_s = now_s
             counts.tell.remote(number, done)
 
-    value, error = job.run(progress)
-    return done, (value, _placed(error, here))
+    value, failure = job.run(progress)
+    return done, (value, _placed(failure, here))
 
 
 def _placed(error: IbrobotError | None, machine: str) -> IbrobotError | None:
