@@ -292,7 +292,9 @@ class Drive:
         registry = discover([])
 
         def make(options: object, ctx: Any) -> LeRobotHardware:
-            self.hardware = LeRobotHardware(RobotOptions("wheels"), ctx)
+            self.hardware = LeRobotHardware(
+                RobotOptions("wheels", units={"x": "metres", "y": "metres", "theta": "degrees"}), ctx
+            )
             return self.hardware
 
         registry.entries["hardware", "wheels"] = Entry(

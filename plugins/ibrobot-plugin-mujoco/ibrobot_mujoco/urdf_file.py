@@ -270,7 +270,7 @@ class _Reader:
             self.still.append(name)
             type_ = "fixed"
         place = f"{element.file}:{element.line}"
-        return UrdfJoint(name, type_, place, *ends, xyz, rpy, direction, limits, effort, velocity, mimic)
+        return UrdfJoint(name, type_, place, ends[0], ends[1], xyz, rpy, direction, limits, effort, velocity, mimic)
 
     def _tree(
         self, links: Mapping[str, Link], found: Mapping[str, tuple[XmlElement, UrdfJoint]], root: XmlElement

@@ -73,7 +73,7 @@ def _with_event(type_name: str, text: str) -> str:
 
 
 def _of_services(types: dict[str, Any]) -> dict[str, Any]:
-    """The types, of which those of services are named as in ROS: rosbags takes every type for that of a message."""
+    """The types; rosbags takes every type for that of a message, so services get their names of ROS here."""
     return {
         name.replace("/srv/msg/", "/srv/"): (constants, [(field, renamed(desc)) for field, desc in fields])
         for name, (constants, fields) in types.items()
