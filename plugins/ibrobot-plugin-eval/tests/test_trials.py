@@ -119,6 +119,7 @@ def test_damaged_order_is_an_error(tmp_path):
 @pytest.mark.parametrize("policies", range(2, 11))
 def test_stated_numbers_of_trials_have_a_power_of_80_percent(policies, difference):
     number = trials_needed(difference, policies)
+    assert number is not None
     level = ALPHA / (policies * (policies - 1) / 2)
     power_of = decided_by(0.5 + difference / 2, 0.5 - difference / 2, number, level)
     assert power_of[-2] < 0.8 <= power_of[-1]
@@ -136,6 +137,7 @@ def test_power_grows_with_the_number_of_policies():
 def test_stated_number_of_trials_finds_a_difference_among_three_policies():
     rng, rates = np.random.default_rng(0), np.array([0.65, 0.5, 0.35])
     number, found = trials_needed(0.3, 3), 0
+    assert number is not None
     for _ in range(200):
         outcomes = rng.random((number, 3)) < rates
         made = compare({name: results(*column) for name, column in zip("abc", outcomes.T, strict=True)}, 0.1)
