@@ -560,7 +560,7 @@ class ControlCore:
 
     def _goal(
         self, executor: str, goal_id: str, goal: Mapping[str, Any], stops: int = -1, generation: int = -1
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Pass a goal to an executor; one requested before an emergency stop, or in another generation, is refused."""
         if generation not in (-1, self.generation) or self.stops > stops >= 0:
             raise HardwareError(f"goal {goal_id}: refused, a stop, a reset or another mode came after it was requested")
