@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import random
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -56,7 +57,9 @@ def _forkserver() -> Iterator[None]:
     server._stop()
     installed_plugins()
     needed = ("ibrobot_core.cli.main", "ibrobot_eval.evaluation", "ibrobot_testing.fakes")
-    set_forkserver_preload([*needed, *(name for name in sys.modules if name.startswith("ibrobot_"))])
+    # Of other plugins the packages alone: what reads the installed plugins when it is imported would not see the site.
+    plugins = (name for name in sys.modules if name.startswith("ibrobot_") and "." not in name)
+    set_forkserver_preload([*needed, *plugins])
     forkserver.ensure_running()
     yield
     server._stop()
@@ -72,8 +75,12 @@ class Here(Pool):
 
 
 @pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
+def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(Registry, "pool", lambda *_: Here())
+    log = logging.getLogger("ibrobot")
+    level = log.level
+    yield
+    log.setLevel(level)  # an episode makes it quiet, for its process
 
 
 @pytest.fixture
@@ -210,7 +217,7 @@ def test_code_that_changed_between_calls_is_refused(code: dict[str, str], packag
     assert f"out: was begun with other settings: versions {package} 1.0, now 1.1; choose a new folder" in text
 
 
-@pytest.mark.usefixtures("site")
+@pytest.mark.usefixtures("here", "site")
 @pytest.mark.parametrize("package", CODE)
 def test_code_that_changes_during_an_evaluation_ends_it(
     code: dict[str, str], package: str, monkeypatch: pytest.MonkeyPatch

@@ -255,7 +255,7 @@ def test_flood_of_refused_goals_does_not_flood_the_log(robot: Robot, caplog: pyt
 
     for _ in range(1100):  # 11 s
         robot.step()
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.INFO, logger="ibrobot"):
         for _ in range(150):
             robot.by_ros(far)
         assert len(lines("ros: ")) <= 3

@@ -39,7 +39,8 @@ def test_one_episode_in_real_time(launch: Callable[..., Ran]):
 
 
 def test_the_whole_robot_with_its_cameras_in_lockstep(launch: Callable[..., Ran], rendering: None):
-    ran = launch("--lockstep", "--episodes", "1", robot="so101")
+    kept = "recording={type: mcap, root: kept, dataset: pick}"  # without a receiver, they would render nothing
+    ran = launch("--lockstep", "--episodes", "1", "--set", kept, robot="so101")
     assert ran.code == 0, ran.err
     summary = ran.summary
     assert summary["successes"] == 1

@@ -556,6 +556,10 @@ class Program(_Stream):
         self._program.close()
 
     @override
+    def again(self) -> None:
+        self.run.runtime.switch_mode(self.run.session.mode)
+
+    @override
     def close(self) -> None:
         super().close()
         for channel in (self._channel, self._program):

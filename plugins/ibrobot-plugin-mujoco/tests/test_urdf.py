@@ -48,6 +48,7 @@ def refused(done: CompletedProcess[str], folder: Path, *parts: str) -> None:
 
 
 def loads_in_each_mode(path: Path) -> dict[str, tuple[str, ...]]:
+    pytest.importorskip("ibrobot_web", reason="needs ibrobot-plugin-web, which a new robot's YAML names")
     config = load_config(path, sim=True)
     for mode in config.control_modes:
         load_config(path, sim=True, mode=mode)
@@ -57,6 +58,7 @@ def loads_in_each_mode(path: Path) -> dict[str, tuple[str, ...]]:
 # Joints and chains
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("count", [1, 2, 6, 7, 8, 9, 14, 16])
 @pytest.mark.parametrize("fingers", [0, 1])
 def test_arm_of_any_number_of_joints_starts_in_each_mode(count: int, fingers: int, tmp_path: Path, new: New) -> None:
@@ -67,6 +69,7 @@ def test_arm_of_any_number_of_joints_starts_in_each_mode(count: int, fingers: in
     assert len(groups.get("gripper", ())) == fingers
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("naming", "names"),
     [
@@ -118,6 +121,7 @@ def test_names_of_joints_are_texts_in_the_yaml(pattern: str, tmp_path: Path, new
     assert joints == tuple(pattern.format(i) for i in range(1, len(joints) + 1))
 
 
+@pytest.mark.integration
 def test_a_sliding_axis_of_an_arm_is_not_its_gripper(tmp_path: Path, new: New) -> None:
     text = make.chain(2, "base", "turn_{}") + make.link("z") + make.link("w")
     text += make.joint("z", "link_turn_2", "z", type="prismatic", inside=make.LIMIT.replace("2", "0.1"))
@@ -126,6 +130,7 @@ def test_a_sliding_axis_of_an_arm_is_not_its_gripper(tmp_path: Path, new: New) -
     assert loads_in_each_mode(tmp_path / "arm.yaml")["arm"] == ("turn_1", "turn_2", "z", "w")
 
 
+@pytest.mark.integration
 def test_a_hand_alone_is_an_arm(tmp_path: Path, new: New) -> None:
     assert new(make.arm(4, "finger_{}")).returncode == 0
     assert len(loads_in_each_mode(tmp_path / "arm.yaml")["arm"]) == 4

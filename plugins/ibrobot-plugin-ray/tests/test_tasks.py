@@ -63,7 +63,7 @@ def test_machine_without_the_folder_is_named(here: Path) -> None:
     assert "missing: No such file or directory; run the command in a folder that all machines share" in str(error)
 
 
-@pytest.mark.parametrize("name", ["Python", "ray", "numpy", "mujoco", "ibrobot-core", "ibrobot-plugin-processes"])
+@pytest.mark.parametrize("name", ["Python", "ray", "numpy", "ibrobot-core", "ibrobot-plugin-ray"])
 def test_machine_with_other_code_is_named(here: Path, name: str) -> None:
     _, (_, error) = do(Job(square, Order(1)), here, None, **{name: "0.7"})
     assert f"has other versions than this one: {name} {pool._versions()[name]}, not 0.7" in str(error)

@@ -147,8 +147,8 @@ def test_another_build_of_a_package_counts(install: Install, first: dict[str, An
 
 
 def test_the_environment_of_this_test_has_what_episodes_depend_on() -> None:
-    found = installed_code(["ibrobot-plugin-mujoco"])
-    assert {"Python", "mujoco", "numpy", "ibrobot-core", "ibrobot-plugin-mujoco"} <= found.keys()
+    found = installed_code(["ibrobot-testing"])
+    assert {"Python", "attrs", "numpy", "ibrobot-core", "ibrobot-testing"} <= found.keys()
 
 
 def test_differences_in_words() -> None:
