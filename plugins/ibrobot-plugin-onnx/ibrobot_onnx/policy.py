@@ -24,6 +24,8 @@ SEED = "seed"
 """Seed of a request's noise, shape (2,): the episode's seed and the tick."""
 _FIRST_S = 60.0
 """Longest time that a first run may take [s]; a policy that drives a robot answers in a second."""
+_LATER_S = 20.0
+"""Longest time per later request [s], below the time after which a server counts its model as hanging."""
 _SAMPLE, _TIME, _CONDITION = "sample", "time", "condition"
 """Inputs of the graph of a denoising step; the last one is the output of the graph that encodes observations."""
 
@@ -76,7 +78,7 @@ class OnnxPolicy(Policy):
             digest.update(graph)
             sessions.append(_session(self._options, self._options.path / name, graph))
         zeros = {key: np.zeros(shape, dtype) for key, (dtype, shape) in self._expected.items()}
-        [chunk] = self._first_run(sessions, zeros)
+        [chunk] = self._run(sessions, [zeros], _FIRST_S, "its first run")
         manifest = self._manifest
         if chunk.dtype.kind not in "fiu":
             kind = "text" if chunk.dtype.kind in "OSU" else str(chunk.dtype)
@@ -140,7 +142,7 @@ class OnnxPolicy(Policy):
             raise PolicyError(f"{self._options.path} is not loaded: call load() first")
         for tensors in batch:
             check_tensors(tensors, self._expected)
-        return [{ACTION: actions} for actions in self._run(self._sessions, batch)]
+        return [{ACTION: actions} for actions in self._run(self._sessions, batch, _LATER_S * len(batch), "a request")]
 
     @override
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
@@ -149,38 +151,37 @@ class OnnxPolicy(Policy):
         chunk = np.asarray(tensors[ACTION], np.float64)[first : first + self.spec.chunk_size]
         return chunk * manifest.scale + manifest.offset
 
-    def _first_run(self, sessions: Sequence[Any], zeros: Tensors) -> list[NDArray[Any]]:
-        """The outputs for a request of zeros.
+    def _run(self, sessions: Sequence[Any], batch: Sequence[Tensors], limit_s: float, what: str) -> list[NDArray[Any]]:
+        """Outputs of the network, each of shape (N, A), before they are unnormalised.
+
+        Args:
+            sessions: those of the graphs.
+            batch: the requests.
+            limit_s: longest time that it may take [s].
+            what: the run, for the error.
 
         Raises:
-            PolicyError: if it takes too long, e.g. in a loop of the graph.
+            PolicyError: if ONNX Runtime fails, or it takes too long, e.g. in a loop of the graph.
         """
         import onnxruntime
 
         settings = onnxruntime.RunOptions()
-        timer = threading.Timer(_FIRST_S, setattr, (settings, "terminate", True))
+        timer = threading.Timer(limit_s, setattr, (settings, "terminate", True))
         timer.start()
         try:
-            return self._run(sessions, [zeros], settings)
+            return self._compute(sessions, batch, settings)
         except PolicyError as error:
             if settings.terminate:
                 raise PolicyError(
-                    f"{self._options.path}: its first run takes more than {_FIRST_S:g} s; such a graph cannot "
-                    "drive a robot"
+                    f"{self._options.path}: {what} takes more than {limit_s:g} s; such a graph cannot drive a robot"
                 ) from error
             raise
         finally:
             timer.cancel()
             timer.join()
 
-    def _run(self, sessions: Sequence[Any], batch: Sequence[Tensors], settings: Any = None) -> list[NDArray[Any]]:
-        """Outputs of the network, each of shape (N, A), before they are unnormalised.
-
-        Args:
-            sessions: those of the graphs.
-            batch: the requests.
-            settings: ONNX Runtime's options of a run.
-        """
+    def _compute(self, sessions: Sequence[Any], batch: Sequence[Tensors], settings: Any) -> list[NDArray[Any]]:
+        """The outputs, with ONNX Runtime's options of a run."""
         manifest = self._manifest
         inputs = {key: np.stack([tensors[key] for tensors in batch]) for key in manifest.observations}
         noise = manifest.noise

@@ -236,9 +236,8 @@ def test_a_graph_that_returns_text_is_refused(tmp_path: Path) -> None:
         loaded(folder)
 
 
-def test_a_graph_that_does_not_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ibrobot_onnx.policy._FIRST_S", 0.05)
-    folder = exported(tmp_path / "exported")
+def looping_graph(path: Path, *, always: bool) -> None:
+    """Its loop does not end: always, or if the first joint is above 0."""
     body = helper.make_graph(
         [helper.make_node("Identity", ["go"], ["goes"]), helper.make_node("Identity", ["before"], ["after"])],
         "body",
@@ -255,14 +254,40 @@ def test_a_graph_that_does_not_end_is_refused(tmp_path: Path, monkeypatch: pytes
     nodes = [
         helper.make_node("Unsqueeze", [STATE, "ones"], ["row"]),
         helper.make_node("Add", ["row", "zeros"], ["rows"]),
-        helper.make_node("Loop", ["turns", "begin", "rows"], ["action"], body=body),
+        helper.make_node("ReduceMax", [STATE], ["largest"], keepdims=0),
+        helper.make_node("Greater", ["largest", "none"], ["above"]),
+        helper.make_node("Or", ["above", "begin"], ["begins"]),
+        helper.make_node("Loop", ["turns", "begins", "rows"], ["action"], body=body),
     ]
     inputs = [_value(STATE, SIZE), _value(CAMERA, *IMAGE, dtype=TensorProto.UINT8)]
-    constants = {"turns": np.array(2**62), "begin": np.array(True), "ones": np.array([1])}
+    constants = {"turns": np.array(2**62), "begin": np.array(always), "ones": np.array([1])}
     zeros = np.zeros((1, CHUNK, SIZE), np.float32)
-    save(folder / "policy.onnx", nodes, inputs, _value("action", CHUNK, SIZE), zeros=zeros, **constants)
+    none = np.array(0, np.float32)
+    save(path, nodes, inputs, _value("action", CHUNK, SIZE), zeros=zeros, none=none, **constants)
+
+
+def test_a_graph_that_does_not_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ibrobot_onnx.policy._FIRST_S", 0.05)
+    folder = exported(tmp_path / "exported")
+    looping_graph(folder / "policy.onnx", always=True)
     with pytest.raises(PolicyError, match=r"its first run takes more than 0\.05 s"):
         loaded(folder)
+
+
+@pytest.mark.parametrize("requests", [1, 2, 3])
+def test_a_request_that_does_not_end_fails_and_the_next_one_is_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, requests: int
+) -> None:
+    monkeypatch.setattr("ibrobot_onnx.policy._LATER_S", 0.05)
+    folder = exported(tmp_path / "exported")
+    looping_graph(folder / "policy.onnx", always=False)
+    policy = loaded(folder)
+    state = np.linspace(-0.6, -0.1, SIZE, dtype=np.float32)
+    good = {STATE: state, CAMERA: np.zeros(IMAGE, np.uint8)}
+    bad = {**good, STATE: -state}
+    with pytest.raises(PolicyError, match=rf"exported: a request takes more than {0.05 * requests:g} s; such a graph"):
+        policy.infer_batch([*[good] * (requests - 1), bad])
+    np.testing.assert_array_equal(policy.infer(good)["action"], [state] * CHUNK)
 
 
 def test_a_graph_larger_than_the_memory_is_not_read(tmp_path: Path) -> None:

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from ibrobot_core.api import Frame, Policy, PolicyError
 from ibrobot_core.app import check_finite
 
+_WORDS = {"actions": "joints", "rate_hz": "rate"}
+"""Key of what a model may not know -> word for it."""
+
 
 class ClientModel:
     """Checks the requests of clients, and computes them one after the other.
@@ -38,12 +41,17 @@ class ClientModel:
         self.answered = self.failed = 0
         self._turn = threading.Lock()
         self._log = logging.getLogger("ibrobot.serve")
+        if unstated := [word for key, word in _WORDS.items() if key not in self.trained]:
+            self._log.warning(
+                "model %r does not state the %s of its actions: clients get only their size, %d numbers",
+                name, " and ".join(unstated), self.spec.action_size,
+            )  # fmt: skip
 
     @property
     def trained(self) -> dict[str, Any]:
         """The joints of its actions and their rate, as far as its training data say them."""
-        known = {"actions": self.spec.actions and list(self.spec.actions), "rate_hz": self.spec.rate_hz}
-        return {name: value for name, value in known.items() if value is not None}
+        known = {"actions": list(self.spec.actions or ()), "rate_hz": self.spec.rate_hz}
+        return {name: value for name, value in known.items() if value}
 
     @contextmanager
     def contained(self) -> Iterator[None]:

@@ -15,6 +15,7 @@ from ibrobot_serve.client_model import ClientModel
 from ibrobot_serve.command import _host_and_port
 from ibrobot_serve.openpi_server import OpenpiServer
 from ibrobot_testing import host_context
+from ibrobot_testing.fakes import FakePolicy
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -54,16 +55,27 @@ def test_chunks_are_those_of_the_policy(server: OpenpiServer, model: ClientModel
     assert answer["server_timing"]["infer_ms"] > 0
 
 
-def test_what_a_model_does_not_know_is_not_stated(model: ClientModel) -> None:
+@pytest.mark.parametrize("rate", [None, 30.0])
+@pytest.mark.parametrize("actions", [None, (), host_context().robot.joint_names])
+def test_what_a_model_does_not_know_is_not_stated_but_said_at_the_start(
+    caplog: pytest.LogCaptureFixture, actions: tuple[str, ...] | None, rate: float | None
+) -> None:
     """A folder without the dataset's note has neither joints nor a rate, and an empty list says that it moves none."""
-    model.spec = attrs.evolve(model.spec, actions=None, rate_hz=None)
-    server = OpenpiServer(model, "127.0.0.1", 0)
+    policy = FakePolicy(host_context())
+    policy.load()
+    policy.spec = attrs.evolve(policy.spec, actions=actions, rate_hz=rate)
+    with caplog.at_level("WARNING", "ibrobot.serve"):
+        server = OpenpiServer(ClientModel(policy, "net", "openpi"), "127.0.0.1", 0)
     try:
         (metadata,) = asked(server)
     finally:
         server.close()
-    assert not {"actions", "rate_hz"} & metadata.keys()
+    known = {key: each for key, each in (("actions", list(actions or ())), ("rate_hz", rate)) if each}
+    assert {key: metadata[key] for key in ("actions", "rate_hz") if key in metadata} == known
     assert metadata["action_size"] == 6
+    lacking = " and ".join(word for key, word in (("actions", "joints"), ("rate_hz", "rate")) if key not in known)
+    said = f"model 'net' does not state the {lacking} of its actions: clients get only their size, "
+    assert [record.getMessage() for record in caplog.records] == ([f"{said}6 numbers"] if lacking else [])
 
 
 @pytest.mark.parametrize(
