@@ -15,6 +15,8 @@ class Sensor(ABC):
 
     topic: str
     message_type: type[Message]
+    idle: bool = False
+    """Whether it makes no messages since they have no receiver; a run does not wait for its first one then."""
 
     @abstractmethod
     def open(self) -> None:

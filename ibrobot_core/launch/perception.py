@@ -16,7 +16,7 @@ _RATE_WINDOW = 31
 
 
 class SensorWorker(SessionWorker):
-    """Opens a sensor and publishes its messages; ready after the first message."""
+    """Opens a sensor and publishes its messages; ready after the first message, or when it has no receiver to serve."""
 
     session: Session
     urgent = True
@@ -46,16 +46,15 @@ class SensorWorker(SessionWorker):
         now_ns = self.session.clock.now_ns()
         self._stamps.append(now_ns)
         self._received += 1
-        elapsed_s = seconds(self._stamps[-1] - self._stamps[0])
-        if elapsed_s > 0:
+        if (elapsed_s := seconds(self._stamps[-1] - self._stamps[0])) > 0:
             header = getattr(message, "header", None)
             age_s = seconds(now_ns - header.stamp_ns) if header is not None else None
-            rate_hz = (len(self._stamps) - 1) / elapsed_s
-            self.session.sensors[self._peripheral.name] = SensorFigures(self._received, rate_hz, age_s)
+            figures = SensorFigures(self._received, (len(self._stamps) - 1) / elapsed_s, age_s)
+            self.session.sensors[self._peripheral.name] = figures
 
     @override
     def is_ready(self) -> bool:
-        return bool(self._stamps)
+        return bool(self._stamps) or (self._sensor is not None and self._sensor.idle)
 
     @override
     def not_ready(self) -> str:

@@ -37,7 +37,7 @@ _FURTHEST_M = 10.0
 class MujocoCamera(Sensor):
     """Renders in the thread of `open` and `read`. Images that are due too soon are counted and skipped.
 
-    In lockstep, only the first picture and those with a receiver are rendered.
+    In lockstep, only pictures that have a receiver are rendered; rendering starts with the first of them.
     """
 
     def __init__(self, options: CameraOptions, ctx: Context) -> None:
@@ -50,7 +50,6 @@ class MujocoCamera(Sensor):
         self._ctx = ctx
         self._period_ns = ns(1.0 / options.fps)
         self._lockstep = isinstance(ctx.clock, SteppedClock)
-        self._is_first = True
         self._last_slot: int | None = None
         self._renderer: Renderer | None = None
         self._states: Subscription | None = None
@@ -62,13 +61,25 @@ class MujocoCamera(Sensor):
             raise SensorError(f"camera {self._ctx.name!r}: type mujoco needs a running simulation: {{type: mujoco}}")
         self._drawn = DrawnWorld.of(simulation, self._ctx.robot)
         self._model = self._drawn.model
-        camera = self._find_camera()
-        self._fovy = math.radians(self._model.cam_fovy[camera])
-        size = self._options.width, self._options.height
-        self._renderer = Renderer(self._model, camera, *size, shadows=self._options.shadows)
-        self._ctx.log.info("camera %s renders with %s", self._ctx.name, self._renderer.backend)
+        self._camera = self._find_camera()
+        self._fovy = math.radians(self._model.cam_fovy[self._camera])
         self._last_slot = None
         self._states = bus.subscribe(PHYSICS_TOPIC, _QUEUE)
+        if not self.idle:
+            self._rendering()
+
+    @property
+    @override
+    def idle(self) -> bool:
+        bus = self._ctx.bus
+        return self._lockstep and not (bus is not None and bus.has_subscribers(self.topic))
+
+    def _rendering(self) -> Renderer:
+        if self._renderer is None:
+            size = self._options.width, self._options.height
+            self._renderer = Renderer(self._model, self._camera, *size, shadows=self._options.shadows)
+            self._ctx.log.info("camera %s renders with %s", self._ctx.name, self._renderer.backend)
+        return self._renderer
 
     def _find_camera(self) -> int:
         """The camera's number in the model: by `camera`, or by the peripheral's name, with or without `_cam`."""
@@ -83,7 +94,7 @@ class MujocoCamera(Sensor):
 
     @override
     def read(self, timeout_s: float) -> Image | CompressedImage | None:
-        if self._renderer is None or self._states is None:
+        if self._states is None:
             raise SensorError(f"camera {self._ctx.name!r} is not open")
         deadline = time.monotonic() + timeout_s
         while True:
@@ -91,11 +102,12 @@ class MujocoCamera(Sensor):
             if state is None:
                 return None
             stamp_ns = stamp_of(state)
-            if self._is_due(stamp_ns) and self._is_wanted():
+            if self._is_due(stamp_ns) and not self.idle:
+                renderer = self._rendering()
                 self._drawn.follow(state)
                 if self._is_depth:
-                    return self._depth_image(stamp_ns, self._renderer.render_depth(self._drawn.data))
-                return self._image(stamp_ns, self._renderer.render(self._drawn.data))
+                    return self._depth_image(stamp_ns, renderer.render_depth(self._drawn.data))
+                return self._image(stamp_ns, renderer.render(self._drawn.data))
             if timeout_s <= 0:
                 return None
 
@@ -107,12 +119,6 @@ class MujocoCamera(Sensor):
         self.skipped += 0 if last is None else slot - last - 1
         self._last_slot = slot
         return True
-
-    def _is_wanted(self) -> bool:
-        """Whether a picture is needed; the first one shows that the camera works."""
-        first, self._is_first = self._is_first, False
-        bus = self._ctx.bus
-        return first or not self._lockstep or (bus is not None and bus.has_subscribers(self.topic))
 
     def _image(self, stamp_ns: int, pixels: np.ndarray) -> Image | CompressedImage:
         height, width, _ = pixels.shape
