@@ -1,6 +1,7 @@
 """Fifty dispatchers on three servers of one model: one server is killed, one drained for an update, one a canary.
 
     python benchmarks/moving_fleet.py [--robots 50] [--seconds 10]
+    python benchmarks/moving_fleet.py --faults [--robots 12] [--seconds 30]
 
 Three `ibrobot serve` with a model of 20 ms a request, over Zenoh on this machine, with `lease=0.7`. Each robot is a
 dispatcher with chunks of 50 actions at 30 Hz along a sine, ten robots a process, an episode every 8 s. After
@@ -11,6 +12,12 @@ Prints for each phase p50 and p99 of the latency [ms], holds (plans that ran out
 server; for each event, how many robots the server had, and the seconds until the last of them had the answer to what it
 asked, or had asked when its server went. Exits with 1 when that is more than a second, when setpoints moved faster
 than their joint may, an answer was to another request, no robot tried the canary, or the drained server failed.
+
+With `--faults` there are four servers and twelve robots: a server whose model works, one whose model raises at every
+request, one that takes 500 ms, and a canary for 30 % whose model raises. Prints for each robot its largest number of
+failed requests in a row, and for each server its requests, errors, latency, state and robots. Exits with 1 when a robot
+had more than two failures in a row, a faulty server got no robot, or a robot is at the slow server or a faulty canary
+at the end; robots may try the ordinary server that raises again, which the working one then answers for.
 """
 
 from __future__ import annotations
@@ -23,23 +30,29 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from itertools import groupby
 from pathlib import Path
 from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_serve.wire import health_name
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 from ibrobot_testing.ports import free_port
 from made_up import plugin
 from serve_fleet import A_PROCESS, CHUNK, RATE_HZ, Robot, say, transport
 
+from ibrobot_core.inference.client import Chunk
 from ibrobot_core.interfaces import Frame, Tensors, Transport
 from ibrobot_core.robot import Vector
 
 EPISODE_S, LEASE_S, AGAIN_S = 8.0, 0.7, 1.0
+FAULTS = {"works": "", "raises": "raises", "slow": "slow", "canary": "raises"}
+"""What is wrong with the models of `--faults`."""
+CANARY_SHARE, MOST_FAILURES = 30, 2
+REPLACED = "replaced by the newer request"
 PLUGIN = """
 import time
 from pathlib import Path
@@ -53,19 +66,22 @@ from ibrobot_testing.fakes import FakePolicy
 
 @attrs.frozen
 class Options:
-    path: Path = option(help="a folder with a file `weights`")
+    path: Path = option(help="a folder with the files `weights` and `fault`")
 
 class Sine(FakePolicy):
     def __init__(self, options, ctx):
         super().__init__(host_context())
         self.spec = attrs.evolve(self.spec, chunk_size=50)
         self._weights = (options.path / "weights").read_text()
+        self._fault = (options.path / "fault").read_text()
     def load(self):
         pass
     def weights(self):
         return self._weights
     def infer(self, tensors):
-        time.sleep(0.02)
+        time.sleep(0.5 if self._fault == "slow" else 0.02)
+        if self._fault == "raises":
+            raise RuntimeError("CUDA error: device-side assert triggered")
         at = 0.4 * np.sin(tensors["phase"])
         return {"actions": np.repeat(at[:, None], 6, axis=1), "echo": tensors["number"]}
 
@@ -106,6 +122,8 @@ class MovingRobot(Robot):
 
     def __init__(self, number: int, network: Transport) -> None:
         super().__init__(number, network, "auto", Sine(), self._take)
+        # Names without chance: robots draw by them whether they try a canary.
+        self.engine._robot = self.engine._choice.robot = f"robot{number}"
         self._plan: tuple[int, int, Vector] | None = None
         self._last: tuple[int, Vector] | None = None
         """The last setpoint and its time [ns]; None while the arm holds."""
@@ -114,6 +132,16 @@ class MovingRobot(Robot):
         """Greatest speed of a joint between setpoints, as a share of its limit, unless the arm held in between."""
         self.servers: list[tuple[float, str]] = []
         """When the robot came to which server [s]."""
+        self.failures: list[bool] = []
+        """Whether each request failed, but for those in whose place the robot itself sent a newer one."""
+        self.replaced = 0
+
+    @override
+    def after_chunk(self, chunk: Chunk) -> None:
+        if REPLACED in chunk.error:
+            self.replaced += 1
+        else:
+            self.failures.append(chunk.actions is None)
 
     def _take(self, start_ns: int, step_ns: int, positions: Vector) -> None:
         self._plan = (start_ns, step_ns, positions)
@@ -150,6 +178,10 @@ class MovingRobot(Robot):
             "servers": self.servers,
             "wrong": self.policy.wrong,
             "failures": self.engine.stats.failures,
+            "requests": len(self.failures),
+            "replaced": self.replaced,
+            "failed": sum(self.failures),
+            "in_a_row": max((len(list(row)) for failed, row in groupby(self.failures) if failed), default=0),
         }
 
 
@@ -201,15 +233,13 @@ class Server:
         return self._process.returncode
 
 
-@contextmanager
-def folders(root: Path) -> Iterator[dict[str, Path]]:
-    """Two models with other weights."""
-    made = {}
-    for name in ("old", "new"):
-        made[name] = root / name
-        made[name].mkdir()
-        (made[name] / "weights").write_text(name)
-    yield made
+def folder(root: Path, name: str, weights: str, fault: str = "") -> Path:
+    """A model."""
+    made = root / name
+    made.mkdir()
+    (made / "weights").write_text(weights)
+    (made / "fault").write_text(fault)
+    return made
 
 
 def started(arguments: list[str]) -> subprocess.Popen[str]:
@@ -252,14 +282,27 @@ def measured(answers: list[Any], begin_s: float, end_s: float) -> dict[str, Any]
     }
 
 
-def run(count: int, seconds: float, models: dict[str, Path]) -> int:
-    """All phases; 1 when a limit is missed."""
-    endpoints = [f"tcp/127.0.0.1:{free_port()}" for _ in range(3)]
-    servers = [Server(models["old"], endpoint) for endpoint in endpoints]
+def fleet(endpoints: list[str], count: int) -> list[subprocess.Popen[str]]:
+    """Robots at these servers, ready."""
     shares = [(first, min(A_PROCESS, count - first)) for first in range(0, count, A_PROCESS)]
-    asking = [
+    return [
         started(["--endpoints", *endpoints, "--first", str(first), "--count", str(share)]) for first, share in shares
     ]
+
+
+def ended(asking: list[subprocess.Popen[str]]) -> list[Any]:
+    """What the robots counted until now."""
+    for process in asking:
+        say(process, "end")
+    return [robot for process in asking for robot in json.loads(process.communicate()[0].splitlines()[-1])]
+
+
+def run(count: int, seconds: float, root: Path) -> int:
+    """All phases; 1 when a limit is missed."""
+    models = {name: folder(root, name, weights=name) for name in ("old", "new")}
+    endpoints = [f"tcp/127.0.0.1:{free_port()}" for _ in range(3)]
+    servers = [Server(models["old"], endpoint) for endpoint in endpoints]
+    asking = fleet(endpoints, count)
     events: dict[str, tuple[str, float]] = {}
     phases = {"before": time.monotonic() + seconds / 2}
     time.sleep(seconds)
@@ -287,9 +330,7 @@ def run(count: int, seconds: float, models: dict[str, Path]) -> int:
     phases["a canary"] = time.monotonic()
     time.sleep(seconds)
     end_s = time.monotonic()
-    for process in asking:
-        say(process, "end")
-    answers = [robot for process in asking for robot in json.loads(process.communicate()[0].splitlines()[-1])]
+    answers = ended(asking)
     for server in servers:
         server.signal(signal.SIGTERM)
         server.end()
@@ -313,12 +354,70 @@ def run(count: int, seconds: float, models: dict[str, Path]) -> int:
     return int(bool(late or drained or summary["wrong_answers"] or summary["worst_step"] > 1 or not trying))
 
 
+def health(endpoint: str) -> dict[str, Any]:
+    """What a server says of itself."""
+    network = transport(mode="client", connect=(endpoint,))
+    try:
+        answer: dict[str, Any] = json.loads(bytes(network.request(health_name("model"), b"", 5.0)))
+    finally:
+        network.close()
+    return answer
+
+
+def run_faults(count: int, seconds: float, root: Path) -> int:
+    """Servers with faults; 1 when a limit is missed."""
+    endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in FAULTS}
+
+    def serve(name: str) -> Server:
+        canary = name == "canary"
+        model = folder(root, name, weights="new" if canary else "old", fault=FAULTS[name])
+        return Server(model, endpoints[name], *(("--canary", f"{CANARY_SHARE}%") if canary else ()))
+
+    with ThreadPoolExecutor() as pool:
+        servers = dict(zip(FAULTS, pool.map(serve, FAULTS), strict=True))
+    asking = fleet([*endpoints.values()], count)
+    time.sleep(seconds)
+    states = {name: health(endpoint) for name, endpoint in endpoints.items()}
+    answers = ended(asking)
+    for server in servers.values():
+        server.signal(signal.SIGTERM)
+    for server in servers.values():
+        server.end()
+
+    print(f"{'robot':>8} {'requests':>8} {'replaced':>8} {'failed':>8} {'in a row':>8}  servers")
+    names = {server.id: name for name, server in servers.items()}
+    ways = [[names[server] for _, server in robot["servers"]] for robot in answers]
+    for number, (robot, way) in enumerate(zip(answers, ways, strict=True)):
+        figures = " ".join(f"{robot[key]:>8}" for key in ("requests", "replaced", "failed", "in_a_row"))
+        print(f"{number:>8} {figures}  {' -> '.join(way)}")
+    print(
+        f"\n{'server':>8} {'requests':>8} {'errors':>8} {'p50 ms':>8} {'p99 ms':>8} {'state':>8} {'robots':>8}",
+        "at the end",
+    )
+    ever = {name: sum(name in way for way in ways) for name in FAULTS}
+    last = {name: sum(name == way[-1] for way in ways) for name in FAULTS}
+    for name, state in states.items():
+        keys = ("requests", "failed", "latency_p50_ms", "latency_p99_ms", "state")
+        print(f"{name:>8} {' '.join(f'{state[key]:>8}' for key in keys)} {ever[name]:>8} {last[name]:>10}")
+    worst = max(robot["in_a_row"] for robot in answers)
+    unused = [name for name in FAULTS if not ever[name]]
+    stayed = [name for name in ("slow", "canary") if last[name]]
+    share = states["canary"]["requests"] / sum(state["requests"] for state in states.values())
+    tried = f"{ever['canary']} of {count} tried it, with {share:.1%} of all requests"
+    print(f"\nthe canary asks for {CANARY_SHARE} % of the robots: {tried}; {last['canary']} are there at the end")
+    print(f"failed requests in a row: at most {worst}")
+    print(f"servers without robots: {', '.join(unused) or 'none'}; servers not left: {', '.join(stayed) or 'none'}")
+    wrong = sum(robot["wrong"] for robot in answers)
+    return int(bool(worst > MOST_FAILURES or unused or stayed or wrong))
+
+
 def main() -> int:
     """As a made-up plugin, which `ibrobot serve` finds."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--robots", type=int, default=50)
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--endpoints", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--faults", action="store_true")
+    parser.add_argument("--robots", type=int)
+    parser.add_argument("--seconds", type=float)
+    parser.add_argument("--endpoints", nargs="+", help=argparse.SUPPRESS)
     parser.add_argument("--first", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--count", type=int, help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -326,8 +425,10 @@ def main() -> int:
         logging.disable(logging.CRITICAL)
         robots(given.endpoints, given.first, given.count)
         return 0
-    with plugin("sine_parts", PLUGIN) as folder, folders(folder) as models:
-        return run(given.robots, given.seconds, models)
+    with plugin("sine_parts", PLUGIN) as root:
+        if given.faults:
+            return run_faults(given.robots or 12, given.seconds or 30.0, root)
+        return run(given.robots or 50, given.seconds or 10.0, root)
 
 
 if __name__ == "__main__":

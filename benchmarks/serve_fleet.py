@@ -47,7 +47,7 @@ from ibrobot_core.config.schema import (
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.errors import PolicyError
-from ibrobot_core.inference.client import EngineClient
+from ibrobot_core.inference.client import Chunk, EngineClient
 from ibrobot_core.interfaces import Frame, Policy, Tensors, Transport
 from ibrobot_core.messages import Header, JointState
 from ibrobot_core.options import NoOptions
@@ -162,6 +162,9 @@ class Robot:
     def after_tick(self, now_ns: int) -> None:
         """What else to do in each tick."""
 
+    def after_chunk(self, chunk: Chunk) -> None:
+        """What else to do with each answer or error."""
+
     def run(self, until_s: float) -> None:
         """Go on until a time, which may be changed meanwhile."""
         self.until_s = until_s
@@ -170,6 +173,7 @@ class Robot:
         while time.monotonic() < self.until_s:
             chunk = self._client.poll(max(0.0, (next_ns - self._clock.now_ns()) / 1e9))
             if chunk is not None:
+                self.after_chunk(chunk)
                 before = stats.chunks
                 self.dispatcher.accept(chunk, self._clock.now_ns())
                 if stats.chunks > before:
