@@ -10,6 +10,7 @@ import pkgutil
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -53,12 +54,13 @@ def choices(kind: Kind, wanted: str = "") -> Mapping[str, type[Any]]:
     return dict(sorted(found.items()))
 
 
+@cache
 def _import_third_parties() -> None:
-    """Import the packages that LeRobot would import; its own function also imports those of policies, with torch."""
+    """Import the packages that LeRobot would import, once; its own function imports those of policies too, with torch."""
     for name in third_parties(distributions()):
         try:
             importlib.import_module(name)
-        except Exception as error:  # noqa: BLE001 - of a package of others, which is named
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - of a package of others, which is named
             logging.getLogger("ibrobot.lerobot").warning("package %s cannot be imported: %s", name, error)
 
 

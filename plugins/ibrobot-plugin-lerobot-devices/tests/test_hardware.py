@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from ibrobot_lerobot_devices import link
 from ibrobot_lerobot_devices.hardware import LeRobotHardware
+from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem
 from ibrobot_lerobot_devices.options import RobotOptions
 from ibrobot_testing.contexts import control_context
 from ibrobot_testing.hardware import HardwareSuite
@@ -234,3 +235,17 @@ def test_a_third_party_robot_is_found_as_lerobot_finds_it(motors: Motors, lerobo
     with connected(motors, robot="mine") as hardware:
         assert hardware.joints == JOINTS
         assert not hardware.read().stale
+
+
+@pytest.mark.parametrize(
+    "error", ["ImportError('no libmotor.so')", "RuntimeError('no libmotor.so')", "SystemExit('no libmotor.so')"]
+)
+def test_a_package_that_cannot_be_imported_is_named_once(
+    lerobot: Path, caplog: pytest.LogCaptureFixture, error: str
+) -> None:
+    (lerobot / "lerobot_robot_broken.py").write_text(f"raise {error}\n")
+    install(lerobot, "lerobot_robot_broken")
+    link = DeviceLink("robot", "nowhere", {}, only_make=True)
+    with caplog.at_level("WARNING", "ibrobot"), pytest.raises(DeviceProblem, match="LeRobot has no robot 'nowhere'"):
+        link.start(PATIENCE_S)
+    assert caplog.messages == ["package lerobot_robot_broken cannot be imported: no libmotor.so"]

@@ -27,8 +27,10 @@ from ibrobot_lerobot.checkpoint import (
     read_checkpoint,
 )
 from ibrobot_lerobot.options import LeRobotPolicyOptions
+from ibrobot_lerobot.quiet import held_back
 from ibrobot_lerobot.steps import Steps, read_steps
 
+_LOG = logging.getLogger("ibrobot.export")
 MANIFEST = "onnx_policy.json"
 EXPORTED = ("act", "diffusion", "vqbet")
 """LeRobot's names of the policy types that can be exported."""
@@ -72,17 +74,20 @@ def export_onnx(path: Path, out: Path) -> Exported:
     try:
         import onnxruntime  # noqa: F401 - checked before torch is loaded, which takes long
         import onnxscript  # noqa: F401
-        import torch
 
-        from ibrobot_lerobot.model import PolicyModel
-        from ibrobot_lerobot.onnx_graphs import GRAPHS
+        with held_back(_LOG):
+            import torch
+
+            from ibrobot_lerobot.model import PolicyModel
+            from ibrobot_lerobot.onnx_graphs import GRAPHS
     except ImportError as error:
         raise PolicyError(
             f"an export needs LeRobot, onnxscript and ONNX Runtime ({error}); install them with: "
             'pip install "ibrobot-plugin-lerobot[export]" "lerobot>=0.6.1,<0.7"'
         ) from error
     options = LeRobotPolicyOptions(path, device="cpu", dtype="float32")
-    model = PolicyModel(checkpoint, options, pre, (), logging.getLogger("ibrobot.export"))
+    with held_back(_LOG):
+        model = PolicyModel(checkpoint, options, pre, (), _LOG)
     inputs = _example(checkpoint)
     policy = GRAPHS[checkpoint.type](model.network, model.steps, {k: torch.from_numpy(v) for k, v in inputs.items()})
     partial = out.with_name(f"{out.name}.partial")

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from collections.abc import Sequence
-from contextlib import nullcontext, redirect_stdout
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from ibrobot_lerobot.checkpoint import ACTION, Checkpoint
 from ibrobot_lerobot.draws import Draw, Draws, NotByRequest
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy_types import import_others
+from ibrobot_lerobot.quiet import cause
 from ibrobot_lerobot.steps import Steps
 
 _IMAGES, _IMAGE = "observation.images", "observation.image"
@@ -182,12 +182,11 @@ class PolicyModel:
             chunked = hasattr(config, "rtc_config")
             if chunked:
                 config.rtc_config = config.rtc_config or RTCConfig()
-            with redirect_stdout(sys.stderr):
-                policy = get_policy_class(config.type).from_pretrained(str(path), config=config, strict=True)
+            policy = get_policy_class(config.type).from_pretrained(str(path), config=config, strict=True)
             if chunked and hasattr(policy, "init_rtc_processor"):
                 policy.init_rtc_processor()
         except Exception as error:
-            raise PolicyError(f"{path}: LeRobot cannot load it: {error}") from error
+            raise PolicyError(f"{path}: LeRobot cannot load it: {cause(error)}") from error
         for name, tensor in policy.named_parameters():
             if not torch.isfinite(tensor).all():
                 raise PolicyError(f"{path}: the weights {name} have values that are not finite, such as NaN")

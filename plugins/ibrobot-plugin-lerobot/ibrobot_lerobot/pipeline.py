@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ibrobot_core.api import PolicyError
 from ibrobot_lerobot.checkpoint import POSTPROCESSOR, PREPROCESSOR, Checkpoint
 from ibrobot_lerobot.policy_types import import_others
+from ibrobot_lerobot.quiet import cause
 from ibrobot_lerobot.untrusted import check_step_name
 
 _DEVICE = {"device_processor": {"device": "cpu"}}
@@ -49,7 +50,7 @@ class LeRobotSteps:
                 postprocessor_overrides=overrides[POSTPROCESSOR],
             )
         except Exception as error:
-            raise PolicyError(f"{checkpoint.path}: LeRobot cannot create its processors: {error}") from error
+            raise PolicyError(f"{checkpoint.path}: LeRobot cannot create its processors: {cause(error)}") from error
 
     def preprocess(self, batch: Mapping[str, NDArray[Any]], prompt: str, robot_type: str) -> dict[str, NDArray[Any]]:
         """Run a batch of one through the preprocessor.

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, override
 
 import numpy as np
@@ -16,6 +17,7 @@ from ibrobot_core.api import Context, Frame, PictureCodec, Policy, PolicyError, 
 from ibrobot_core.app import check_finite, check_tensors
 from ibrobot_lerobot.checkpoint import ACTION, POSTPROCESSOR, PREPROCESSOR, check_weights, hash_weights, read_checkpoint
 from ibrobot_lerobot.options import LeRobotPolicyOptions
+from ibrobot_lerobot.quiet import cause, held_back
 from ibrobot_lerobot.steps import read_steps
 
 if TYPE_CHECKING:
@@ -29,6 +31,7 @@ TASK = "task"
 PREFIX = "prefix"
 """`Frame.prefix`, normalised, shape (1, K, A)."""
 DELAY = "delay_steps"
+_INSTALL = "pip install 'lerobot>=0.6.1,<0.7'"
 
 
 class LeRobotPolicy(Policy):
@@ -60,7 +63,8 @@ class LeRobotPolicy(Policy):
         if any(others.values()):
             steps = "; ".join(f"{file}: {', '.join(names)}" for file, names in others.items() if names)
             ctx.log.info("%s has steps that only LeRobot runs, so this process loads torch (%s)", options.path, steps)
-            self._lerobot = _import("pipeline").LeRobotSteps(checkpoint)
+            with held_back(ctx.log):
+                self._lerobot = _import("pipeline").LeRobotSteps(checkpoint)
         for step in self._pre.normalising:
             for key in step.modes.keys() - {ACTION}:
                 if constant := step.constant(key):
@@ -85,9 +89,11 @@ class LeRobotPolicy(Policy):
     def load(self) -> None:
         self.check_weights()
         weights = hash_weights(self._options.path)
-        model = _import("model").PolicyModel(self._checkpoint, self._options, self._pre, self._pictures, self._ctx.log)
-        tensors = self.preprocess(self._typical())
-        actions = self.postprocess({ACTION: model.warm_up(tensors)})
+        log = self._ctx.log
+        with held_back(log):
+            model = _import("model").PolicyModel(self._checkpoint, self._options, self._pre, self._pictures, log)
+            tensors = self.preprocess(self._typical())
+            actions = self.postprocess({ACTION: model.warm_up(tensors)})
         check_finite(f"{self._options.path}: postprocess of its first run", {ACTION: actions})
         # The length of a text, and the output of LeRobot's own steps for it, are not known in advance.
         self._expected = {
@@ -236,7 +242,7 @@ def _import(name: str) -> Any:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         return import_module(f"ibrobot_lerobot.{name}")
-    except ImportError as error:
-        raise PolicyError(
-            f"LeRobot policies need LeRobot ({error}); install it with: pip install 'lerobot>=0.6.1,<0.7'"
-        ) from error
+    except Exception as error:  # of whatever LeRobot imports
+        if find_spec("lerobot") is None:
+            raise PolicyError(f"LeRobot policies need LeRobot ({error}); install it with: {_INSTALL}") from error
+        raise PolicyError(f"LeRobot is installed, but cannot be imported: {cause(error)}") from error

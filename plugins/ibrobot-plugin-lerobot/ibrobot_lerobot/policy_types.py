@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import logging
 from collections.abc import Mapping
 from importlib.metadata import distributions
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Literal
 import attrs
 
 from ibrobot_core.api import PolicyError
+from ibrobot_lerobot.quiet import cause
 
 _PREFIX = "lerobot_policy_"
 """LeRobot imports the packages whose names begin like this: they add policy types to it."""
@@ -83,15 +83,20 @@ def import_others(path: Path, kind: str) -> None:
 
     if kind in POLICY_TYPES:
         return
+    failed = _import_packages()
+    known = PreTrainedConfig.get_known_choices()
+    if kind not in known:
+        found = "; ".join(failed) or f"packages named {_PREFIX}* add types: is the one of {kind!r} installed here?"
+        raise PolicyError(f"{path}: LeRobot has no policy type {kind!r}; {found}")
+
+
+def _import_packages() -> tuple[str, ...]:
+    """Import the packages that add policy types; which cannot be imported, and why."""
     names = sorted({each.metadata["Name"].replace("-", "_") for each in distributions() if each.metadata["Name"]})
     failed = []
     for name in (each for each in names if each.startswith(_PREFIX)):
         try:
             importlib.import_module(name)
-        except Exception as error:  # noqa: BLE001 - of a package of others, which is named
-            failed.append(f"{name} cannot be imported: {type(error).__name__}: {error}")
-            logging.getLogger("ibrobot.lerobot").warning("package %s", failed[-1])
-    known = PreTrainedConfig.get_known_choices()
-    if kind not in known:
-        found = "; ".join(failed) or f"packages named {_PREFIX}* add types: is the one of {kind!r} installed here?"
-        raise PolicyError(f"{path}: LeRobot has no policy type {kind!r}; {found}")
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - of a package of others, which is named
+            failed.append(f"{name} cannot be imported: {type(error).__name__}: {cause(error)}")
+    return tuple(failed)
