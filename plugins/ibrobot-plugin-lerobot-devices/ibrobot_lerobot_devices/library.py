@@ -56,7 +56,7 @@ def choices(kind: Kind, wanted: str = "") -> Mapping[str, type[Any]]:
 
 @cache
 def _import_third_parties() -> None:
-    """Import the packages that LeRobot would import, once; its own function imports those of policies too, with torch."""
+    """Import the packages that LeRobot would import, once; its own function also imports policies, with torch."""
     for name in third_parties(distributions()):
         try:
             importlib.import_module(name)
