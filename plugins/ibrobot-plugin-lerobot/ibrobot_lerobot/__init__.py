@@ -38,7 +38,7 @@ def ibrobot_readers() -> Iterable[ReaderDescriptor]:
     """The reader of LeRobot datasets."""
     yield ReaderDescriptor(
         "lerobot",
-        "LeRobot v3.0 datasets, as DATASET:N",
+        "LeRobot datasets, v2.0 to v3.0, as DATASET:N",
         _reads,
         Late("ibrobot_lerobot.reader:LeRobotReader"),
         numbered=True,

@@ -37,10 +37,12 @@ def info(options: InfoOptions, as_json: bool, events: bool) -> None:
         return
     console = Screen(width=None if sys.stdout.isatty() else 1000)
     console.print(
-        f"{contents.path}: {contents.episodes} episodes, {contents.frames} frames at {contents.fps:g} Hz, "
-        f"{contents.seconds:.1f} s, {contents.bytes / 1e6:.1f} MB",
+        f"{contents.path}: LeRobot {contents.version}, {contents.episodes} episodes, {contents.frames} frames at "
+        f"{contents.fps:g} Hz, {contents.seconds:.1f} s, {contents.bytes / 1e6:.1f} MB",
         soft_wrap=True,
     )
+    for note in contents.notes:
+        console.print(f"note: {note}", soft_wrap=True)
     for task in contents.tasks:
         console.print(f"task: {task or '(empty)'}", soft_wrap=True)
     table = Table(box=None, padding=(0, 1))
@@ -50,6 +52,9 @@ def info(options: InfoOptions, as_json: bool, events: bool) -> None:
         for row in _rows(feature):
             table.add_row(*row)
     console.print(table)
+    for feature in contents.features:
+        for text in feature.texts:
+            console.print(f"{feature.key}: {text}", soft_wrap=True, markup=False)
 
 
 @datasets.command()
@@ -57,10 +62,10 @@ def info(options: InfoOptions, as_json: bool, events: bool) -> None:
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder of the whole dataset.")
 @wrong_input()
 def merge(parts: tuple[Path, ...], out: Path) -> None:
-    """Join datasets, e.g. those of `ibrobot convert --shard`.
+    """Join datasets, e.g. those of `ibrobot convert --shard`, into one of LeRobot v3.0.
 
-    They must have the same contract and settings. An episode that two of them have is an error. Nothing is encoded
-    again.
+    They must have the same contract and settings, or the same features where other programs made them. One dataset is
+    copied: so v2.0 and v2.1 become v3.0. An episode that two of them have is an error. Nothing is encoded again.
     """
     from ibrobot_lerobot.join import join_datasets
 

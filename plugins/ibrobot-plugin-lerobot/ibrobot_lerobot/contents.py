@@ -32,6 +32,7 @@ class FeatureContents:
         help="min, max, mean, std, q01 and q99 of each value or colour; null if not finite"
     )
     picture: bool = option(help="whether it is a picture")
+    texts: tuple[str, ...] = option((), help="its first different texts, if it has no numbers")
 
 
 @attrs.frozen(kw_only=True)
@@ -61,6 +62,8 @@ class Contents(Event):
     bytes: int = option(unit="bytes", help="size")
     fingerprint: str = option(help="fingerprint of the contract; empty if unknown")
     features: tuple[FeatureContents, ...] = option(help="the features")
+    version: str = option(help="version of the format, e.g. v3.0")
+    notes: tuple[str, ...] = option(help="what is not as it should be, but can be read")
     list: tuple[EpisodeContents, ...] = option(help="the episodes")
 
     @override

@@ -1,4 +1,4 @@
-"""`ibrobot datasets merge`: joins datasets that `ibrobot convert` has made with the same settings."""
+"""`ibrobot datasets merge`: joins datasets of `ibrobot convert` with the same settings, or those of other programs."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from ibrobot_lerobot.merge import merge, reading
 
 
 def join_datasets(parts: Sequence[Path], out: Path) -> int:
-    """Write the episodes of `parts`, in their order, into a new dataset; returns their number.
+    """Write the episodes of `parts`, in their order, into a new dataset of v3.0; returns their number.
 
     Raises:
-        DatasetError: if the parts differ in contract, settings or features, or have an episode twice, or `out` exists.
+        DatasetError: if the parts differ in contract, settings or features, or have an episode twice, or `out` exists,
+            or only some are from `ibrobot convert`.
     """
     with ExitStack() as stack:
         found = []
         for part in parts:
             stack.enter_context(reading(part, "is being merged"))
-            found.append((part, _opened(part)))
+            found.append((part, layout.existing_dataset(part)))
         if layout.open_dataset(out) is not None or (out.exists() and any(out.iterdir())):
             raise DatasetError(f"{out}: exists already; choose a new folder")
         metadata = _joined(found)
@@ -31,17 +32,32 @@ def join_datasets(parts: Sequence[Path], out: Path) -> int:
         return sum(each.info["total_episodes"] for _, each in found)
 
 
-def _opened(part: Path) -> OnDisk:
-    there = layout.existing_dataset(part)
-    if "episodes" not in there.metadata or "contract" not in there.metadata:
-        raise DatasetError(f"{part}: was not made by ibrobot convert; lerobot-edit-dataset merges other datasets")
-    return there
-
-
 def _joined(found: Sequence[tuple[Path, OnDisk]]) -> dict[str, Any]:
     """The metadata of the whole, after checks that the parts fit."""
     first, one = found[0]
     for part, other in found[1:]:
+        if _is_ours(other) != _is_ours(one):
+            ours, theirs = (part, first) if _is_ours(other) else (first, part)
+            raise DatasetError(f"{theirs}: was not made by ibrobot convert, as {ours} was; they cannot be one dataset")
+        _compare_settings(part, other, first, one)
+    if not _is_ours(one):
+        return {}
+    _check_copies(found)
+    metadata = dict(one.metadata)
+    for name in ("episodes", "runs"):
+        metadata[name] = [each for _, other in found for each in other.metadata.get(name, ())]
+    for name in ("calibrations", "configs"):
+        metadata[name] = {key: each for _, other in found for key, each in other.metadata.get(name, {}).items()}
+    return metadata
+
+
+def _is_ours(dataset: OnDisk) -> bool:
+    """Whether `ibrobot convert` has made a dataset."""
+    return "episodes" in dataset.metadata and "contract" in dataset.metadata
+
+
+def _compare_settings(part: Path, other: OnDisk, first: Path, one: OnDisk) -> None:
+    if _is_ours(one):
         if other.metadata["fingerprint"] != one.metadata["fingerprint"]:
             contract = Contract.from_canonical(other.metadata["contract"])
             difference = contract.difference(one.metadata["contract"], names=(str(part), str(first)))
@@ -51,20 +67,14 @@ def _joined(found: Sequence[tuple[Path, OnDisk]]) -> dict[str, Any]:
                 f"{part}: was made with other settings than {first}: {other.metadata['conversion']}, not "
                 f"{one.metadata['conversion']}"
             )
-        for what, ours, theirs in (
-            ("robot_type", one.metadata.get("robot_type"), other.metadata.get("robot_type")),
-            ("frame rate", one.info["fps"], other.info["fps"]),
-            ("features", one.features, other.features),
-        ):
-            if ours != theirs:
-                raise DatasetError(f"{part}: its {what} is {theirs}; that of {first} is {ours}")
-    _check_copies(found)
-    metadata = dict(one.metadata)
-    for name in ("episodes", "runs"):
-        metadata[name] = [each for _, other in found for each in other.metadata.get(name, ())]
-    for name in ("calibrations", "configs"):
-        metadata[name] = {key: each for _, other in found for key, each in other.metadata.get(name, {}).items()}
-    return metadata
+    robots = [each.info.get("robot_type") or "" for each in (one, other)]
+    for what, ours, theirs in (
+        ("robot_type", *(robots if all(robots) else ("", ""))),
+        ("frame rate", one.info["fps"], other.info["fps"]),
+        ("features", one.features, other.features),
+    ):
+        if ours != theirs:
+            raise DatasetError(f"{part}: its {what} is {theirs}; that of {first} is {ours}")
 
 
 def _check_copies(found: Sequence[tuple[Path, OnDisk]]) -> None:

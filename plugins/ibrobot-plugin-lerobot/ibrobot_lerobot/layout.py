@@ -1,11 +1,11 @@
-"""LeRobot v3.0 on disk: paths, `info.json`, table schemas and metadata."""
+"""LeRobot datasets on disk: paths, `info.json`, table schemas and metadata. v3.0 is written; v2.0 and v2.1 are read."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, override
 
 import attrs
 import numpy as np
@@ -26,6 +26,8 @@ DATA = "data"
 EPISODES = "meta/episodes"
 VIDEOS = "videos"
 FILES_PER_CHUNK = 1000
+TABLE_MB, VIDEO_MB = 100, 200
+"""Default sizes of files [MiB], those of LeRobot."""
 COUNTERS = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -35,7 +37,10 @@ COUNTERS = {
 }
 """Columns that the writer generates."""
 _VERSION = "v3.0"
+_TASKS_LINES, _EPISODES_LINES, _STATS_LINES = "meta/tasks.jsonl", "meta/episodes.jsonl", "meta/episodes_stats.jsonl"
+"""Files of v2.0 and v2.1."""
 _PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+_NUMBERS = (*(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)), "float16", "float32", "float64")
 _DEPTH_UNITS = {"uint16": "mm", "float32": "m"}
 
 
@@ -131,7 +136,7 @@ def table_schema(stored: Mapping[str, Column]) -> pa.Schema:
     return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": described}})})
 
 
-def new_info(stored: Mapping[str, Column], fps: int, robot_type: str, table_mb: int, video_mb: int) -> dict[str, Any]:
+def new_info(stored: Mapping[str, Column], fps: float, robot_type: str, table_mb: int, video_mb: int) -> dict[str, Any]:
     """`info.json` of a dataset without episodes."""
     features = {key: column.info for key, column in stored.items()}
     features |= {key: {"dtype": dtype, "shape": [1], "names": None} for key, dtype in COUNTERS.items()}
@@ -143,6 +148,22 @@ def new_info(stored: Mapping[str, Column], fps: int, robot_type: str, table_mb: 
         "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
         "robot_type": robot_type, "splits": {},
     }  # fmt: skip
+
+
+def current_info(info: Mapping[str, Any]) -> dict[str, Any]:
+    """`info.json` of an older dataset as this version has it, without episodes."""
+    form = new_info({}, info["fps"], info.get("robot_type") or "", TABLE_MB, VIDEO_MB)
+    return form | {"features": info["features"]}
+
+
+def features_of(info: Mapping[str, Any]) -> dict[str, Feature]:
+    """The features of `info.json`, without the writer's own columns."""
+    return {key: _feature(entry) for key, entry in info["features"].items() if key not in COUNTERS}
+
+
+def is_numeric(feature: Feature) -> bool:
+    """Whether a feature has statistics: text and LeRobot's language columns have none."""
+    return feature.dtype in ("bool", "image", *_NUMBERS)
 
 
 def task_table(tasks: list[str]) -> pa.Table:
@@ -208,22 +229,103 @@ class OnDisk:
     @property
     def features(self) -> dict[str, Feature]:
         """The features given to `create`."""
-        return {
-            key: Feature(_dtype(entry), tuple(entry["shape"]), element_names(entry.get("names")))
-            for key, entry in self.info["features"].items()
-            if key not in COUNTERS
-        }
+        return features_of(self.info)
+
+    @property
+    def is_current(self) -> bool:
+        """Whether it has the version that is written, so that it can grow."""
+        return bool(self.info["codebase_version"] == _VERSION)
 
     def episodes(self) -> Iterator[dict[str, Any]]:
-        """The rows of `meta/episodes`, in order."""
+        """The rows of `meta/episodes`, in order.
+
+        Raises:
+            DatasetError: if they cannot be read.
+        """
         for path in self.files(EPISODES, "parquet"):
-            with pq.ParquetFile(path) as file:
-                for batch in file.iter_batches(batch_size=64):
-                    yield from batch.to_pylist()
+            try:
+                with pq.ParquetFile(path) as file:
+                    for batch in file.iter_batches(batch_size=64):
+                        yield from batch.to_pylist()
+            except (OSError, pa.ArrowException) as error:
+                raise DatasetError(f"{path}: cannot be read: {error}") from error
 
     def files(self, folder: str, suffix: str) -> list[Path]:
         """The files of a folder below the root, in order."""
         return sorted((self.root / folder).glob(f"chunk-*/file-*.{suffix}"))
+
+    def tables(self) -> list[Path]:
+        """The files of all rows, in their order."""
+        return self.files(DATA, "parquet")
+
+    def table(self, row: Mapping[str, Any]) -> Path:
+        """The file with the rows of an episode."""
+        return self.root / chunk_file(DATA, file_number(row, "data"), "parquet")
+
+    def video(self, row: Mapping[str, Any], key: str) -> Path:
+        """The file with a camera's pictures of an episode."""
+        folder = f"{VIDEOS}/{key}"
+        return self.root / chunk_file(folder, file_number(row, folder), "mp4")
+
+
+class OlderOnDisk(OnDisk):
+    """An open dataset of v2.0 or v2.1: a table, and a video of each camera, for each episode."""
+
+    @override
+    def episodes(self) -> Iterator[dict[str, Any]]:
+        stats = {
+            row["episode_index"]: row["stats"] for row in _lines(self.root / _STATS_LINES, "episode_index", "stats")
+        }
+        begin = 0
+        for row in sorted(
+            _lines(self.root / _EPISODES_LINES, "episode_index", "tasks", "length"),
+            key=lambda row: row["episode_index"],
+        ):
+            length = row["length"]
+            times = {"from_timestamp": 0.0, "to_timestamp": length / self.info["fps"]}
+            yield {
+                "episode_index": row["episode_index"],
+                "tasks": row["tasks"],
+                "length": length,
+                "dataset_from_index": begin,
+                "dataset_to_index": begin + length,
+                **{f"{VIDEOS}/{key}/{name}": time for key in self.videos for name, time in times.items()},
+                **{
+                    f"stats/{key}/{name}": value
+                    for key, each in stats.get(row["episode_index"], {}).items()
+                    for name, value in each.items()
+                },
+            }
+            begin += length
+
+    @override
+    def tables(self) -> list[Path]:
+        return [self.table(row) for row in self.episodes()]
+
+    @override
+    def table(self, row: Mapping[str, Any]) -> Path:
+        return self._path("data_path", row["episode_index"])
+
+    @override
+    def video(self, row: Mapping[str, Any], key: str) -> Path:
+        return self._path("video_path", row["episode_index"], video_key=key)
+
+    def _path(self, template: str, number: int, **more: str) -> Path:
+        """The file of an episode, below the root, as `info.json` names it."""
+        text = self.info[template]
+        try:
+            path = Path(text.format(episode_chunk=number // self.info["chunks_size"], episode_index=number, **more))
+        except (KeyError, IndexError, ValueError, AttributeError, TypeError) as error:
+            raise DatasetError(
+                f"{self.root / INFO}: {template}: {text!r} is no path of an episode: {error!r}"
+            ) from None
+        if path.is_absolute() or ".." in path.parts:
+            raise DatasetError(f"{self.root / INFO}: {template}: {text!r} leads out of the dataset")
+        return self.root / path
+
+
+_OLDER = {"v2.0": OlderOnDisk, "v2.1": OlderOnDisk}
+"""Version -> how it is read."""
 
 
 def open_dataset(root: Path) -> OnDisk | None:
@@ -237,15 +339,17 @@ def open_dataset(root: Path) -> OnDisk | None:
     try:
         info = json.loads((root / INFO).read_bytes())
         stats = json.loads((root / STATS).read_bytes()) if (root / STATS).exists() else {}
-        tasks = _read_tasks(root / TASKS) if (root / TASKS).exists() else []
+        tasks = _read_tasks(root)
         metadata = json.loads((root / OWN).read_bytes()) if (root / OWN).exists() else {}
         pixels = json.loads((root / PIXELS).read_bytes()) if (root / PIXELS).exists() else {}
         version = info["codebase_version"]
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
         raise DatasetError(f"{root}: is not a LeRobot dataset: {error!r}") from error
-    if version != _VERSION:
-        raise DatasetError(f"{root}: has version {version!r}, must be {_VERSION!r}; LeRobot can convert older versions")
-    return OnDisk(root, info, stats, tasks, metadata, pixels)
+    opened = OnDisk if version == _VERSION else _OLDER.get(version)
+    if opened is None:
+        known = ", ".join((*_OLDER, _VERSION))
+        raise DatasetError(f"{root / INFO}: codebase_version: {version!r} cannot be read; versions that can: {known}")
+    return opened(root, info, stats, tasks, metadata, pixels)
 
 
 def existing_dataset(root: Path) -> OnDisk:
@@ -260,17 +364,55 @@ def existing_dataset(root: Path) -> OnDisk:
     return dataset
 
 
-def _read_tasks(path: Path) -> list[str]:
-    """The tasks, ordered by number."""
-    with pq.ParquetFile(path) as file:
-        rows = file.read(["task_index", "task"]).to_pylist()
-    return [row["task"] for row in sorted(rows, key=lambda row: row["task_index"])]
+def _read_tasks(root: Path) -> list[str]:
+    """The tasks, ordered by number; a number that no task has is an empty one.
+
+    LeRobot 0.4 leaves the index of its table without a name, which pyarrow then calls `__index_level_0__`.
+    """
+    if (root / TASKS).exists():
+        with pq.ParquetFile(root / TASKS) as file:
+            rows = file.read().to_pylist()
+    else:
+        rows = list(_lines(root / _TASKS_LINES, "task_index", "task"))
+    named = {row["task_index"]: _task(row) for row in rows}
+    return [named.get(number, "") for number in range(max(named, default=-1) + 1)]
+
+
+def _task(row: Mapping[str, Any]) -> str:
+    texts = [value for value in row.values() if isinstance(value, str)]
+    return str(row["task"]) if "task" in row or len(texts) != 1 else texts[0]
+
+
+def _lines(path: Path, *keys: str) -> Iterator[dict[str, Any]]:
+    """The objects of a file of JSON lines, with certain keys; none if there is no such file.
+
+    Raises:
+        DatasetError: if it cannot be read.
+    """
+    if not path.exists():
+        return
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        try:
+            row = json.loads(line)
+        except ValueError as error:
+            raise DatasetError(f"{path}:{number}: is no JSON: {error}") from None
+        if not isinstance(row, dict) or not row.keys() >= {*keys}:
+            raise DatasetError(f"{path}:{number}: {line[:40]!r} is no object with {', '.join(keys)}")
+        yield row
 
 
 def write_json(path: Path, document: Any) -> None:
     """Write a JSON file, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(document, indent=4, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _feature(entry: Mapping[str, Any]) -> Feature:
+    """A feature from its entry in `info.json`; older datasets have pictures with their channels first."""
+    dtype, shape, names = _dtype(entry), tuple(entry["shape"]), element_names(entry.get("names"))
+    if dtype == "image" and len(shape) == 3 and names[:1] in (("channel",), ("channels",)):
+        shape, names = (*shape[1:], shape[0]), (*names[1:], names[0])
+    return Feature(dtype, shape, names)
 
 
 def _dtype(entry: Mapping[str, Any]) -> str:

@@ -19,7 +19,8 @@ from ibrobot_lerobot import layout
 from ibrobot_lerobot.arrow import table_of, to_array, to_numpy
 from ibrobot_lerobot.episode import counter_stats, stats_columns, write_meta
 from ibrobot_lerobot.layout import OnDisk
-from ibrobot_lerobot.stats import PictureStats, Stats, picture_stats, vector_stats
+from ibrobot_lerobot.rows import EpisodeRows
+from ibrobot_lerobot.stats import QUANTILES, PictureStats, Stats, picture_stats, vector_stats
 from ibrobot_lerobot.video import join_videos
 
 _MERGING = ".merging"
@@ -31,6 +32,8 @@ _WAIT_S = 10.0
 """How long to wait for another process that merges [s]."""
 _EPISODES_AT_ONCE = 64
 _MIB = 1 << 20
+_STATISTICS = {"min", "max", "mean", "std", "count", *QUANTILES}
+"""What an episode's statistics have, for every feature."""
 
 
 def complete(root: Path) -> None:
@@ -144,6 +147,8 @@ class _Merge:
         self._episode = old.info["total_episodes"] if old else 0
         self._frame = old.info["total_frames"] if old else 0
         self._table: pq.ParquetWriter | None = None
+        self._schema: pa.Schema | None = None
+        """That of all tables, which is that of the first one."""
         self._data = _Place(_next(old, layout.DATA, "parquet"))
         self._videos: dict[str, _Place] = {}
         self._joining: dict[str, list[tuple[Path, int]]] = {}
@@ -154,12 +159,13 @@ class _Merge:
 
     def run(self, parts: Iterable[Path], metadata: Mapping[str, Any]) -> None:
         if self._old is not None:
-            self._count_pictures(self._old)
+            self._count_known(self._old)
+            for row in self._old.episodes() if self._uncounted(self._old) else ():
+                self._count_episode(self._old, row)
         try:
             for path in parts:
                 part = layout.existing_dataset(path)
                 self._check(part)
-                self._count_pictures(part)
                 self._append(part)
                 if len(self._rows) >= _EPISODES_AT_ONCE:
                     self._flush_rows()
@@ -176,34 +182,35 @@ class _Merge:
     def _check(self, part: OnDisk) -> None:
         """Check that a part is compatible; an empty dataset adopts the first part's description."""
         if not self._info:
-            self._info = part.info
-        for name in ("fps", "features"):
-            if part.info[name] != self._info[name]:
-                raise DatasetError(
-                    f"{part.root} does not fit: its {name} are {_difference(part.info[name], self._info[name])}"
-                )
+            self._info = part.info if part.is_current else layout.current_info(part.info)
+        for name, found, wanted in (
+            ("fps", part.info["fps"], self._info["fps"]),
+            ("features", _stored(part.info), _stored(self._info)),
+        ):
+            if found != wanted:
+                raise DatasetError(f"{part.root} does not fit: its {name} are {_difference(found, wanted)}")
 
     def _append(self, part: OnDisk) -> None:
+        self._count_known(part)
         tasks = np.array([self._tasks.setdefault(task, len(self._tasks)) for task in part.tasks], dtype=np.int64)
-        data = [self._append_table(path, tasks) for path in part.files(layout.DATA, "parquet")]
+        data = {path: self._append_table(path, tasks) for path in part.tables()}
         rows = list(part.episodes())
         videos = {key: self._append_videos(part, key, rows) for key in part.videos}
         for row in rows:
             n = row["length"]
-            place = data[layout.file_number(row, "data")]
-            stats = _row_stats(row)
+            stats = self._count_episode(part, row)
             task_numbers = tasks[[part.tasks.index(task) for task in row["tasks"]]]
             stats |= counter_stats(n, self._info["fps"], self._frame, self._episode, np.resize(task_numbers, n))
             moved: dict[str, Any] = {
                 "episode_index": self._episode,
                 "tasks": row["tasks"],
                 "length": n,
-                **_indices("data", place),
+                **_indices("data", data[part.table(row)]),
                 "dataset_from_index": self._frame,
                 "dataset_to_index": self._frame + n,
             }
             for key, places in videos.items():
-                file, begin_s = places[layout.file_number(row, f"videos/{key}")]
+                file, begin_s = places[part.video(row, key)]
                 moved |= _indices(f"videos/{key}", file)
                 for name in ("from_timestamp", "to_timestamp"):
                     moved[f"videos/{key}/{name}"] = row[f"videos/{key}/{name}"] + begin_s
@@ -211,26 +218,51 @@ class _Merge:
             self._episode += 1
             self._frame += n
 
-    def _count_pictures(self, part: OnDisk) -> None:
+    def _count_known(self, part: OnDisk) -> None:
+        """Add the statistics of a dataset's pictures, as far as it keeps their state."""
         for key, feature in part.features.items():
-            if len(feature.shape) != 3:
-                continue
-            if key not in part.pixels:
-                raise DatasetError(
-                    f"{part.root}: lacks the state of the statistics of {key} ({layout.PIXELS}), so they "
-                    "cannot be extended; convert its episodes again"
-                )
-            self._pictures.setdefault(key, picture_stats(feature)).join(part.pixels[key])
+            if key in part.pixels and len(feature.shape) == 3:
+                self._pictures.setdefault(key, picture_stats(feature)).join(part.pixels[key])
+
+    def _uncounted(self, part: OnDisk) -> list[str]:
+        """The cameras whose statistics need their pictures: other programs keep no state that can be extended."""
+        return [key for key, feature in part.features.items() if len(feature.shape) == 3 and key not in part.pixels]
+
+    def _count_episode(self, part: OnDisk, row: Mapping[str, Any]) -> dict[str, Stats]:
+        """The statistics of an episode; those that it lacks are computed from its rows and pictures."""
+        stats = _row_stats(row)
+        cameras = {key: picture_stats(part.features[key]) for key in self._uncounted(part)}
+        vectors: dict[str, list[Any]] = {
+            key: [] for key, feature in part.features.items()
+            if layout.is_numeric(feature) and len(feature.shape) != 3 and not stats.get(key, {}).keys() >= _STATISTICS
+        }  # fmt: skip
+        for values in (
+            EpisodeRows(part, row["episode_index"], row).read([*cameras, *vectors]) if cameras or vectors else ()
+        ):
+            for key, counted in cameras.items():
+                counted.add(values[key])
+            for key, rows in vectors.items():
+                rows.append(values[key])
+        for key, counted in cameras.items():
+            stats[key] = counted.stats()
+            self._pictures.setdefault(key, picture_stats(part.features[key])).join(counted.state())
+        stats |= {key: vector_stats(np.array(rows)) for key, rows in vectors.items()}
+        return {
+            key: {name: stats[key][name] for name in stats[key] if name in _STATISTICS}
+            for key in part.features
+            if key in stats
+        }
 
     def _stats(self) -> dict[str, Stats]:
         """Statistics of all rows, old and new, with one column at a time in memory."""
         old = self._old.files(layout.DATA, "parquet") if self._old else []
         files = [*old, *sorted((self._target / layout.DATA).glob("chunk-*/file-*.parquet"))]
         stats = {}
+        features = layout.features_of(self._info)
         for key in self._info["features"]:
             if key in self._pictures:
                 stats[key] = self._pictures[key].stats()
-            else:
+            elif key in layout.COUNTERS or layout.is_numeric(features[key]):
                 stats[key] = vector_stats(np.concatenate([_column(path, key) for path in files]))
         return stats
 
@@ -245,33 +277,39 @@ class _Merge:
             if self._table is None:
                 target = self._target / layout.chunk_file(layout.DATA, self._data.number, "parquet")
                 target.parent.mkdir(parents=True, exist_ok=True)
-                self._table = pq.ParquetWriter(target, file.schema_arrow, compression="snappy")
+                self._schema = self._schema or file.schema_arrow
+                self._table = pq.ParquetWriter(target, self._schema, compression="snappy")
             for group in range(file.num_row_groups):
                 table = file.read_row_group(group)
                 for name, offset in (("index", self._frame), ("episode_index", self._episode)):
                     table = _replaced(table, name, _numbers(table, name) + offset)
                 table = _replaced(table, "task_index", tasks[_numbers(table, "task_index")])
-                self._table.write_table(table)
+                try:
+                    self._table.write_table(table.select(self._schema.names).cast(self._schema))
+                except (KeyError, pa.ArrowException) as error:
+                    raise DatasetError(
+                        f"{path}: its columns do not fit those of the dataset before: {error}"
+                    ) from error
         self._data.bytes += size
         return self._data.number
 
-    def _append_videos(self, part: OnDisk, key: str, rows: list[dict[str, Any]]) -> list[tuple[int, float]]:
+    def _append_videos(self, part: OnDisk, key: str, rows: list[dict[str, Any]]) -> dict[Path, tuple[int, float]]:
         """Schedule a part's videos of a camera for joining; returns file number and start time [s] of each."""
         limit = self._info["video_files_size_in_mb"] * _MIB
-        frames: dict[int, int] = {}
+        frames: dict[Path, int] = {}
         for row in rows:
-            number = layout.file_number(row, f"videos/{key}")
-            frames[number] = frames.get(number, 0) + row["length"]
-        placed = []
+            path = part.video(row, key)
+            frames[path] = frames.get(path, 0) + row["length"]
+        placed = {}
         place = self._videos.setdefault(key, _Place(_next(self._old, f"{layout.VIDEOS}/{key}", "mp4")))
-        for number, path in enumerate(part.files(f"{layout.VIDEOS}/{key}", "mp4")):
+        for path, count in sorted(frames.items()):
             size = path.stat().st_size
             if place.frames and place.bytes + size > limit:
                 self._join(key)
                 place = self._videos[key] = _Place(place.number + 1)
-            placed.append((place.number, place.frames / self._info["fps"]))
-            self._joining.setdefault(key, []).append((path, frames[number]))
-            place.bytes, place.frames = place.bytes + size, place.frames + frames[number]
+            placed[path] = (place.number, place.frames / self._info["fps"])
+            self._joining.setdefault(key, []).append((path, count))
+            place.bytes, place.frames = place.bytes + size, place.frames + count
         return placed
 
     def _join(self, key: str) -> None:
@@ -331,6 +369,20 @@ def _row_stats(row: Mapping[str, Any]) -> dict[str, Stats]:
             key, _, name = column.removeprefix("stats/").rpartition("/")
             stats.setdefault(key, {})[name] = np.array(value)
     return stats
+
+
+def _stored(info: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """How the features are stored: key -> what must be equal in all parts."""
+    features = layout.features_of(info)
+    return {
+        key: {
+            "dtype": entry["dtype"],
+            "shape": features[key].shape if key in features else entry["shape"],
+            "names": features[key].names if key in features else entry.get("names"),
+            "video.codec": (entry.get("info") or {}).get("video.codec"),
+        }
+        for key, entry in info["features"].items()
+    }
 
 
 def _difference(found: Any, wanted: Any) -> str:

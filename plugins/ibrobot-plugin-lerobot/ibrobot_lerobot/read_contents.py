@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from ibrobot_core.api import DatasetError
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.contents import Contents, EpisodeContents, FeatureContents
 
 _UNITS = {"radians": "rad", "degrees": "°", "range_m100_100": "% of the range, -100 to 100"}
+_TEXTS = 5
 _SHOWN = ("min", "max", "mean", "std", "q01", "q99")
 
 
@@ -31,31 +35,69 @@ def dataset_contents(root: Path) -> Contents:
             episodes=info["total_episodes"], frames=info["total_frames"],
             seconds=info["total_frames"] / info["fps"], tasks=tuple(dataset.tasks), norm_mode=norm_mode,
             bytes=sum(file.stat().st_size for file in root.rglob("*") if file.is_file()),
-            fingerprint=str(own.get("fingerprint", "")),
+            fingerprint=str(own.get("fingerprint", "")), version=str(info["codebase_version"]), notes=_notes(dataset),
             features=tuple(
-                _feature(key, entry, norm_mode, dataset.stats.get(key) or {})
+                _feature(dataset, key, entry, norm_mode)
                 for key, entry in info["features"].items() if key not in layout.COUNTERS
             ),
             list=_episodes(dataset, own),
         )  # fmt: skip
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+    except (KeyError, TypeError, ValueError, ZeroDivisionError, OSError, pa.ArrowException) as error:
         raise DatasetError(f"{root}: is not a LeRobot dataset: {error!r}") from error
 
 
-def _feature(key: str, entry: Mapping[str, Any], norm_mode: str, stats: Mapping[str, Any]) -> FeatureContents:
-    """A feature with its unit, and statistics of each value or colour."""
+def _feature(dataset: layout.OnDisk, key: str, entry: Mapping[str, Any], norm_mode: str) -> FeatureContents:
+    """A feature with its unit, and statistics of each value or colour, or its first texts."""
     picture = entry["dtype"] in ("video", "image")
-    names = entry.get("names") or []
+    feature, stats = dataset.features[key], dataset.stats.get(key) or {}
     values = {name: np.ravel(stats[name]).astype(float) for name in _SHOWN if name in stats}
     return FeatureContents(
         key=key,
         dtype=entry["dtype"],
-        shape=tuple(entry["shape"]),
-        names=() if picture else tuple(str(name) for name in names),
-        unit=_unit(entry, norm_mode, names),
+        shape=feature.shape,
+        names=() if picture else feature.names,
+        unit=_unit(entry, norm_mode, feature.names),
         stats={name: tuple(float(x) if np.isfinite(x) else None for x in each) for name, each in values.items()},
         picture=picture,
+        texts=() if picture or layout.is_numeric(feature) else _texts(dataset, key),
     )
+
+
+def _texts(dataset: layout.OnDisk, key: str) -> tuple[str, ...]:
+    """The first different texts of a feature that has no numbers."""
+    found: dict[str, None] = {}
+    for path in dataset.tables():
+        with pq.ParquetFile(path) as file:
+            for batch in file.iter_batches(1000, columns=[key]) if key in file.schema_arrow.names else ():
+                for value in batch.column(0).to_pylist():
+                    found.setdefault(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))
+                    if len(found) > _TEXTS:
+                        return (*list(found)[:_TEXTS], "…")
+    return tuple(found)
+
+
+def _notes(dataset: layout.OnDisk) -> tuple[str, ...]:
+    """What of a dataset is not as it should be, but can be read."""
+    rows = list(dataset.episodes())
+    counted = {"total_episodes": len(rows), "total_frames": sum(row["length"] for row in rows)}
+    notes = [
+        f"{layout.INFO} says {name}: {dataset.info[name]}, its episodes have {count}"
+        for name, count in counted.items()
+        if dataset.info[name] != count
+    ]
+    tables = [path for path in dataset.tables() if path.exists()]
+    stored = sum(pq.ParquetFile(path).metadata.num_rows for path in tables)
+    if stored != counted["total_frames"]:
+        notes.append(f"the tables have {stored} rows, the episodes {counted['total_frames']}")
+    for key in dataset.videos:
+        wanted = {dataset.video(row, key) for row in rows}
+        if missing := [path for path in sorted(wanted) if not path.exists()]:
+            notes.append(f"{key}: {len(missing)} of {len(wanted)} videos are missing, e.g. {missing[0]}")
+    if not dataset.is_current:
+        notes.append(
+            "an older version, which is read only; `ibrobot datasets merge DATASET --out NEW` copies it to v3.0"
+        )
+    return tuple(notes)
 
 
 def _unit(entry: Mapping[str, Any], norm_mode: str, names: Any) -> str:

@@ -40,7 +40,7 @@ _POSITION = ".pos"
 
 
 class LeRobotReader(EpisodeReader):
-    """Reads an episode of a LeRobot v3.0 dataset: one message of each topic of the contract at every tick.
+    """Reads an episode of a LeRobot dataset: one message of each topic of the contract at every tick.
 
     Datasets of `ibrobot convert` contain the contract, unit, robot and prompt of each episode; for others the caller
     provides them. Stamps begin at the time of the recording or, if it is unknown, at the dataset's first frame.

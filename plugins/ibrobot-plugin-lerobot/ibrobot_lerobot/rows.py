@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Generator, Iterator
+from collections.abc import Collection, Generator, Iterator, Mapping
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import av
@@ -16,7 +15,6 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from ibrobot_core.api import DatasetError, Feature
-from ibrobot_lerobot import layout
 from ibrobot_lerobot.layout import OnDisk
 from ibrobot_lerobot.pictures import decode_picture
 
@@ -29,14 +27,15 @@ class EpisodeRows:
     Args:
         dataset: the dataset.
         number: the episode, from 0.
+        row: what `dataset.episodes()` says of it, if that is known.
 
     Raises:
         DatasetError: if there is no such episode.
     """
 
-    def __init__(self, dataset: OnDisk, number: int) -> None:
+    def __init__(self, dataset: OnDisk, number: int, row: Mapping[str, Any] | None = None) -> None:
         total = dataset.info["total_episodes"]
-        row = next((row for row in dataset.episodes() if row["episode_index"] == number), None)
+        row = row or next((row for row in dataset.episodes() if row["episode_index"] == number), None)
         if row is None:
             available = f"0 to {total - 1}" if total else "none"
             raise DatasetError(f"{dataset.root}: has no episode {number}; available: {available}")
@@ -68,11 +67,8 @@ class EpisodeRows:
         if rows != self.length:
             raise DatasetError(f"{self._dataset.root}: episode {self._number} has {rows} rows, must have {self.length}")
 
-    def _file(self, what: str, folder: str, suffix: str) -> Path:
-        return self._dataset.root / layout.chunk_file(folder, layout.file_number(self._row, what), suffix)
-
     def _table(self, features: dict[str, Feature]) -> Iterator[dict[str, NDArray[Any]]]:
-        path = self._file("data", layout.DATA, "parquet")
+        path = self._dataset.table(self._row)
         try:
             with pq.ParquetFile(path) as file:
                 for group in range(file.num_row_groups):
@@ -88,7 +84,12 @@ class EpisodeRows:
 
     def _pictures(self, key: str, first: int) -> Generator[NDArray[Any]]:
         """The episode's part of a camera's video, from row `first` on."""
-        path = self._file(f"videos/{key}", f"{layout.VIDEOS}/{key}", "mp4")
+        path = self._dataset.video(self._row, key)
+        if not path.exists():
+            raise DatasetError(
+                f"{path}: is missing; download the videos of the dataset too, or use a robot YAML whose contract has "
+                f"no {key}"
+            )
         fps = self._dataset.info["fps"]
         begin = round(self._row[f"videos/{key}/from_timestamp"] * fps)
         wanted = begin + first

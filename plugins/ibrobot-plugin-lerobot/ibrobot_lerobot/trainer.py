@@ -16,6 +16,7 @@ from pathlib import Path
 
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import echo, owned
+from ibrobot_lerobot.layout import existing_dataset
 from ibrobot_lerobot.pretrained import check_policy
 from ibrobot_lerobot.training import AUTO, SMALL, TrainOptions, find_trainer
 from ibrobot_lerobot.training_checkpoints import TrainingCheckpoint, begun_in_vain, check_same, newest_checkpoint
@@ -58,8 +59,11 @@ def run_training(options: TrainOptions, follow: Follow | None) -> tuple[int, Tra
     from ibrobot_lerobot.merge import reading
 
     dataset, out, policy, steps = options.dataset, options.out, options.policy, options.steps
-    if not (dataset / "meta" / "info.json").is_file():
-        raise DatasetError(f"{dataset}: is not a LeRobot dataset: it has no meta/info.json")
+    if not existing_dataset(dataset).is_current:
+        raise DatasetError(
+            f"{dataset}: LeRobot does not train on so old a version of its format; `ibrobot datasets merge {dataset} "
+            f"--out {dataset}-v3` copies it to v3.0"
+        )
     program = find_trainer()
     given = (*arguments(options), *options.lerobot_options)
     chosen = list({each.partition("=")[0]: each for each in given}.values())  # of two for one option, the last counts

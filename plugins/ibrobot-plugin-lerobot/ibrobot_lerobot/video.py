@@ -229,7 +229,7 @@ class VideoTrack:
             pass
 
 
-def join_videos(parts: Sequence[tuple[Path, int]], path: Path, fps: int) -> None:
+def join_videos(parts: Sequence[tuple[Path, int]], path: Path, fps: float) -> None:
     """Join videos without re-encoding.
 
     Args:
@@ -238,19 +238,25 @@ def join_videos(parts: Sequence[tuple[Path, int]], path: Path, fps: int) -> None
         fps: images per second.
 
     Raises:
-        DatasetError: if a part cannot be read or has an unexpected number of images, or the disk is full.
+        DatasetError: if a part cannot be read, has an unexpected number of images or another codec than the others, or
+            the disk is full.
     """
     begin = 0
     stream: Any = None
+    first: tuple[Any, ...] = ()
     try:
         with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as joined:
             for part, frames in parts:
                 with av.open(str(part)) as container:
                     source: Any = container.streams.video[0]
+                    coded = source.codec.canonical_name, source.width, source.height, source.pix_fmt
+                    first = first or coded
+                    if coded != first:
+                        raise DatasetError(f"{part}: is {_words(coded)}, the videos before it are {_words(first)}")
                     if stream is None:
                         stream = joined.add_stream_from_template(source, opaque=True)
                         stream.time_base = source.time_base
-                    offset = round(begin / (fps * source.time_base))
+                    offset = round(begin / (fps * float(source.time_base)))
                     count = 0
                     for packet in container.demux(source):
                         if packet.dts is None:
@@ -264,6 +270,11 @@ def join_videos(parts: Sequence[tuple[Path, int]], path: Path, fps: int) -> None
                 begin += frames
     except (av.error.FFmpegError, OSError) as error:
         raise DatasetError(f"{path}: cannot be joined: {error}") from error
+
+
+def _words(coded: tuple[Any, ...]) -> str:
+    codec, width, height, pixels = coded
+    return f"{codec} of {width}x{height} {pixels}"
 
 
 def describe_video(path: Path, fps: int, encoder: Encoder) -> dict[str, Any]:

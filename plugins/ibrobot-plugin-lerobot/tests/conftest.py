@@ -28,12 +28,14 @@ def picture(number: int, shape: tuple[int, ...] = (64, 96, 3)) -> NDArray[np.uin
     return blocks.repeat(32, 0).repeat(32, 1)
 
 
-def write(root: Path, features: dict[str, Feature], lengths: tuple[int, ...], **options: Any) -> Path:
-    """A dataset whose frame i has `values(features, i)`, counted through all episodes."""
+def write(
+    root: Path, features: dict[str, Feature], lengths: tuple[int, ...], begin: int = 0, task: int = 0, **options: Any
+) -> Path:
+    """A dataset whose frame i has `values(features, begin + i)`, counted through all episodes."""
     writer = LeRobotDatasetWriter(LeRobotOptions(**options))
     writer.create(root, FPS, features, {"robot_type": "tester"})
-    number = 0
-    for episode, length in enumerate(lengths):
+    number = begin
+    for episode, length in enumerate(lengths, task):
         for _ in range(length):
             writer.add_frame(values(features, number), f"task {episode % 2}")
             number += 1
