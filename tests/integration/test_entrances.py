@@ -320,3 +320,22 @@ def test_cell(name: str, column: str, cell: str, tmp_path: Path, monkeypatch: py
         CHECKS[column](entrance, cell)
     finally:
         entrance.close()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("make", [entrances.GripperCommand, entrances.ParallelGripperCommand])
+def test_effort_that_is_not_finite_is_refused_by_name(
+    make: type[entrances.GripperCommand], value: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An effort of NaN would never be reached. A gripper's result has no text, so that the log has the name."""
+    entrance = make()
+    try:
+        run = entrance.launch()
+        entrance.prepare()
+        assert not entrance.give(entrance.command(entrance.far, value))
+        begun = len(run.commands)
+        run.ticks(40)
+        assert run.moved(begun) < _STILL_RAD
+        assert f"INVALID_GOAL: max_effort must be a finite number, got {value!r}" in caplog.text
+    finally:
+        entrance.close()

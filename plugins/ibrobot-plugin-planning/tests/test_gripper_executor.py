@@ -227,6 +227,10 @@ def test_deactivation_ends_the_goal() -> None:
         ({"position": True}, "position must be a finite number, got True"),
         ({"position": float("nan")}, "position must be a finite number, got nan"),
         ({"position": 2.0}, "position 2 rad is outside the limits of jaw, -0.2 to 1.7"),
+        *(
+            ({"position": 1.0, "max_effort": value}, f"max_effort must be a finite number, got {value!r}")
+            for value in (float("nan"), float("inf"), -float("inf"))
+        ),
         ({"position": 1.0, "max_effort": -1}, "max_effort is -1 Nm; it must be from 0, for no limit, to 1000"),
         ({"position": 1.0, "max_effort": 1e308}, "max_effort is 1e+308 Nm; it must be from 0, for no limit, to 1000"),
         ({"position": 1.0, "max_effort": 1}, "max_effort cannot be kept: jaw has no measured effort; leave it out"),

@@ -9,13 +9,15 @@ from typing import Any, override
 
 import numpy as np
 import pytest
+from ibrobot_planning.execution.requests import Numbered
+from ibrobot_planning.execution.source import RESULT as MOTION_RESULT
 from ibrobot_planning.tasks.reading import read_task
 from ibrobot_planning.tasks.result import TaskResult
 from ibrobot_planning.tasks.runner import CANCEL, CHECK, RESULT, RUN, STATUS, TaskRunner
 from ibrobot_planning.world.objects import SNAPSHOT
 from ibrobot_testing import SectionSuite
 
-from ibrobot_core.api import PlanningError, String
+from ibrobot_core.api import IbrobotError, PlanningError, String
 from ibrobot_core.app import ConfigError, RequestError, Runtime
 
 from .conftest import Make
@@ -320,6 +322,85 @@ def test_fault_fails_the_step(run):
     runtime.session.control.call("fault", fault="the cable is loose")
     result = finish(runtime, number)
     assert result.message == "step 1 (wait): the robot stopped: the cable is loose"
+
+
+def stop_and_reset(runtime: Runtime) -> None:
+    """An emergency stop and a reset at once, as soon as the robot may be reset, unseen by polls of the task."""
+    runner = next(each for each in runtime.plan.components if isinstance(each, TaskRunner))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "work", lambda timeout_s: None)
+        runtime.session.emergency_stop()
+        for _ in range(300):
+            runtime.step()
+            try:
+                runtime.reset()
+            except IbrobotError:
+                continue
+            return
+    raise AssertionError("no reset")
+
+
+STILL = 0.03
+"""A reset lets the command go to where the arm is measured [rad]."""
+FIRST = {
+    "left": "move: {pose: left}",
+    "wait": "wait: {seconds: 0.2}",
+    "grip": "gripper: {position: 1.0}",
+    "policy": "run_policy: {mode: policy, seconds: 0.2}",
+    "alternatives": "alternatives: [[{move: {pose: left}}], [{move: {pose: right}}]]",
+}
+
+
+@pytest.mark.parametrize("polls", [0, 1, 5])
+@pytest.mark.parametrize("first", FIRST)
+def test_stop_and_reset_between_two_polls_end_the_task(run, first: str, polls: int):
+    runtime = run()
+    number = runtime.session.bus.call(RUN, steps(FIRST[first], "move: {pose: right}"))
+    for _ in range(polls):
+        runtime.step()
+    stop_and_reset(runtime)
+    before = runtime.session.state.command
+    result = finish(runtime, number)
+    assert result.outcome == "FAILED"
+    assert result.message.endswith("the robot stopped: an emergency stop"), result.message
+    for _ in range(100):
+        runtime.step()
+    np.testing.assert_allclose(runtime.session.state.command, before, atol=STILL)
+
+
+def test_stop_and_reset_before_the_next_step_begins(run):
+    """The motion had ended before the stop: its result is a success, and the next step must not follow."""
+    runtime = run()
+    bus = runtime.session.bus
+    number = bus.call(RUN, steps("move: {pose: left}", "move: {pose: right}"))
+    runtime.step()
+    while bus.call(MOTION_RESULT, Numbered(1)) is None:
+        runtime.step()
+    stop_and_reset(runtime)
+    before = runtime.session.state.command
+    result = finish(runtime, number)
+    assert [each.outcome for each in result.steps] == ["SUCCEEDED", "FAILED"]
+    assert result.message == "step 2 (move): the robot stopped: an emergency stop"
+    for _ in range(100):
+        runtime.step()
+    np.testing.assert_allclose(runtime.session.state.command, before, atol=STILL)
+
+
+def test_stop_and_reset_while_a_task_is_checked(run, monkeypatch: pytest.MonkeyPatch):
+    runtime = run()
+    runner = next(each for each in runtime.plan.components if isinstance(each, TaskRunner))
+    check = runner._checked
+
+    def slow(file: Any) -> Any:
+        checked = check(file)
+        stop_and_reset(runtime)
+        return checked
+
+    monkeypatch.setattr(runner, "_checked", slow)
+    number = runtime.session.bus.call(RUN, steps("move: {pose: left}"))
+    before = runtime.session.state.command
+    assert finish(runtime, number).message == "step 1 (move): the robot stopped: an emergency stop"
+    np.testing.assert_allclose(runtime.session.state.command, before, atol=STILL)
 
 
 def test_requests_read_nothing_of_the_environment(run, monkeypatch: pytest.MonkeyPatch):

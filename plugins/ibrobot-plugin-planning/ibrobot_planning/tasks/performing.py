@@ -70,6 +70,7 @@ class Performance:
         session: the run.
         checked: the task.
         number: its number.
+        stops: number of emergency stops when it was requested; it fails after a newer one.
         begins: called with this and each step before it begins.
 
     Attributes:
@@ -79,8 +80,9 @@ class Performance:
     """
 
     def __init__(
-        self, session: RunView, checked: CheckedTask, number: int, begins: Callable[[Performance, Step], None]
-    ) -> None:
+        self, session: RunView, checked: CheckedTask, number: int, stops: int,
+        begins: Callable[[Performance, Step], None],
+    ) -> None:  # fmt: skip
         self._session = session
         self.checked, self.number = checked, number
         self._begins = begins
@@ -91,7 +93,7 @@ class Performance:
         """The episode to record with the next policy."""
         self._recording = False
         """Whether an episode of the task is being recorded."""
-        self._stops = session.stops
+        self._stops = stops
         self._held: str | None = None
         """What the gripper holds."""
         self._arm = self._perform()
@@ -116,8 +118,7 @@ class Performance:
             outcome: StepOutcome = "SUCCEEDED"
             message, code, facts = "", "", {}
             try:
-                if self.cancelled:
-                    raise Cancelled
+                self._check()
                 while observed_world(session.bus).is_awaited:
                     yield from self._tick()
                 facts = dict((yield from self._act(step)))
@@ -139,6 +140,7 @@ class Performance:
         return StepResult(number + 1, step.kind, step.name, outcome, message)
 
     def _act(self, step: Step) -> Steps:
+        self._check()
         kinds: dict[str, Callable[[Any], Steps]] = {
             "move": self._move,
             "gripper": self._grip,
@@ -152,6 +154,15 @@ class Performance:
 
     def _tick(self) -> Generator[None, None, None]:
         yield
+        self._check()
+
+    def _check(self) -> None:
+        """Check that the task may go on.
+
+        Raises:
+            Cancelled: if it was cancelled.
+            StepFailed: if the robot has stopped, also if it was reset since.
+        """
         if self.cancelled:
             raise Cancelled
         if self._session.faults:
@@ -180,7 +191,7 @@ class Performance:
                     yield from self._act(each)
             except (StepFailed, IbrobotError) as error:
                 self._episode = None
-                if self._session.faults or self._held != held:
+                if self._session.faults or self._session.stops != self._stops or self._held != held:
                     raise
                 failures.append(error)
                 self._session.log.info("alternative %d of %d: %s", number, len(alternatives), error)

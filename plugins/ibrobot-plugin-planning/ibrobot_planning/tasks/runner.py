@@ -83,11 +83,12 @@ class TaskRunner(SessionWorker):
             ConfigError: with all faults of the task.
             PlanningError: while another task runs.
         """
+        stops = self.session.stops  # also one during the check ends the task
         checked = self._checked(file)
         with self._lock:
             if self._running is not None:
                 raise PlanningError(f"task {self._running.number} is running; {CANCEL.name} ends it")
-            self._running = running = Performance(self.session, checked, self._results.number(), self._show)
+            self._running = running = Performance(self.session, checked, self._results.number(), stops, self._show)
         self._wake.put(None)
         return running.number
 
