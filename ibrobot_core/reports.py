@@ -50,8 +50,8 @@ class Case:
 
     title: str
     text: str
-    episode: Path
-    """Its recording."""
+    episode: Path | None
+    """Its recording; None if there is none."""
     video: Path | None = None
     command: str = ""
     """The command that repeats it."""

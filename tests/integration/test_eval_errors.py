@@ -77,10 +77,11 @@ class Here(Pool):
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(Registry, "pool", lambda *_: Here())
-    log = logging.getLogger("ibrobot")
-    level = log.level
+    log, requests = logging.getLogger("ibrobot"), logging.getLogger("ibrobot.inference")
+    level, filters = log.level, [*requests.filters]
     yield
-    log.setLevel(level)  # an episode makes it quiet, for its process
+    log.setLevel(level)  # an episode makes both quiet, for its process
+    requests.filters[:] = filters
 
 
 @pytest.fixture

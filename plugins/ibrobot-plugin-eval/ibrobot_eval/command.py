@@ -195,10 +195,14 @@ def _lines(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
         counts: dict[str, list[int]] = {}
 
         def move(done: int, total: int, policy: Policy, result: Result) -> None:
-            count = counts.setdefault(policy.label, [0, 0])
+            count = counts.setdefault(policy.label, [0, 0, 0])
             count[0] += result.success
             count[1] += 1
-            successes = ", ".join(f"{label} {won} of {ran}" for label, (won, ran) in counts.items())
+            count[2] += result.is_error
+            successes = ", ".join(
+                f"{label} {won} of {ran}{f' ({errors} errors)' if errors else ''}"
+                for label, (won, ran, errors) in counts.items()
+            )
             bar.update(
                 task, description=f"{done} of {total} episodes", completed=done, total=total, successes=successes
             )

@@ -10,9 +10,11 @@ from pathlib import Path
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import Case, Cases, Plots, ReportSection, Table, Text
 from ibrobot_eval import plots
+from ibrobot_eval.episodes import Result
 from ibrobot_eval.options import REPORT
 from ibrobot_eval.report import (
     COMPARISON_HEAD,
+    COUNTED,
     NOTE,
     SUMMARY_HEAD,
     Episode,
@@ -57,22 +59,30 @@ def read_contents(out: Path) -> Sequence[ReportSection]:
 def contents_of(out: Path, report: Report) -> list[ReportSection]:
     """Contents of a report, with the videos in the folder of the evaluation."""
     rates = [(each.label, each.successes, each.episodes) for each in report.summaries]
-    verdicts = (Text(f"{each.words}.", "verdict") for each in report.comparisons)
+    verdicts = (Text(f"{each}.", "verdict") for each in report.verdicts)
     table = Table(SUMMARY_HEAD, tuple(map(summary_row, report.summaries)))
-    found = [ReportSection("Evaluation", (*verdicts, table, Plots((plots.rates(rates),))))]
+    counted = (Text(COUNTED, "note"),) if report.broken else ()
+    found = [ReportSection("Evaluation", (*verdicts, table, *counted, Plots((plots.rates(rates),))))]
     if report.comparisons:
         found.append(_comparison(report))
     found.append(_outcomes(report))
     if panels := list(_panels(report)):
-        note = Text("Dots are successes, crosses failures. Bars are 95 % intervals.", "note")
+        left_out = " Errors are left out." if report.broken else ""
+        note = Text(f"Dots are successes, crosses failures. Bars are 95 % intervals.{left_out}", "note")
         found.append(ReportSection("Where it succeeds and fails", (note, Plots(tuple(panels)))))
-    for title, lines in (("Errors of policies", report.errors), ("Notes", report.notes)):
-        if lines:
-            found.append(ReportSection(title, tuple(Text(line) for line in lines)))
+    if report.notes:
+        found.append(ReportSection("Notes", tuple(map(Text, report.notes))))
+    if report.broken:
+        title = f"Errors of policies ({len(report.broken)})"
+        found.append(ReportSection(title, (*map(Text, report.errors), _cases(out, report.broken))))
     failures = report.failures
-    cases = Cases(tuple(_case(out, each) for each in failures))
-    found.append(ReportSection(f"Failures ({len(failures)})", (cases if failures else Text("None."),)))
+    shown = _cases(out, failures) if failures else Text("None.")
+    found.append(ReportSection(f"Failures ({len(failures)})", (shown,)))
     return found
+
+
+def _cases(out: Path, episodes: Sequence[Episode]) -> Cases:
+    return Cases(tuple(_case(out, each) for each in episodes))
 
 
 def _comparison(report: Report) -> ReportSection:
@@ -92,12 +102,14 @@ def _outcomes(report: Report) -> ReportSection:
     """Plot outcomes and times by seed."""
     by_policy = [(each.label, _episodes(report, each.label)) for each in report.summaries]
     outcomes = [
-        (label, [(e.result.seed, e.result.success, e.result.time_s) for e in found]) for label, found in by_policy
+        (label, [(e.result.seed, e.result.success, e.result.time_s, e.result.error) for e in found])
+        for label, found in by_policy
     ]
     times = [
         (label, [(e.result.seed, e.result.time_s) for e in found if e.result.success]) for label, found in by_policy
     ]
-    blocks: list[Text | Plots] = [Plots((plots.strips(outcomes),)), Text("Tall marks are failures.", "note")]
+    errors = " Marks at the top alone are errors of the policy." if report.broken else ""
+    blocks: list[Text | Plots] = [Plots((plots.strips(outcomes),)), Text(f"Tall marks are failures.{errors}", "note")]
     if any(found for _, found in times):
         blocks.append(Plots((plots.times(times),)))
     return ReportSection("Episodes", tuple(blocks))
@@ -107,6 +119,11 @@ def _episodes(report: Report, label: str) -> list[Episode]:
     return [each for each in report.episodes if each.policy == label]
 
 
+def _acted(report: Report, label: str) -> list[Result]:
+    """Results of the episodes in which the policy acted without an error."""
+    return [each.result for each in _episodes(report, label) if not each.result.is_error]
+
+
 def _panels(report: Report) -> Iterator[str]:
     """Plot outcomes over the scene's random factors."""
     values_of = {name: {each.result.factors.get(name) for each in report.episodes} for name in report.factors}
@@ -114,7 +131,7 @@ def _panels(report: Report) -> Iterator[str]:
     ends = [(x, x.removesuffix(a) + b) for a, b in _AXES for x in names if x.endswith(a)]
     pairs = [(x, y) for x, y in ends if y in names]
     for summary in report.summaries:
-        results = [each.result for each in _episodes(report, summary.label)]
+        results = _acted(report, summary.label)
         for x, y in pairs:
             points = [
                 (each.factors[x], each.factors[y], each.success, f"seed {each.seed}")
@@ -125,16 +142,17 @@ def _panels(report: Report) -> Iterator[str]:
                 yield plots.map_of(points, (x, y), summary.label)
     others = [name for name in names if not any(name in pair for pair in pairs)]
     for name, summary in itertools.product(others, report.summaries):
-        results = [each.result for each in _episodes(report, summary.label)]
+        results = _acted(report, summary.label)
         values = [(each.factors[name], each.success) for each in results if name in each.factors]
         if len({value for value, _ in values}) > 1:
             yield plots.by_factor(values, name, summary.label)
 
 
 def _case(out: Path, episode: Episode) -> Case:
-    """A failure: its reason, recording, video if any, and the command that repeats it."""
+    """A failure or an error: its reason, recording and video if any, and the command that repeats it."""
     result = episode.result
     ended = result.error or "; ".join(result.faults) or f"no success within {result.time_s:.1f} s"
     video = out / episode.video
     shown = video if episode.video and video.is_file() else None
-    return Case(f"{episode.policy}, seed {result.seed}", ended, out / episode.recording, shown, episode.command)
+    recording = out / episode.recording if episode.recording else None
+    return Case(f"{episode.policy}, seed {result.seed}", ended, recording, shown, episode.command)

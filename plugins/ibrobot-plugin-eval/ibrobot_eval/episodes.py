@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import override
 from uuid import uuid4
 
 import attrs
@@ -184,9 +185,30 @@ def code_here() -> dict[str, str]:
     return installed_code([*installed_plugins().versions(), "ibrobot-plugin-eval"])
 
 
+class _NewErrors(logging.Filter):
+    """Passes each error once: a policy that raises does so at every request of every episode."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._known: set[str] = set()
+
+    @override
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.exc_info is None or record.exc_info[1] is None:
+            return True
+        text = f"{record.getMessage()}: {record.exc_info[1]!r}"
+        new = text not in self._known
+        self._known.add(text)
+        return new
+
+
+_NEW_ERRORS = _NewErrors()
+
+
 def hide_messages() -> None:
-    """Keep the messages of runs in this process out of the evaluation's log."""
+    """Keep the messages of runs in this process out of the evaluation's log, and all but the first of equal errors."""
     logging.getLogger("ibrobot").setLevel(logging.ERROR)
+    logging.getLogger("ibrobot.inference").addFilter(_NEW_ERRORS)
 
 
 def recorded_in(folder: Path, config: RobotConfig) -> tuple[RobotConfig, Path]:

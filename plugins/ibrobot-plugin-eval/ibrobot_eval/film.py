@@ -70,8 +70,8 @@ def film(file: Path, policy: Policy, result: Result, attempt: Attempt) -> None:
     if (bool(session.outcome.successes), time_s) != (result.success, result.time_s):
         ended = f"{'a success' if session.outcome.successes else 'a failure'} after {time_s:.2f} s"
         raise ComponentFailed(
-            f"not filmed: repeated for its video, the episode was {ended}, not {_ended(result)}: the policy is not "
-            "deterministic, so that the command in the report may not repeat it either"
+            f"not filmed: repeated for its video, the episode ended in {ended}, not in {_ended(result)}: the policy is "
+            "not deterministic, so that the command in the report may not repeat it either"
         )
     frames = images.drain()
     lasted_s = seconds(frames[-1].received_ns - frames[0].received_ns) if len(frames) > 1 else 1.0

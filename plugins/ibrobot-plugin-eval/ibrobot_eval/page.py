@@ -34,7 +34,7 @@ svg .margin { stroke: var(--muted); stroke-dasharray: 4 4; }
 .panels { display: grid; grid-template-columns: repeat(auto-fill, minmax(320px, 1fr)); gap: 1rem; }
 .failure { background: var(--card); border-radius: 8px; padding: .8rem; min-width: 0; }
 .failure h3 { margin: 0 0 .4rem; font-size: 1rem; } video { width: 100%; border-radius: 4px; background: #000; }
-code { font: 12.5px/1.4 ui-monospace, monospace; overflow-wrap: anywhere; }
+code { font: 12.5px/1.4 ui-monospace, monospace; } code, p, a, .text { overflow-wrap: anywhere; }
 a { color: var(--ok); } p { max-width: 75ch; }
 """
 
@@ -72,13 +72,15 @@ def _block(out: Path, block: Text | Table | Plots | Cases) -> str:
 
 
 def _case(out: Path, case: Case) -> str:
-    """Render the video, recording, seed and command of a failure."""
+    """Render the video, recording, seed and command of a failure or an error."""
     lines = [tag("h3", escape(case.title))]
     if case.video is not None:
         source = f"data:video/mp4;base64,{base64.b64encode(case.video.read_bytes()).decode()}"
         lines.append(tag("video", "", src=source, controls="", muted="", preload="metadata"))
-    recording = str(case.episode.relative_to(out))
-    lines += [tag("div", escape(case.text)), tag("div", tag("a", escape(recording), href=recording))]
+    lines.append(tag("div", escape(case.text), class_="text"))
+    if case.episode is not None:
+        recording = str(case.episode.relative_to(out))
+        lines.append(tag("div", tag("a", escape(recording), href=recording)))
     if case.command:
         lines.append(tag("code", escape(case.command)))
     return tag("div", "".join(lines), class_="failure")

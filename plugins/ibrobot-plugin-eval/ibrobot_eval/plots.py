@@ -142,11 +142,11 @@ def course(points: Sequence[tuple[int, float, float, float]], margin: float, tit
     return svg(WIDTH, height, parts, title)
 
 
-def strips(rows: Sequence[tuple[str, Sequence[tuple[int, bool, float]]]]) -> str:
+def strips(rows: Sequence[tuple[str, Sequence[tuple[int, bool, float, str]]]]) -> str:
     """Plot outcomes by seed.
 
     Args:
-        rows: label of each policy, with seed, success and duration [s] of each episode.
+        rows: label of each policy, with seed, success, duration [s] and error of each episode.
     """
     left = _margin(label for label, _ in rows)
     count = max(len(episodes) for _, episodes in rows)
@@ -155,9 +155,12 @@ def strips(rows: Sequence[tuple[str, Sequence[tuple[int, bool, float]]]]) -> str
     for number, (label, episodes) in enumerate(rows):
         y = _TOP + 30 * number
         parts.append(_text(left - 10, y + 16, label, "end"))
-        for place, (seed, success, time_s) in enumerate(episodes):
-            tip = tag("title", f"seed {seed}: {'success' if success else 'failure'} after {time_s:.1f} s")
-            top, size = (y + 9, 13) if success else (y, 22)  # failures are taller
+        for place, (seed, success, time_s, error) in enumerate(episodes):
+            broken = bool(error) and not success
+            ended = f"error: {error}" if broken else f"{'success' if success else 'failure'} after {time_s:.1f} s"
+            tip = tag("title", escape(f"seed {seed}: {ended}"))
+            # Successes are at the bottom, errors at the top, failures as tall as both.
+            top, size = (y + 9, 13) if success else (y, 7 if broken else 22)
             shape = {"x": round(left + place * step, 1), "y": top, "width": round(max(step - 1, 1), 1), "height": size}
             parts.append(tag("rect", tip, **shape, class_="ok" if success else "bad-fill"))
     first = rows[0][1][0][0]

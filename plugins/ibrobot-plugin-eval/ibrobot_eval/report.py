@@ -115,8 +115,24 @@ class Report:
 
     @property
     def failures(self) -> list[Episode]:
-        """The episodes that failed, or ended in an error."""
-        return [each for each in self.episodes if not each.result.success]
+        """The episodes that failed without an error."""
+        return [each for each in self.episodes if not (each.result.success or each.result.is_error)]
+
+    @property
+    def broken(self) -> list[Episode]:
+        """The episodes that ended in an error."""
+        return [each for each in self.episodes if each.result.is_error]
+
+    @property
+    def verdicts(self) -> list[str]:
+        """The results in words: policies without any result, and the comparisons."""
+        empty = [each for each in self.summaries if each.episodes and each.errors == each.episodes]
+        which = {1: "its only episode", 2: "both episodes"}
+        return [
+            f"{each.label}: {which.get(each.episodes, f'all {each.episodes} episodes')} ended in an error, so this is "
+            "no evaluation of it"
+            for each in empty
+        ] + [each.words for each in self.comparisons]
 
     def facts(self) -> dict[str, Any]:
         """The report as a JSON object."""
@@ -145,21 +161,18 @@ class Report:
 
     def as_markdown(self) -> str:
         """Tables of policies, comparisons and failures."""
-        lines = ["# Evaluation", "", *(f"**{each.words}.**  " for each in self.comparisons)]
-        lines += [""] if self.comparisons else []
+        lines = ["# Evaluation", "", *(f"**{each}.**  " for each in self.verdicts)]
+        lines += [""] if self.verdicts else []
         lines += table(SUMMARY_HEAD, [summary_row(each) for each in self.summaries])
+        lines += ["", COUNTED] if self.broken else []
         if self.comparisons:
             lines += ["", *table(COMPARISON_HEAD, [comparison_row(each) for each in self.comparisons]), "", NOTE]
-        for title, found in (("Errors", self.errors), ("Notes", self.notes)):
-            if found:
-                lines += ["", f"## {title}", "", *(f"- {line}" for line in found)]
-        if failures := self.failures:
-            lines += ["", "## Failures", ""]
-            rows = [
-                (each.policy, str(each.result.seed), f"`{each.command}`" if each.command else "", each.recording)
-                for each in failures
-            ]
-            lines += table(("policy", "seed", "command that repeats it", "recording"), rows)
+        for title, said, cases in (
+            ("Errors", self.errors, self.broken), ("Notes", self.notes, []), ("Failures", [], self.failures),
+        ):  # fmt: skip
+            lines += ["", f"## {title}"] if said or cases else []
+            lines += ["", *(f"- {line}" for line in said)] if said else []
+            lines += ["", *table(CASE_HEAD, [_case_row(each) for each in cases])] if cases else []
         return "\n".join(lines) + "\n"
 
     def lines(self) -> list[str]:
@@ -200,8 +213,10 @@ NOTE = (
     "stay valid however often one looks and whenever one stops, and the verdict is read off them. Those for a fixed "
     "number are valid only if the number of episodes was chosen beforehand. With more than two policies all are "
     "corrected for the number of pairs, by Bonferroni's method, so that an interval excludes 0 exactly if its p is at "
-    "most 0.05. Episodes that ended in an error of the policy count as failures."
+    "most 0.05."
 )
+COUNTED = "Episodes that ended in an error of the policy count as failures in the rates and comparisons."
+CASE_HEAD = ("policy", "seed", "command that repeats it", "recording")
 
 
 def summary_row(each: Summary) -> tuple[str, ...]:
@@ -213,6 +228,11 @@ def summary_row(each: Summary) -> tuple[str, ...]:
         each.label, f"{each.successes} of {each.episodes}", rate, percent(each.exact), percent(each.wilson), time,
         f"{interventions:.1f}", str(each.disturbed), str(each.errors),
     )  # fmt: skip
+
+
+def _case_row(each: Episode) -> tuple[str, ...]:
+    """A failure, or an error, as a row of the table."""
+    return each.policy, str(each.result.seed), f"`{each.command}`" if each.command else "", each.recording
 
 
 def comparison_row(each: Comparison) -> tuple[str, ...]:

@@ -86,6 +86,57 @@ def test_page_has_the_videos_of_the_folder(tmp_path):
     assert base64.b64encode(b"a video").decode() in text
 
 
+LONG = f"ValueError: <{'x' * 300}>"
+
+
+def with_errors():
+    """A report on a policy with a success, a failure, an error with a recording and one without, and one of errors."""
+    near, far = {"cube_x": 0.1}, {"cube_x": 0.2}
+    mixed = [
+        result(0, True, factors=near), result(1, False, factors=far),
+        result(2, False, factors=near, error=LONG, acting={"weights": "1"}),
+        result(3, False, factors=far, error="it hung"),
+    ]  # fmt: skip
+    broken = [result(seed, False, error="it hung") for seed in range(4)]
+    return Report.of_simulation(
+        [policy("mixed"), policy("no")], {"mixed": mixed, "no": broken}, 0.1, until_decided=False
+    )
+
+
+def test_errors_do_not_look_like_failures(tmp_path):
+    report = with_errors()
+    found = {each.title: each.blocks for each in contents_of(tmp_path, report)}
+    errors, failures = (
+        [case for block in found[title] if isinstance(block, Cases) for case in block.cases]
+        for title in ("Errors of policies (6)", "Failures (1)")
+    )
+    assert [each.title for each in failures] == ["mixed, seed 1"]
+    assert [each.text for each in errors] == [LONG, *["it hung"] * 5]
+    assert [each.episode is None for each in errors] == [False, *[True] * 5], "what hung has no recording"
+    texts = [each.text for each in blocks(tmp_path, report, Text)]
+    assert texts[0] == "no: all 4 episodes ended in an error, so this is no evaluation of it."
+    assert "Episodes that ended in an error of the policy count as failures in the rates and comparisons." in texts
+    (strips,) = found["Episodes"][0].pictures
+    marks = re.findall(r"<rect[^>]*height=\"(\d+)\"[^>]*><title>seed \d: (success|failure|error)", strips)
+    assert marks == [("13", "success"), ("22", "failure"), *[("7", "error")] * 6]
+    page = as_page(tmp_path, report)
+    assert 'href="."' not in page
+    assert LONG not in page
+    (panel,) = found["Where it succeeds and fails"][1].pictures
+    assert "1 of 1" in panel
+    assert "1 of 2" not in panel, "an error has no place in it"
+
+
+def test_markdown_lists_errors_apart_from_failures():
+    head, errors, failures = with_errors().as_markdown().split("\n## ")
+    assert "**no: all 4 episodes ended in an error, so this is no evaluation of it.**" in head
+    assert (errors.count("`ibrobot record"), failures.count("`ibrobot record")) == (6, 1)
+
+
+def test_report_without_errors_mentions_none(tmp_path):
+    assert "error" not in as_page(tmp_path, made()).replace("episodes with errors", "")
+
+
 def test_report_of_one_policy_compares_nothing(tmp_path):
     report = Report.of_simulation([policy("a")], {"a": [result(0, False)]}, 0.1, until_decided=False)
     assert report.comparisons == ()

@@ -33,6 +33,7 @@ def taste(folder: Path) -> list[ReportSection]:
     cases = [
         Case("cup 1", "cold", folder / "one", folder / "one.mp4", "brew --cup 1"),
         Case("cup 2", "gone", folder / "two", folder / "link.mp4"),
+        Case("cup 3", "never filled", None),
     ]
     table = Table(("cup", "taste"), (("1", "nut"),))
     return [ReportSection("Tasting", (Text("fine", "verdict"), table, Plots(("<svg/>",)), Cases(tuple(cases))))]
@@ -79,6 +80,7 @@ def test_reports_are_listed_and_shown(folder: Path) -> None:
                 "video": "good/one.mp4",
             },
             {"title": "cup 2", "text": "gone", "command": "", "episode": "", "video": ""},
+            {"title": "cup 3", "text": "never filled", "command": "", "episode": "", "video": ""},
         ]
 
     run_ui([folder], test)

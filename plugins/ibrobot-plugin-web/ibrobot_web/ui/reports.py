@@ -64,14 +64,14 @@ def _block(ui: Ui, block: Text | Table | Plots | Cases) -> dict[str, Any]:
 def _case(ui: Ui, case: Case) -> dict[str, Any]:
     return {
         "title": case.title, "text": case.text, "command": case.command, "episode": _name(ui, case.episode),
-        "video": _name(ui, case.video) if case.video is not None else "",
+        "video": _name(ui, case.video),
     }  # fmt: skip
 
 
-def _name(ui: Ui, path: Path) -> str:
+def _name(ui: Ui, path: Path | None) -> str:
     """A path for requests; empty if it is outside the opened folders, or there is nothing."""
     try:
-        return ui.folders.name(ui.folders.find(str(path))) if path.exists() else ""
+        return ui.folders.name(ui.folders.find(str(path))) if path and path.exists() else ""
     except IbrobotError:
         return ""
 
