@@ -119,10 +119,10 @@ class Theirs:
         torch.manual_seed(seed)
         return self.post(self.policy.predict_action_chunk(self.batch(values, prompt), **arguments)).numpy()[0]
 
-    def select(self, values: Mapping[str, NDArray[Any]], seed: int) -> NDArray[Any]:
+    def select(self, values: Mapping[str, NDArray[Any]], seed: int, prompt: str = "") -> NDArray[Any]:
         """Its action at this control step, shape (A,)."""
         torch.manual_seed(seed)
-        return self.post(self.policy.select_action(self.batch(values))).numpy()[0]
+        return self.post(self.policy.select_action(self.batch(values, prompt))).numpy()[0]
 
 
 def normalised_by(mode: str, config: PreTrainedConfig) -> PreTrainedConfig:

@@ -21,6 +21,7 @@ from ibrobot_core.errors import PolicyError
 
 sys.path.insert(0, str(Path(__file__).parent))
 from checkpoints import CONFIGS, STATE, TOP, act, features, save
+from test_large_policies import LARGE
 
 pytestmark = pytest.mark.lerobot
 PAGE = Path(__file__).parents[2] / "docs/how-to/run-a-policy.md"
@@ -58,7 +59,11 @@ def test_a_refused_type_says_why(name: str, tmp_path: Path) -> None:
 
 
 def test_each_type_that_runs_has_a_network_in_these_tests() -> None:
-    assert {name for name, known in POLICY_TYPES.items() if known.state == "runs"} == {*CONFIGS, "smolvla"}
+    assert {name for name, known in POLICY_TYPES.items() if known.state == "runs"} == {*CONFIGS, "smolvla", *LARGE}
+
+
+def test_each_type_that_does_not_run_says_why() -> None:
+    assert not [name for name, known in POLICY_TYPES.items() if bool(known.why) is (known.state == "runs")]
 
 
 OTHERS = """

@@ -22,8 +22,8 @@ class PolicyType:
     """A type of LeRobot's, and whether it works here."""
 
     state: Literal["runs", "unproved", "refused"]
-    """`runs`: tested with a network of random weights; `unproved`: nothing speaks against it, but its network is too
-    large for a test, or needs a download; `refused`: with the error `why`."""
+    """`runs`: tested with a network of random weights; `unproved`: nothing speaks against it, but a test
+    would need a download, `why`; `refused`: with the error `why`."""
     why: str = ""
     prompt: bool = True
     prefix: bool = False
@@ -34,25 +34,35 @@ _DOWNLOADS = "LeRobot runs downloaded code for it"
 POLICY_TYPES: Mapping[str, PolicyType] = {
     "act": PolicyType("runs", prompt=False),
     "diffusion": PolicyType("runs", prompt=False),
-    "eo1": PolicyType("unproved"),
-    "evo1": PolicyType("unproved", prefix=True),
-    "fastwam": PolicyType("unproved"),
+    "eo1": PolicyType("unproved", "its tokeniser and processor are files of Qwen2.5-VL, which only the Hub has"),
+    "evo1": PolicyType(
+        "unproved",
+        "it loads its language model InternVL3 by name, which only the Hub has, beside its own weights",
+        prefix=True,
+    ),
+    "fastwam": PolicyType("unproved", "it always loads the encoders of Wan2.2-TI2V-5B from the Hub"),
     "gaussian_actor": PolicyType("refused", "it returns single actions, and LeRobot runs downloaded code for it"),
     "groot": PolicyType("refused", f"{_DOWNLOADS}; use its own server, by a model of type gr00t"),
     "lingbot_va": PolicyType(
         "refused", "it continues its own pictures from chunk to chunk, and requests here are alone"
     ),
-    "molmoact2": PolicyType("unproved", prefix=True),
-    "multi_task_dit": PolicyType("unproved"),
-    "pi0": PolicyType("unproved", prefix=True),
-    "pi05": PolicyType("unproved", prefix=True),
+    "molmoact2": PolicyType(
+        "unproved",
+        "its network is a checkpoint of its own kind, allenai/MolmoAct2, which only the Hub has",
+        prefix=True,
+    ),
+    "multi_task_dit": PolicyType("runs"),
+    "pi0": PolicyType("runs", prefix=True),
+    "pi05": PolicyType("runs", prefix=True),
     "pi0_fast": PolicyType("refused", _DOWNLOADS),
     "smolvla": PolicyType("runs", prefix=True),
     "tdmpc": PolicyType("refused", "it plans each action from its previous plan, and requests here are alone"),
-    "vla_jepa": PolicyType("unproved"),
+    "vla_jepa": PolicyType(
+        "unproved", "it loads Qwen3-VL and V-JEPA 2 by name, which only the Hub has, beside its own weights"
+    ),
     "vqbet": PolicyType("runs", prompt=False),
     "wall_x": PolicyType("refused", _DOWNLOADS),
-    "xvla": PolicyType("unproved"),
+    "xvla": PolicyType("runs"),
 }
 """LeRobot's name -> what is known of it."""
 OTHER = PolicyType("unproved")
