@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ibrobot_testing import host_context
+from ibrobot_testing.fakes import FakeTeleop
 
 from ibrobot_core.deadman import HOLD_S, Deadman
+from ibrobot_core.interfaces import teleop
 from ibrobot_core.units import ns
 
 T0 = 1_000_000_000_000
@@ -35,6 +41,21 @@ def hold(deadman: Deadman, from_ns: int, ticks: int) -> list[bool]:
 
 def test_a_press_that_nobody_saw_begin_moves_nothing():
     assert not any(hold(Deadman(), T0, 100))
+
+
+def test_all_threads_of_a_device_see_one_deadman(monkeypatch: pytest.MonkeyPatch):
+    """A device reports in a thread of its own, perhaps before the run has looked at it."""
+    device = FakeTeleop(host_context())
+    both = threading.Barrier(2)
+
+    def make() -> Deadman:
+        both.wait(30.0)
+        return Deadman()
+
+    monkeypatch.setattr(teleop, "Deadman", make)
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(lambda _: device.deadman, range(2))
+    assert first is second
 
 
 def test_a_held_deadman_allows_motion_until_its_release():

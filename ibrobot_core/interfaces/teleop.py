@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from functools import cached_property
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 import attrs
 import numpy as np
@@ -48,10 +47,14 @@ class Teleop(ABC):
     operated: ClassVar[bool] = True
     """Whether an operator starts every motion by a deadman. False for a device that moves by itself, e.g. a demo."""
 
-    @cached_property
-    def deadman(self) -> Deadman:
-        """The device's deadman: `read` reports each state of it that the device sends, and moves while it allows."""
-        return Deadman()
+    deadman: Deadman
+    """The device's deadman: `read` reports each state of it that the device sends, and moves while it allows."""
+
+    def __new__(cls, *args: object, **kwargs: object) -> Self:
+        """Create the device with its deadman here, so that its threads cannot make two."""
+        made = super().__new__(cls)
+        made.deadman = Deadman()
+        return made
 
     @abstractmethod
     def connect(self) -> None:
@@ -158,8 +161,7 @@ def operate(device: Teleop, measured: JointReading) -> TeleopCommand:
         raise
     if command.estop:
         deadman.disarm(now_ns)
-    allowed = deadman.allows(now_ns) or deadman.brakes(now_ns)
-    if allowed or command.positions is None or not device.operated:
+    if deadman.allows(now_ns) or deadman.brakes(now_ns) or command.positions is None or not device.operated:
         return command
     if not deadman.reported:
         raise TeleopError(
