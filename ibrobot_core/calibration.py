@@ -207,7 +207,8 @@ def load_calibration(
 
     Args:
         name: a name or a path, see `calibration_path`.
-        joints: names of the required joints; for IB-Robot's file, in the order of their ids from 1.
+        joints: names of the required joints; for IB-Robot's file, in the order of their ids from 1, unless they are
+            its numbers. None: the names in the file.
         zero_at: position of 0 rad, one of `ZERO_AT`; overrides the companion file, whose hash is then not checked.
         tool: the command that has `calibrate` and `import` for this hardware, for error messages, e.g.
             `ibrobot my_arm`.
@@ -282,17 +283,16 @@ def _joint(numbers: Any) -> JointCalibration:
 
 
 def _by_name(document: dict[str, Any], path: Path, joints: Sequence[str] | None) -> dict[str, Any]:
-    """Convert IB-Robot's format to LeRobot's: servo ids become names and are repeated as `id`."""
-    if joints is None:
-        raise CalibrationError(f"{path}: its joints are numbered; say which joint each number is")
-    named = {}
+    """Convert IB-Robot's format to LeRobot's: servo ids become names that are no numbers, and `id` has them."""
+    names, named = dict(enumerate(joints or (), 1)), {}
+    if own := joints is None or document.keys() >= set(joints):
+        names = {int(key): key for key in document}
     for key, numbers in document.items():
-        servo = int(key)
-        if not 1 <= servo <= len(joints):
-            raise CalibrationError(f"{path}: {key}: no such servo; ids are 1 to {len(joints)}")
-        if not isinstance(numbers, dict) or numbers.get("id", servo) != servo:
+        if (servo := int(key)) not in names:
+            raise CalibrationError(f"{path}: {key}: no such servo; ids are 1 to {len(names)}")
+        if not isinstance(numbers, dict) or (numbers.get("id", servo) != servo and not own):
             raise CalibrationError(f"{path}: {key}: must be an object with {_KEYS}; its id must be {servo}")
-        named[joints[servo - 1]] = {"id": servo, "drive_mode": 0, **numbers}
+        named[names[servo]] = {"id": servo, "drive_mode": 0, **numbers}
     return named
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import attrs
@@ -77,7 +78,6 @@ def test_what_cannot_be_true_is_refused_by_name(tmp_path: Path, change: dict[str
         ('{"pan": {"id": 1}}', "pan: drive_mode: is missing"),
         (json.dumps({"a": GOOD, "b": GOOD}), "b: id: servo 1 belongs to a already"),
         ('{"pan": {}, "pan": {}}', "'pan' is there twice"),
-        (json.dumps({"1": GOOD}), "its joints are numbered; say which joint each number is"),
     ],
 )
 def test_files_that_are_none_are_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -128,6 +128,30 @@ def test_angles_of_lerobots_file_are_lerobots_degrees(
 def test_ib_robots_file_has_zero_at_the_pose(tmp_path: Path) -> None:
     (tmp_path / "arm.json").write_text(json.dumps({"1": GOOD}))
     assert load_calibration(tmp_path / "arm.json", ["pan"]).joints["pan"].zero() == 2048
+
+
+@given(
+    st.integers(1, 12), st.sampled_from(["numbers", "names", "names without ids"]), st.randoms(use_true_random=False)
+)
+def test_numbers_are_names_where_the_joints_have_them(
+    tmp_path_factory: pytest.TempPathFactory, size: int, layout: str, random: Random
+) -> None:
+    """Robots of IB-Robot have joints "1" to "6"; for other robots the numbers are the servos, in the joints' order."""
+    numbers = [str(number) for number in range(1, size + 1)]
+    joints = numbers if layout == "numbers" else [f"joint{number}" for number in numbers]
+    ids = dict(
+        zip(numbers, random.sample(range(1, 254), size) if layout == "numbers" else range(1, size + 1), strict=True)
+    )
+    document = {name: {**GOOD, "id": ids[name], "range_min": 100 + int(name)} for name in random.sample(numbers, size)}
+    if layout == "names without ids":
+        document = {name: {key: each for key, each in row.items() if key != "id"} for name, row in document.items()}
+    path = tmp_path_factory.mktemp("calibration") / "arm.json"
+    path.write_text(json.dumps(document))
+    for wanted in [joints, random.sample(joints, size), None] if layout == "numbers" else [joints]:
+        found = load_calibration(path, wanted).joints
+        assert {name: (each.id, each.range_min) for name, each in found.items()} == {
+            joint: (ids[number], 100 + int(number)) for number, joint in zip(numbers, joints, strict=True)
+        }
 
 
 def test_a_companion_that_does_not_say_it_is_refused(tmp_path: Path) -> None:

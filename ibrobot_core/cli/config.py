@@ -100,7 +100,8 @@ def _uncalibrated(config: RobotConfig) -> Iterator[Problem]:
     for path, part in parts:
         try:
             if part.calibration is not None:
-                load_calibration(part.calibration).check_ranges(limits, config.closed_ends)
+                joints = part.joints if isinstance(part, HardwareConfig) else None
+                load_calibration(part.calibration, joints).check_ranges(limits, config.closed_ends)
         except CalibrationError as error:
             yield Problem(config.source, 0, path, str(error))
 

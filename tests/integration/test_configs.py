@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import attrs
 import jsonschema
 import pytest
+from click.testing import CliRunner
 
+from ibrobot_core.cli.main import cli
 from ibrobot_core.config import load_config
 from ibrobot_core.config.jsonschema import json_schema
 from ibrobot_core.config.show import to_yaml
@@ -42,3 +45,30 @@ def test_what_show_prints_is_the_same_config(path: Path, tmp_path: Path) -> None
     loaded = attrs.evolve(load_config(again), source=config.source, document={})
 
     assert loaded == attrs.evolve(config, document={})
+
+
+@pytest.mark.parametrize("fits", [True, False])
+def test_check_reads_a_calibration_whose_joints_are_numbers_as_a_run_does(tmp_path: Path, fits: bool) -> None:
+    """IB-Robot's files have the servos' numbers; the joints are those of the hardware, in its order."""
+    (tmp_path / "arm.json").write_text(
+        json.dumps(
+            {
+                str(number): {
+                    "homing_offset": 0,
+                    "range_min": 900 if fits else 2000,
+                    "range_max": 3196 if fits else 2096,
+                }
+                for number in range(1, 7)
+            }
+        )
+    )
+    given = [
+        f"--set=hardware.calibration={tmp_path}/arm.json",
+        f"--set=teleoperation.leader.calibration={tmp_path}/arm.json",
+    ]
+    so101 = next(path for path in CONFIGS if path.stem == "so101")
+    done = CliRunner().invoke(cli, ["config", "check", "--deep", "--mode", "teleop", *given, str(so101)])
+    if fits:
+        assert done.exit_code == 0, done.exception
+    else:
+        assert "shoulder_pan: its range, " in str(done.exception)

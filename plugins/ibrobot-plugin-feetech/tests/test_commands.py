@@ -378,6 +378,47 @@ def test_a_file_whose_joints_have_prefixes_names_them(home, tmp_path, file, hint
     assert not list(home.rglob("mine*"))
 
 
+def arm_of(tmp_path: Path, joints: list[str]) -> Path:
+    """A robot YAML with these joints, whose calibration is `mine`."""
+    names = json.dumps(joints)
+    path = tmp_path / "arm.yaml"
+    limits = "lower: -1.5, upper: 1.5, max_velocity: 3.0, max_acceleration: 40.0"
+    path.write_text(
+        "robot:\n  name: arm\n  robot_type: arm\n  joints:\n"
+        + "".join(f"    - {{name: {json.dumps(name)}, {limits}}}\n" for name in joints)
+        + f"  groups: {{arm: {names}}}\n"
+        f"hardware: {{type: feetech_so101, port: /dev/null, calibration: mine, anchored: [], joints: {names}}}\n"
+        "executors: {arm_position: {type: position, group: arm}}\n"
+        "teleoperation: {leader: {type: so101_leader, port: /dev/zero, calibration: mine}}\n"
+        "control_modes: {teleop: {executors: [arm_position], teleop: leader}}\n"
+        "default_control_mode: teleop\n"
+    )
+    return path
+
+
+@pytest.mark.parametrize("size", [1, 5, 6, 7, 8, 12])
+@pytest.mark.parametrize("numbers", [True, False])
+def test_arms_of_any_size_and_with_numbers_as_names_are_imported_and_used(home, tmp_path, size, numbers):
+    file = tmp_path / "theirs.json"
+    document = {
+        str(n): {"id": n, "drive_mode": 0, "homing_offset": n, "range_min": 1048, "range_max": 3048 + n}
+        for n in range(1, size + 1)
+    }
+    file.write_text(json.dumps(document))
+    joints = list(document) if numbers else [f"joint{n}" for n in document]
+    robot = arm_of(tmp_path, joints)
+    if size > len(JOINTS):
+        with pytest.raises(
+            CalibrationError, match=f"the file has {size} joints, the arm 6: give the robot YAML of its"
+        ):
+            CliRunner().invoke(feetech, ["import", str(file), "--name", "mine"], catch_exceptions=False)
+        assert not list(home.rglob("mine*"))
+    done = CliRunner().invoke(feetech, ["import", str(file), "--name", "mine", "--robot", str(robot)])
+    assert done.exit_code == 0, done.output
+    found = load_calibration("mine", joints[::-1])
+    assert found.numbers() == dict(zip(joints, document.values(), strict=True))
+
+
 @pytest.mark.parametrize("joint", JOINTS)
 def test_a_joint_that_was_hardly_moved_is_refused(home, tmp_path, joint):
     path = tmp_path / "theirs.json"

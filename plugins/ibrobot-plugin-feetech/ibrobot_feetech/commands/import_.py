@@ -82,14 +82,18 @@ def _load(file: str, wanted: Sequence[Joint], prefix: str, zero_at: str | None) 
 
 
 def _hint(file: str, plain: Sequence[str]) -> str:
-    """The prefixes with which a file has the joints."""
+    """The prefixes with which a file has the joints, or what to give if it has another arm's."""
     try:
         known = load_calibration(file).joints
     except CalibrationError:
         return ""
     prefixes = [name.removesuffix(plain[0]) for name in known if name.endswith(plain[0])]
     fitting = [each for each in prefixes if each and all(f"{each}{name}" in known for name in plain)]
-    return f"; give --prefix {' or --prefix '.join(fitting)}" if fitting else ""
+    if fitting:
+        return f"; give --prefix {' or --prefix '.join(fitting)}"
+    if len(known) != len(plain):
+        return f"; the file has {len(known)} joints, the arm {len(plain)}: give the robot YAML of its arm by --robot"
+    return ""
 
 
 def _doubts(found: Calibration, joints: Sequence[Joint]) -> list[str]:
