@@ -176,7 +176,8 @@ def _jog(session: RunView, sent: Sent[messages.Jog]) -> None:
     if not session.bus.serves(JOG):
         raise IbrobotError("this mode does not jog from the page: enter a mode whose teleop is of type web")
     jog, now_ms = sent.command, clock_ns() / _NS_PER_MS
-    if jog.at > now_ms + _AHEAD_MS:
+    # A press in the future would be new at each message: one held over a stop and its reset would move the robot.
+    if jog.at > now_ms + _AHEAD_MS or jog.press > jog.at + _AHEAD_MS:
         raise IbrobotError("the page's time is wrong; press again")
     if now_ms - jog.at > _LATE_MS:
         raise IbrobotError(f"the connection is too slow to jog: {(now_ms - jog.at) / 1e3:.1f} s")

@@ -12,6 +12,7 @@ from ibrobot_testing import make_session, stand_in
 from ibrobot_web import messages
 from ibrobot_web.commands import Commands
 from ibrobot_web.messages import RunCommand, Sent
+from ibrobot_web.teleop import JOG
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import Reset, Session, SetMode
@@ -255,3 +256,17 @@ def test_a_stop_that_would_fail_ends_the_run_at_its_start():
     commands = Commands(session, lambda: None, lambda reply: None, failures.put)
     assert "control does not answer" in str(failures.get(timeout=_WAIT_S))
     commands.close(_WAIT_S)
+
+
+@pytest.mark.parametrize("press", [6, 100, 3_600_000, 2**52])
+@pytest.mark.parametrize("ahead", [-20, 0, 4])
+def test_a_press_in_the_future_is_refused(rig: Callable[..., Rig], ahead: int, press: int) -> None:
+    """It would count as a new press with each message, so that one held over a stop and its reset would move."""
+    asked: list[Any] = []
+    made = rig({JOG.name: asked.append})
+    at = messages.clock_ms() + ahead
+    made.send(messages.Jog(at=at, press=at + press), messages.Jog(at=at, press=at), messages.Jog(at=at, press=at - 50))
+    refused, *taken = made.answers(3)
+    assert refused["error"] == "the page's time is wrong; press again"
+    assert [each.get("error") for each in taken] == [None, None]
+    assert len(asked) == 2
