@@ -165,6 +165,8 @@ class _Merge:
         try:
             for path in parts:
                 part = layout.existing_dataset(path)
+                if not part.info["total_episodes"]:
+                    raise DatasetError(f"{path}: has no episodes")
                 self._check(part)
                 self._append(part)
                 if len(self._rows) >= _EPISODES_AT_ONCE:
@@ -187,7 +189,7 @@ class _Merge:
             ("fps", part.info["fps"], self._info["fps"]),
             ("features", _stored(part.info), _stored(self._info)),
         ):
-            if found != wanted:
+            if not _fits(found, wanted):
                 raise DatasetError(f"{part.root} does not fit: its {name} are {_difference(found, wanted)}")
 
     def _append(self, part: OnDisk) -> None:
@@ -385,8 +387,17 @@ def _stored(info: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     }
 
 
+def _fits(found: Any, wanted: Any) -> bool:
+    """Whether what two datasets store is equal, as far as both say it."""
+    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
+        return found.keys() == wanted.keys() and all(_fits(found[key], wanted[key]) for key in found)
+    return found == wanted or None in (found, wanted)
+
+
 def _difference(found: Any, wanted: Any) -> str:
     if not isinstance(found, Mapping):
         return f"{found}, the others' {wanted}"
-    keys = [key for key in {**wanted, **found} if found.get(key) != wanted.get(key)]
+    keys = [
+        key for key in {**wanted, **found} if not (key in found and key in wanted and _fits(found[key], wanted[key]))
+    ]
     return "; ".join(f"{key} {found.get(key)}, the others' {wanted.get(key)}" for key in keys)
