@@ -6,6 +6,7 @@ import json
 import queue
 from collections.abc import Collection, Iterator
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any, override
 
@@ -33,6 +34,7 @@ from ibrobot_core.api import (
     NotSupported,
     ReaderDescriptor,
     Recorded,
+    RecorderError,
     SteppedClock,
     TopicSummary,
     TransportError,
@@ -86,6 +88,20 @@ class Episode(EpisodeReader):
     @override
     def close(self) -> None:
         pass
+
+
+@attrs.define
+class PartlyUnreadable(Episode):
+    """Topics that cannot be read are refused before the first message, as the readers here do."""
+
+    topics: Collection[str]
+
+    @override
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[Recorded]:
+        for topic in topics or TYPES:
+            if topic in self.topics:
+                raise RecorderError(f"taught: {topic} cannot be read: its messages are serialised as 'json'")
+        yield from super().messages(topics)
 
 
 @attrs.define
@@ -235,3 +251,36 @@ def test_wrong_options_are_named(arguments: list[str], reason: str, network: tup
     result = CliRunner().invoke(bag, ["play", "taught", "--endpoint", network[1], *arguments])
     assert result.exit_code != 0
     assert reason in (str(result.exception) if isinstance(result.exception, IbrobotError) else result.output)
+
+
+PLAYED = ("/joint_states", "/lamp", "/recommended")
+SUBSETS = [frozenset(each) for size in range(4) for each in combinations(PLAYED, size)]
+
+
+@pytest.mark.parametrize("unreadable", SUBSETS, ids=lambda each: " ".join(sorted(each)) or "none")
+@pytest.mark.parametrize("asked", SUBSETS, ids=lambda each: " ".join(sorted(each)) or "all")
+def test_topics_that_cannot_be_read_are_named_and_leave_the_others(
+    network: tuple[ZenohTransport, str], monkeypatch: pytest.MonkeyPatch, asked: frozenset[str],
+    unreadable: frozenset[str],
+) -> None:  # fmt: skip
+    reader = ReaderDescriptor("taught", "", lambda path: True, lambda address: PartlyUnreadable(unreadable))
+    monkeypatch.setattr("ibrobot_zenoh.commands.bag.installed_plugins", lambda: Registry(readers=[reader]))
+    sent: list[str] = []
+    monkeypatch.setattr(ZenohTransport, "publish_message", lambda self, topic, message, **options: sent.append(topic))
+    chosen = [argument for topic in sorted(asked) for argument in ("--topics", topic)]
+    result = CliRunner().invoke(bag, ["play", "taught", "--endpoint", network[1], "-r", "1000", *chosen])
+    if asked & unreadable or (unreadable == frozenset(PLAYED) and not asked):
+        assert isinstance(result.exception, RecorderError)
+        assert str(result.exception).removesuffix("its messages are serialised as 'json'") in {
+            f"taught: {topic} cannot be read: " for topic in (asked & unreadable or unreadable)
+        }
+        assert sent == []
+        return
+    assert result.exit_code == 0, result.exception
+    lines = [line for line in result.output.splitlines() if line.startswith("not played: ")]
+    assert lines == [
+        f"not played: taught: {topic} cannot be read: its messages are serialised as 'json'"
+        for topic in PLAYED
+        if topic in unreadable and not asked
+    ]
+    assert set(sent) == (asked or frozenset(PLAYED) - unreadable)

@@ -16,6 +16,7 @@ from ibrobot_core.api import (
     NS_PER_S,
     Clock,
     Contract,
+    EpisodeReader,
     EpisodeSummary,
     IbrobotError,
     Message,
@@ -75,6 +76,7 @@ def play(
         if start_ns > summary.end_ns:
             length = (summary.end_ns - summary.start_ns) / NS_PER_S
             raise RecorderError(f"{episode}: --start-offset {start_offset:g} is after its end; it lasts {length:.1f} s")
+        chosen = readable(reader, chosen, start_ns, topics)
         with suppress(KeyboardInterrupt), network as transport:
             player = Player(RealClock(), transport.publish_message, chosen, rate, clock_hz)
             while True:
@@ -180,6 +182,34 @@ def choose(
     if left_out:
         echo(f"not played, as they command a robot: {', '.join(left_out)}", err=True)
     return {topic: names.get(topic, topic) for topic in wanted if topic not in left_out}
+
+
+def readable(reader: EpisodeReader, chosen: Mapping[str, str], start_ns: int, asked: Collection[str]) -> dict[str, str]:
+    """The chosen topics that can be read; prints why the others cannot, e.g. since their messages are JSON.
+
+    Args:
+        reader: of the episode.
+        chosen: topic -> the name to play it under.
+        start_ns: from when it is played [ns].
+        asked: the topics that the operator has named.
+
+    Raises:
+        RecorderError: for a topic that the operator has named, or if none can be read.
+    """
+    found, errors = dict(chosen), []
+    for topic in chosen:
+        try:
+            next(reader.messages_since(start_ns, [topic]), None)
+        except RecorderError as error:
+            if topic in asked:
+                raise
+            errors.append(error)
+            del found[topic]
+    if errors and not found:
+        raise errors[0]
+    for each in errors:
+        echo(f"not played: {each}", err=True)
+    return found
 
 
 def _renaming(text: str) -> tuple[str, str]:
