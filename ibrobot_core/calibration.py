@@ -255,12 +255,10 @@ def _document(path: Path, tool: str | None = None) -> tuple[str, Any]:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"{twice!r} is there twice")
-    return found
+    names = [name for name, _ in pairs]
+    if len({*names}) < len(names):
+        raise ValueError(f"{max(names, key=names.count)!r} is there twice")
+    return dict(pairs)
 
 
 def _line(text: str, *keys: str) -> int:
@@ -284,9 +282,8 @@ def _joint(numbers: Any) -> JointCalibration:
 
 def _by_name(document: dict[str, Any], path: Path, joints: Sequence[str] | None) -> dict[str, Any]:
     """Convert IB-Robot's format to LeRobot's: servo ids become names that are no numbers, and `id` has them."""
-    names, named = dict(enumerate(joints or (), 1)), {}
-    if own := joints is None or document.keys() >= set(joints):
-        names = {int(key): key for key in document}
+    own, named = joints is None or document.keys() >= set(joints), dict[str, Any]()
+    names = {int(key): key for key in document} if own else dict(enumerate(joints or (), 1))
     for key, numbers in document.items():
         if (servo := int(key)) not in names:
             raise CalibrationError(f"{path}: {key}: no such servo; ids are 1 to {len(names)}")

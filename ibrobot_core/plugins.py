@@ -371,12 +371,15 @@ def _contained(offer: Any, message: str) -> dict[str, Callable[..., Any]]:
 
     def ask(name: str, *arguments: Any) -> Any:
         try:
-            return getattr(offer, name)(*arguments)
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - contained: other plugins' are asked, too
+            return list(offer.check_config(*arguments)) if name == "check_config" else getattr(offer, name)(*arguments)
+        except (Exception, SystemExit, GeneratorExit) as error:  # other plugins' are asked, too
+            if name not in _NOT_THEIRS:
+                raise PluginError(message % (name, _reason(error))) from error
             _log.error(message, name, _reason(error))
             return _NOT_THEIRS[name]
 
-    return {name: partial(ask, name) for name in _NOT_THEIRS if name in attrs.fields_dict(type(offer))}
+    asked = (*_NOT_THEIRS, "make" if isinstance(offer, descriptors.DecoderDescriptor) else "check_config")
+    return {name: partial(ask, name) for name in asked if name in attrs.fields_dict(type(offer))}
 
 
 def _add(registry: Registry, plugin: str, package: str, version: str, load: Callable[[], Any]) -> None:

@@ -6,13 +6,17 @@ import json
 import logging
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
 from ibrobot_core import hookspecs
-from ibrobot_core.errors import RecorderError
+from ibrobot_core.descriptors import SectionDescriptor
+from ibrobot_core.errors import PluginError, RecorderError
+from ibrobot_core.messages import CompressedImage, Header
 from ibrobot_core.plugins import KINDS, discover
 
 if TYPE_CHECKING:
@@ -112,6 +116,25 @@ def test_a_question_about_any_robot_or_file_that_raises_is_answered_by_others(
         assert ran.returncode == 0, ran.stderr
         assert "plugin 'fake_odd' failed in without_section of ibrobot_sections: SystemExit: not today" in ran.stderr
         assert "plugin 'fake_odd' failed in takes of ibrobot_commands: SystemExit: not today" in ran.stderr
+
+
+@pytest.mark.parametrize(
+    "error",
+    [SystemExit("not today"), ImportError("not today"), OSError("not today"), GeneratorExit("not today")],
+    ids=repr,
+)
+@pytest.mark.parametrize("asked", ["make of ibrobot_decoders", "check_config of ibrobot_sections"])
+def test_what_a_plugin_raises_where_it_is_needed_names_it(site: Site, error: BaseException, asked: str) -> None:
+    site.add("fake-checks", "raising_checks.py")
+    registry = discover(site.entry_points())
+    sys.modules["fake_checks"].RAISED = error
+    section = registry.find("section", "odd")
+    assert isinstance(section, SectionDescriptor)
+    picture = CompressedImage(Header(0), "odd", np.zeros(1, np.uint8))
+    ask: Any = partial(registry.decode, picture) if "make" in asked else partial(section.check_config, None)
+    with pytest.raises(PluginError) as raised:
+        ask()
+    assert str(raised.value) == f"plugin 'fake_checks' failed in {asked}: {type(error).__name__}: not today"
 
 
 def test_every_kind_is_among_the_hooks_tried() -> None:
