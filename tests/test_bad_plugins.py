@@ -127,11 +127,12 @@ def test_a_question_about_any_robot_or_file_that_raises_is_answered_by_others(
 def test_what_a_plugin_raises_where_it_is_needed_names_it(site: Site, error: BaseException, asked: str) -> None:
     site.add("fake-checks", "raising_checks.py")
     registry = discover(site.entry_points())
-    sys.modules["fake_checks"].RAISED = error
+    vars(sys.modules["fake_checks"])["RAISED"] = error
     section = registry.find("section", "odd")
     assert isinstance(section, SectionDescriptor)
     picture = CompressedImage(Header(0), "odd", np.zeros(1, np.uint8))
-    ask: Any = partial(registry.decode, picture) if "make" in asked else partial(section.check_config, None)
+    nothing: Any = None
+    ask: Any = partial(registry.decode, picture) if "make" in asked else partial(section.check_config, nothing)
     with pytest.raises(PluginError) as raised:
         ask()
     assert str(raised.value) == f"plugin 'fake_checks' failed in {asked}: {type(error).__name__}: not today"
