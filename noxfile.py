@@ -57,6 +57,8 @@ EXTRAS = {
     "ibrobot-plugin-zenoh": "[interop]",
 }
 """Distribution -> extras that its tests use."""
+LEROBOT_VERSIONS = ("0.4.4", "0.5.1", "0.6.1")
+"""The newest of each minor version that the plugins know: `ibrobot_lerobot/versions.py`."""
 THIRD_PARTIES = ("lerobot-robot-dummy==1.0.1", "lerobot-robot-lekiwi-pincopen==0.1.2")
 """Packages of others that add robots to LeRobot; these run without their device, or name what they lack."""
 PLATFORMS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "aarch64-apple-darwin")
@@ -219,6 +221,18 @@ def lerobot(session: nox.Session) -> None:
     system_libraries(session)
     folder = {"IBROBOT_THIRD_PARTIES": str(others)}
     session.run(*PYTEST, "-m", f"lerobot{SHORT}", *marked("lerobot"), *session.posargs, env=folder)
+
+
+@nox.session(default=False)
+@nox.parametrize("version", LEROBOT_VERSIONS, ids=LEROBOT_VERSIONS)
+def lerobot_versions(session: nox.Session, version: str) -> None:
+    """Another version of LeRobot: its datasets, its loading of ours, its checkpoints, and its devices."""
+    extras = "dataset,training,diffusion,feetech" if version >= "0.6" else "feetech"
+    install(session, *PLUGINS, options=(f"lerobot[{extras}]=={version}",))
+    system_libraries(session)
+    tests = [f"tests/lerobot/test_{name}.py" for name in ("recorded", "dataset", "policy", "feetech_bus", "devices")]
+    # What it warns of is its own.
+    session.run(*PYTEST, "-W", "default", "-m", "lerobot and not long", *(session.posargs or tests))
 
 
 def run_again(session: nox.Session, *command: str) -> None:

@@ -57,8 +57,9 @@ def random_policy(kind: str, path: Path) -> Path:
 
     Of LeRobot's default size, but Diffusion has a quarter of its widths, and ten steps of DDIM.
     """
-    from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
-    from lerobot.policies import get_policy_class, make_pre_post_processors
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
     sizes: dict[str, dict[str, Any]] = {
         "act": {"chunk_size": 50, "n_action_steps": 50},

@@ -25,9 +25,9 @@ import torch
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import LeRobotPolicy
 from ibrobot_testing import host_context
-from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.policies import get_policy_class, make_pre_post_processors
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from progress import in_rounds
 

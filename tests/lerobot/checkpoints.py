@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 from ibrobot_testing.contexts import ARM, GRIPPER
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
-from lerobot.policies import get_policy_class, make_pre_post_processors
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig

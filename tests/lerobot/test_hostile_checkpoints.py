@@ -16,9 +16,9 @@ from ibrobot_lerobot.policy import LeRobotPolicy
 from ibrobot_lerobot.policy_types import check_type
 from ibrobot_lerobot.untrusted import BASE_MODELS, check_step_name, names_a_model
 from ibrobot_testing.contexts import host_context
-from lerobot.configs import PreTrainedConfig
-from lerobot.policies import make_pre_post_processors
-from lerobot.processor import ProcessorStepRegistry
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot.processor.pipeline import ProcessorStepRegistry
 
 from ibrobot_core.errors import PolicyError
 

@@ -17,8 +17,8 @@ from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import SEED, LeRobotPolicy
 from ibrobot_testing import PolicySuite
 from ibrobot_testing.contexts import START_NS, host_context
-from lerobot.configs import PreTrainedConfig
-from lerobot.policies import make_pre_post_processors
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.pi0.configuration_pi0 import PI0Config
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.rtc.configuration_rtc import RTCConfig

@@ -13,7 +13,7 @@ import torch
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import SEED, LeRobotPolicy
 from ibrobot_testing.contexts import START_NS, host_context
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
 from lerobot.policies.pi0 import modeling_pi0
 from lerobot.policies.pi0.configuration_pi0 import PI0Config

@@ -15,7 +15,7 @@ from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy import LeRobotPolicy
 from ibrobot_lerobot.policy_types import POLICY_TYPES
 from ibrobot_testing.contexts import host_context
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs.policies import PreTrainedConfig
 
 from ibrobot_core.errors import PolicyError
 
@@ -68,7 +68,7 @@ def test_each_type_that_does_not_run_says_why() -> None:
 
 OTHERS = """
 from dataclasses import dataclass
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 
 @PreTrainedConfig.register_subclass("other_act")

@@ -17,7 +17,7 @@ import pytest
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_testing.site import made_up_site
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.robots.so_follower import SO101Follower, SO101FollowerConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_robot_ibrobot import IbrobotRobot, IbrobotRobotConfig

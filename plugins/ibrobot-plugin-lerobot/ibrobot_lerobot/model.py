@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig
-from lerobot.policies import get_policy_class
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from numpy.typing import NDArray
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig
-from lerobot.policies import make_pre_post_processors
-from lerobot.processor import ProcessorStep
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot.processor.pipeline import ProcessorStep
 from numpy.typing import NDArray
 
 from ibrobot_core.api import PolicyError

@@ -89,7 +89,7 @@ def import_others(path: Path, kind: str) -> None:
     Raises:
         PolicyError: if none of them adds it.
     """
-    from lerobot.configs import PreTrainedConfig
+    from lerobot.configs.policies import PreTrainedConfig
 
     if kind in POLICY_TYPES:
         return

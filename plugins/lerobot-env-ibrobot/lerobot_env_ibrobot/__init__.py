@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import ibrobot_gym
 from gymnasium import spaces
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 

@@ -58,6 +58,10 @@ def summary_of(path: Path) -> EpisodeSummary:
         return reader.summary()
 
 
+_FIRST_DATE_NS = 365 * 86_400 * NS_PER_S
+"""Times before 1971 count from the begin of something else than 1970."""
+
+
 def size_of(path: Path) -> int:
     """Total size of an episode's files [bytes]."""
     size = 0
@@ -73,8 +77,8 @@ def duration_s(summary: EpisodeSummary) -> float:
 
 
 def date_of(summary: EpisodeSummary) -> str:
-    """The start of an episode, in UTC; empty if it has no messages."""
-    if not summary.start_ns:
+    """The start of an episode, in UTC; empty if it has no messages, or begins at time 0 as those of a dataset do."""
+    if summary.start_ns < _FIRST_DATE_NS:
         return ""
     return datetime.fromtimestamp(summary.start_ns / NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M")
 

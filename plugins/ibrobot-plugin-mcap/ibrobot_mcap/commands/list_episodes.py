@@ -118,7 +118,8 @@ def info(episode: Path, as_json: bool) -> None:
     console = Screen(width=None if sys.stdout.isatty() else 1000)
     state = summary.outcome if summary.finished else "unfinished; `ibrobot episodes repair` makes it whole"
     console.print(f"{episode}: {state}", soft_wrap=True)
-    began = f"{date_of(summary)} UTC" if date_of(summary) else "no messages"
+    empty = not any(topic.count for topic in summary.topics.values())
+    began = "no messages" if empty else f"{date_of(summary)} UTC" if date_of(summary) else "without a date"
     console.print(f"{began}, {duration_s(summary):.2f} s, {size_text(size_of(episode))}")
     table = Table(box=None, padding=(0, 1))
     for heading in ("topic", "type", "messages", "Hz", "lost"):
