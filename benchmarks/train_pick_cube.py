@@ -8,7 +8,7 @@
 4. `ibrobot eval`: the trained policy in the same simulation, with cubes at places that were in no demonstration; with
    --onnx, also what `ibrobot export` makes of it, with the same seeds.
 
-Needs LeRobot in the same environment: `pip install 'lerobot[dataset,training]>=0.6.1,<0.7'`. A stage whose result is in
+Needs LeRobot in the same environment: `pip install 'lerobot[dataset,training]'`. A stage whose result is in
 the folder `--work` is not done again. Prints one JSON object with the successes and their 95 % interval, and with
 --onnx the successes of the exported policy and the number of seeds with different outcomes.
 """

@@ -13,6 +13,7 @@ from ibrobot_data.request import ConversionRequest
 from ibrobot_data.run import convert, find_episodes
 from ibrobot_lerobot.options import LeRobotOptions
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot_version import since
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 from recordings import CAMERAS, SIZE, record
@@ -90,7 +91,7 @@ def converted(bags: Path, out: Path, *, labels: bool = False, **options: Any) ->
     request = ConversionRequest(out, LeRobotOptions(**options), "lerobot", labels=labels)
     report = convert(request, find_episodes([bags]))
     assert not report.failed
-    return LeRobotDataset("local/converted", root=out)
+    return LeRobotDataset("local/converted", root=out, video_backend="pyav")
 
 
 def check_frames(dataset: LeRobotDataset, bags: Path, tolerance: float) -> None:
@@ -128,7 +129,7 @@ def test_small_files_keep_step(bags: Path, tmp_path: Path) -> None:
     )
     rest = convert(ConversionRequest(tmp_path / "set", LeRobotOptions(), "lerobot", append=True), find_episodes([bags]))
     assert (len(first.converted), len(rest.converted)) == (1, 2)
-    check_frames(LeRobotDataset("local/converted", root=tmp_path / "set"), bags, LOSSY)
+    check_frames(LeRobotDataset("local/converted", root=tmp_path / "set", video_backend="pyav"), bags, LOSSY)
 
 
 def test_labels_say_who_commanded_and_how_episodes_end(bags: Path, tmp_path: Path) -> None:
@@ -158,11 +159,12 @@ def test_labels_say_who_commanded_and_how_episodes_end(bags: Path, tmp_path: Pat
         theirs.add_frame({key: values[i : i + 1] for key, values in found.items()} | {"task": "pick the cube"})
     theirs.save_episode()
     theirs.finalize()
-    theirs = LeRobotDataset("local/theirs", root=tmp_path / "theirs")
+    theirs = LeRobotDataset("local/theirs", root=tmp_path / "theirs", video_backend="pyav")
     for key in labels:
         assert dataset.hf_dataset.features[key] == theirs.hf_dataset.features[key]
 
 
+@since("0.6", "takes the deviation of pictures for that of the episodes' means")
 def test_statistics_are_lerobots(bags: Path, tmp_path: Path) -> None:
     ours = converted(bags, tmp_path / "ours", videos=False)
     features = {key: f for key, f in ours.meta.features.items() if key in ours[0] and key.startswith(("obs", "act"))}
@@ -186,7 +188,8 @@ def test_act_trains_on_it(bags: Path, tmp_path: Path) -> None:
     converted(bags, tmp_path / "set", labels=True)
     command = [
         sys.executable, "-m", "lerobot.scripts.lerobot_train", "--dataset.repo_id=local/converted",
-        f"--dataset.root={tmp_path / 'set'}", "--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false",
+        f"--dataset.root={tmp_path / 'set'}", "--dataset.video_backend=pyav",
+        "--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false",
         "--policy.pretrained_backbone_weights=null", "--policy.dim_model=32", "--policy.n_heads=2",
         "--policy.dim_feedforward=64", "--policy.n_encoder_layers=1", "--policy.n_vae_encoder_layers=1",
         "--policy.chunk_size=10", "--policy.n_action_steps=10", "--steps=5", "--batch_size=2", "--num_workers=0",

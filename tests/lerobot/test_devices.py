@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator, Mapping
 from importlib import invalidate_caches
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,8 @@ from ibrobot_lerobot_devices import hardware
 from ibrobot_lerobot_devices.hardware import LeRobotHardware
 from ibrobot_lerobot_devices.options import RobotOptions
 from ibrobot_testing.contexts import control_context, make_robot
+from lerobot_version import LEROBOT
+from packaging.version import Version
 
 from ibrobot_core.api import (
     Calibration,
@@ -39,6 +42,8 @@ CALIBRATION = {
     for servo, name in enumerate(JOINTS, 1)
 }
 PATIENCE_S = 30.0
+TORCH = Version("0.5") > LEROBOT
+"""Whether LeRobot's devices call torch, and do not only import it."""
 PATIENT = """
 import lerobot.motors.feetech.feetech as bus
 from dataclasses import dataclass
@@ -129,7 +134,9 @@ def goals(emulator: Emulator) -> list[int]:
 def test_so101_follower_moves_as_our_own_driver(emulator: Emulator, clock: SteppedClock, folder: Path) -> None:
     """Positions and goals are those of our driver, within the tick that LeRobot cuts off."""
     config = {"port": emulator.port, "id": "arm", "calibration_dir": str(folder)}
-    theirs = LeRobotHardware(RobotOptions("patient_so101", config), control_context("theirs", clock=RealClock()))
+    theirs = LeRobotHardware(
+        RobotOptions("patient_so101", config, torch=TORCH), control_context("theirs", clock=RealClock())
+    )
     theirs.connect()
     ours = FeetechFollower(
         FollowerOptions(emulator.port, str(folder / "arm.json")), control_context("ours", clock=clock)
@@ -158,8 +165,10 @@ def test_so101_follower_moves_as_our_own_driver(emulator: Emulator, clock: Stepp
 
 
 def test_an_arm_without_its_cable_is_named_and_comes_back(emulator: Emulator, folder: Path) -> None:
-    config = {"port": emulator.port, "id": "arm", "calibration_dir": str(folder), "num_read_retries": 0}
-    options = RobotOptions("patient_so101", config, lost_readings=0)
+    config: dict[str, Any] = {"port": emulator.port, "id": "arm", "calibration_dir": str(folder)}
+    if Version("0.6") <= LEROBOT:
+        config["num_read_retries"] = 0
+    options = RobotOptions("patient_so101", config, lost_readings=0, torch=TORCH)
     arm = LeRobotHardware(options, control_context("arm", clock=RealClock()))
     arm.connect()
     try:
@@ -193,7 +202,7 @@ def test_lekiwi_drives_and_measures_its_way(clock: SteppedClock, tmp_path: Path)
         config = {"port": emulator.port, "id": "kiwi", "calibration_dir": str(tmp_path), "cameras": {}}
         names = {f"arm_{name}": name for name in JOINTS}
         kiwi = LeRobotHardware(
-            RobotOptions("patient_lekiwi", config, names),
+            RobotOptions("patient_lekiwi", config, names, torch=TORCH),
             control_context("kiwi", robot=robot, joints=robot.joint_names, clock=clock),
         )
         kiwi.connect()

@@ -16,6 +16,8 @@ from lerobot.motors.feetech import FeetechMotorsBus
 from lerobot.robots.so_follower import SO101Follower, SO101FollowerConfig
 from lerobot.teleoperators.so_leader import SO101Leader, SO101LeaderConfig
 from lerobot_units import normalised
+from lerobot_version import LEROBOT
+from packaging.version import Version
 
 from ibrobot_core.calibration import Calibration, JointCalibration, load_calibration
 from ibrobot_core.clock import SteppedClock
@@ -143,7 +145,8 @@ class TestBus:
         bus.configure_motors()
         assert everywhere(emulator, "return_delay") == [0] * 6
         assert everywhere(emulator, "maximum_acceleration") == everywhere(emulator, "acceleration") == [254] * 6
-        assert everywhere(emulator, "phase") == [12] * 6
+        if Version("0.6") <= LEROBOT:  # it turns a servo that counts turns back
+            assert everywhere(emulator, "phase") == [12] * 6
 
     def test_an_error_bit_is_named(self, bus: FeetechMotorsBus, emulator: Emulator) -> None:
         emulator.faults.errors[5] = 0x04

@@ -138,7 +138,9 @@ def test_lerobot_loads_what_merging_makes_of_its_own(theirs: Path, tmp_path: Pat
         for name in ("min", "max", "mean"):
             # Of a video, LeRobot counts some pictures, or some before they are encoded.
             tolerance = 0.15 if key == TOP else 1e-5
-            np.testing.assert_allclose(stats[1][key][name], stats[0][key][name], atol=tolerance, err_msg=f"{key} {name}")
+            np.testing.assert_allclose(
+                stats[1][key][name], stats[0][key][name], atol=tolerance, err_msg=f"{key} {name}"
+            )
 
 
 def test_its_episodes_become_bags_and_are_replayed(
@@ -155,5 +157,7 @@ def test_its_episodes_become_bags_and_are_replayed(
     np.testing.assert_array_equal(found, [values(4 + i)["action"] for i in range(6)])
     listed = run_here("episodes", "info", "bags/episodes/episode_000002")
     assert (listed.returncode, "no messages" in listed.stdout) == (0, False), listed.stdout
-    replayed = run_here("replay", f"{theirs}:1", "desk.yaml", "--sim", "--lockstep", "--headless", "--norm-mode", "radians")
+    replayed = run_here(
+        "replay", f"{theirs}:1", "desk.yaml", "--sim", "--lockstep", "--headless", "--norm-mode", "radians"
+    )
     assert replayed.returncode == 0, replayed.stdout + replayed.stderr

@@ -12,7 +12,7 @@ from typing import Any
 from ibrobot_core.app import Child, ComponentFailed
 from ibrobot_lerobot_devices.device import ANSWER, CONNECT, DONE, READY, STAND, TRAFFIC
 
-INSTALL = "pip install 'lerobot>=0.6.1,<0.7'"
+INSTALL = "pip install lerobot"
 """The command that installs LeRobot; its devices need extras, e.g. `lerobot[feetech]`."""
 _MODULE = "ibrobot_lerobot_devices.device"
 _END_S = 1.5

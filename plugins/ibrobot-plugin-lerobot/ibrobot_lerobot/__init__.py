@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from ibrobot_core.api import DatasetDescriptor, Late, PolicyDescriptor, ReaderDescriptor, hookimpl
+from ibrobot_core.api import Check, DatasetDescriptor, Late, PolicyDescriptor, ReaderDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_lerobot.contents import Contents, InfoOptions
 from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions
@@ -55,6 +55,14 @@ def ibrobot_policies() -> Iterable[PolicyDescriptor]:
         reads=_is_checkpoint,
         summary="a LeRobot checkpoint: ACT, Diffusion, VQ-BeT, SmolVLA, pi0, …",
     )
+
+
+@hookimpl
+def ibrobot_doctor() -> Iterable[Check]:
+    """Check LeRobot's version."""
+    from ibrobot_lerobot.versions import check
+
+    yield check()
 
 
 _DATASETS = Late("ibrobot_lerobot.commands:datasets").load

@@ -83,7 +83,7 @@ def export_onnx(path: Path, out: Path) -> Exported:
     except ImportError as error:
         raise PolicyError(
             f"an export needs LeRobot, onnxscript and ONNX Runtime ({error}); install them with: "
-            'pip install "ibrobot-plugin-lerobot[export]" "lerobot>=0.6.1,<0.7"'
+            'pip install "ibrobot-plugin-lerobot[export]" lerobot'
         ) from error
     options = LeRobotPolicyOptions(path, device="cpu", dtype="float32")
     with held_back(_LOG):

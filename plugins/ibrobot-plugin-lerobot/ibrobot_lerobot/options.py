@@ -46,6 +46,9 @@ class LeRobotPolicyOptions:
         None, ge=1, help="CPU threads of torch; by default one fewer than the cores, at least 1"
     )
     n_action_steps: int | None = option(None, ge=1, help="number of actions of a chunk to use; by default all")
+    untested: str = option(
+        "warn", choices=("warn", "refuse"), help="what to do with a LeRobot that is not one of the tested versions"
+    )
     base_models: tuple[str, ...] = option(
         (),
         help="additional models or folders that the checkpoint may load; LeRobot's own are always allowed",

@@ -19,6 +19,7 @@ from ibrobot_lerobot.checkpoint import ACTION, POSTPROCESSOR, PREPROCESSOR, chec
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.quiet import cause, held_back
 from ibrobot_lerobot.steps import read_steps
+from ibrobot_lerobot.versions import INSTALL, installed, untested
 
 if TYPE_CHECKING:
     from ibrobot_lerobot.model import PolicyModel
@@ -31,7 +32,6 @@ TASK = "task"
 PREFIX = "prefix"
 """`Frame.prefix`, normalised, shape (1, K, A)."""
 DELAY = "delay_steps"
-_INSTALL = "pip install 'lerobot>=0.6.1,<0.7'"
 
 
 class LeRobotPolicy(Policy):
@@ -88,6 +88,7 @@ class LeRobotPolicy(Policy):
     @override
     def load(self) -> None:
         self.check_weights()
+        self._check_version()
         weights = hash_weights(self._options.path)
         log = self._ctx.log
         with held_back(log):
@@ -102,6 +103,12 @@ class LeRobotPolicy(Policy):
         }
         self._model, self._weights = model, weights
         self._identity = f"lerobot {version('lerobot')}, torch {version('torch')}"
+
+    def _check_version(self) -> None:
+        if sentence := untested(installed() or ""):
+            if self._options.untested == "refuse":
+                raise PolicyError(f"{self._options.path}: {sentence}, and `untested` is refuse")
+            self._ctx.log.warning("%s: %s", self._options.path, sentence)
 
     @override
     def reset(self, seed: int) -> None:
@@ -244,5 +251,5 @@ def _import(name: str) -> Any:
         return import_module(f"ibrobot_lerobot.{name}")
     except Exception as error:  # of whatever LeRobot imports
         if find_spec("lerobot") is None:
-            raise PolicyError(f"LeRobot policies need LeRobot ({error}); install it with: {_INSTALL}") from error
+            raise PolicyError(f"LeRobot policies need LeRobot ({error}); install it with: {INSTALL}") from error
         raise PolicyError(f"LeRobot is installed, but cannot be imported: {cause(error)}") from error

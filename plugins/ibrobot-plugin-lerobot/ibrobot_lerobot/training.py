@@ -13,7 +13,7 @@ import attrs
 from ibrobot_core.api import MissingDependency, option
 from ibrobot_core.app import Event, Shown, on_option
 
-LEROBOT = "lerobot[dataset,training]>=0.6.1,<0.7"
+LEROBOT = "lerobot[dataset,training]"
 SMALL = "small_act"
 """The policy of the tutorial: an ACT with 0.5 million parameters, for a CPU."""
 AUTO = "auto"

@@ -320,7 +320,7 @@ def test_episode_of_several_tasks(version: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("found", ["v1.6", "v3.1", "3", None])
-def test_unknown_version_is_named_with_those_that_can_be_read(found: str | None, tmp_path: Path) -> None:
+def test_unknown_version_is_named_beside_all_that_can_be_read(found: str | None, tmp_path: Path) -> None:
     root = current(tmp_path / "set")
     edit(root, lambda info: info.update(codebase_version=found))
     with pytest.raises(DatasetError, match=r"info.json: codebase_version: .* can: v2.0, v2.1, v3.0"):

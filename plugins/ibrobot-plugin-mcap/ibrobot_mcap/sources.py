@@ -92,8 +92,9 @@ class McapSource(Source):
         ]
         self._blocks = sorted(blocks, key=lambda item: item[0])
         self.finished = all(file.finished for file in self._files)
-        self.start_ns = min((block.start_ns for _, _, block in blocks), default=0)
-        self.end_ns = max((block.end_ns for _, _, block in blocks), default=0)
+        filled = [block for _, _, block in blocks if block.start_ns <= block.end_ns]
+        self.start_ns = min((block.start_ns for block in filled), default=0)
+        self.end_ns = max((block.end_ns for block in filled), default=0)
         self.metadata = [record for file in self._files for record in file.metadata]
         self.latched = frozenset(
             channel.topic

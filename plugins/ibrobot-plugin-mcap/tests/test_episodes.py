@@ -144,6 +144,26 @@ def test_info_needs_no_repair(tmp_path):
     assert json.loads(run("info", path, "--json"))["metadata"]["prompt"] == "pick"
 
 
+@pytest.mark.parametrize(
+    ("begins_ns", "count", "words"),
+    [
+        (0, 3, "without a date, 2.00 s"),
+        (1, 3, "without a date, 2.00 s"),
+        (10**9, 3, "without a date, 2.00 s"),
+        (1_800_000_000 * 10**9, 3, "2027-01-15 08:00 UTC, 2.00 s"),
+        (0, 0, "no messages, 0.00 s"),
+    ],
+)
+def test_an_episode_that_begins_at_time_0_has_messages_and_no_date(tmp_path, begins_ns, count, words):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    text = store.types["std_msgs/msg/String"]
+    with RosbagsWriter(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection("/words", "std_msgs/msg/String", typestore=store)
+        for index in range(count):
+            writer.write(topic, begins_ns + index * 10**9, store.serialize_cdr(text("x"), "std_msgs/msg/String"))
+    assert words in run("info", tmp_path / "bag")
+
+
 @pytest.mark.parametrize("cut", [0, 1, 300, 2000])
 def test_repair_makes_an_episode_whole_with_all_that_was_there(tmp_path, cut):
     path = unfinish(made(tmp_path, frames=20, prompt="pick"), cut)
