@@ -16,6 +16,7 @@ from ibrobot_lerobot.rows import EpisodeRows
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from numpy.typing import NDArray
 
+from ibrobot_core.api import Float64MultiArray
 from ibrobot_core.app import installed_plugins
 
 pytestmark = [
@@ -152,7 +153,8 @@ def test_its_episodes_become_bags_and_are_replayed(
     done = run_here("convert", theirs, "--to", "bag", "--out", "bags", *given)
     assert done.returncode == 0, done.stdout + done.stderr
     reader = installed_plugins().open_episode(sorted(Path("bags/episodes").iterdir())[1])
-    found = [each.message.data for each in reader.messages({"/arm/commands"})]
+    sent = [each.message for each in reader.messages({"/arm/commands"})]
+    found = [each.data for each in sent if isinstance(each, Float64MultiArray)]
     reader.close()
     np.testing.assert_array_equal(found, [values(4 + i)["action"] for i in range(6)])
     listed = run_here("episodes", "info", "bags/episodes/episode_000002")

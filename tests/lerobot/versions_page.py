@@ -12,6 +12,8 @@ from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
+from ibrobot_lerobot.versions import TESTED
+
 PAGE = Path(__file__).parents[2] / "docs/reference/lerobot-versions.md"
 COLUMNS = {
     "recorded": "its datasets",
@@ -40,8 +42,9 @@ def row_of(version: str, report: Path) -> str:
             failed[file] += 1
         else:
             passed[file] += 1
+    known = [TESTED[version]] if TESTED.get(version) else []
     cells = [f"{passed[name]} of {passed[name] + failed[name]}" for name in COLUMNS]
-    return f"| {version} | {' | '.join(cells)} | {seconds / 60:.0f} | {'; '.join(notes)} |"
+    return f"| {version} | {' | '.join(cells)} | {seconds / 60:.0f} | {'; '.join([*known, *notes])} |"
 
 
 def main() -> None:

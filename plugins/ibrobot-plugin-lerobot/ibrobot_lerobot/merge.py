@@ -281,6 +281,7 @@ class _Merge:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 self._schema = self._schema or file.schema_arrow
                 self._table = pq.ParquetWriter(target, self._schema, compression="snappy")
+            assert self._schema is not None
             for group in range(file.num_row_groups):
                 table = file.read_row_group(group)
                 for name, offset in (("index", self._frame), ("episode_index", self._episode)):

@@ -65,14 +65,14 @@ class MujocoCamera(Sensor):
         self._fovy = math.radians(self._model.cam_fovy[self._camera])
         self._last_slot = None
         self._states = bus.subscribe(PHYSICS_TOPIC, _QUEUE)
-        if not self.idle:
+        if not self._is_idle():
             self._rendering()
 
-    @property
-    @override
-    def idle(self) -> bool:
+    def _is_idle(self) -> bool:
+        """Whether nobody would receive a picture of a simulation that waits for nobody."""
         bus = self._ctx.bus
-        return self._lockstep and not (bus is not None and bus.has_subscribers(self.topic))
+        self.idle = self._lockstep and not (bus is not None and bus.has_subscribers(self.topic))
+        return self.idle
 
     def _rendering(self) -> Renderer:
         if self._renderer is None:
@@ -102,7 +102,7 @@ class MujocoCamera(Sensor):
             if state is None:
                 return None
             stamp_ns = stamp_of(state)
-            if self._is_due(stamp_ns) and not self.idle:
+            if self._is_due(stamp_ns) and not self._is_idle():
                 renderer = self._rendering()
                 self._drawn.follow(state)
                 if self._is_depth:

@@ -16,6 +16,7 @@ from ibrobot_onnx import ibrobot_policies
 from ibrobot_onnx.options import MANIFEST, OnnxPolicyOptions
 from ibrobot_onnx.policy import OnnxPolicy
 from ibrobot_testing import PolicySuite, check_descriptor, host_context
+from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from ibrobot_core.api import Context, Frame, Policy, PolicyError
@@ -283,7 +284,7 @@ def test_a_request_that_does_not_end_fails_and_the_next_one_is_answered(
     looping_graph(folder / "policy.onnx", always=False)
     policy = loaded(folder)
     state = np.linspace(-0.6, -0.1, SIZE, dtype=np.float32)
-    good = {STATE: state, CAMERA: np.zeros(IMAGE, np.uint8)}
+    good: dict[str, NDArray[Any]] = {STATE: state, CAMERA: np.zeros(IMAGE, np.uint8)}
     bad = {**good, STATE: -state}
     with pytest.raises(PolicyError, match=rf"exported: a request takes more than {0.05 * requests:g} s; such a graph"):
         policy.infer_batch([*[good] * (requests - 1), bad])
