@@ -61,6 +61,8 @@ class Service[Q, A]:
     limits: RequestLimits = RequestLimits()
     urgent: bool = False
     """Whether it must not wait behind other requests, as an emergency stop."""
+    reads: bool = False
+    """Whether it changes nothing and moves nothing, so that a request may be answered however late it arrives."""
     ros_type: str = ""
     """The ROS 2 type with the same fields, if there is one, e.g. `ibrobot_msgs/srv/MoveToPose`, or an action."""
     progress: Service[NoRequest, Any] | None = None
@@ -84,8 +86,7 @@ class Service[Q, A]:
         """
         if isinstance(request, self.request):
             return request
-        faults = _too_much(request, self.limits)
-        if not faults:
+        if not (faults := _too_much(request, self.limits)):
             found: Any = {} if request is None else request
             if self.alone and not isinstance(found, Mapping):
                 found = {self.alone: found}

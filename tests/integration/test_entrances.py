@@ -69,6 +69,10 @@ ADAPTERS: Mapping[str, Callable[[], Entrance]] = {
 """Entrance -> who uses it."""
 
 
+_SERVICES = (
+    "source planner", "/planning/go_to", "/move_action", "/moveit_gateway/move_to_pose",
+    "/moveit_gateway/move_to_configuration", "/execute_trajectory", "/task/run", "/intervene",
+)  # fmt: skip
 _CORRECTIONS = "plugins/ibrobot-plugin-data/tests/test_corrections.py"
 _LOST = f"{_CORRECTIONS}::test_a_lost_device_is_a_fault_and_a_reset_gives_the_policy_the_robot"
 _SERVER = "plugins/ibrobot-plugin-serve/tests/test_distributed.py"
@@ -76,11 +80,15 @@ _PAGE = (
     "plugins/ibrobot-plugin-web/tests/test_commands.py::"
     "test_what_was_sent_before_a_stop_and_arrives_after_it_is_refused"
 )
+_LATE = (
+    "plugins/ibrobot-plugin-zenoh/tests/test_arrivals.py::test_what_was_sent_before_a_stop_or_its_reset_moves_nothing"
+)
 _ALIKE = f"{_SERVER}::test_every_execution_mode_moves_alike"
 _GONE = f"{_SERVER}::test_the_arm_holds_while_the_server_is_gone_and_goes_on_when_it_is_back"
 ELSEWHERE: Mapping[tuple[str, str], str] = {
     ("page reset", "older"): _PAGE,
     ("page intervene", "older"): _PAGE,
+    **{(name, "older"): _LATE for name in _SERVICES},
     **{(name, "STOP"): _LOST for name in ("source intervene", "page intervene", "/intervene")},
     ("engine distributed", "world"): _ALIKE,
     ("engine distributed", "numbers"): _ALIKE,

@@ -26,6 +26,7 @@ CLEARANCE = Service(
     Configuration,
     float,
     "Distance from the nearest object [m]; an error if the objects are too old.",
+    reads=True,
 )
 
 

@@ -110,12 +110,18 @@ REDO = Service(
     "Record the present or last episode again, which replaces it; begins as with `wait`.",
 )  # fmt: skip
 DISCARD = Service("/record_episode/discard", NoRequest, NoneType, "End the episode, and delete it.")
-STATUS = Service("/record_episode/status", NoRequest, EpisodeStatus, "The state of recording, for a user interface.")
-INFO = Service("/record_episode/get_info", NoRequest, DatasetInfo, "Where episodes go, as IB-Robot's recorder says.")
+STATUS = Service(
+    "/record_episode/status", NoRequest, EpisodeStatus, "The state of recording, for a user interface.", reads=True
+)
+INFO = Service(
+    "/record_episode/get_info", NoRequest, DatasetInfo, "Where episodes go, as IB-Robot's recorder says.", reads=True
+)
 CANCEL = Service(
     "/record_episode/cancel", NoRequest, NoneType, "End the episode early, and keep it, as IB-Robot's recorder does."
 )
-PROGRESS = Service("/record_episode/progress", NoRequest, RecordProgress, "How the present episode goes on.")
+PROGRESS = Service(
+    "/record_episode/progress", NoRequest, RecordProgress, "How the present episode goes on.", reads=True
+)
 RECORD = Service(
     "/record_episode", RecordEpisode, RecordedEpisode, "Record an episode, and answer when it has ended.",
     alone="prompt", ros_type="ibrobot_msgs/action/RecordEpisode", progress=PROGRESS, cancel=CANCEL,

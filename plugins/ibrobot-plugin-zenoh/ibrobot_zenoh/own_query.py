@@ -55,3 +55,8 @@ class OwnQuery:
 
 
 type Query = zenoh.Query | OwnQuery
+
+
+def attachment_of(query: Query) -> bytes:
+    """What is attached to a query; empty if nothing is."""
+    return query.attachment.to_bytes() if query.attachment is not None else b""

@@ -116,6 +116,11 @@ def caller_of(attached: bytes) -> tuple[int, bytes]:
     return number, gid
 
 
+def sent_of(attached: bytes) -> int:
+    """When a request was sent, by its client's time of day [ns], from its attachment; 0 if it has none."""
+    return int(_ATTACHMENT.unpack(attached)[1]) if len(attached) == _ATTACHMENT.size else 0
+
+
 @attrs.frozen
 class Node:
     """The ROS 2 node that publishes topics.

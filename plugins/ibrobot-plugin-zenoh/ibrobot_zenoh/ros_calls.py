@@ -16,9 +16,9 @@ from ibrobot_ros2.workers import StopWay, Workers
 
 from ibrobot_core.api import TransportError
 from ibrobot_zenoh.connection import first_line
-from ibrobot_zenoh.own_query import OwnQuery, Query
-from ibrobot_zenoh.ros2 import attachment, caller_of
-from ibrobot_zenoh.sharing import RosHandler
+from ibrobot_zenoh.own_query import OwnQuery, Query, attachment_of
+from ibrobot_zenoh.ros2 import attachment, caller_of, sent_of
+from ibrobot_zenoh.sharing import Reply, RosHandler
 
 _WORKERS, _URGENT_WORKERS = 4, 2
 _CHECK_S = 10.0
@@ -26,6 +26,11 @@ _CHECK_S = 10.0
 _CALLER = uuid.uuid4().bytes
 """Id of this process as a client."""
 _numbers = itertools.count(1)
+
+
+def sent_now() -> bytes:
+    """The attachment of a request that is sent now."""
+    return attachment(next(_numbers), time.time_ns(), _CALLER)
 
 
 class RosServer:
@@ -66,7 +71,7 @@ class RosServer:
         Raises:
             TransportError: if there is no answer, or one without `success`.
         """
-        query = OwnQuery(to_cdr(self._kind.request, {}), "own", attachment(0, time.time_ns(), _CALLER))
+        query = OwnQuery(to_cdr(self._kind.request, {}), "own", sent_now())
         self._checks[query] = check
         self.take(query)
         answer = from_cdr(self._kind.response, query.answer(_CHECK_S))
@@ -74,10 +79,10 @@ class RosServer:
             raise TransportError(f"a call of {self._name} would fail: {answer['message']}")
 
     def _answer(self, query: Query) -> None:
-        payload, attached = query.payload, query.attachment
-        number, caller = caller_of(attached.to_bytes() if attached is not None else b"")
+        payload, attached = query.payload, attachment_of(query)
+        number, caller = caller_of(attached)
 
-        def reply(response: Mapping[str, Any]) -> None:
+        def send(response: Mapping[str, Any]) -> None:
             with query:
                 sent = attachment(number, time.time_ns(), caller)
                 try:
@@ -86,6 +91,7 @@ class RosServer:
                     self._log.debug("%s: %s", self._name, first_line(error))
 
         handler = self._checks.pop(query, self._handler) if self._checks else self._handler
+        reply = Reply(send, sent_of(attached))
         try:
             handler(from_cdr(self._kind.request, payload.to_bytes() if payload is not None else b""), reply)
         except CodecError as error:
@@ -110,7 +116,7 @@ def call(
         replies = session.get(
             key,
             payload=to_cdr(kind.request, request),
-            attachment=attachment(next(_numbers), time.time_ns(), _CALLER),
+            attachment=sent_now(),
             target=zenoh.QueryTarget.ALL_COMPLETE,
             timeout=timeout_s,
             consolidation=zenoh.ConsolidationMode.NONE,

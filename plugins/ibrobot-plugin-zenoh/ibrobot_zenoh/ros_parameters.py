@@ -11,6 +11,7 @@ from ibrobot_ros2.interfaces import service_type
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import SET_MODE, Component, RunView, TransportLink, dump_yaml
+from ibrobot_zenoh.arrivals import Arrivals
 from ibrobot_zenoh.sharing import Reply, transport_of
 
 MODE = "mode"
@@ -89,13 +90,17 @@ class RosParameters(Component):
         session: the run.
         link: its transport.
         is_shared: whether others may call a service of the bus: setting the mode needs `/set_mode`.
+        arrivals: refuses requests to set the mode that come too late.
     """
 
-    def __init__(self, session: RunView, link: TransportLink, is_shared: Callable[[str], bool]) -> None:
+    def __init__(
+        self, session: RunView, link: TransportLink, is_shared: Callable[[str], bool], arrivals: Arrivals
+    ) -> None:  # fmt: skip
         super().__init__("share:parameters", "this file as parameters", (link.name,))
         self._session = session
         self._link = link
         self._is_shared = is_shared
+        self._arrivals = arrivals
         self._ends = ExitStack()
 
     @override
@@ -126,11 +131,13 @@ class RosParameters(Component):
         reply({"values": [to_parameter(now.get(name)) for name in request["names"]]})
 
     def _set(self, request: dict[str, Any], reply: Reply) -> None:
-        reply({"results": [self._set_one(each["name"], each["value"]) for each in request["parameters"]]})
+        sent_ns, given = reply.sent_ns, request["parameters"]
+        reply({"results": [self._set_one(each["name"], each["value"], sent_ns) for each in given]})
 
-    def _set_one(self, name: str, value: Mapping[str, Any]) -> dict[str, Any]:
+    def _set_one(self, name: str, value: Mapping[str, Any], sent_ns: int) -> dict[str, Any]:
         if name == MODE and self._is_shared(SET_MODE.name):
             try:
+                self._arrivals.check(SET_MODE.name, sent_ns)
                 self._session.bus.call(SET_MODE.name, {"mode": from_parameter(value)})
             except (IbrobotError, ValueError) as error:
                 return {"successful": False, "reason": str(error)}

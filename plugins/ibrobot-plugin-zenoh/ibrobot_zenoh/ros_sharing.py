@@ -12,11 +12,12 @@ from typing import Any, Literal, override
 import attrs
 from ibrobot_ros2.goals import Actions, with_goals
 from ibrobot_ros2.interfaces import ActionType, ServiceType, action_type, fields_of, service_type, to_cdr
-from ibrobot_ros2.offers import TRIGGER, Offer, Offers, time_of
+from ibrobot_ros2.offers import TRIGGER, Offer, Offers, refused, time_of
 from ibrobot_ros2.workers import StopWay
 
-from ibrobot_core.api import NS_PER_S, IbrobotError, NotSupported, did_you_mean
+from ibrobot_core.api import NS_PER_S, HardwareError, IbrobotError, NotSupported, did_you_mean
 from ibrobot_core.app import CHECK_ESTOP, CONTROL, ESTOP, RunAccess, SessionWorker, TransportLink
+from ibrobot_zenoh.arrivals import Arrivals
 from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.ros2 import absolute
 from ibrobot_zenoh.ros_goals import Status
@@ -70,6 +71,7 @@ class RosSharing(SessionWorker):
         session: the run.
         link: the network.
         share: what is shared.
+        arrivals: refuses calls and goals that come too late.
 
     Raises:
         NotSupported: for an executor that takes no goals.
@@ -77,9 +79,10 @@ class RosSharing(SessionWorker):
 
     session: RunAccess
 
-    def __init__(self, session: RunAccess, link: TransportLink, share: Share) -> None:
+    def __init__(self, session: RunAccess, link: TransportLink, share: Share, arrivals: Arrivals) -> None:
         super().__init__(session, "share:ros", "services and actions for ROS 2 nodes", (link.name, CONTROL))
         self._link = link
+        self._arrivals = arrivals
         known = list(with_goals(session))
         for name in share.actions:
             if name not in known:
@@ -134,7 +137,11 @@ class RosSharing(SessionWorker):
         self._ends.callback(self._transport.serve_ros(name, kind, handler, way=way, check=check))
 
     def _answer(self, offer: Offer, request: dict[str, Any], reply: Reply) -> None:
-        answer = self._offers.answer(offer, request)
+        try:
+            self._arrivals.check(offer.service, reply.sent_ns)
+            answer = self._offers.answer(offer, request)
+        except HardwareError as error:
+            answer = refused(error)
         known = fields_of(service_type(offer.type).response)
         reply({name: value for name, value in answer.items() if name in known})
 
@@ -169,7 +176,12 @@ class RosSharing(SessionWorker):
             self._count += 1
             goal = server.goals[uuid] = self._goals[self._count] = _Goal(self._count, uuid, now_ns, server)
         head = {"goal": goal.number, **server.address, "fields": request["goal"]}
-        accepted = self._actions.take_goal(self, head, stops)
+        try:
+            self._arrivals.check(server.address.get("service", ""), reply.sent_ns)
+        except HardwareError as error:
+            accepted = self._actions.refuse(self, head, error)
+        else:
+            accepted = self._actions.take_goal(self, head, stops)
         with self._lock:
             if accepted and goal.status is Status.ACCEPTED:
                 goal.status = Status.EXECUTING

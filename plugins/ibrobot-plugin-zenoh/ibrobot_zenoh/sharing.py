@@ -24,7 +24,6 @@ from ibrobot_ros2.workers import StopWay
 
 from ibrobot_core.api import (
     NS_PER_S,
-    Handler,
     IbrobotError,
     Message,
     NotSupported,
@@ -45,9 +44,11 @@ from ibrobot_core.app import (
     described,
     type_name,
 )
+from ibrobot_zenoh.arrivals import Arrivals
 from ibrobot_zenoh.options import Share
 
-type Reply = Callable[[Mapping[str, Any]], None]
+type UrgentHandler = Callable[[Payload, str | None, int], Payload]
+"""As `Handler`; the last argument is when the request was sent, by the sender's time of day [ns], 0 if unknown."""
 type RosHandler = Callable[[dict[str, Any], Reply], object]
 _DEPTH = 10
 """Queue size of a topic for the network; when it is full, the bus drops and counts the oldest message."""
@@ -73,6 +74,19 @@ class Urgent:
 
     Args: the request, and the longest wait [s]. Raises TransportError if there is no answer.
     """
+
+
+@attrs.frozen
+class Reply:
+    """Answers a call with plain data: call it, once."""
+
+    send: Callable[[Mapping[str, Any]], None]
+    sent_ns: int = 0
+    """When the call was sent, by the caller's time of day [ns]; 0 if that is unknown."""
+
+    def __call__(self, response: Mapping[str, Any]) -> None:
+        """Answer."""
+        self.send(response)
 
 
 class TopicTransport(Transport):
@@ -101,7 +115,7 @@ class TopicTransport(Transport):
 
     @abstractmethod
     def serve_with_urgent(
-        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool], largest: int, way: StopWay
+        self, name: str, handler: UrgentHandler, is_urgent: Callable[[Payload], bool], largest: int, way: StopWay
     ) -> Urgent:
         """Like `serve`; urgent requests have their own queue and threads, so that no other request delays them.
 
@@ -161,14 +175,15 @@ def components(share: Share, session: RunAccess, link: TransportLink) -> list[Co
     from ibrobot_zenoh.ros_sharing import RosSharing
 
     session.refuse_absent("transport.share.publish", share.publish.__contains__)
+    arrivals = Arrivals(session)
     subscribed: list[Component] = [SubscribedTopics(session, link, share.subscribe)] if share.subscribe else []
     served: list[Component] = []
     if share.services:
-        served.append(SharedServices(session, link, share))
+        served.append(SharedServices(session, link, share, arrivals))
     if share.parameters:
-        served.append(RosParameters(session, link, share.offers))
+        served.append(RosParameters(session, link, share.offers, arrivals))
     if share.actions or share.services:
-        served.append(RosSharing(session, link, share))
+        served.append(RosSharing(session, link, share, arrivals))
     return [*(PublishedTopic(session, link, topic) for topic in share.publish), *subscribed, *served]
 
 
@@ -275,11 +290,12 @@ class SharedServices(Component):
     and `/rosapi/service_request_details` describes one.
     """
 
-    def __init__(self, session: RunView, link: TransportLink, share: Share) -> None:
+    def __init__(self, session: RunView, link: TransportLink, share: Share, arrivals: Arrivals) -> None:
         super().__init__("share:services", f"{', '.join(share.services)} for other machines", (link.name,))
         self._session = session
         self._link = link
         self._share = share
+        self._arrivals = arrivals
         self._way = StopWay(session, "services for other machines")
         self._ends = ExitStack()
 
@@ -313,7 +329,7 @@ class SharedServices(Component):
             return False
         return service is not None and service.urgent
 
-    def _answer(self, payload: Payload, sender: str | None) -> bytes:
+    def _answer(self, payload: Payload, sender: str | None, sent_ns: int) -> bytes:
         call = None
         try:
             call = decode_call(payload)
@@ -327,6 +343,7 @@ class SharedServices(Component):
                 )
             if call.service == DETAILS:
                 return encode_answer(Answer(self._details(name)))
+            self._arrivals.check(name, sent_ns)
             return encode_answer(Answer(self._session.bus.call(name, call.request)))
         except IbrobotError as error:
             return encode_answer(Answer(str(error), result=False))

@@ -16,11 +16,11 @@ from ibrobot_core.app import HANDLER_THREADS
 from ibrobot_zenoh.access import ANYBODY, SERVED, SERVICES, TOPICS
 from ibrobot_zenoh.connection import first_line
 from ibrobot_zenoh.options import ZenohOptions
-from ibrobot_zenoh.own_query import OwnQuery, Query
+from ibrobot_zenoh.own_query import OwnQuery, Query, attachment_of
 from ibrobot_zenoh.presence import Presence
-from ibrobot_zenoh.ros2 import service_key
-from ibrobot_zenoh.ros_calls import RosServer, call
-from ibrobot_zenoh.sharing import RosHandler, Urgent
+from ibrobot_zenoh.ros2 import sent_of, service_key
+from ibrobot_zenoh.ros_calls import RosServer, call, sent_now
+from ibrobot_zenoh.sharing import RosHandler, Urgent, UrgentHandler
 from ibrobot_zenoh.topics import RosTransport
 
 SUBSCRIBER_DEPTH = 1000
@@ -102,7 +102,7 @@ class ZenohTransport(RosTransport):
 
     @override
     def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
-        server = self._workers_of(name, handler, workers)
+        server = self._workers_of(name, lambda request, sender, sent_ns: handler(request, sender), workers)
         limit = self.options.max_message_size
 
         def take(query: Query) -> None:
@@ -117,7 +117,7 @@ class ZenohTransport(RosTransport):
 
     @override
     def serve_with_urgent(
-        self, name: str, handler: Handler, is_urgent: Callable[[Payload], bool], largest: int, way: StopWay
+        self, name: str, handler: UrgentHandler, is_urgent: Callable[[Payload], bool], largest: int, way: StopWay
     ) -> Urgent:
         def answer_or_raise(query: Query) -> None:
             if (error := self._answer(name, handler, query)) is not None:
@@ -148,17 +148,18 @@ class ZenohTransport(RosTransport):
 
         return Urgent(self._keep(self._serve(name, take, server), urgent), ask)
 
-    def _workers_of(self, name: str, handler: Handler, workers: int) -> Workers[Query]:
+    def _workers_of(self, name: str, handler: UrgentHandler, workers: int) -> Workers[Query]:
         return Workers(
             lambda query: self._answer(name, handler, query), f"the server of {name}", workers, REQUESTS_WAITING
         )
 
-    def _answer(self, name: str, handler: Handler, query: Query) -> Exception | None:
+    def _answer(self, name: str, handler: UrgentHandler, query: Query) -> Exception | None:
         """Answer a query; return the error that was its answer."""
         with query:  # dropping it signals the end of replies to the requester
             try:
                 request = query.payload
-                reply = handler(request.to_bytes() if request is not None else b"", self._sender(query))
+                data, sent_ns = request.to_bytes() if request is not None else b"", sent_of(attachment_of(query))
+                reply = handler(data, self._sender(query), sent_ns)
                 self._check_size(len(reply), name)
             except Exception as error:  # noqa: BLE001 - passed to the requester
                 query.reply_err(f"{type(error).__name__}: {error}", encoding=_FAILED)
@@ -204,6 +205,7 @@ class ZenohTransport(RosTransport):
             replies = session.get(
                 key,
                 payload=_sendable(payload),
+                attachment=sent_now(),
                 timeout=timeout_s,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.BLOCK,

@@ -11,6 +11,7 @@ import click
 import pytest
 from click.testing import CliRunner
 from ibrobot_ros2.interfaces import action_type, to_cdr
+from ibrobot_zenoh.arrivals import Arrivals
 from ibrobot_zenoh.commands import network as network_module
 from ibrobot_zenoh.commands.action import action
 from ibrobot_zenoh.commands.param import param
@@ -19,7 +20,7 @@ from ibrobot_zenoh.ros_goals import Status
 from ibrobot_zenoh.ros_parameters import ParameterType, RosParameters, flat, from_parameter, to_parameter
 from ibrobot_zenoh.transport import ZenohTransport
 
-from ibrobot_core.api import NotSupported, TransportError
+from ibrobot_core.api import NotSupported, RealClock, TransportError
 
 from .pair import WAIT_S, free_endpoint, router
 
@@ -107,10 +108,11 @@ def robot(machine: tuple[ZenohTransport, str]) -> tuple[Any, str]:
 
     document = {"control": {"rate_hz": 100.0, "stop": "hold"}, "peripherals": [{"name": "top"}], "transport": None}
     session: Any = SimpleNamespace(
-        config=SimpleNamespace(document=document), mode="idle", bus=SimpleNamespace(call=call)
-    )
+        config=SimpleNamespace(document=document), mode="idle", bus=SimpleNamespace(call=call, services=dict),
+        on_state=[], clock=RealClock(), stops=0, stopped_by="",
+    )  # fmt: skip
     link: Any = SimpleNamespace(name="transport", transport=transport)
-    parameters = RosParameters(session, link, lambda name: session.shared)
+    parameters = RosParameters(session, link, lambda name: session.shared, Arrivals(session))
     session.shared = True
     parameters.start()
     return session, address

@@ -182,7 +182,7 @@ def test_without_further_threads_stops_are_answered_and_others_refused(monkeypat
     endpoint = free_endpoint()
     server, robot = router(endpoint), client(endpoint)
     way = StopWay(make_session(), "the test")
-    server.serve_with_urgent("services", lambda payload, _: b"done", lambda payload: payload == b"stop", 1000, way)
+    server.serve_with_urgent("services", lambda payload, *_: b"done", lambda payload: payload == b"stop", 1000, way)
     settle(robot, server)
     with monkeypatch.context() as patch:
         patch.setattr(threading.Thread, "start", _refuse)
@@ -205,7 +205,7 @@ def test_a_request_that_cannot_be_read_ends_the_run():
     def is_urgent(payload: Payload) -> bool:
         raise MemoryError
 
-    server.serve_with_urgent("services", lambda payload, _: b"done", is_urgent, 1000, StopWay(session, "the test"))
+    server.serve_with_urgent("services", lambda payload, *_: b"done", is_urgent, 1000, StopWay(session, "the test"))
     settle(robot, server)
     with pytest.raises(TransportError):
         robot.request("services", b"stop", 1.0)
@@ -222,7 +222,7 @@ def test_urgent_requests_wait_for_no_others(monkeypatch: pytest.MonkeyPatch):
     server, robot = router(endpoint), client(endpoint)
     release, busy = threading.Event(), threading.Semaphore(0)
 
-    def answer(payload: Payload, _: object) -> bytes:
+    def answer(payload: Payload, *_: object) -> bytes:
         if payload != b"stop":
             busy.release()
             release.wait()

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 import attrs
 import pytest
 from ibrobot_ros2.interfaces import action_type, service_type
-from ibrobot_zenoh.ros2 import actions_of
+from ibrobot_zenoh import ros_calls
+from ibrobot_zenoh.ros2 import actions_of, attachment
 from ibrobot_zenoh.ros_goals import SentGoal, Status
 
-from ibrobot_core.api import NotSupported, TransportError
+from ibrobot_core.api import NS_PER_S, NotSupported, TransportError
 from ibrobot_core.app import NoRequest, Service
 
 from .pair import WAIT_S, client, free_endpoint, wait_for
@@ -153,6 +155,28 @@ def test_a_stop_by_service_ends_a_goal(robot: Any):
     assert (refused["success"], "refused before a reset" in refused["message"]) == (False, True)
     assert near.call_ros("/reset", trigger, {}, WAIT_S)["success"]
     assert not runtime.session.faults
+
+
+@pytest.mark.parametrize("stall_s", [0.1, 0.7, 1.6, 5.0])
+def test_a_goal_from_before_a_stop_moves_nothing_after_its_reset(
+    robot: Any, stall_s: float, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    runtime, near = robot
+    sent_ns = time.time_ns() - round(stall_s * NS_PER_S)
+    runtime.session.emergency_stop()
+    wait_for(lambda: runtime.session.stopped_by)
+    runtime.reset()
+    before = runtime.session.state.command.copy()
+    with monkeypatch.context() as patch:
+        patch.setattr(ros_calls, "sent_now", lambda: attachment(1, sent_ns, bytes(16)))
+        with pytest.raises(TransportError, match="rejected the goal"):
+            SentGoal(near, HAND, GRIP, {"command": {"position": 0.3}})
+        ended = SentGoal(near, ARM, FOLLOW, to(0.4)).result(WAIT_S)
+    assert (ended.status, ended.result["error_code"]) == (Status.ABORTED, -1)
+    assert "the goal: refused, it was sent before the robot was last stopped or reset" in ended.result["error_string"]
+    assert "goal for grip_action refused: INVALID_GOAL: the goal: refused, it was sent before" in caplog.text
+    assert (runtime.session.state.command == before).all()
+    assert SentGoal(near, ARM, FOLLOW, to(0.4)).result(WAIT_S).status is Status.SUCCEEDED
 
 
 @attrs.frozen

@@ -13,7 +13,7 @@ import attrs
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import RunView, Service
-from ibrobot_ros2.offers import answered, with_ns
+from ibrobot_ros2.offers import answered, refused, with_ns
 from ibrobot_ros2.services import plain
 
 _FEEDBACK_S = 0.5
@@ -96,6 +96,12 @@ class Calls:
         self._start(self._call, goal, with_ns(head["fields"]))
         if goal.service.progress is not None:
             self._start(self._report, goal, goal.service.progress)
+        return True
+
+    def refuse(self, wire: Wire, head: Mapping[str, Any], error: IbrobotError) -> bool:
+        """Accept a goal only to say why it is refused."""
+        self._session.log.warning("%s: %s", self._who, error)
+        wire.send({"op": "ended", "goal": head["goal"], "state": "aborted", "values": refused(error)})
         return True
 
     def cancel(self, wire: Wire, number: int) -> bool:

@@ -167,11 +167,14 @@ class Actions:
         except IbrobotError as error:
             with self._lock:
                 self._goals.pop(name, None)
-            return self._refuse(wire, head["goal"], executor, error)
+            return self.refuse(wire, head, error)
         return True
 
-    def _refuse(self, wire: Wire, number: int, executor: ExecutorConfig, error: IbrobotError) -> bool:
+    def refuse(self, wire: Wire, head: Mapping[str, Any], error: IbrobotError) -> bool:
         """Say why a goal is refused; returns whether it was accepted, only to say so."""
+        if "service" in head:
+            return self._calls.refuse(wire, head, error)
+        number, executor = head["goal"], self._executors[head["executor"]]
         code = error.code if isinstance(error, _Invalid) else TrajectoryCode.INVALID_GOAL
         if isinstance(error, PlanningError) and error.code is PlanCode.INVALID_GROUP_NAME:
             code = TrajectoryCode.INVALID_JOINTS

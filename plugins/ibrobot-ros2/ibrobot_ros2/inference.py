@@ -46,7 +46,7 @@ class InferResult:
 DISPATCH_INFER = Service(
     "/act_inference_node/DispatchInfer", InferRequest, InferResult,
     "Wait for the next chunk of the model that acts; nothing more is asked of it, and nothing moves by it.",
-    ros_type="ibrobot_msgs/action/DispatchInfer",
+    ros_type="ibrobot_msgs/action/DispatchInfer", reads=True,
 )  # fmt: skip
 
 

@@ -89,10 +89,15 @@ def answered(
     try:
         return shaped(session.bus.call(service, request))
     except IbrobotError as error:
-        return {"success": False, "message": str(error)}
+        return refused(error)
     except Exception:
         session.log.exception("%s failed", service)
         return {"success": False, "message": "the service failed; the robot's log has the cause"}
+
+
+def refused(error: IbrobotError) -> dict[str, Any]:
+    """An error as the fields of a response."""
+    return {"success": False, "message": str(error)}
 
 
 def time_of(stamp_ns: int) -> dict[str, int]:

@@ -26,6 +26,7 @@ class Network(FakeTransport, TopicTransport):
         self.sent, self.callbacks, self.refuses, self.goes_on = [], {}, False, threading.Event()
         self.goes_on.set()
         self.closed = False
+        self.sent_ns = 0
 
     def publish_message(self, topic, message, *, latched=False):
         self.goes_on.wait(60)
@@ -39,7 +40,8 @@ class Network(FakeTransport, TopicTransport):
 
     def serve_with_urgent(self, name, handler, is_urgent, largest, way):
         self.is_urgent = is_urgent
-        return Urgent(self.serve(name, handler), lambda request, timeout_s: handler(request, None))
+        end = self.serve(name, lambda request, sender: handler(request, sender, self.sent_ns))
+        return Urgent(end, lambda request, timeout_s: handler(request, None, 0))
 
     def publish_cdr(self, name, type_name, payload, *, latched=False):
         self.sent.append((name, type_name, latched))

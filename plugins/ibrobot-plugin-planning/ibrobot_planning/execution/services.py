@@ -37,16 +37,28 @@ from ibrobot_planning.world.objects import observed_world, world_of
 if TYPE_CHECKING:
     from ibrobot_planning.world.arm import Arm
 
-COMPUTE_IK = Service("/compute_ik", IkQuery, IkAnswer, "Joint positions for a position or pose of the tool.")
-COMPUTE_FK = Service("/compute_fk", FkQuery, FkAnswer, "Poses of links.")
+COMPUTE_IK = Service(
+    "/compute_ik", IkQuery, IkAnswer, "Joint positions for a position or pose of the tool.", reads=True
+)
+COMPUTE_FK = Service("/compute_fk", FkQuery, FkAnswer, "Poses of links.", reads=True)
 PLAN = Service(
-    "/plan_kinematic_path", PlanQuery, PlanAnswer, "Plan to the first goal that can be reached, without moving."
+    "/plan_kinematic_path",
+    PlanQuery,
+    PlanAnswer,
+    "Plan to the first goal that can be reached, without moving.",
+    reads=True,
 )
-PLAN_GOAL = Service("/planning/plan", PlanAhead, PlanAnswer, "Plan to a goal, without moving.", alone="goal")
+PLAN_GOAL = Service(
+    "/planning/plan", PlanAhead, PlanAnswer, "Plan to a goal, without moving.", alone="goal", reads=True
+)
 CARTESIAN = Service(
-    "/compute_cartesian_path", CartesianQuery, PlanAnswer, "Plan straight lines of the tool through waypoints."
+    "/compute_cartesian_path",
+    CartesianQuery,
+    PlanAnswer,
+    "Plan straight lines of the tool through waypoints.",
+    reads=True,
 )
-SCENE = Service("/get_planning_scene", NoRequest, PlanningScene, "The robot and what is around it.")
+SCENE = Service("/get_planning_scene", NoRequest, PlanningScene, "The robot and what is around it.", reads=True)
 BASE_FRAME = "base_link"
 """Frame of poses in answers."""
 

@@ -45,7 +45,12 @@ GO_TO = Service(
     "/planning/go_to", GoTo, int, "Move to a goal, which replaces the present one; answers with its number.", "goal"
 )
 RESULT: Service[Numbered, MoveResult | None] = Service(
-    "/planning/result", Numbered, MoveResult | None, "The result of a goal; null while the robot moves.", "number"
+    "/planning/result",
+    Numbered,
+    MoveResult | None,
+    "The result of a goal; null while the robot moves.",
+    "number",
+    reads=True,
 )
 CANCEL = Service(
     "/planning/cancel", NoRequest, NoneType, "Drop all goals: the robot slows down and holds.", urgent=True

@@ -34,9 +34,11 @@ class RunTask:
 
 _LIMITS = RequestLimits(text=20_000)
 RUN = Service("/task/run", RunTask, int, "Check a task and begin it; answers with its number.", "task", _LIMITS)
-CHECK = Service("/task/check", RunTask, NoneType, "Check a task; fails as /task/run would.", "task", _LIMITS)
+CHECK = Service(
+    "/task/check", RunTask, NoneType, "Check a task; fails as /task/run would.", "task", _LIMITS, reads=True
+)
 RESULT: Service[Numbered, TaskResult | None] = Service(
-    "/task/result", Numbered, TaskResult | None, "The result of a task; null until it has ended.", "number"
+    "/task/result", Numbered, TaskResult | None, "The result of a task; null until it has ended.", "number", reads=True
 )
 CANCEL = Service(
     "/task/cancel", NoRequest, NoneType, "End the present task: the robot slows down and holds.", urgent=True

@@ -303,10 +303,18 @@ class ObservedWorld:
 
 
 SNAPSHOT = Service(
-    "/world/snapshot", NoRequest, World, "The objects around the robot; an error if they are too old to plan with."
+    "/world/snapshot",
+    NoRequest,
+    World,
+    "The objects around the robot; an error if they are too old to plan with.",
+    reads=True,
 )
 OBSERVED = Service(
-    "/world/observed", NoRequest, ObservedWorld, "The objects around the robot, and their ages, however old they are."
+    "/world/observed",
+    NoRequest,
+    ObservedWorld,
+    "The objects around the robot, and their ages, however old they are.",
+    reads=True,
 )
 
 

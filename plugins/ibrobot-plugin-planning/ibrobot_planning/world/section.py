@@ -73,7 +73,7 @@ DETACH = Service("/world/detach", Detached, list, "Put down an object where it i
 TOUCH = Service("/world/touch", Touched, list, "Let the hand touch objects, until the next call." + _ANSWER)
 ALLOW = Service("/world/allow", Allowed, list, "State what an object may touch." + _ANSWER)
 SHAPES: Service[NoRequest, Sequence[SceneObject]] = Service(
-    "/world/shapes", NoRequest, Sequence, "The objects in the base frame that have simple shapes."
+    "/world/shapes", NoRequest, Sequence, "The objects in the base frame that have simple shapes.", reads=True
 )
 _MOST_NAMED = 3
 """Clouds and objects that the reason of a refused plan names."""
