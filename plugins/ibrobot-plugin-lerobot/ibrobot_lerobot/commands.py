@@ -62,9 +62,9 @@ def info(options: InfoOptions, as_json: bool, events: bool) -> None:
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder of the whole dataset.")
 @wrong_input()
 def merge(parts: tuple[Path, ...], out: Path) -> None:
-    """Join datasets, e.g. those of `ibrobot convert --shard`, into one of LeRobot v3.0.
+    """Join datasets, or copy an older one, to LeRobot v3.0.
 
-    They must have the same contract and settings, or the same features where other programs made them. One dataset is
+    Those of `ibrobot convert --shard` become one. Datasets must have the same contract and settings, or the same features where other programs made them. One dataset is
     copied: so v2.0 and v2.1 become v3.0. An episode that two of them have is an error. Nothing is encoded again.
     """
     from ibrobot_lerobot.join import join_datasets
