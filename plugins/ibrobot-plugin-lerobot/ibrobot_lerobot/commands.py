@@ -64,8 +64,9 @@ def info(options: InfoOptions, as_json: bool, events: bool) -> None:
 def merge(parts: tuple[Path, ...], out: Path) -> None:
     """Join datasets, or copy an older one, to LeRobot v3.0.
 
-    Those of `ibrobot convert --shard` become one. Datasets must have the same contract and settings, or the same features where other programs made them. One dataset is
-    copied: so v2.0 and v2.1 become v3.0. An episode that two of them have is an error. Nothing is encoded again.
+    Those of `ibrobot convert --shard` become one. Datasets must have the same contract and settings, or the same
+    features where other programs made them. A single one of v2.0 or v2.1 becomes v3.0. An episode that two of them
+    have is an error. Nothing is encoded again.
     """
     from ibrobot_lerobot.join import join_datasets
 
