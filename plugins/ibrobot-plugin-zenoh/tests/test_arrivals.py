@@ -6,6 +6,7 @@ import itertools
 import queue
 import sys
 import time
+from functools import partial
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from ibrobot_ros2.interfaces import action_type, from_cdr, service_type, to_cdr
 from ibrobot_ros2.services import SERVICES, Answer, Call, decode_answer, encode_call
 from ibrobot_ros2.workers import StopWay
 from ibrobot_testing import stand_in
+from ibrobot_testing.section import make_session
 from ibrobot_zenoh import ros_calls
 from ibrobot_zenoh.ros2 import actions_of, attachment, service_key
 from ibrobot_zenoh.ros_goals import SentGoal, Status
@@ -26,7 +28,6 @@ from ibrobot_core.api import NS_PER_S, IbrobotError, Payload
 from ibrobot_core.app import NoRequest, Service
 
 from .pair import WAIT_S, client, free_endpoint, router, settle, wait_for
-from .test_bad_networks import make_session
 from .test_topics import raw_config
 
 if TYPE_CHECKING:
@@ -77,9 +78,14 @@ class Robot:
     def serve(self) -> None:
         """Serve what moves, and what does not."""
         for name in MOVING:
-            self.runtime.session.bus.serve(stand_in(name), lambda request, name=name: self.calls.append(name) or "done")
+            self.runtime.session.bus.serve(stand_in(name), partial(self.carry_out, name, "done"))
         for service in (READING, URGENT):
             self.runtime.session.bus.serve(service, lambda request: "done")
+
+    def carry_out(self, name: str, answer: Any, request: object) -> Any:
+        """Note a request, and answer it."""
+        self.calls.append(name)
+        return answer
 
     def stop(self, cause: str) -> int:
         """Stop the robot; returns a time of day before [ns]."""
@@ -249,7 +255,7 @@ def test_actions_over_zenoh(near: tuple[Robot, ZenohTransport, zenoh.Session], m
     foreign.close()
     kind = action_type("ibrobot_msgs/action/RecordEpisode")
     service = Service("/record_episode/start/it", Prompt, Ended, ros_type=kind.name)
-    robot.runtime.session.bus.serve(service, lambda request: robot.calls.append("it") or Ended(True, request.prompt))
+    robot.runtime.session.bus.serve(service, partial(robot.carry_out, "it", Ended(True, "recorded")))
     wait_for(lambda: (service.name, kind.name) in actions_of(own.shared_services(WAIT_S)))
     stopped_ns = robot.stop("STOP")
     robot.reset()
