@@ -133,7 +133,7 @@ def _rows(feature: FeatureContents) -> list[tuple[str, ...]]:
     """One row for each value of a feature."""
     head = (feature.key, feature.dtype, "x".join(map(str, feature.shape)), feature.unit)
     rows = []
-    for i in range(len(feature.stats.get("mean", ())) or 1):
+    for i in range(len(feature.stats.get("mean", ())) or len(feature.names) or 1):
         name = feature.names[i] if i < len(feature.names) else ""
         values = [feature.stats[each][i] if each in feature.stats else None for each in ("min", "mean", "max", "std")]
         numbers = ["" if value is None else f"{value:.4g}" for value in values]

@@ -306,6 +306,8 @@ class _Merge:
         placed = {}
         place = self._videos.setdefault(key, _Place(_next(self._old, f"{layout.VIDEOS}/{key}", "mp4")))
         for path, count in sorted(frames.items()):
+            if not path.exists():
+                raise DatasetError(f"{path}: is missing; download the videos of the dataset too")
             size = path.stat().st_size
             if place.frames and place.bytes + size > limit:
                 self._join(key)

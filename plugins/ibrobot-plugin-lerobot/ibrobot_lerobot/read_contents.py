@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import attrs
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -27,6 +28,7 @@ def dataset_contents(root: Path) -> Contents:
         DatasetError: if there is no dataset, or it cannot be read.
     """
     dataset = layout.existing_dataset(root)
+    dataset = attrs.evolve(dataset, stats=dataset.stats or _joined_stats(dataset))
     info, own = dataset.info, dataset.metadata
     norm_mode = str((own.get("conversion") or {}).get("norm_mode", ""))
     try:
@@ -61,6 +63,31 @@ def _feature(dataset: layout.OnDisk, key: str, entry: Mapping[str, Any], norm_mo
         picture=picture,
         texts=() if picture or layout.is_numeric(feature) else _texts(dataset, key),
     )
+
+
+def _joined_stats(dataset: layout.OnDisk) -> dict[str, dict[str, Any]]:
+    """Minimum, maximum, mean and deviation of all episodes, from those of each: v2.1 has no others."""
+    episodes: dict[str, list[dict[str, Any]]] = {}
+    for row in dataset.episodes():
+        own: dict[str, dict[str, Any]] = {}
+        for column, value in row.items():
+            if column.startswith("stats/"):
+                key, _, name = column.removeprefix("stats/").rpartition("/")
+                own.setdefault(key, {})[name] = np.asarray(value, float)
+        for key, each in own.items():
+            if each.keys() >= {"min", "max", "mean", "std", "count"}:
+                episodes.setdefault(key, []).append(each)
+    joined = {}
+    for key, rows in episodes.items():
+        low, high, mean, std = (
+            np.stack([np.ravel(row[name]) for row in rows]) for name in ("min", "max", "mean", "std")
+        )
+        share = np.stack([row["count"][:1] for row in rows])
+        share = share / share.sum()
+        middle = (share * mean).sum(0)
+        spread = np.sqrt((share * (std**2 + (mean - middle) ** 2)).sum(0))
+        joined[key] = {"min": low.min(0), "max": high.max(0), "mean": middle, "std": spread}
+    return joined
 
 
 def _texts(dataset: layout.OnDisk, key: str) -> tuple[str, ...]:

@@ -151,6 +151,15 @@ def test_every_version_is_shown(version: str, tmp_path: Path) -> None:
     assert ("note: an older version, which is read only" in done.stdout) == version.startswith("v2")
 
 
+def test_statistics_of_episodes_are_shown_as_those_of_the_whole(tmp_path: Path) -> None:
+    shown, wanted = (dataset_contents(VERSIONS[each](tmp_path / each)) for each in ("v2.1", "v3.0"))
+    for mine, other in zip(shown.features, wanted.features, strict=True):
+        for name in ("min", "max", "mean", "std"):
+            assert mine.stats[name] == pytest.approx(other.stats[name], rel=1e-6, abs=1e-9), (mine.key, name)
+    without = dataset_contents(VERSIONS["v2.0"](tmp_path / "v2.0"))
+    assert [each.key for each in without.features] == list(FEATURES)
+
+
 @pytest.mark.parametrize("options", [{"videos": False}, {"codec": "h264"}, {}], ids=str)
 def test_every_version_becomes_the_current_one_by_merging(
     version: str, options: dict[str, Any], tmp_path: Path
@@ -287,7 +296,7 @@ def test_pictures_that_are_missing_are_an_error_where_they_are_needed(
         list(EpisodeRows(dataset, 0).read(FEATURES))
     done = run_here("datasets", "merge", root, "--out", tmp_path / "new")
     assert done.returncode == 2
-    assert "mp4" in done.stderr
+    assert "mp4: is missing; download the videos of the dataset too" in done.stderr
     assert not (tmp_path / "new/meta").exists()
 
 
