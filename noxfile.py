@@ -54,6 +54,7 @@ EXTRAS = {
     "ibrobot-plugin-mcap": "[plot]",
     "ibrobot-plugin-mujoco": "[urdf]",
     "ibrobot-plugin-planning": "[client,obstacles,plot]",
+    "ibrobot-plugin-policy-servers": "[grpc]",
     "ibrobot-plugin-zenoh": "[interop]",
 }
 """Distribution -> extras that its tests use."""
@@ -219,7 +220,7 @@ def minimums(session: nox.Session) -> None:
 @nox.session
 def lerobot(session: nox.Session) -> None:
     """LeRobot itself, unmodified, against what the plugins offer; the one session with torch."""
-    extras = "damiao,dataset,diffusion,dynamixel,evaluation,feetech,rebot,smolvla,training"
+    extras = "async,damiao,dataset,diffusion,dynamixel,evaluation,feetech,rebot,smolvla,training"
     lerobot = f"lerobot[{extras}]=={LEROBOT_VERSIONS[-1]}"
     install(session, *PLUGINS, options=(lerobot, "onnxscript"))  # the latter exports policies
     # Beside the environment: LeRobot imports them wherever it runs, with torch.

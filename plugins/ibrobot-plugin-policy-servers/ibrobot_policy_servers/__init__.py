@@ -1,16 +1,17 @@
-"""The plugin's hook: policies `openpi`, `gr00t` and `vla_eval`, models of servers of other projects."""
+"""The plugin's hook: policies `openpi`, `gr00t`, `vla_eval` and `lerobot_server`, models of other projects' servers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 from ibrobot_core.api import Late, PolicyDescriptor, hookimpl
-from ibrobot_policy_servers.options import Gr00tOptions, OpenpiOptions, VlaEvalOptions
+from ibrobot_policy_servers.options import Gr00tOptions, LerobotServerOptions, OpenpiOptions, VlaEvalOptions
 
 _SERVED = Late("ibrobot_policy_servers.served:ServedPolicy")
 _OPENPI = Late("ibrobot_policy_servers.openpi:OpenpiConnection")
 _GR00T = Late("ibrobot_policy_servers.gr00t:Gr00tConnection")
 _VLA_EVAL = Late("ibrobot_policy_servers.vla_eval:VlaEvalConnection")
+_LEROBOT = Late("ibrobot_policy_servers.lerobot_server:LerobotConnection")
 
 
 @hookimpl
@@ -33,4 +34,10 @@ def ibrobot_policies() -> Iterable[PolicyDescriptor]:
         options=VlaEvalOptions,
         make=lambda options, ctx: _SERVED(options, ctx, _VLA_EVAL(options), stateful=True),
         summary="a model of a model server of vla-eval",
+    )
+    yield PolicyDescriptor(
+        type="lerobot_server",
+        options=LerobotServerOptions,
+        make=lambda options, ctx: _SERVED(options, ctx, _LEROBOT(options)),
+        summary="a model of LeRobot's policy server",
     )

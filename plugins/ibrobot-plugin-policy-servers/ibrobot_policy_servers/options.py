@@ -23,6 +23,11 @@ def _not_empty(instance: Any, attribute: attrs.Attribute[Any], value: Sequence[A
         raise ValueError("must not be empty")
 
 
+def _host_and_port(instance: Any, attribute: attrs.Attribute[Any], value: str) -> None:
+    if not re.fullmatch(r"([^\s/:]+|\[[0-9a-fA-F:]+\]):\d{1,5}", value):
+        raise ValueError("must be HOST:PORT")
+
+
 def _tcp(instance: Any, attribute: attrs.Attribute[Any], value: str) -> None:
     if not re.fullmatch(r"tcp://[^\s/:]+:\d{1,5}|ipc://\S+", value):
         raise ValueError("must be tcp://HOST:PORT, or ipc://PATH")
@@ -122,3 +127,18 @@ class VlaEvalOptions(ServerOptions):
     )
     url: str = option("ws://127.0.0.1:8000", validator=_websocket, help="the server; wss:// for TLS")
     ca: str = option("", help="file with the certificate authority for wss://, in place of the system's")
+
+
+@documented
+@attrs.frozen(kw_only=True)
+class LerobotServerOptions(ServerOptions):
+    """Address of LeRobot's policy server, the checkpoint that it loads, and the mapping to it."""
+
+    policy_type: str = option(validator=_not_empty, help="LeRobot's type of the policy, e.g. act")
+    pretrained_name_or_path: str = option(
+        validator=_not_empty,
+        help="the checkpoint: a folder on the server's machine, or a name on the Hugging Face Hub",
+    )
+    policy_device: str = option("cpu", validator=_not_empty, help="where the server computes, e.g. cuda")
+    prompt: tuple[str, ...] = option(("task",), help="[task], or empty: the model takes no prompt")
+    address: str = option("127.0.0.1:8080", validator=_host_and_port, help="the server; not encrypted")
