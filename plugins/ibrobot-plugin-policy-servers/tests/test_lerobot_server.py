@@ -176,7 +176,7 @@ def test_a_mapping_that_the_server_does_not_know_is_an_error(changes: dict[str, 
         make(attrs.evolve(OPTIONS, **changes))
 
 
-def test_a_robot_without_grpcio_is_told_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_without_grpcio_names_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     [descriptor] = [each for each in ibrobot_policies() if each.type == "lerobot_server"]
     monkeypatch.setitem(sys.modules, "grpc", None)
     monkeypatch.delitem(sys.modules, "ibrobot_policy_servers.lerobot_server")
@@ -265,7 +265,7 @@ def test_a_late_answer_reaches_no_later_request(options: LerobotServerOptions, s
     policy.close()
 
 
-def test_a_server_that_is_killed_is_told_its_model_again(options: LerobotServerOptions, server: LerobotServer) -> None:
+def test_a_server_that_was_killed_loads_its_model_again(options: LerobotServerOptions, server: LerobotServer) -> None:
     policy = make(attrs.evolve(options, start_timeout=3000.0))
     policy.load()
     server.stop()
