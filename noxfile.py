@@ -242,8 +242,8 @@ def lerobot_versions(session: nox.Session, version: str) -> None:
     install(session, *PLUGINS, options=(f"lerobot[{extras}]{pinned}", *more), plain=plain)
     system_libraries(session)
     tests = [f"tests/lerobot/test_{name}.py" for name in ("recorded", "dataset", "policy", "feetech_bus", "devices")]
-    # What it warns of is its own.
     report = Path(session.create_tmp()).absolute() / "report.xml"
+    # What it warns of is its own.
     session.run(*PYTEST, "-W", "default", "-m", "lerobot", f"--junitxml={report}", *(session.posargs or tests))
     if pinned and not session.posargs:
         session.run("python", "tests/lerobot/versions_page.py", version, str(report))

@@ -11,9 +11,11 @@ import attrs
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from ibrobot_core.api import DatasetError, Feature
 from ibrobot_lerobot.arrow import table_of
+from ibrobot_lerobot.options import LeRobotOptions
 
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
@@ -26,8 +28,6 @@ DATA = "data"
 EPISODES = "meta/episodes"
 VIDEOS = "videos"
 FILES_PER_CHUNK = 1000
-TABLE_MB, VIDEO_MB = 100, 200
-"""Default sizes of files [MiB], those of LeRobot."""
 COUNTERS = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -152,13 +152,14 @@ def new_info(stored: Mapping[str, Column], fps: float, robot_type: str, table_mb
 
 def current_info(info: Mapping[str, Any]) -> dict[str, Any]:
     """`info.json` of an older dataset as this version has it, without episodes."""
-    form = new_info({}, info["fps"], info.get("robot_type") or "", TABLE_MB, VIDEO_MB)
+    sizes = LeRobotOptions()
+    form = new_info({}, info["fps"], info.get("robot_type") or "", sizes.table_file_mb, sizes.video_file_mb)
     return form | {"features": info["features"]}
 
 
 def features_of(info: Mapping[str, Any]) -> dict[str, Feature]:
     """The features of `info.json`, without the writer's own columns."""
-    return {key: _feature(entry) for key, entry in info["features"].items() if key not in COUNTERS}
+    return {key: feature_of(entry) for key, entry in info["features"].items() if key not in COUNTERS}
 
 
 def is_numeric(feature: Feature) -> bool:
@@ -401,13 +402,23 @@ def _lines(path: Path, *keys: str) -> Iterator[dict[str, Any]]:
         yield row
 
 
+def row_stats(row: Mapping[str, Any]) -> dict[str, dict[str, NDArray[Any]]]:
+    """The statistics in an episode's row: feature -> name -> values."""
+    stats: dict[str, dict[str, NDArray[Any]]] = {}
+    for column, value in row.items():
+        if column.startswith("stats/"):
+            key, _, name = column.removeprefix("stats/").rpartition("/")
+            stats.setdefault(key, {})[name] = np.array(value)
+    return stats
+
+
 def write_json(path: Path, document: Any) -> None:
     """Write a JSON file, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(document, indent=4, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _feature(entry: Mapping[str, Any]) -> Feature:
+def feature_of(entry: Mapping[str, Any]) -> Feature:
     """A feature from its entry in `info.json`; older datasets have pictures with their channels first."""
     dtype, shape, names = _dtype(entry), tuple(entry["shape"]), element_names(entry.get("names"))
     if dtype == "image" and len(shape) == 3 and names[:1] in (("channel",), ("channels",)):

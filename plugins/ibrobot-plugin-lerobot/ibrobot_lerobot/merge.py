@@ -232,7 +232,7 @@ class _Merge:
 
     def _count_episode(self, part: OnDisk, row: Mapping[str, Any]) -> dict[str, Stats]:
         """The statistics of an episode; those that it lacks are computed from its rows and pictures."""
-        stats = _row_stats(row)
+        stats = layout.row_stats(row)
         cameras = {key: picture_stats(part.features[key]) for key in self._uncounted(part)}
         vectors: dict[str, list[Any]] = {
             key: [] for key, feature in part.features.items()
@@ -367,26 +367,17 @@ def _replaced(table: pa.Table, name: str, values: np.ndarray[Any, Any]) -> pa.Ta
     return table.set_column(position, field, to_array(values, field.type))
 
 
-def _row_stats(row: Mapping[str, Any]) -> dict[str, Stats]:
-    stats: dict[str, Stats] = {}
-    for column, value in row.items():
-        if column.startswith("stats/"):
-            key, _, name = column.removeprefix("stats/").rpartition("/")
-            stats.setdefault(key, {})[name] = np.array(value)
-    return stats
-
-
 def _stored(info: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """How the features are stored: key -> what must be equal in all parts."""
-    features = layout.features_of(info)
+    features = {key: (layout.feature_of(entry), entry) for key, entry in info["features"].items()}
     return {
         key: {
             "dtype": entry["dtype"],
-            "shape": features[key].shape if key in features else entry["shape"],
-            "names": features[key].names if key in features else entry.get("names"),
+            "shape": feature.shape,
+            "names": feature.names,
             "video.codec": (entry.get("info") or {}).get("video.codec"),
         }
-        for key, entry in info["features"].items()
+        for key, (feature, entry) in features.items()
     }
 
 

@@ -69,12 +69,7 @@ def _joined_stats(dataset: layout.OnDisk) -> dict[str, dict[str, Any]]:
     """Minimum, maximum, mean and deviation of all episodes, from those of each: v2.1 has no others."""
     episodes: dict[str, list[dict[str, Any]]] = {}
     for row in dataset.episodes():
-        own: dict[str, dict[str, Any]] = {}
-        for column, value in row.items():
-            if column.startswith("stats/"):
-                key, _, name = column.removeprefix("stats/").rpartition("/")
-                own.setdefault(key, {})[name] = np.asarray(value, float)
-        for key, each in own.items():
+        for key, each in layout.row_stats(row).items():
             if each.keys() >= {"min", "max", "mean", "std", "count"}:
                 episodes.setdefault(key, []).append(each)
     joined = {}
