@@ -26,6 +26,10 @@ class _Server[Q, A]:
     files: Callable[[str], Path]
 
 
+type Wants = Callable[[str], bool]
+"""Whether a subscription to every topic gets the messages of one; by default it gets all."""
+
+
 @attrs.frozen
 class Received:
     """A message with its time of receipt by the bus [ns]."""
@@ -38,9 +42,10 @@ class Received:
 class Subscription:
     """A subscriber's queue with `depth` messages; when it is full, the oldest is dropped and counted."""
 
-    def __init__(self, bus: Bus, topic: str, depth: int) -> None:
+    def __init__(self, bus: Bus, topic: str, depth: int, wants: Wants) -> None:
         self.topic = topic
         self.depth = depth
+        self.wants = wants
         self.lost = Counter[str]()
         """Topic -> number of dropped messages."""
         self._bus = bus
@@ -65,16 +70,14 @@ class Subscription:
     def drain(self) -> list[Received]:
         """All queued messages, oldest first."""
         with self._arrived:
-            items = list(self._queue)
-            self._queue.clear()
+            items, self._queue = list(self._queue), deque()
             return items
 
     def close(self) -> None:
         """End the subscription."""
         with self._arrived:
-            subscriptions = self._bus._subscriptions[self.topic]
-            if self in subscriptions:
-                subscriptions.remove(self)
+            others = [each for each in self._bus._subscriptions[self.topic] if each is not self]
+            self._bus._subscriptions[self.topic] = others
 
 
 class Bus:
@@ -136,16 +139,20 @@ class Bus:
             self._counts[topic] = self._counts.get(topic, 0) + 1
             if latched:
                 self._latched[topic] = item
-            for subscription in (*self._subscriptions.get(topic, ()), *self._subscriptions.get("", ())):
+            for subscription in self._receivers(topic):
                 subscription._put(item)
 
-    def subscribe(self, topic: str | None, depth: int = 10, *types: type[Message]) -> Subscription:
+    def _receivers(self, topic: str) -> list[Subscription]:
+        return [each for key in (topic, "") for each in self._subscriptions.get(key, ()) if each.wants(topic)]
+
+    def subscribe(self, topic: str | None, depth: int = 10, *types: type[Message], wants: Wants = bool) -> Subscription:
         """A new queue on `topic` (None: every topic), holding the newest `depth` messages.
 
         Args:
             topic: the topic.
             depth: size of the queue.
             types: the types that the topic carries from now on, as `expect`; any if there are none.
+            wants: of every topic, those to receive; by default all. It is asked at each message, so that it may change.
 
         Raises:
             ValueError: if `depth` is below one.
@@ -156,17 +163,17 @@ class Bus:
         if topic is not None and types:
             self.expect(topic, *(each.ros_type for each in types))
         with self._lock:
-            subscription = Subscription(self, topic or "", depth)
+            subscription = Subscription(self, topic or "", depth, wants)
             self._subscriptions[subscription.topic].append(subscription)
             for item in self._latched.values():
-                if topic in (None, item.topic):
+                if topic in (None, item.topic) and wants(item.topic):
                     subscription._put(item)
             return subscription
 
     def has_subscribers(self, topic: str) -> bool:
         """Whether anybody receives the messages of a topic; if not, there is no need to compute them."""
         with self._lock:
-            return bool(self._subscriptions.get(topic) or self._subscriptions.get(""))
+            return bool(self._receivers(topic))
 
     def snapshot_ns(self) -> int:
         """The present time [ns], such that every message received until then is in its subscribers' queues."""
@@ -186,10 +193,8 @@ class Bus:
     def dropped(self) -> dict[str, int]:
         """Topic -> number of messages dropped from full queues of present subscribers; only topics with losses."""
         with self._lock:
-            lost = Counter[str]()
-            for topic, subscriptions in self._subscriptions.items():
-                lost[topic or "*"] += sum(subscription.lost.total() for subscription in subscriptions)
-            return dict(+lost)
+            lost = {topic: sum(each.lost.total() for each in every) for topic, every in self._subscriptions.items()}
+            return {topic or "*": number for topic, number in lost.items() if number}
 
     def serve[Q, A](
         self, service: Service[Q, A], handler: Callable[[Q], A], files: Callable[[str], Path] = no_files

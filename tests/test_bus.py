@@ -100,6 +100,20 @@ def test_a_subscription_to_everything(bus: Bus) -> None:
     assert bus.dropped() == {"*": 1}
 
 
+def test_a_subscription_to_everything_that_is_wanted(bus: Bus) -> None:
+    wanted = {"/a"}
+    bus.publish("/b", Int32(1), latched=True)
+    some = bus.subscribe(None, wants=lambda topic: topic in wanted)
+    assert (bus.has_subscribers("/a"), bus.has_subscribers("/b")) == (True, False)
+
+    bus.publish("/a", Int32(2))
+    bus.publish("/b", Int32(3))
+    wanted.add("/b")
+    bus.publish("/b", Int32(4))
+
+    assert [item.message for item in some.drain()] == [Int32(2), Int32(4)]
+
+
 def test_a_closed_subscription_gets_nothing_more(bus: Bus) -> None:
     one, everything = bus.subscribe("/a"), bus.subscribe(None)
     one.close()

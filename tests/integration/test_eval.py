@@ -10,7 +10,8 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import chdir
+from collections import Counter
+from contextlib import chdir, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -137,6 +138,25 @@ def test_printed_command_repeats_an_episode_byte_by_byte(folder: Path, whole: Pa
         assert (program, run_here(*command).returncode) == ("ibrobot", 3)
     repeated = tmp_path / "episodes/default/episodes/episode_000001"
     assert digests(repeated) == digests(whole / episode["recording"])
+
+
+def test_pictures_that_the_policy_does_not_look_at_are_recorded_on_request_only(tmp_path: Path) -> None:
+    shared = "so101.yaml", "--sim", "--episodes", 1, "--jobs", 1, "--videos", 0, "--set", "contract.max_duration_s=1"
+    lines = []
+    for out, more in (("few", ()), ("all", ("--all-pictures",))):
+        with chdir(tmp_path):
+            assert run_here("eval", *map(str, (*shared, "--out", out, *more))).returncode == 0
+        lines.append(topics_of(next((tmp_path / out / "episodes").rglob("*_000000"))))
+    few, every = lines
+    assert {topic for topic in every if topic not in few} == {"/camera/top/image_raw", "/camera/wrist/image_raw"}
+    assert few == {topic: number for topic, number in every.items() if topic in few}
+    assert few["/model_answers"] > 0
+
+
+def topics_of(episode: Path) -> dict[str, int]:
+    """Topic -> number of messages in a recording."""
+    with closing(installed_plugins().open_episode(episode)) as reader:
+        return dict(Counter(each.topic for each in reader.messages()))
 
 
 def test_episode_of_a_killed_worker_is_run_again(start: Any, folder: Path, whole: Path) -> None:

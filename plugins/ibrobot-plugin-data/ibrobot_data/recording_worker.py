@@ -140,7 +140,7 @@ class RecordingWorker(SessionWorker):
         self._closed = False
         self.on_end.callback(self._close)
         self.recorder: Recorder = session.make("recorder", self._config, "recording")
-        self._incoming = session.bus.subscribe(None, _DEPTH)
+        self._incoming = session.bus.subscribe(None, _DEPTH, wants=self._keeps)
         self.on_end.callback(self._incoming.close)
         self.episodes.serve()
         self.on_end.callback(self.episodes.unserve)

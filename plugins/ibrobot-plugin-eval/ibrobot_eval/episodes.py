@@ -16,6 +16,7 @@ from ibrobot_provenance import differing_code, installed_code
 
 from ibrobot_core.api import (
     MODEL_ANSWERS,
+    Contract,
     DatasetError,
     Message,
     ModelAnswer,
@@ -23,7 +24,15 @@ from ibrobot_core.api import (
     replace_file,
     seconds,
 )
-from ibrobot_core.app import ComponentFailed, LaunchRequest, RobotConfig, Runtime, Session, installed_plugins
+from ibrobot_core.app import (
+    ComponentFailed,
+    LaunchRequest,
+    RobotConfig,
+    Runtime,
+    Session,
+    build_policy,
+    installed_plugins,
+)
 from ibrobot_eval.limits import Attempt, EpisodeTooLong
 from ibrobot_eval.policies import Policy, as_texts, document_hash
 
@@ -97,6 +106,8 @@ class EpisodeJob:
     """Hash of the robot YAML with which the evaluation began."""
     code: Mapping[str, str]
     """The installed code with which it began."""
+    all_pictures: bool
+    """Whether the recording also has the pictures that the policy does not look at."""
     answer_s: float
     """Longest time of a step, e.g. of an answer of the policy [s]."""
     episode_s: float
@@ -146,6 +157,8 @@ def _run(job: EpisodeJob, attempt: Attempt) -> Result:
     place, policy, seed = job.place, job.policy, job.seed
     scratch = job.out / SCRATCH / uuid4().hex  # another process may run the episode at the same time
     config, recordings = recorded_in(scratch, policy.load(seed))
+    if not job.all_pictures:
+        config = without_unseen_pictures(config, policy.model)
     runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=seed, episodes=1)))
     session = runtime.session
     answers = session.bus.subscribe(MODEL_ANSWERS, _DEPTH)
@@ -219,6 +232,24 @@ def recorded_in(folder: Path, config: RobotConfig) -> tuple[RobotConfig, Path]:
     assert config.recording is not None
     recording = attrs.evolve(config.recording, root=str(folder), dataset="one")
     return attrs.evolve(config, recording=recording, viewer=None), recording.folder / "episodes"
+
+
+def without_unseen_pictures(config: RobotConfig, model: str) -> RobotConfig:
+    """Have a robot that records its contract leave out the pictures that a model does not look at.
+
+    In lockstep, a picture that nobody receives is not rendered, which would take most of an episode's time.
+    """
+    assert config.recording is not None
+    if config.recording.topics != "contract":
+        return config
+    seen = build_policy(config, installed_plugins(), model).spec.observations
+    contract = Contract.from_config(config, config.models[model].extra_observations)
+    unseen = {each.topic for each in contract.observation_parts if each.image is not None}
+    unseen -= {each.topic for each in contract.observation_parts if each.key in seen}
+    if not unseen:
+        return config
+    kept = tuple(topic for topic in (*contract.topics, MODEL_ANSWERS) if topic not in unseen)
+    return attrs.evolve(config, recording=attrs.evolve(config.recording, topics=kept))
 
 
 def interventions(session: Session) -> dict[str, int]:

@@ -152,7 +152,8 @@ class Evaluation:
     def _job(self, policy: Policy, seed: int) -> EpisodeJob:
         options = self.options
         document = self._identities[policy.label].document
-        return EpisodeJob(options.out, policy, seed, document, self._code, options.answer_limit, options.episode_limit)
+        limits = options.answer_limit, options.episode_limit
+        return EpisodeJob(options.out, policy, seed, document, self._code, options.all_pictures, *limits)
 
     @contextmanager
     def _running[R](
@@ -223,6 +224,7 @@ def opened(options: EvalOptions, policies: Sequence[Policy]) -> Iterator[Evaluat
         "margin": options.margin,
         "trials": options.trials,
         "vary": list(options.vary),
+        "all_pictures": options.all_pictures,
         "policies": {
             each.label: {"mode": each.mode, "model": each.model, **attrs.asdict(identities[each.label])}
             for each in policies

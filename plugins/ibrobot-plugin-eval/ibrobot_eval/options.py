@@ -50,6 +50,12 @@ class EvalOptions:
     on: str = on_option()
     shard: str = shard_option()
     videos: int = option(20, ge=0, label="Videos", more=True, help="failures of each policy to film for the report")
+    all_pictures: bool = option(
+        False,
+        label="All pictures",
+        more=True,
+        help="also record the cameras that the policy does not look at; rendering them takes most of the time",
+    )
     answer_limit: float = option(
         120.0,
         gt=0,
