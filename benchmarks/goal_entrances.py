@@ -25,7 +25,7 @@ from typing import Any
 import attrs
 import numpy as np
 import yaml
-from ibrobot_planning.client import LocalNode, MoveIt2
+from ibrobot_planning.client import Client
 from ibrobot_planning.execution.requests import GoTo
 from ibrobot_planning.goals.text import Target
 from ibrobot_planning.world.objects import Box, World, WorldObject
@@ -235,27 +235,7 @@ class Robot:
 
     def by_client(self, goal: Goal) -> tuple[Verdict, Any]:
         """Send a goal by the client package."""
-        numbers: list[int] = []
-
-        def sent() -> int:
-            with LocalNode(self.runtime) as node:
-                call = node.call
-
-                def noting(service: str, request: Any = None) -> Any:
-                    answer = call(service, request)
-                    if service == "/execute_trajectory":
-                        numbers.append(answer)
-                    return answer
-
-                node.call = noting  # type: ignore[method-assign]
-                arm = MoveIt2(node, list(goal.names), "base_link", "gripperframe")
-                arm.execute(goal.message)
-                if not numbers:
-                    error = arm.get_last_execution_error_code()
-                    raise IbrobotError(error.message if error is not None else "refused")
-            return numbers[0]
-
-        return self._asked(sent)
+        return self._asked(lambda: Client.of_run(self.runtime).follow(goal.message).number)
 
     def _asked(self, send: Callable[[], int]) -> tuple[Verdict, Any]:
         """Send a goal to the planner's source, which decides at its next unit of work."""

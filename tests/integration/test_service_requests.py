@@ -1,7 +1,4 @@
-"""Generated requests and messages for every service and topic of an arm in motion.
-
-`benchmarks/service_requests.py` sends thousands.
-"""
+"""Generated requests and messages for every service and topic of an arm in motion."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ibrobot_planning.client import LocalNode, MoveIt2
+from ibrobot_planning.client import Client
 from ibrobot_planning.execution.requests import Execute, GoTo
 from ibrobot_planning.execution.results import MoveResult
 from ibrobot_planning.execution.source import EXECUTE, GO_TO
@@ -105,12 +105,7 @@ def through_target(runtime: Runtime, wanted: JointTrajectory) -> MoveResult:
 
 
 def through_client(runtime: Runtime, wanted: JointTrajectory) -> MoveResult:
-    with LocalNode(runtime) as node:
-        arm = MoveIt2(node, list(ARM), "base_link", "tip")
-        arm.execute(wanted)
-        done = arm.wait_until_executed()
-        error: Any = arm.get_last_execution_error_code()
-    return MoveResult(done, error.message, 0.0, "SUCCEEDED" if done else "PLANNING_FAILED", error.val)
+    return Client.of_run(runtime).follow(wanted).wait()
 
 
 WAYS = [through_service, through_target, through_client]

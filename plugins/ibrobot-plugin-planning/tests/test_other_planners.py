@@ -6,20 +6,20 @@ import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, override
+from typing import override
 
 import attrs
 import pytest
 from click.testing import CliRunner
 from ibrobot_planning import ibrobot_planners
-from ibrobot_planning.client import LocalNode, MoveIt2
+from ibrobot_planning.client import Client
 from ibrobot_planning.commands.plan import plan
 from ibrobot_planning.execution.requests import GoTo
 from ibrobot_planning.execution.source import GO_TO
 from ibrobot_testing import PlannerSuite
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.api import Context
+from ibrobot_core.api import Context, PlanningError
 from ibrobot_core.app import (
     ConfigError,
     LaunchRequest,
@@ -97,21 +97,23 @@ def test_run_moves_with_it(run: Callable[..., Runtime], mode: str):
     assert (result.outcome, result.code) == ("PLANNING_FAILED", PlanCode.NO_IK_SOLUTION)
 
 
-def test_it_sees_the_world_of_the_run_and_serves_scripts(run: Callable[..., Runtime], caplog: Any):
-    with LocalNode(run("curobo")) as node:
-        node.wait(0.1)
-        arm = MoveIt2(node, list(ARM), "base_link", "tip")
-        arm.move_to_configuration([0.0] * 5)
-        assert arm.wait_until_executed()
-        trajectory = arm.plan(joint_positions=[1.0, 0.8, 0.8, 0.5, 0.0])
-        assert trajectory is not None
-        middle = arm.compute_fk(trajectory.points[len(trajectory.points) // 2].positions.tolist())
-        arm.add_collision_sphere("ball", 0.03, pose=middle)
-        assert arm.plan(joint_positions=[1.0, 0.8, 0.8, 0.5, 0.0]) is None
-        assert "PLANNING_FAILED: every line to a goal touches a sphere" in caplog.text
-        arm.remove_collision_object("ball")
-        arm.move_to_pose(position=(0.2, 0.05, 0.1), cartesian=True)
-        assert "UNRECOGNIZED_GOAL_TYPE: goals like LinearGoal are unknown" in caplog.text
+def test_it_sees_the_world_of_the_run_and_serves_programs(run: Callable[..., Runtime]):
+    client = Client.of_run(run("curobo"))
+    client.wait(0.1)
+    assert client.go_to({"joints": dict.fromkeys(ARM, 0.0)}).wait().success
+    goal = {"joints": dict(zip(ARM, [1.0, 0.8, 0.8, 0.5, 0.0], strict=True))}
+    trajectory = client.plan(goal)
+    middle = trajectory.points[len(trajectory.points) // 2].positions.tolist()
+    place = client.fk(dict(zip(ARM, middle, strict=True))).position
+    ball = {"shape": "sphere", "radius": 0.03, "position": [place.x, place.y, place.z]}
+    client.call("/world/add", {"name": "ball", "object": ball})
+    with pytest.raises(PlanningError, match="every line to a goal touches a sphere") as refused:
+        client.plan(goal)
+    assert refused.value.code is PlanCode.PLANNING_FAILED
+    client.call("/world/remove", "ball")
+    with pytest.raises(PlanningError, match="goals like LinearGoal are unknown") as refused:
+        client.plan_straight({"xyz": [0.2, 0.05, 0.1]})
+    assert refused.value.code is PlanCode.UNRECOGNIZED_GOAL_TYPE
 
 
 def test_commands_take_it(site: SimpleNamespace):
