@@ -896,8 +896,8 @@ class Twists(Operated):
 class PageGoal(Entrance):
     """The goals of the page in a browser."""
 
-    name: ClassVar[str] = "goal"
-    facts: ClassVar[Mapping[str, Any]] = {"goal": f"shoulder_pan={FAR}"}
+    service: ClassVar[str] = "/planning/go_to"
+    request: ClassVar[str] = f"shoulder_pan={FAR}"
 
     @override
     def meet(self) -> None:
@@ -906,10 +906,11 @@ class PageGoal(Entrance):
         self.replies: list[Mapping[str, Any]] = []
         self._commands = page_commands.Commands(session, session.finish, self.replies.append, failed.append)
 
-    def send(self, stops: int, **facts: Any) -> None:
-        """Send a command by a page that has seen `stops` emergency stops, and wait until it was carried out."""
+    def send(self, stops: int, request: str) -> None:
+        """Send a request by a page that has seen `stops` emergency stops, and wait until it was carried out."""
         before = len(self.replies)
-        sent = to_run(from_page(json.dumps({"do": self.name, "id": 7, "stops": stops, **facts})))  # type: ignore[arg-type]
+        message = {"do": "call", "id": 7, "stops": stops, "service": self.service, "request": request}
+        sent = to_run(from_page(json.dumps(message)))  # type: ignore[arg-type]
         command = from_server(json.loads(json.dumps(sent)))
         assert isinstance(command, Sent)
         self._commands.take(command)
@@ -919,17 +920,17 @@ class PageGoal(Entrance):
 
     @override
     def ask(self) -> object:
-        return self.send(self.run.session.stops, **self.facts)
+        return self.send(self.run.session.stops, self.request)
 
     @override
     def with_number(self, value: float) -> Iterator[Callable[[], object]]:
-        yield lambda: self.send(self.run.session.stops, goal=f"shoulder_pan={value}")
-        yield lambda: self.send(self.run.session.stops, goal=f"xyz={value},0.1,0.1")
+        yield lambda: self.send(self.run.session.stops, f"shoulder_pan={value}")
+        yield lambda: self.send(self.run.session.stops, f"xyz={value},0.1,0.1")
 
     @override
     def keep(self) -> Callable[[], object]:
         stops = self.run.session.stops
-        return lambda: self.send(stops, **self.facts)
+        return lambda: self.send(stops, self.request)
 
     @override
     def close(self) -> None:
@@ -941,8 +942,8 @@ class PageGoal(Entrance):
 class PageMode(PageGoal):
     """The modes of the page in a browser: that of a policy moves the robot."""
 
-    name = "mode"
-    facts: ClassVar[Mapping[str, Any]] = {"mode": "model_inference"}
+    service = "/set_mode"
+    request = "model_inference"
     overrides = Policy.overrides
 
     @override

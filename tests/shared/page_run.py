@@ -151,6 +151,10 @@ class PageClient:
         await self.drive.send_json({"id": number, "do": do, "stops": stops, **facts})
         return await self._answer_in(self.answers, number)
 
+    async def service(self, name: str, request: Any = None) -> Any:
+        """Call a service of the run; as `call`."""
+        return await self.call("call", service=name, request=request)
+
     @staticmethod
     async def _answer_in(answers: dict[int, Mapping[str, Any]], number: int) -> Any:
         async with asyncio.timeout(_ANSWER_S):

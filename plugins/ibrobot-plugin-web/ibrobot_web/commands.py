@@ -15,16 +15,13 @@ from ibrobot_core.api import IbrobotError, PlanningError, seconds
 from ibrobot_core.app import (
     PULSE_S,
     RESET,
-    SET_MODE,
-    TOGGLE_SMOOTHING,
     Pulse,
     Reset,
     RunView,
-    SetMode,
     error_text,
     raise_thread_priority,
 )
-from ibrobot_web import messages, run_services
+from ibrobot_web import messages
 from ibrobot_web.messages import RunCommand, Sent, clock_ns
 from ibrobot_web.teleop import JOG, RELEASE, Jog, Released
 
@@ -37,6 +34,7 @@ _AHEAD_MS = 5
 _ALWAYS = messages.Finish | messages.Reset | messages.Preview
 """Commands that may be older than an emergency stop: a reset says which stops it clears, the others move nothing."""
 _STOPPED = "an emergency stop came after this command was sent, so it is not carried out; reset, then send it again"
+_PLAN = "/planning/plan"
 _PREVIEW_ROWS = 40
 _BLOCKED_S = 6.0
 """Time without a sign of life of a thread that stops go through after which the run ends [s]; control may take 5 s to
@@ -203,22 +201,9 @@ def _reset(session: RunView, sent: Sent[messages.Reset]) -> Any:
     return session.bus.call(RESET, Reset(sent.stops))
 
 
-def _joints_of(session: RunView, pose: str) -> dict[str, float]:
-    """The positions of a named pose [rad], of the joints that follow trajectories in this mode."""
-    config = session.config
-    if pose not in config.robot.description.poses:
-        raise ValueError(f"no pose {pose!r}; the poses are: {', '.join(config.robot.description.poses)}")
-    values = dict(zip(config.robot.joint_names, config.robot.pose(pose).tolist(), strict=True))
-    executors = (config.executors[name] for name in config.control_modes[session.mode].executors)
-    return {joint: values[joint] for each in executors if each.goals == "trajectory" for joint in each.joints}
-
-
 def _preview(session: RunView, sent: Sent[messages.Preview]) -> Mapping[str, Any]:
     """The path to a goal, planned and not executed: joints by index, and rows of positions [rad]."""
-    goal = sent.command.goal
-    joints = goal.joints if goal.pose is None else _joints_of(session, goal.pose)
-    target = {"xyz": list(goal.xyz)} if goal.xyz is not None else {"joints": dict(joints or {})}
-    answer = session.bus.call(run_services.PLAN, {"goals": [target]})
+    answer = session.bus.call(_PLAN, {"goal": sent.command.goal})
     if answer.trajectory is None:
         raise PlanningError(answer.message)
     points = answer.trajectory.points
@@ -234,16 +219,6 @@ _HANDLERS: Mapping[type[RunCommand], Handler] = {
     messages.Jog: _jog,
     messages.Release: _release,
     messages.Reset: _reset,
-    messages.SetMode: lambda session, sent: session.bus.call(SET_MODE, SetMode(sent.command.mode)),
-    messages.BeginEpisode: lambda session, sent: session.bus.call(
-        run_services.START_EPISODE, {"prompt": sent.command.prompt or None, "wait": True}
-    ),
-    messages.EndEpisode: lambda session, sent: session.bus.call(run_services.STOP_EPISODE, sent.command.outcome),
-    messages.DiscardEpisode: lambda session, sent: session.bus.call(run_services.DISCARD_EPISODE),
-    messages.RedoEpisode: lambda session, sent: session.bus.call(run_services.REDO_EPISODE),
-    messages.SetSmoothing: lambda session, sent: session.bus.call(TOGGLE_SMOOTHING, sent.command.enabled),
-    messages.Intervene: lambda session, sent: session.bus.call(run_services.INTERVENE, sent.command.take),
+    messages.Call: lambda session, sent: session.bus.call(sent.command.service, sent.command.request),
     messages.Preview: _preview,
-    messages.GoTo: lambda session, sent: session.bus.call(run_services.GO_TO, sent.command.goal),
-    messages.Cancel: lambda session, sent: session.bus.call(run_services.CANCEL),
 }

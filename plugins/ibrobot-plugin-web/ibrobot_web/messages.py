@@ -107,81 +107,36 @@ class Reset:
     """Clears faults and the emergency stops that the page has seen."""
 
 
-@attrs.frozen
-class SetMode:
-    """Enters a mode."""
-
-    mode: str = option(help="its name")
-
-
-@attrs.frozen
-class BeginEpisode:
-    """Begins an episode, once the robot follows the operator."""
-
-    prompt: str = option("", help="the task; empty: as before")
+SERVICES = (
+    "/set_mode", "/action_dispatcher/toggle_smoothing", "/intervene", "/planning/go_to", "/planning/cancel",
+    "/record_episode/start", "/record_episode/stop", "/record_episode/redo", "/record_episode/discard",
+)  # fmt: skip
+"""The services of a run that its operator may call from a page."""
 
 
-@attrs.frozen
-class EndEpisode:
-    """Ends the episode."""
+def _is_offered(instance: object, attribute: object, name: str) -> None:
+    """Check that pages may call a service; a validator of attrs.
 
-    outcome: str = option(help="how it went")
+    Raises:
+        ValueError: if not.
+    """
+    if name not in SERVICES:
+        raise ValueError(f"pages cannot call {name[:80]!r}; they can call: {', '.join(SERVICES)}")
 
 
 @attrs.frozen
-class DiscardEpisode:
-    """Ends the episode and deletes it."""
+class Call:
+    """Calls a service of the run, which reads the request."""
 
-
-@attrs.frozen
-class RedoEpisode:
-    """Records the present or last episode again, which replaces it."""
-
-
-@attrs.frozen
-class SetSmoothing:
-    """Switches the blending of action chunks."""
-
-    enabled: bool = option(help="whether to blend")
-
-
-@attrs.frozen
-class Intervene:
-    """Takes the robot from the policy, or gives it back."""
-
-    take: bool = option(help="whether to take it")
-
-
-@attrs.frozen
-class Target:
-    """Where to move: one of these."""
-
-    pose: str | None = option(None, help="named pose")
-    xyz: tuple[float, float, float] | None = option(None, unit="m", help="position of the tool")
-    joints: Mapping[str, float] | None = option(None, unit="rad", help="joint -> position")
-
-    def __attrs_post_init__(self) -> None:
-        if sum(each is not None for each in (self.pose, self.xyz, self.joints)) != 1:
-            raise ValueError("a goal is one of pose, xyz and joints")
+    service: str = option(validator=_is_offered, help="its name")
+    request: Any = option(None, help="as the service takes it")
 
 
 @attrs.frozen
 class Preview:
     """Plans a motion without executing it."""
 
-    goal: Target = option(help="where to")
-
-
-@attrs.frozen
-class GoTo:
-    """Plans a motion and executes it."""
-
-    goal: str = option(help="pose, joint=rad,… or xyz=x,y,z")
-
-
-@attrs.frozen
-class Cancel:
-    """Ends the planned motion."""
+    goal: str = option(help="as `/planning/go_to` takes it")
 
 
 @attrs.frozen
@@ -206,20 +161,15 @@ class AskTime:
     """Asks for the time of `clock_ms`, which every answer has."""
 
 
-RunCommand = (
-    Jog | Release | Reset | SetMode | BeginEpisode | EndEpisode | DiscardEpisode | RedoEpisode | SetSmoothing
-    | Intervene | Preview | GoTo | Cancel | Finish
-)  # fmt: skip
+RunCommand = Jog | Release | Reset | Call | Preview | Finish
 """Commands that the run carries out."""
 PageCommand = RunCommand | Operate | Resign | AskTime
 """Commands that pages may send."""
 _COMMANDS: Mapping[str, Service[Any, None]] = {
     name: Service(name, kind, type(None), limits=_LIMITS)
     for name, kind in {
-        "jog": Jog, "release": Release, "reset": Reset, "mode": SetMode, "episode_start": BeginEpisode,
-        "episode_stop": EndEpisode, "episode_discard": DiscardEpisode, "episode_redo": RedoEpisode,
-        "smoothing": SetSmoothing, "intervene": Intervene, "preview": Preview, "goal": GoTo, "cancel": Cancel,
-        "finish": Finish, "operate": Operate, "resign": Resign, "time": AskTime,
+        "jog": Jog, "release": Release, "reset": Reset, "call": Call, "preview": Preview, "finish": Finish,
+        "operate": Operate, "resign": Resign, "time": AskTime,
     }.items()
 }  # fmt: skip
 _NAMES = {service.request: name for name, service in _COMMANDS.items()}

@@ -8,8 +8,8 @@ from typing import Any
 
 from ibrobot_core.api import Float64MultiArray, HardwareDescriptor, IbrobotError, SceneObject, Vector
 from ibrobot_core.app import Registry, RobotConfig, RunView, Subscription
-from ibrobot_web.run_services import SHAPES
 
+SHAPES = "/world/shapes"
 _POSE_SIZE = 7
 _log = logging.getLogger("ibrobot.web")
 

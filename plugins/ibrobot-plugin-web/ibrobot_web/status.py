@@ -14,9 +14,9 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S, JointState, Message, Vector
-from ibrobot_core.app import TOGGLE_SMOOTHING, ControlState, RunView, error_text
+from ibrobot_core.app import ControlState, RunView, error_text
+from ibrobot_web.messages import SERVICES
 from ibrobot_web.modes import modes_json, page_devices
-from ibrobot_web.run_services import EPISODE_STATUS, GO_TO, INTERVENE, PLAN, REDO_EPISODE, START_EPISODE
 from ibrobot_web.teleop import JOG
 
 _TOKEN = re.compile(r"(?<=[?&]token=)[\w-]+")
@@ -28,15 +28,7 @@ _LEAVES = 64
 _DIGITS = 5
 _NO_VALUES = ("header", "layout")
 """Fields of messages that are not plotted."""
-SERVICES = {
-    "goal": GO_TO,
-    "smoothing": TOGGLE_SMOOTHING.name,
-    "record": START_EPISODE,
-    "redo": REDO_EPISODE,
-    "intervene": INTERVENE,
-    "preview": PLAN,
-}
-"""What a page offers only while its service is served."""
+EPISODE_STATUS = "/record_episode/status"
 
 
 def without_tokens(text: str) -> str:
@@ -102,7 +94,7 @@ def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
         "all_faults": len(session.outcome.faults), "failure": session.failure_text,
         "conditions": [{name: str(value) for name, value in each.items()} for each in conditions],
         "absent": [{"name": each.label, "why": str(each.missing)} for each in session.absent],
-        "services": [name for name, service in SERVICES.items() if session.bus.serves(service)],
+        "services": [name for name in SERVICES if session.bus.serves(name)],
         "help": session.command_source.help(), "autonomous": session.command_source.autonomous,
         "sensors": {
             name: {"rate_hz": round(each.rate_hz, 1),

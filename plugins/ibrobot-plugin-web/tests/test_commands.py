@@ -15,20 +15,13 @@ from ibrobot_web.messages import RunCommand, Sent
 from ibrobot_web.teleop import JOG
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Reset, Session, SetMode
+from ibrobot_core.app import Reset, Session
 
 _WAIT_S = 60.0
+GO_HOME = messages.Call("/planning/go_to", "home")
 SERVICES: dict[str, tuple[RunCommand, Any]] = {
     "/reset": (messages.Reset(), Reset(0)),
-    "/set_mode": (messages.SetMode("web"), SetMode("web")),
-    "/record_episode/start": (messages.BeginEpisode("pick"), {"prompt": "pick", "wait": True}),
-    "/record_episode/stop": (messages.EndEpisode("failure"), "failure"),
-    "/record_episode/discard": (messages.DiscardEpisode(), None),
-    "/record_episode/redo": (messages.RedoEpisode(), None),
-    "/action_dispatcher/toggle_smoothing": (messages.SetSmoothing(enabled=False), False),
-    "/intervene": (messages.Intervene(take=True), True),
-    "/planning/go_to": (messages.GoTo("home"), "home"),
-    "/planning/cancel": (messages.Cancel(), None),
+    **{name: (messages.Call(name, {"a": [name]}), {"a": [name]}) for name in messages.SERVICES},
 }
 """Service -> the command that calls it, and its argument."""
 
@@ -116,9 +109,9 @@ def test_a_failure_is_the_answer_and_harms_no_other_command() -> None:
 
     found = answers(
         {"/record_episode/start": fails, "/reset": breaks, "/planning/cancel": lambda _: "cancelled"},
-        messages.BeginEpisode(),
+        messages.Call("/record_episode/start"),
         messages.Reset(),
-        messages.Cancel(),
+        messages.Call("/planning/cancel"),
     )
     assert found[0]["error"] == "the disk is full"
     assert "KeyError" in found[1]["error"]
@@ -135,7 +128,7 @@ def test_a_stop_waits_for_no_command_and_empties_the_queue(rig: Callable[..., Ri
         return "recovered"
 
     found = rig({"/reset": recovers, "/planning/go_to": ran.append, "/set_mode": ran.append})
-    found.send(messages.Reset(), messages.GoTo("home"), messages.SetMode("web"))
+    found.send(messages.Reset(), GO_HOME, messages.Call("/set_mode", "web"))
     assert recovering.wait(_WAIT_S)
     found.commands.stop(3)
     stopped = found.answers(3)
@@ -154,7 +147,12 @@ def test_what_was_sent_before_a_stop_and_arrives_after_it_is_refused(rig: Callab
     )
     found.commands.stop(0)
     found.answers(1)
-    sent = (messages.GoTo("home"), messages.SetMode("web"), messages.Intervene(take=False), messages.BeginEpisode())
+    sent = (
+        GO_HOME,
+        messages.Call("/set_mode", "web"),
+        messages.Call("/intervene", False),
+        messages.Call("/record_episode/start"),
+    )
     for stops in (0, None):
         found.send(*sent, stops=stops)
         assert all("an emergency stop came after" in each["error"] for each in found.answers(len(sent)))
@@ -162,7 +160,7 @@ def test_what_was_sent_before_a_stop_and_arrives_after_it_is_refused(rig: Callab
     found.send(messages.Reset(), stops=0)
     found.answers(1)
     assert ran == [Reset(0)], "control refuses a reset that has not seen the stop"
-    found.send(messages.Reset(), messages.GoTo("home"), stops=1)
+    found.send(messages.Reset(), GO_HOME, stops=1)
     assert all("ok" in each for each in found.answers(2))
     assert ran == [Reset(0), Reset(1), "home"]
 

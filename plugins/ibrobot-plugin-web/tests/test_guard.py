@@ -13,7 +13,7 @@ import aiohttp
 import pytest
 from ibrobot_http.server import HttpServer, ServerThread
 from ibrobot_testing.http import HttpSuite, Served
-from ibrobot_web.messages import LARGEST_MESSAGE, Jog, Release, RunCommand, Sent, SetMode, clock_ms
+from ibrobot_web.messages import LARGEST_MESSAGE, Call, Jog, Release, RunCommand, Sent, clock_ms
 from ibrobot_web.options import WebOptions
 from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
@@ -85,6 +85,7 @@ def jog() -> dict[str, Any]:
 
 
 MALFORMED = 10_000
+MODE = {"do": "call", "service": "/set_mode", "request": "a"}
 
 
 async def no_scene() -> bytes:
@@ -165,8 +166,8 @@ def test_malformed_messages_are_refused_and_harm_nobody(monkeypatch: pytest.Monk
                         pass
                 await socket.close()
                 if sent % 1000 < 20:
-                    assert (await call(operator, do="mode", mode="a"))["ok"] == "SetMode"
-        assert set(server.executed) == {SetMode("a")}
+                    assert (await call(operator, **MODE))["ok"] == "Call"
+        assert set(server.executed) == {Call("/set_mode", "a")}
         assert server.drive.refused > 50
 
     run(test)
@@ -180,10 +181,10 @@ def test_only_the_operator_commands_and_taking_over_is_explicit() -> None:
             await server.signed_in(watcher, "watch")
             one, two = await first.ws_connect("/drive"), await second.ws_connect("/drive")
             three = await watcher.ws_connect("/drive")
-            assert (await call(one, do="mode", mode="a"))["ok"] == "SetMode"
-            assert "take over first" in (await call(two, do="mode", mode="b"))["error"]
+            assert (await call(one, **MODE))["ok"] == "Call"
+            assert "take over first" in (await call(two, **MODE))["error"]
             assert "take over explicitly" in (await call(two, do="operate"))["error"]
-            for command in ({"do": "cancel"}, jog(), {"do": "operate", "take_over": True}, {"do": "mode", "mode": "a"}):
+            for command in ({"do": "finish"}, jog(), {"do": "operate", "take_over": True}, MODE):
                 assert "watching only" in (await call(three, **command))["error"]
             released = server.released
             assert "ok" in await call(two, do="operate", take_over=True)

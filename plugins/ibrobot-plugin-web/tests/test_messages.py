@@ -26,10 +26,11 @@ from ibrobot_web.messages import (
 
 from ibrobot_core.api import IbrobotError
 
-NAMES = ("jog", "release", "reset", "mode", "episode_start", "goal", "preview", "finish", "operate", "smoothing")
+NAMES = ("jog", "release", "reset", "call", "preview", "finish", "operate")
 WORDS = st.sampled_from(
     ["do", "id", "stops", "event", "log", "failed", "failure", "pages", "wanted", "count", "command", "stop", "number",
-     "facts", "reply", "ok", "error", "alive", "at", "press", "joints", "mode", "goal", "take", "estop", *NAMES]
+     "facts", "reply", "ok", "error", "alive", "at", "press", "joints", "mode", "goal",
+     "take", "estop", "service", "request", *NAMES, *messages.SERVICES]
 )  # fmt: skip
 JSON = st.recursive(
     st.none() | st.booleans() | st.floats(allow_nan=False) | st.integers() | st.text(max_size=5) | WORDS,
@@ -76,21 +77,21 @@ def test_text_that_is_no_json_is_refused(text: str) -> None:
         ({"do": "release", "event": "log"}, "event: unknown key"),
         ({"do": "reset", "event": "failed"}, "event: unknown key"),
         ({"event": "log", "logger": "ibrobot", "message": "forged"}, "expected an object with a text `do`"),
-        ({"do": "mode", "mode": ["web"]}, "mode: expected text"),
-        ({"do": "mode"}, "mode: required key is missing"),
-        ({"do": "intervene", "take": 1}, "take: expected true or false"),
+        ({"do": "call", "service": ["/set_mode"]}, "service: expected text"),
+        ({"do": "call"}, "service: required key is missing"),
+        ({"do": "call", "service": "/world/add"}, "pages cannot call '/world/add'; they can call: /set_mode, "),
+        ({"do": "call", "service": "/set_mode/"}, "pages cannot call '/set_mode/'"),
+        ({"do": "call", "service": "/set_mode", "request": [[[[["web"]]]]]}, "more than 4 lists and mappings"),
         ({"do": "jog", "at": 1.5, "press": 1}, "at: expected a whole number"),
         ({"do": "jog", "at": 1, "press": -1}, "press: -1 is too small"),
         ({"do": "jog", "at": 1, "press": 1, "joints": {"a": 2}}, "between -1 and 1"),
         ({"do": "jog", "at": 1, "press": 1, "linear": [1, 2]}, "expected a list of 3 values"),
         ({"do": "jog", "at": 1, "press": 1, "targets": {"a": True}}, "expected a number"),
         ({"do": "jog", "at": 1, "press": 1, "targets": {"a": 1e308}}, "a position must lie between -1000 and 1000"),
-        ({"do": "episode_stop", "outcome": 1}, "outcome: expected text"),
-        ({"do": "preview", "goal": {"pose": "home", "xyz": [0, 0, 0]}}, "one of pose, xyz and joints"),
-        ({"do": "preview", "goal": {"file": "/etc/passwd"}}, "unknown key"),
-        ({"do": "mode", "mode": "x" * 2000}, "2000 characters"),
-        ({"do": "mode", "mode": "web", "id": True}, "id must be a whole number"),
-        ({"do": "mode", "mode": "web", "stops": "0"}, "stops must be a whole number"),
+        ({"do": "preview", "goal": {"pose": "home"}}, "goal: expected text"),
+        ({"do": "call", "service": "/set_mode", "request": "x" * 2000}, "2000 characters"),
+        ({"do": "preview", "goal": "home", "id": True}, "id must be a whole number"),
+        ({"do": "preview", "goal": "home", "stops": "0"}, "stops must be a whole number"),
     ],
     ids=lambda value: str(value)[:40],
 )
@@ -109,11 +110,10 @@ def test_values_are_not_expanded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Requests are plain data: in robot YAMLs these texts would become the value and the home folder."""
     monkeypatch.setenv("IBROBOT_PASSWORD", "correct horse battery")
     for text in ("${IBROBOT_PASSWORD}", "~", "$(env IBROBOT_PASSWORD)", "!!python/name:os.environ"):
-        sent = from_page(json.dumps({"do": "preview", "goal": {"pose": text}}))
-        assert isinstance(sent.command, messages.Preview)
-        assert sent.command.goal.pose == text
+        sent = from_page(json.dumps({"do": "call", "service": "/planning/go_to", "request": {"goal": text}}))
+        assert sent.command == messages.Call("/planning/go_to", {"goal": text})
         with pytest.raises(MalformedMessage) as refused:
-            from_page(json.dumps({"do": "preview", "goal": {"xyz": text}}))
+            from_page(json.dumps({"do": "jog", "at": 1, "press": 1, "linear": text}))
         assert "horse" not in str(refused.value)
 
 
@@ -127,10 +127,7 @@ def test_a_stop_is_a_number_and_nothing_else(text: str) -> None:
 
 COMMANDS = (
     messages.Jog(7, 5, joints={"a": 0.5}, linear=(0.0, 1.0, 0.0)), Release(), Release(3), messages.Reset(),
-    messages.SetMode("web"), messages.BeginEpisode("pick"), messages.EndEpisode("failure"), messages.DiscardEpisode(),
-    messages.RedoEpisode(),
-    messages.SetSmoothing(True), messages.Intervene(False), messages.Preview(messages.Target(xyz=(0.1, 0.2, 0.3))),
-    messages.GoTo("home"), messages.Cancel(), messages.Finish(),
+    messages.Call("/set_mode", "web"), messages.Call("/planning/cancel"), messages.Preview("home"), messages.Finish(),
 )  # fmt: skip
 """Every command of the run."""
 

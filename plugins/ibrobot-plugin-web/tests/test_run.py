@@ -85,7 +85,7 @@ def test_one_operates_and_the_other_watches(address: str) -> None:
             await one.call("operate", take_over=True)
             await ready(one)
             with pytest.raises(RuntimeError, match="this page only watches"):
-                await two.call("mode", mode="moveit_planning")
+                await two.service("/set_mode", "moveit_planning")
             await two.estop()
             await one.until(lambda: one.states[-1]["estop"])
             await one.until(lambda: one.status["faults"])
@@ -130,7 +130,7 @@ def test_uploads_and_malformed_messages_harm_no_run(address: str) -> None:
             await attacks
             await operator.until(lambda: operator.states[-1]["tick"] > before + 100)
             assert operator.status["faults"] == []
-            await operator.call("mode", mode="web")
+            await operator.service("/set_mode", "web")
 
     run(test)
 
@@ -141,10 +141,10 @@ def test_modes_goals_and_errors_of_commands(address: str) -> None:
             await page.call("operate", take_over=True)
             await ready(page)
             for wrong, why in (
-                ({"do": "mode", "mode": "moveit"}, "no mode 'moveit'; the modes are"),
-                ({"do": "mode"}, "mode: required key is missing"),
+                ({"do": "call", "service": "/set_mode", "request": "moveit"}, "no mode 'moveit'; the modes are"),
+                ({"do": "call", "service": "/set_mode", "request": {}}, "mode: required key is missing"),
                 ({"do": "fly"}, "unknown command 'fly'"),
-                ({"do": "goal", "goal": "home"}, "nobody serves /planning/go_to"),
+                ({"do": "call", "service": "/planning/go_to", "request": "home"}, "nobody serves /planning/go_to"),
                 ({"do": "jog", "at": clock_ms(), "press": 1, "joints": {"elbow": 1}}, "no joint 'elbow'"),
                 ({"do": "jog", "at": clock_ms(), "press": 1, "joints": {"gripper": 7}}, "between -1 and 1"),
                 ({"do": "jog", "at": 1, "press": 1}, "the connection is too slow to jog"),
@@ -152,11 +152,11 @@ def test_modes_goals_and_errors_of_commands(address: str) -> None:
             ):
                 with pytest.raises(RuntimeError, match=why):
                     await page.call(**wrong)
-            await page.call("mode", mode="moveit_planning")
-            await page.until(lambda: "goal" in page.status["services"])
-            await page.call("goal", goal="home")
+            await page.service("/set_mode", "moveit_planning")
+            await page.until(lambda: "/planning/go_to" in page.status["services"])
+            await page.service("/planning/go_to", "home")
             await page.until(lambda: np.abs(page.states[-1]["position"]).max() < 0.05)
-            await page.call("mode", mode="web")
+            await page.service("/set_mode", "web")
 
     run(test)
 

@@ -48,6 +48,8 @@ const page = {
       return false;
     }
   },
+  // As `command`, for a service of the run.
+  call(service, request = null, done = "") { return this.command("call", { service, request }, done); },
 };
 page.deadman = new Deadman(page.drive);
 window.ibrobot = page; // for tests and for the console
@@ -166,7 +168,7 @@ function showFaults() {
         h("strong", {}, "Fault: "), h("span", {}, `${text}. The robot holds. ${remedy}`), reset())),
       estop && !faults.length ? h("div", { class: "fault" }, h("strong", {}, "Emergency stop. "), reset()) : null,
       held ? h("div", { class: "warning" }, h("strong", {}, "Holding: "), h("span", {}, held),
-        h("button", { onclick: () => page.command("mode", { mode: page.status.mode }), disabled: !page.operating }, "Go on"))
+        h("button", { onclick: () => page.call("/set_mode", page.status.mode), disabled: !page.operating }, "Go on"))
         : null,
       failure ? h("div", { class: "fault" }, h("strong", {}, "The run ended: "), h("span", {}, failure)) : null,
       ended && !failure ? h("div", { class: "ended" }, h("strong", {}, "The run has ended"), h("span", {}, results(status)), ...onwards(status)) : null,
@@ -242,7 +244,7 @@ function update() {
   showFaults();
   const tool = page.operating && page.status?.robot.tool;
   view.tell({
-    do: "handle", jog: Boolean(tool && page.device), goal: Boolean(tool && page.status.services.includes("goal")),
+    do: "handle", jog: Boolean(tool && page.device), goal: Boolean(tool && page.status.services.includes("/planning/go_to")),
     moved: page.mode?.jogs[page.device] ?? [],
   });
   for (const part of parts) if (page.status) part.update(page.status);

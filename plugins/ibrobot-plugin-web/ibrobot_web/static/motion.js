@@ -9,6 +9,10 @@ const TOOL = [
   ["pitch down", { turn: [0, 1, 0] }], ["roll right", { turn: [0, 0, 1] }],
 ];
 
+const GO_TO = "/planning/go_to";
+const INTERVENE = "/intervene";
+const SMOOTHING = "/action_dispatcher/toggle_smoothing";
+
 const COMMANDS = {
   policy: "The policy commands the robot.", operator: "An operator commands the robot.",
   handover: "The robot brakes and holds until it is moved or given back.",
@@ -55,20 +59,20 @@ export class Motion {
   plans(services, dispatch, status) {
     const { page } = this;
     const found = [];
-    if (services.includes("goal")) found.push(...this.goals(services, status));
-    if (services.includes("intervene") || (services.includes("smoothing") && dispatch)) found.push(h("h3", {}, "Policy"));
-    if (services.includes("intervene")) {
+    if (services.includes(GO_TO)) found.push(...this.goals(services, status));
+    if (services.includes(INTERVENE) || (services.includes(SMOOTHING) && dispatch)) found.push(h("h3", {}, "Policy"));
+    if (services.includes(INTERVENE)) {
       const taken = status.commander !== "policy";
       found.push(h("p", { class: "note" }, COMMANDS[status.commander] ?? ""), h("div", { class: "row" },
         h("button", { class: taken ? "" : "primary", disabled: !page.operating || taken,
-          onclick: () => page.command("intervene", { take: true }) }, "Take the robot"),
+          onclick: () => page.call(INTERVENE, true) }, "Take the robot"),
         h("button", { class: taken ? "primary" : "", disabled: !page.operating || !taken,
-          onclick: () => page.command("intervene", { take: false }) }, "Give it back")));
+          onclick: () => page.call(INTERVENE, false) }, "Give it back")));
     }
-    if (services.includes("smoothing") && dispatch) {
+    if (services.includes(SMOOTHING) && dispatch) {
       const box = h("input", { type: "checkbox", disabled: !page.operating });
       box.checked = dispatch.smoothing;
-      box.addEventListener("change", () => page.command("smoothing", { enabled: box.checked }));
+      box.addEventListener("change", () => page.call(SMOOTHING, box.checked));
       found.push(h("label", { class: "row" }, box, "blend chunks (smoothing)"));
     }
     return found;
@@ -76,15 +80,15 @@ export class Motion {
 
   goals(services, status) {
     const { page } = this;
-    const goal = h("input", { type: "text", id: "goal", "aria-label": "Goal", placeholder: "home, joint=rad,… or xyz=x,y,z", required: true });
+    const goal = h("input", { type: "text", id: "goal", "aria-label": "Goal", placeholder: "home, joint=rad,… or xyz=x,y,z axis=down", required: true });
     goal.value = this.goal ?? "";
     goal.addEventListener("input", () => { this.goal = goal.value; });
     this.setGoal = (text) => { goal.value = this.goal = text; this.preview(); };
-    const go = () => page.command("goal", { goal: goal.value }, `goal ${goal.value}`);
+    const go = () => page.call(GO_TO, { goal: goal.value }, `goal ${goal.value}`);
     const form = h("form", { class: "row" }, goal,
-      services.includes("preview") ? h("button", { type: "button", disabled: !page.operating, onclick: () => this.preview() }, "Preview") : null,
+      h("button", { type: "button", disabled: !page.operating, onclick: () => this.preview() }, "Preview"),
       h("button", { class: "primary", disabled: !page.operating }, "Go"),
-      h("button", { type: "button", disabled: !page.operating, onclick: () => page.command("cancel") }, "Cancel"));
+      h("button", { type: "button", disabled: !page.operating, onclick: () => page.call("/planning/cancel") }, "Cancel"));
     form.addEventListener("submit", (event) => {
       event.preventDefault();
       go();
@@ -97,9 +101,8 @@ export class Motion {
   // Shows the path to the goal in 3D, without moving.
   async preview() {
     const { page } = this;
-    if (!page.status.services.includes("preview")) return;
     try {
-      const plan = await page.drive.command("preview", { goal: parsed(this.goal ?? "") });
+      const plan = await page.drive.command("preview", { goal: this.goal ?? "" });
       page.view.tell({ do: "plan", plan, positions: page.state.position, kept: true });
       toast(`The path takes ${plan.duration_s} s.`);
     } catch (error) {
@@ -107,12 +110,4 @@ export class Motion {
       toast(`No path: ${error.message}`, "error");
     }
   }
-}
-
-// A goal's text as an object: a pose's name, joint=rad,…, or xyz=x,y,z.
-function parsed(text) {
-  if (!text.includes("=")) return { pose: text.trim() };
-  const xyz = /^\s*xyz\s*=(.*)$/.exec(text);
-  if (xyz) return { xyz: xyz[1].split(",").map(Number) };
-  return { joints: Object.fromEntries(text.split(",").map((each) => each.split("=")).map(([name, value]) => [name.trim(), Number(value)])) };
 }

@@ -33,7 +33,7 @@ export class Record {
     say(this.problem, episode.failure);
     this.time.classList.toggle("idle", !episode.recording);
     this.time.value = Math.min(1, episode.elapsed_s / episode.max_duration_s);
-    const redo = services.includes("redo") && episode.can_redo;
+    const redo = services.includes("/record_episode/redo") && episode.can_redo;
     const { recording, waiting, by_mode: byMode } = episode;
     refresh(this.line, [recording, waiting, byMode, redo, page.operating, ended], () => [this.facts, ...(ended ? [] : this.controls(episode, redo))]);
   }
@@ -41,15 +41,15 @@ export class Record {
   controls({ recording, waiting, by_mode: byMode, prompt: before }, redo) {
     const { page } = this;
     if (byMode) return [h("span", { class: "note" }, "The mode begins and ends its episodes itself.")];
-    const button = (text, key, command, facts, kind = "") => h("button", {
-      class: kind, disabled: !page.operating, "data-key": key, onclick: () => page.command(command, facts),
+    const button = (text, key, service, request, kind = "") => h("button", {
+      class: kind, disabled: !page.operating, "data-key": key, onclick: () => page.call(`/record_episode/${service}`, request),
     }, text, h("kbd", { "aria-hidden": "true" }, key.toUpperCase()));
-    const again = (text) => redo ? [button(text, "r", "episode_redo", {})] : [];
-    if (waiting) return [button("Cancel", "d", "episode_discard", {})];
+    const again = (text) => redo ? [button(text, "r", "redo", null)] : [];
+    if (waiting) return [button("Cancel", "d", "discard", null)];
     if (recording) {
-      return [button("Success", "s", "episode_stop", { outcome: "success" }, "primary"),
-        button("Failure", "f", "episode_stop", { outcome: "failure" }),
-        button("Discard", "d", "episode_discard", {}, "danger"), ...again("Again")];
+      return [button("Success", "s", "stop", "success", "primary"),
+        button("Failure", "f", "stop", "failure"),
+        button("Discard", "d", "discard", null, "danger"), ...again("Again")];
     }
     const prompt = h("input", { type: "text", "aria-label": "Task", placeholder: "task, e.g. pick the cube" });
     prompt.value = this.prompt ?? before;
@@ -58,7 +58,7 @@ export class Record {
       h("kbd", { "aria-hidden": "true" }, "B")));
     form.addEventListener("submit", (event) => {
       event.preventDefault();
-      page.command("episode_start", { prompt: prompt.value });
+      page.call("/record_episode/start", { prompt: prompt.value || null, wait: true });
       prompt.blur(); // so that keys judge the episode
     });
     return [form, ...again("Redo the last"), this.cues.choice];
