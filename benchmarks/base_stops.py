@@ -15,10 +15,14 @@ import argparse
 import logging
 import sys
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import pytest
-from takeovers import of_tests
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests/shared"))
+from figures import report
+from plugin_tests import of_tests
 
 STOP_S, FAULT_S, BACK_M = 0.3, 0.5, 0.001
 
@@ -48,6 +52,8 @@ def main() -> int:
         stands = [each.stand for each in sequences]
         worst = [max(getattr(stand, name) for stand in stands) for name in ("time_s", "way", "back")]
         print(f"{event:20} {len(stands):5} {worst[0]:10.3f} {worst[1]:8.3f} {worst[2] * 1e3:9.2f}")
+    stands = [each.stand for sequences in found.values() for each in sequences]
+    report(failed=len(failed), slowest_s=max(s.time_s for s in stands), back_mm=1e3 * max(s.back for s in stands))
     print(f"{options.sequences} sequences, {len(failed)} failed", *failed, sep="\n")
     return 1 if failed else 0
 

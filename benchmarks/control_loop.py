@@ -4,14 +4,17 @@
 
 Interleaved, in one run: (a) a process that does nothing but wait for absolute deadlines at 100 Hz; (b) `ibrobot launch`
 of the simulated SO-101: physics at 100 Hz in the control process, `scripted_pick` and two 640x480 cameras at 30 Hz in
-the host; (c) the same with a pure-Python thread that never rests in the host. Exits with 1 when the median ratio of p99
-lateness (b)/(a) or (c)/(a) is above 2, or when the host made the control loop miss a tick. Ratios below 1 are no error:
-a processor that idles, as in (a), takes longer to wake.
+the host; (c) the same with a pure-Python thread that never rests in the host; (d) the simulated SO-101 with its page
+and three clients, which take all states and pictures. Exits with 1 when the median ratio of p99 lateness of (b), (c) or
+(d) to (a) is above 2, or when the host made the control loop miss a tick. Ratios below 1 are no error: a processor that
+idles, as in (a), takes longer to wake.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
+import contextlib
 import json
 import statistics
 import subprocess
@@ -19,6 +22,10 @@ import sys
 import threading
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests/shared"))
+from figures import report
+from page_run import client, page_run
 
 from ibrobot_core.clock import RealClock
 from ibrobot_core.config import load_config
@@ -31,7 +38,13 @@ from ibrobot_core.units import ns
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101.yaml"
 ALLOWED_RATIO = 2.0
-LOOPS = {"bare": "a bare loop", "system": "the control loop", "busy": "with a busy thread in the host"}
+LOOPS = {
+    "bare": "a bare loop",
+    "system": "the control loop",
+    "busy": "with a busy thread in the host",
+    "pages": "with three pages",
+}
+PAGES = 3
 
 
 def bare(seconds: float, period_ns: int, priority: int) -> dict[str, Any]:
@@ -76,6 +89,15 @@ def _count(end: threading.Event) -> None:
         number += 1
 
 
+async def beside_pages(seconds: float) -> dict[str, Any]:
+    """A run with its page and clients of it."""
+    with page_run("so101", "--sim", "--mode", "web") as address:
+        async with contextlib.AsyncExitStack() as stack:
+            pages = [await stack.enter_async_context(client(address)) for _ in range(PAGES)]
+            await asyncio.sleep(seconds)
+            return {"loop": pages[0].status["counts"]["loop"], "refused": []}
+
+
 def measure(loop: str, seconds: float) -> dict[str, Any]:
     """One measurement, in a process of its own."""
     command = [sys.executable, __file__, "--only", loop, "--seconds", str(seconds)]
@@ -100,8 +122,8 @@ def compare(repetitions: int, seconds: float) -> int:
             )
     for line in found["bare"][0]["refused"]:
         print(f"note: {line}")
-    failed = False
-    for loop in ("system", "busy"):
+    failed, measured = False, {}
+    for loop in ("system", "busy", "pages"):
         pairs = zip(found[loop], found["bare"], strict=True)
         ratio = statistics.median(
             one["loop"]["lateness_p99_us"] / max(1, other["loop"]["lateness_p99_us"]) for one, other in pairs
@@ -110,8 +132,10 @@ def compare(repetitions: int, seconds: float) -> int:
         # What the bare loop misses too is the machine's doing and not the host's.
         machine = sum(result["loop"]["missed"] for result in found["bare"])
         failed |= ratio > ALLOWED_RATIO or missed > machine
+        measured |= {f"{loop}_p99_ratio": ratio, f"{loop}_missed": missed}
         print(f"{LOOPS[loop]}: p99 {ratio:.2f} times the bare loop's, {missed} ticks missed (bare loop: {machine})")
     print("FAILED" if failed else "passed")
+    report(**measured)
     return int(failed)
 
 
@@ -126,6 +150,8 @@ def main() -> int:
     if arguments.only == "bare":
         control = load_config(CONFIG, sim=True).control
         result = bare(arguments.seconds, ns(1.0 / control.rate_hz), control.priority)
+    elif arguments.only == "pages":
+        result = asyncio.run(beside_pages(arguments.seconds))
     else:
         result = system(arguments.seconds, busy=arguments.only == "busy")
     print(json.dumps(result))

@@ -41,6 +41,7 @@ from typing import Any
 from uuid import UUID
 
 import numpy as np
+from figures import report
 
 HEIGHT, WIDTH, FPS = 480, 640, 30
 CAMERAS = ("top", "wrist")
@@ -231,7 +232,7 @@ def theirs(python: str, mode: str, out: Path, frames: int) -> dict[str, float]:
     return found | {"frames_s": found["frames"] / found["seconds"]}
 
 
-def speed(python: str, folder: Path, frames: int, times: int) -> bool:
+def speed(python: str, folder: Path, frames: int, times: int) -> dict[str, float]:
     """Ours and LeRobot's, the same pictures, one after the other."""
     source = folder / "two"
     for number in (1, 2):
@@ -255,11 +256,12 @@ def speed(python: str, folder: Path, frames: int, times: int) -> bool:
     }
     default, streaming = median(ratios["LeRobot, default"]), median(ratios["LeRobot, streaming"])
     print(f"{default:.2f} times LeRobot's default, {streaming:.2f} times its streaming (medians of {times} pairs)")
-    return default >= ENOUGH and streaming >= 1.0
+    own = median(row["frames_s"] for row in found["ibrobot convert"])
+    return {"frames_per_s": own, "times_default": default, "times_streaming": streaming}
 
 
-def memory(folder: Path) -> bool:
-    """Whether memory depends on the length or the number of episodes."""
+def memory(folder: Path) -> dict[str, float]:
+    """Memory for one episode, and how much more longer or more episodes take."""
     found = {}
     record(folder / "short" / "episode_000001", 60, 1)
     record(folder / "long" / "episode_000001", 600, 1)
@@ -278,7 +280,8 @@ def memory(folder: Path) -> bool:
     found["1 of 600 frames"] = ours(folder / "long", folder / "ours", "--jobs", "1")["peak_mib"]
     for name, mib in found.items():
         print(f"{name:16} {mib:6.0f} MiB", flush=True)
-    return max(found.values()) <= GROWTH * found["1 of 60 frames"]
+    least = found["1 of 60 frames"]
+    return {"memory_mib": least, "memory_growth": max(found.values()) / least}
 
 
 def main() -> int:
@@ -294,9 +297,11 @@ def main() -> int:
         lerobot(asked.child, asked.out, asked.frames, 2)
         return 0
     with tempfile.TemporaryDirectory() as folder:
-        good = asked.only == "memory" or speed(asked.lerobot, Path(folder), asked.frames, asked.times)
-        good = (asked.only == "speed" or memory(Path(folder))) and good
-    return 0 if good else 1
+        found = {} if asked.only == "memory" else speed(asked.lerobot, Path(folder), asked.frames, asked.times)
+        found |= {} if asked.only == "speed" else memory(Path(folder))
+    report(**found)
+    fast = found.get("times_default", ENOUGH) >= ENOUGH and found.get("times_streaming", 1.0) >= 1.0
+    return 0 if fast and found.get("memory_growth", 1.0) <= GROWTH else 1
 
 
 if __name__ == "__main__":

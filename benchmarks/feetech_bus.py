@@ -25,6 +25,7 @@ from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
+from figures import report
 from ibrobot_feetech import protocol
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.protocol import Packet
@@ -220,6 +221,9 @@ def main() -> int:
     print(json.dumps(result, indent=2))
     for missing in {"sdk", "lerobot"} - available().keys():
         print(f"{missing} is not installed: not measured", file=sys.stderr)
+    read, wire = result["unthrottled"]["read"], result["throttled"]["read"]
+    cpu = {f"{name}_cpu_us": wire[name]["cpu_us"] for name in ("ours", "lerobot") if name in wire}
+    report(ratio=read["ours"]["ratio"], ratio_on_the_wire=wire["ours"]["ratio"], **cpu)
     good = result["unthrottled"]["read"]["ours"]["ratio"] <= LIMIT
     good &= result["throttled"]["read"]["ours"]["ratio"] <= LIMIT_THROTTLED
     theirs = result["throttled"]["read"].get("lerobot")

@@ -25,6 +25,7 @@ from typing import Any
 import attrs
 import numpy as np
 import yaml
+from figures import report
 from ibrobot_planning.client import Client
 from ibrobot_planning.execution.requests import GoTo
 from ibrobot_planning.goals.text import Target
@@ -611,6 +612,13 @@ def main() -> int:
     print(
         f"commands: velocity {tally.velocity:.3f} and acceleration {tally.acceleration:.3f} of their limits at most, "
         f"least clearance by MuJoCo {1000 * tally.least_m:.1f} mm; {len(tally.wrong)} wrong"
+    )
+    report(
+        wrong=len(tally.wrong),
+        executed=sum(tally.executed.values()),
+        of_velocity_limit=tally.velocity,
+        of_acceleration_limit=tally.acceleration,
+        least_clearance_mm=1000 * tally.least_m,
     )
     for line in tally.wrong[:20]:
         print(line)

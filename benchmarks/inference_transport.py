@@ -1,17 +1,16 @@
 """From a request to its chunk with a policy that does nothing: each way to a model, and LeRobot's own, in one run.
 
-    python benchmarks/inference_transport.py [--count 200] [--pause 0] [--lerobot PYTHON] [--ray PYTHON]
+    python benchmarks/inference_transport.py [--count 200] [--pause 0] [--lerobot PYTHON]
 
 Every way carries the same observations: two raw pictures of 640x480, two of 224x224 in float32, two JPEGs of 38 kB,
 each with six joint positions; a chunk of 50x6 comes back. `tcp` sends a frame of the same bytes over a plain socket
 between two processes and gets a chunk's back: the floor. `tls` is the same with TLS and certificates of both sides, the
 floor of mTLS. `process` is execution mode process; `zenoh` and `zenoh mTLS` are execution mode distributed as between
 machines, `zenoh shm` as within one. `lerobot` is its RobotClient and PolicyServer, in the interpreter PYTHON, which has
-`lerobot[async]==0.6.1`: it has no JPEG there and sends raw pictures of as many bytes. `ray HTTP` and `ray handle` are
-Ray Serve in the interpreter PYTHON, which has `ray[serve]==2.60.*`; of these blocking and processor time are unknown.
+`lerobot[async]==0.6.1`: it has no JPEG there and sends raw pictures of as many bytes.
 
-All ways are measured in turn, eight times, since a machine may be slower for a while; LeRobot and Ray Serve, which are
-slow to start, every other time. Times are in ms: request to chunk p50 and p99, how long the control loop is blocked in
+All ways are measured in turn, eight times, since a machine may be slower for a while; LeRobot, which is slow to
+start, every other time. Times are in ms: request to chunk p50 and p99, how long the control loop is blocked in
 asking, and processor time of both sides together for a request. One request follows the other; with a pause between
 them [s], all ways find their memory and code out of the caches.
 Exits with 1 where ours is less than 5 times as fast as LeRobot when given, raw cameras over Zenoh take more than 5
@@ -37,6 +36,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import report
 from ibrobot_serve.process import ProcessEngine
 from ibrobot_serve.remote import RemoteEngine
 from ibrobot_serve.service import InferenceService
@@ -308,14 +308,13 @@ def measured(
         yield payload, "zenoh", over_zenoh(*how)
         yield payload, "zenoh shm", over_zenoh(*how, shared=True)
         yield payload, "zenoh mTLS", over_zenoh(*how, certificates)
-    for python, script in ((given.lerobot, "lerobot_async.py"), (given.ray, "ray_serve.py")):
-        if python and number % 2 == 0:
-            command = [python, Path(__file__).absolute().with_name(script)]
-            command += ["--count", str(count), "--pause", str(given.pause)]
-            # LeRobot's logger makes a folder where it runs.
-            lines = subprocess.run(command, check=True, capture_output=True, text=True, cwd=folder).stdout.splitlines()
-            for row in (json.loads(line) for line in lines if line.startswith('{"payload"')):
-                yield row["payload"], row.get("way", "lerobot"), row
+    if given.lerobot and number % 2 == 0:
+        command = [given.lerobot, Path(__file__).absolute().with_name("lerobot_async.py")]
+        command += ["--count", str(count), "--pause", str(given.pause)]
+        # LeRobot's logger makes a folder where it runs.
+        lines = subprocess.run(command, check=True, capture_output=True, text=True, cwd=folder).stdout.splitlines()
+        for row in (json.loads(line) for line in lines if line.startswith('{"payload"')):
+            yield row["payload"], "lerobot", row
 
 
 def run(given: argparse.Namespace, folder: Path) -> int:
@@ -333,7 +332,8 @@ def run(given: argparse.Namespace, folder: Path) -> int:
         f"{'':18} {'':11} {'p50':>8} {'p99':>8} {'blocked':>8} {'CPU':>8} {'x tcp':>7}"
         + (f" {'LeRobot':>8}" if given.lerobot else "")
     )
-    missed = []
+    missed: list[str] = []
+    figures: dict[str, float] = {}
     for payload in PAYLOADS:
         mine = {row["way"]: row for row in rows if row["payload"] == payload}
         for way, row in mine.items():
@@ -344,14 +344,18 @@ def run(given: argparse.Namespace, folder: Path) -> int:
             if way in LIMITS and "uint8" in payload:
                 floor_way, limit = LIMITS[way]
                 ratio = row["p50_ms"] / mine[floor_way]["p50_ms"]
+                figures[f"{way.replace(' ', '_')}_ratio"] = ratio
                 if ratio > limit:
                     missed.append(f"{payload} {way}: {ratio:.1f} times {floor_way}, more than {limit:g}")
             if way in ("process", "zenoh", "zenoh shm", "zenoh mTLS"):
                 if row["blocked_ms"] > BLOCKED_MS:
                     missed.append(f"{payload} {way}: asking blocks for {row['blocked_ms']:.2f} ms")
+                if given.lerobot:
+                    figures["least_times_lerobot"] = min(figures.get("least_times_lerobot", math.inf), faster)
                 if faster < LEROBOT_RATIO:
                     missed.append(f"{payload} {way}: only {faster:.1f} times as fast as LeRobot")
     print("\n".join(missed) or "all within the limits")
+    report(**figures)
     return int(bool(missed))
 
 
@@ -361,7 +365,6 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--pause", type=float, default=0.0)
     parser.add_argument("--lerobot", metavar="PYTHON")
-    parser.add_argument("--ray", metavar="PYTHON")
     for hidden in ("--echo", "--serve", "--certificates"):
         parser.add_argument(hidden, help=argparse.SUPPRESS)
     given = parser.parse_args()

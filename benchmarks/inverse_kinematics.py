@@ -22,6 +22,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from figures import report
 from ibrobot_kinematics import KinematicModel, Target, UnreachableError, read_mjcf, robot_model, solve
 from ibrobot_kinematics.model import TipPose
 from ibrobot_kinematics.search import search
@@ -49,6 +50,8 @@ ARMS = {
     ),
 }
 """Name -> URDF, link of the tip, joints, and their limits on both sides [rad] where the URDF has none."""
+FIGURES = {"least_share": 1.0, "slowest_median_ms": 0.0, "worst_refusal_ms": 0.0, "farther_mm": 0.0}
+"""The worst of all sets of targets."""
 
 
 def configurations(arm: KinematicModel, number: int, seed: int) -> Iterator[Vector]:
@@ -121,7 +124,7 @@ def measure(
     least: float = 1.0,
     median_ms: float = np.inf,
 ) -> bool:
-    """Solves all targets; whether enough were, within the limits of the joints and in time."""
+    """Solves all targets; whether enough were, within the limits of the joints and in time. Adds to `FIGURES`."""
     position_tolerance, rotation_tolerance = (1e-3, 1e-2) if rounded else (1e-6, 1e-5)
     home = (arm.lower + arm.upper) / 2
     solved, outside, took, off, turned = 0, 0, [], [0.0], [0.0]
@@ -144,6 +147,8 @@ def measure(
         f"{name:30} {100 * share:.2f} % of {len(targets)}, {outside} outside limits, at most {1e6 * max(off):.1f} um"
         f" and {1e6 * max(turned):.1f} urad off; median {median:.3f} ms ({wall:.3f}), p99 {tail:.1f} ms"
     )
+    FIGURES["least_share"] = min(FIGURES["least_share"], share)
+    FIGURES["slowest_median_ms"] = max(FIGURES["slowest_median_ms"], median if np.isfinite(median_ms) else 0.0)
     within = max(off) <= position_tolerance and max(turned) <= rotation_tolerance
     return share >= least and not outside and within and median < median_ms
 
@@ -196,6 +201,8 @@ def refuse(name: str, arm: KinematicModel, targets: list[Target], known: list[tu
         f" {1e3 * max(farther):.2f} mm farther and {np.degrees(max(more)):.1f} degrees more than known;"
         f" median {median:.1f} ms, p99 {tail:.1f} ms, worst {worst:.1f} ms ({wall:.1f})"
     )
+    FIGURES["worst_refusal_ms"] = max(FIGURES["worst_refusal_ms"], worst)
+    FIGURES["farther_mm"] = max(FIGURES["farther_mm"], 1e3 * max(farther))
     return refused == len(targets) and not outside and max(farther) < 1e-4 and max(more) < 0.1 and worst < REFUSAL_MS
 
 
@@ -283,6 +290,7 @@ def main() -> int:
         packaged = packaged_arm(name)
         poses = [full_pose(q, packaged) for q in configurations(packaged, number // 10, 6)]
         met.append(measure(f"{name}, full pose", packaged, poses, False, least=0.995))
+    report(**FIGURES)
     return 0 if all(met) else 1
 
 

@@ -37,17 +37,21 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from figures import report
+from fleet_robot import RATE_HZ, Robot, transport
 from ibrobot_serve.wire import health_name
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 from ibrobot_testing.ports import free_port
 from made_up import plugin
-from serve_fleet import A_PROCESS, CHUNK, RATE_HZ, Robot, say, transport
 
 from ibrobot_core.inference.client import Chunk
 from ibrobot_core.interfaces import Frame, Tensors, Transport
 from ibrobot_core.robot import Vector
 
+CHUNK = 50
+A_PROCESS = 10
+"""Robots."""
 EPISODE_S, LEASE_S, AGAIN_S = 8.0, 0.7, 1.0
 FAULTS = {"works": "", "raises": "raises", "slow": "slow", "canary": "raises"}
 """What is wrong with the models of `--faults`."""
@@ -293,7 +297,9 @@ def fleet(endpoints: list[str], count: int) -> list[subprocess.Popen[str]]:
 def ended(asking: list[subprocess.Popen[str]]) -> list[Any]:
     """What the robots counted until now."""
     for process in asking:
-        say(process, "end")
+        assert process.stdin is not None
+        process.stdin.write("end\n")
+        process.stdin.flush()
     return [robot for process in asking for robot in json.loads(process.communicate()[0].splitlines()[-1])]
 
 
@@ -350,6 +356,11 @@ def run(count: int, seconds: float, root: Path) -> int:
         "failures": sum(robot["failures"] for robot in answers),
     }
     print(json.dumps(summary))
+    report(
+        **{f"{name}_again_s": waited_s for name, (_, waited_s) in again.items()},
+        worst_step=summary["worst_step"],
+        wrong_answers=summary["wrong_answers"],
+    )
     late = [name for name, (_, waited_s) in again.items() if waited_s > AGAIN_S]
     return int(bool(late or drained or summary["wrong_answers"] or summary["worst_step"] > 1 or not trying))
 
@@ -408,6 +419,7 @@ def run_faults(count: int, seconds: float, root: Path) -> int:
     print(f"failed requests in a row: at most {worst}")
     print(f"servers without robots: {', '.join(unused) or 'none'}; servers not left: {', '.join(stayed) or 'none'}")
     wrong = sum(robot["wrong"] for robot in answers)
+    report(failed_in_a_row=worst, canary_share=share, not_left=len(stayed), wrong_answers=wrong)
     return int(bool(worst > MOST_FAILURES or unused or stayed or wrong))
 
 

@@ -25,6 +25,7 @@ from typing import Any, override
 import attrs
 import numpy as np
 import yaml
+from figures import report
 
 from ibrobot_core.config import load_config
 from ibrobot_core.interfaces import Context, Sensor
@@ -165,6 +166,7 @@ def compare(repetitions: int, seconds: float, root: Path | None) -> int:
     failed |= ratio > ALLOWED_RATIO or missed[1] > missed[0]
     print(f"p99 lateness recorded / without: {ratio:.2f}; ticks missed: {missed[1]} recorded, {missed[0]} without")
     print("FAILED" if failed else "passed")
+    report(p99_ratio=ratio, missed=missed[1], missed_without=missed[0])
     return int(failed)
 
 

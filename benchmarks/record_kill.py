@@ -23,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from figures import report
 from ibrobot_testing.contexts import host_context
 from mcap.reader import make_reader
 
@@ -172,6 +173,12 @@ def main() -> int:
     for number in bad:
         print(f"recording {number}: {'; '.join(results[number][0])}")
     print("FAILED" if bad else "passed")
+    report(
+        killed=len(results),
+        whole=len(results) - len(bad),
+        median_lost_s=losses[len(losses) // 2],
+        worst_lost_s=losses[-1],
+    )
     return int(bool(bad))
 
 

@@ -17,6 +17,7 @@ import time
 from typing import Any
 
 import numpy as np
+from figures import report
 
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.robot import Joint, Robot
@@ -62,6 +63,10 @@ def main() -> int:
     measure(smooth[:1000])  # warm
     result = {"ticks": ticks, "smooth": measure(smooth), "wild": measure(wild), "budget_us": BUDGET_US}
     print(json.dumps(result))
+    smooth_us, wild_us = result["smooth"]["layer_us"], result["wild"]["layer_us"]
+    report(
+        p50_us=smooth_us["p50"], p99_us=smooth_us["p99"], limited_p50_us=wild_us["p50"], limited_p99_us=wild_us["p99"]
+    )
     return 0 if result["smooth"]["layer_us"]["p50"] <= BUDGET_US else 1
 
 

@@ -17,6 +17,8 @@ from pathlib import Path
 from time import process_time
 from typing import Any
 
+import figures
+
 from ibrobot_core.config import load_config
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import LaunchRequest, Session
@@ -88,6 +90,7 @@ def main() -> int:
         reports.append(report)
     for report in reports:
         print(json.dumps(report))
+    figures.report(**{report["scene"]: report["successes"] for report in reports})
     return 0 if good else 1
 
 

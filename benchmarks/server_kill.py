@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import report
 from ibrobot_testing.ports import free_port
 from made_up import plugin
 
@@ -243,6 +244,7 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
         "last": grown[-1:],
     }
     print(json.dumps(summary))
+    report(**{name: summary[name] for name in ("known_worst_ms", "held_worst_s", "resumed_worst_s", "answered_twice")})
     first, last = (grown[0], grown[-1]) if grown else (resources(), resources())
     good = (
         max(held) <= PLAN_S + STALE_S + SETTLE_S + slack_s

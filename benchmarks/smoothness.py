@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, override
 
 import numpy as np
+from figures import report
 from flow_policy import FlowPolicy
 
 from ibrobot_core.bus import Bus
@@ -209,6 +210,13 @@ def main() -> int:
         results.append(measure(config, strategy, latency_ms, chunk, arguments.duration, arguments.seed))
         print(json.dumps(results[-1]), flush=True)
     problems = list(missed(results))
+    jerks = {s: np.mean([r["rms_jerk"] for r in results if r["strategy"] == s]) for s in STRATEGIES}
+    report(
+        jerk_of_rtc=float(jerks["rtc"] / min(jerks["replace"], jerks["ensemble"])),
+        of_velocity_limit=max(r["of_velocity_limit"] for r in results),
+        of_acceleration_limit=max(r["of_acceleration_limit"] for r in results),
+        needless_holds=sum(r["holds"]["others"] for r in results),
+    )
     for problem in problems:
         print(problem, file=sys.stderr)
     return 1 if problems else 0

@@ -22,6 +22,7 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from figures import report
 from ibrobot_serve.fair_queue import FairQueue
 from ibrobot_serve.pacing import Pacing
 from ibrobot_testing import make_robot
@@ -281,6 +282,13 @@ def main() -> int:
         best = min(runs, key=lambda watermark: (runs[watermark][phase]["holds"], runs[watermark][phase]["age_ms"]))
         problems += worse(auto[phase], runs[best][phase])
         print(json.dumps({"phase": phase, "best": best, "worse": worse(auto[phase], runs[best][phase])}))
+    report(
+        **{
+            f"{name}_{phase}": auto[phase][name]
+            for phase in ("before", "after")
+            for name in ("load", "p50_ms", "p99_ms")
+        }
+    )
     return int(bool(problems))
 
 

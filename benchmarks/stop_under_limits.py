@@ -44,6 +44,7 @@ from typing import Any
 
 import aiohttp
 import attrs
+from figures import report
 from ibrobot_ros2.services import Call, decode_answer, encode_call, endpoint
 from ibrobot_testing import host_context
 from ibrobot_testing.ports import free_port
@@ -476,7 +477,11 @@ def main() -> None:
                 options.json.write_text(json.dumps([attrs.asdict(each) for each in results], indent=1))
     for kind in ("none", *kinds):
         _summarize(kind, [each for each in results if each.kind == kind])
-    sys.exit(any(each.lost for each in results))
+    answered_s = [each.answered_s for each in results if each.answered_s is not None]
+    lost, late = (sum(getattr(each, name) for each in results) for name in ("lost", "late"))
+    rest_s = max((each.rest_s for each in results), default=0.0)
+    report(runs=len(results), lost=lost, late=late, worst_answer_s=max(answered_s, default=0.0), worst_rest_s=rest_s)
+    sys.exit(bool(lost))
 
 
 def _print(result: Result, tail: str) -> None:

@@ -113,6 +113,7 @@ def main() -> int:
         result["onnx_successes"] = other["successes"]
         result["seeds_with_different_outcomes"] = sum(len(each) == 2 for each in outcomes.values())
     print(json.dumps(result))
+    report(successes=found["successes"], trials=found["episodes"])
     return 0
 
 

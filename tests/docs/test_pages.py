@@ -35,7 +35,7 @@ PAGES = [
 ]
 OF_OTHER_PROGRAMS = {"CONTRIBUTING.md", "come-from-lerobot.md", "use-ibrobot-from-lerobot.md"}
 """Pages with options of nox and of LeRobot."""
-OF_OTHERS = {"--cap-add", "--ulimit", "--pause", "--find-links", "--ray", "--teleop"}
+OF_OTHERS = {"--cap-add", "--ulimit", "--pause", "--find-links", "--save", "--teleop"}
 """Options in the running text that are of other programs."""
 NOT_CHECKED = {"of two arms", "of another program", "needs the plugin of this page"}
 """Notes above YAML blocks that no robot YAML here can hold."""

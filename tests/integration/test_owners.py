@@ -1,4 +1,4 @@
-"""Commands at once on one episode or dataset, and killed: a few of what `benchmarks/owners.py` runs twenty times."""
+"""Commands at once on one episode or dataset, and killed: a few of what `tests/shared/owners.py` runs twenty times."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 pytestmark = pytest.mark.integration
 
-PROGRAM = Path(__file__).parents[2] / "benchmarks/owners.py"
+PROGRAM = Path(__file__).parents[2] / "tests/shared/owners.py"
 LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("append", "train")]
 
 

@@ -1,4 +1,4 @@
-"""A takeover and a handback with each device that can intervene; `benchmarks/takeovers.py` makes a hundred."""
+"""A takeover and a handback with each device that can intervene."""
 
 from __future__ import annotations
 

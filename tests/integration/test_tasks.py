@@ -61,7 +61,6 @@ def test_task_with_a_fault_starts_nothing(tmp_path: Path):
 
 
 def test_pick_and_place_among_obstacles_touches_nothing_and_repeats_exactly():
-    """A short variant of `benchmarks/pick_and_place.py`."""
     first, again = perform(5), perform(5)
     assert (first.placed, first.touched, first.beyond, first.message) == (True, (), (), "")
     assert first.digest == again.digest

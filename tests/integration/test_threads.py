@@ -1,4 +1,4 @@
-"""The scheduling classes of the threads of a run, as `benchmarks/threads.py` finds them."""
+"""The scheduling classes of the threads of a run, as `tests/shared/thread_classes.py` finds them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 pytestmark = pytest.mark.integration
-PROGRAM = Path(__file__).parents[2] / "benchmarks/threads.py"
+PROGRAM = Path(__file__).parents[2] / "tests/shared/thread_classes.py"
 URGENT = "RR RESET"
 
 

@@ -36,6 +36,7 @@ from ibrobot_ros2.goals import Actions
 from ibrobot_web import commands as page_commands
 from ibrobot_web.messages import Sent, from_page, from_server, to_run
 from ibrobot_webxr.messages import Hands, decode
+from plugin_tests import of_tests
 
 from ibrobot_core.api import Header, Pose, PoseStamped, Twist, TwistStamped, Vector3, ns
 from ibrobot_core.child import Channel
@@ -1005,7 +1006,7 @@ class _LeRobotLeader(deadman_table.Keyboard):
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
-        fakes = deadman_table.of_tests("ibrobot-plugin-lerobot-devices", "conftest")
+        fakes = of_tests("ibrobot-plugin-lerobot-devices", "conftest")
         site = folder / "site"
         shutil.copytree(fakes.FAKE, site)
         fakes.install(site, "lerobot", "0.6.1")

@@ -183,8 +183,8 @@ def drift(outcomes: Iterable[Sequence[bool]], shuffles: int = _SHUFFLES) -> floa
 def _bets() -> tuple[Array, Array]:
     """Stake of each bet in the mixture, as a fraction of the capital, and the logarithm of its weight.
 
-    Stakes follow a Beta(2, 2) distribution, which needs the fewest episodes over a range of differences
-    (`benchmarks/evaluation_statistics.py`). Any weights that do not depend on the outcomes are valid.
+    Stakes follow a Beta(2, 2) distribution, which needs the fewest episodes over a range of differences.
+    Any weights that do not depend on the outcomes are valid.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     stakes = (nodes + 1) / 2

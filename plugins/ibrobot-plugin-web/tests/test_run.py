@@ -21,7 +21,7 @@ pytestmark = [
     pytest.mark.skipif(("hardware", "mujoco") not in installed_plugins().entries, reason="needs ibrobot-plugin-mujoco"),
 ]
 HOLD_NS = 500_000_000
-"""An arm whose commands stay the same for so long holds [ns]. `benchmarks/web_page.py deadman` measures how soon."""
+"""An arm whose commands stay the same for so long holds [ns]."""
 FAR_RAD = 1.5
 """What an arm that went on would reach, on its way to a limit [rad]."""
 MOVING_RAD = 1e-4

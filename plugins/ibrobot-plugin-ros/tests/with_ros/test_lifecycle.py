@@ -81,7 +81,7 @@ def test_a_peer_that_comes_late_and_goes(start, peers):
 
 @pytest.mark.parametrize("trouble", ["busy", "stopped"])
 def test_the_loop_is_as_punctual_as_before(start, peer, trouble):
-    """The loop's own report says so; `benchmarks/ros.py` measures it on a quiet machine."""
+    """The loop's own report says so."""
     run = start("ros.subscribe={/lamp: std_msgs/msg/Bool}")
     if trouble == "busy":
         peer.send("publish", topic="/lamp", type="std_msgs/msg/Bool", raw="0001000001", count=5000)

@@ -1,6 +1,6 @@
 """Scheduling class of every thread of a run.
 
-    python benchmarks/threads.py record so101 --sim --headless --episodes 1
+    python tests/shared/thread_classes.py record so101 --sim --headless --episodes 1
 
 runs that `ibrobot` command, and afterwards prints, as JSON, each thread of its process and of the processes that it
 started, with the class under which it ran: `OTHER`, `RR` or `FIFO`, and `RESET` where threads that it starts return to

@@ -1,21 +1,17 @@
 """Devices times events: how long the arm moves after an event, and whether it moves again by the same press.
 
-    python benchmarks/deadman_table.py [--device NAME ...] [--event NAME ...]
-
 Each cell is a run of the simulated arm in lockstep, with the device emulated at its reports: HID reports, replies of
 servos, a serial port, bytes of a terminal, messages of pages, twists. A person presses the deadman and moves the arm;
 the event happens, and the person keeps the deadman pressed for 3 s. A cell shows the time from the last report until
-the command rests [ms], and how far the command moved afterwards [mrad]. At the end a new press must move the arm. Exits
-with 1 if a motion lasts longer than 0.3 s, or the arm moves again without a new press.
+the command rests [ms], and how far the command moved afterwards [mrad]. At the end a new press must move the arm.
+A cell is good if no motion lasts longer than 0.3 s, and the arm does not move again without a new press.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import queue
 import sys
-import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +26,8 @@ from ibrobot_web.messages import Sent, from_page, from_server, to_run
 from ibrobot_webxr.messages import Hands, decode
 from ibrobot_webxr.options import WebxrOptions
 from ibrobot_webxr.shared import close_page, open_page
-from takeovers import CONFIG, JOINTS, of_tests
+from plugin_tests import of_tests
+from takeovers import CONFIG, JOINTS
 
 from ibrobot_core.api import Context, Header, Twist, TwistStamped, Vector3
 from ibrobot_core.calibration import Calibration, JointCalibration
@@ -723,26 +720,3 @@ def _measure(person: Person, event: str) -> Cell:
         return Cell(held * period_s, way, trial.moves())
     finally:
         runtime.stop()
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", action="append", choices=tuple(PERSONS))
-    parser.add_argument("--event", action="append", choices=tuple(EVENTS))
-    chosen = parser.parse_args()
-    events, good = chosen.event or list(EVENTS), True
-    print("| device | " + " | ".join(events) + " |", "|---" * (1 + len(events)) + "|", sep="\n")
-    for device in chosen.device or PERSONS:
-        row = []
-        for event in events:
-            with tempfile.TemporaryDirectory() as folder:
-                cell = measure(device, event, Path(folder))
-            good &= cell is None or cell.good
-            row.append("-" if cell is None else str(cell))
-        print(f"| {device} | " + " | ".join(row) + " |", flush=True)
-    sys.exit(not good)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,26 +1,18 @@
 """Random takeovers and handbacks by a gamepad, a leader arm and the keyboard: steps, lost frames, labels, parity.
 
-    python benchmarks/takeovers.py [--takeovers 100] [--seed 0] [--device gamepad --device leader --device keyboard]
-    python benchmarks/takeovers.py --live [--takeovers 10] [--seed 0] [--device gamepad --device keyboard]
-
 The simulated SO-101 follows a policy that moves all joints, in lockstep. At random times a scripted person takes it
 with the device, moves it, lets go of the deadman now and then, and gives it back. The gamepad is a DualSense whose
 reports come from a fake of hidapi, the leader consists of emulated servos, which its motors drive before each
 takeover, and the keyboard is a queue of keys. The run is recorded, and converted to a dataset.
 
-Prints one JSON object per device, and exits with 1 unless every velocity and acceleration of the commands is within the
-limits, nothing is lost, who commands is labelled at every state as the person acted, the frames from the recording
-equal those of the run bit by bit, the column `intervention` is true in exactly the rows that the person commanded, and
-`--only interventions` gives each takeover as an episode. With `--live` the run is in real time, with
-control in a process of its own; then who commands must change as the person acts, and each state must arrive.
+`is_good` holds if every velocity and acceleration of the commands is within the limits, nothing is lost, who commands
+is labelled at every state as the person acted, the frames from the recording equal those of the run bit by bit, the
+column `intervention` is true in exactly the rows that the person commanded, and `--only interventions` gives each
+takeover as an episode.
 """
 
 from __future__ import annotations
 
-import argparse
-import importlib.util
-import itertools
-import json
 import math
 import queue
 import random
@@ -29,7 +21,6 @@ import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any, override
 
 import attrs
@@ -45,7 +36,7 @@ from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_webxr.messages import HandPose, Hands
 from ibrobot_webxr.options import WebxrOptions
 from ibrobot_webxr.shared import close_page, open_page
-from made_up import plugin
+from plugin_tests import ROOT, of_tests
 
 from ibrobot_core.api import Context
 from ibrobot_core.calibration import Calibration, JointCalibration
@@ -57,14 +48,11 @@ from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import installed_plugins
 
-ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "configs" / "so101_blind.yaml"
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 RADIAN = 4096 / (2 * math.pi)
 """Ticks."""
 SLACK = 1.001
-_SETTLED_NS = 500_000_000
-"""Time before the first compared frame of a live run: the recording begins before it."""
 _KEYS = "wsedrftgyhoc"
 """Pairs of keys that jog a joint up and down."""
 _AWAY_RAD, _AWAY_TICKS, _ACTS = 0.2, 100, 25
@@ -96,18 +84,6 @@ class Wander(Policy):
 def ibrobot_policies():
     yield PolicyDescriptor("wander", Wander, "moves all joints to and fro")
 """
-
-
-def of_tests(plugin_name: str, module: str) -> ModuleType:
-    """A fake from a plugin's tests."""
-    path = ROOT / "plugins" / plugin_name / "tests" / f"{module}.py"
-    spec = importlib.util.spec_from_file_location(module, path)
-    assert spec is not None
-    assert spec.loader is not None
-    loaded = importlib.util.module_from_spec(spec)
-    sys.modules[module] = loaded
-    spec.loader.exec_module(loaded)
-    return loaded
 
 
 class Person(ABC):
@@ -497,74 +473,8 @@ class Trial:
         """How many states have another commander than they should."""
         return sum(a != b for a, b in zip(self.labels, self.expected, strict=True))
 
-    def lost_states(self) -> int:
-        """How many states of control did not arrive."""
-        return 0
 
-
-@attrs.define(slots=False)
-class LiveTrial(Trial):
-    """A trial in real time: states and labels arrive when they are published."""
-
-    said: list[tuple[int, str]] = attrs.field(factory=list)
-    """Time of receipt and word of each label."""
-
-    def __attrs_post_init__(self) -> None:
-        super().__attrs_post_init__()
-        bus, config = self.runtime.session.bus, self.runtime.session.config
-        self._states = bus.subscribe("/joint_states", 1000)
-        self._parts = [bus.subscribe(action.topic, 1000) for action in config.contract.actions]
-        self._begin_ns = self.runtime.session.clock.now_ns() + _SETTLED_NS
-
-    @override
-    def tick(self, then: str | None = None) -> str:
-        self.person.tick(self.rng)
-        if self.runtime.wait(0.01):
-            self.runtime.raise_failure()
-            raise SystemExit("the run ended early")
-        session = self.runtime.session
-        if session.faults:
-            raise SystemExit(f"fault: {'; '.join(session.faults)}")
-        self._collect()
-        self.look()
-        if then is not None:
-            self.expected.append(then)
-        now_ns = session.bus.snapshot_ns()
-        if now_ns >= max(self._begin_ns, self._next_ns):
-            self.seen.append(self._sampler.sample(now_ns))
-            self._next_ns = now_ns + self._step_ns
-        return self.said[-1][1] if self.said else POLICY
-
-    @override
-    def until_given_back(self) -> None:
-        self.until(lambda: self.said[-1][1] == HANDOVER)
-        self.until(lambda: self.said[-1][1] != HANDOVER)
-        self.expected.append(POLICY)
-
-    def _collect(self) -> None:
-        self.said += [(item.received_ns, str(item.message.data)) for item in self._words.drain()]  # type: ignore[attr-defined]
-        while (state := self._states.get()) is not None:
-            self.stamps.append(state.message.header.stamp_ns)  # type: ignore[attr-defined]
-            parts = [part.get(1.0) for part in self._parts]  # published after the state
-            self.commands.append(np.concatenate([part.message.data for part in parts if part is not None]))  # type: ignore[attr-defined]
-
-    @override
-    def commanders(self) -> list[tuple[int, str]]:
-        return self.said
-
-    @override
-    def wrong_labels(self) -> int:
-        """How many changes of the commander are not those that the person caused."""
-        self.labels = [word for word, _ in itertools.groupby(word for _, word in self.said)]
-        return sum(a != b for a, b in itertools.zip_longest(self.labels, [POLICY, *self.expected]))
-
-    @override
-    def lost_states(self) -> int:
-        _, published = self.runtime.session.bus.topics()["/joint_states"]
-        return int(self.runtime.summary()["loop"]["ticks"]) - published
-
-
-def measure(name: str, takeovers: int, seed: int, *, live: bool = False) -> dict[str, Any]:
+def measure(name: str, takeovers: int, seed: int) -> dict[str, Any]:
     """All of one device."""
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
@@ -579,11 +489,11 @@ def measure(name: str, takeovers: int, seed: int, *, live: bool = False) -> dict
         ]
         keys = person.subscribe if isinstance(person, WithKeys) else None
         config = load_config(CONFIG, overrides=overrides, sim=True)
-        runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=not live, seed=seed, keys=keys)))
+        runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, seed=seed, keys=keys)))
         runtime.start()
         try:
             person.meet(runtime)
-            trial = (LiveTrial if live else Trial)(runtime, person, random.Random(seed))
+            trial = Trial(runtime, person, random.Random(seed))
             for _ in range(takeovers):
                 trial.takeover()
             trial.wait(0.5, 0.5)
@@ -608,7 +518,6 @@ def figures(trial: Trial) -> dict[str, Any]:
         "faults": summary["faults"],
         "drops": sum(summary["drops"].values()),
         "wrong_labels": trial.wrong_labels(),
-        "lost_states": trial.lost_states(),
     }
 
 
@@ -663,7 +572,6 @@ def is_good(found: dict[str, Any]) -> bool:
     none = (
         "drops",
         "wrong_labels",
-        "lost_states",
         "lost_messages",
         "unequal_frames",
         "skipped_rows",
@@ -673,29 +581,3 @@ def is_good(found: dict[str, Any]) -> bool:
     whole = (found["corrections"], found["correction_rows"]) == (found["takeovers"], found["intervention_rows"])
     steps = max(found["velocity_share"], found["acceleration_share"])
     return whole and not found["faults"] and steps <= SLACK and all(found[name] == 0 for name in none)
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--takeovers", type=int, help="default: 100, with --live 10")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--device", action="append", choices=PERSONS)
-    parser.add_argument("--live", action="store_true", help="in real time; not with the leader")
-    arguments = parser.parse_args()
-    devices = arguments.device or ["gamepad", "leader", "keyboard"]
-    if arguments.live and arguments.device is None:
-        devices.remove("leader")
-    elif arguments.live and "leader" in devices:
-        parser.error("the emulated leader has stepped time: leave it out of --live")
-    takeovers = arguments.takeovers or (10 if arguments.live else 100)
-    good = True
-    with plugin("wander", WANDER):
-        for name in devices:
-            found = measure(name, takeovers, arguments.seed, live=arguments.live)
-            print(json.dumps(found), flush=True)
-            good = good and is_good(found)
-    return 0 if good else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,6 @@
 """Commands at once on one episode or dataset: what was reported as kept is there, once, and refusals name the owner.
 
-    python benchmarks/owners.py [--times 20] [--kills 10] [--seed 0] [--only NAME]
+    python tests/shared/owners.py [--times 20] [--kills 10] [--seed 0] [--only NAME]
 
 Every pair of record, repair, trim, mark, delete, restore, convert, append, merge and train runs at once, `--times`
 times, with random delays. Then each of them is killed (SIGKILL) at `--kills` times of its run, beside another one. Then
@@ -54,8 +54,6 @@ from ibrobot_mcap.options import McapOptions
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.recorder import McapRecorder
 from ibrobot_testing.contexts import host_context
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests/shared"))
 from trainer import install as install_trainer
 
 from ibrobot_core.cli.main import main as ibrobot

@@ -1,6 +1,6 @@
 """Teleoperation over two emulated servo buses on which everything fails in turn, for ten minutes.
 
-    python benchmarks/feetech_faults.py
+    python tests/shared/feetech_faults.py
 
 A person moves the leader; the real leader device, control core, safety layer and driver work in stepped time at 100 Hz
 on real pseudo-terminals. On both buses one byte in a hundred is damaged, and replies are lost and late, all the time.

@@ -1,22 +1,16 @@
 """Pick and place by planning among obstacles, in lockstep: placed, touched, limits, equal trajectories for equal seeds.
 
-    python benchmarks/pick_and_place.py [--tasks 100] [--seed 0] [--repeat 10]
-
 Each task is the bundled `pick_cube` in a scene of its own: the cube at random, and obstacles that fall or slide when
 they are touched, one of them between the cube and the bin. Contacts are those of the physics at each control period.
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
-import logging
-import sys
 from contextlib import suppress
 from itertools import product
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import attrs
@@ -42,7 +36,7 @@ from ibrobot_core.app import (
     single_options,
 )
 
-CONFIG = Path(__file__).parents[1] / "configs" / "so101_pick_cube.yaml"
+CONFIG = Path(__file__).parents[2] / "configs" / "so101_pick_cube.yaml"
 BIN = np.array([0.10, 0.24])
 OBSTACLES = 4
 LONGEST_S = 60.0
@@ -138,13 +132,11 @@ def sample(rng: np.random.Generator) -> dict[str, Any]:
     return {"scene": {"type": "pick_cube", **drawn}, "objects": objects}
 
 
-def perform(seed: int, speed: float = 1.0) -> Outcome:
+def perform(seed: int) -> Outcome:
     """One task."""
     registry = installed_plugins()
     changes = [f"simulation.{key}={json.dumps(value)}" for key, value in scene(seed, so101()).items()]
     changes.append("tasks={}")
-    if speed != 1.0:
-        changes.append(f"control_modes.planned.planner.velocity_scaling={speed}")
     config = load_config(CONFIG, overrides=changes, mode="planned", sim=True, registry=registry)
     runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, seed=seed, duration_s=LONGEST_S)))
     bus = runtime.session.bus
@@ -234,49 +226,3 @@ def exceeded(config: Any, command: Vector) -> list[str]:
         if np.abs(acceleration[:, i]).max() > 1.02 * joint.max_acceleration:
             found.append(f"{joint.name} acceleration {np.abs(acceleration[:, i]).max():.1f}")
     return found
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0, help="of the first task; later ones count up")
-    parser.add_argument("--repeat", type=int, default=10, help="tasks to repeat, for equal trajectories")
-    parser.add_argument("--speed", type=float, default=1.0, help="velocity_scaling of the planner")
-    arguments = parser.parse_args()
-    logging.getLogger("ibrobot").setLevel(logging.CRITICAL)
-    begin = perf_counter()
-    outcomes = []
-    for seed in range(arguments.seed, arguments.seed + arguments.tasks):
-        outcome = perform(seed, arguments.speed)
-        outcomes.append(outcome)
-        if not outcome.placed or outcome.touched or outcome.beyond:
-            what = attrs.asdict(outcome)
-            print(
-                json.dumps({key: what[key] for key in ("seed", "placed", "touched", "beyond", "message")}), flush=True
-            )
-    again = [perform(outcome.seed, arguments.speed) for outcome in outcomes[: arguments.repeat]]
-    equal = sum(a.digest == b.digest for a, b in zip(outcomes, again, strict=False))
-    placed = sum(outcome.placed for outcome in outcomes)
-    touched = sum(bool(outcome.touched) for outcome in outcomes)
-    beyond = sum(bool(outcome.beyond) for outcome in outcomes)
-    durations = [outcome.duration_s for outcome in outcomes if outcome.placed]
-    print(
-        json.dumps(
-            {
-                "tasks": len(outcomes),
-                "placed": placed,
-                "touched": touched,
-                "beyond_limits": beyond,
-                "repeated": len(again),
-                "equal": equal,
-                "median_s": round(float(np.median(durations)), 2) if durations else None,
-                "wall_s": round(perf_counter() - begin, 1),
-            }
-        )
-    )
-    good = placed >= 0.95 * len(outcomes) and not touched and not beyond and equal == len(again)
-    return 0 if good else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())
