@@ -1,7 +1,8 @@
-"""The distributions of this repository: what the extras of `ibrobot` install."""
+"""The distributions of this repository: the extras of `ibrobot`, and the lists that a new one must be in."""
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -17,6 +18,11 @@ def project(folder: Path) -> dict[str, Any]:
     return dict(tomllib.loads((folder / "pyproject.toml").read_text())["project"])
 
 
+LOCAL = {project(folder)["name"] for folder in FOLDERS}
+PLUGINS = {name for name in LOCAL if name.startswith("ibrobot-plugin-")}
+SOURCES = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["uv"]["sources"]
+README = (ROOT / "README.md").read_text()
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text()
 EXTRAS: dict[str, list[str]] = project(ROOT / "plugins/ibrobot")["optional-dependencies"]
 
 
@@ -37,8 +43,39 @@ def test_versions_are_the_same(folder: Path) -> None:
 
 
 def test_all_brings_every_plugin_but_the_one_for_clusters() -> None:
-    plugins = {folder.name for folder in FOLDERS if folder.name.startswith("ibrobot-plugin-")}
-    assert brought("all") == plugins - {"ibrobot-plugin-ray"}
+    missing = PLUGINS - {"ibrobot-plugin-ray"} - brought("all")
+    assert not missing, f"add {missing} to an extra in plugins/ibrobot/pyproject.toml"
+    assert brought("all") == PLUGINS - {"ibrobot-plugin-ray"}
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_what_a_distribution_needs_of_this_repository_is_a_source_of_the_workspace(folder: Path) -> None:
+    settings = tomllib.loads((folder / "pyproject.toml").read_text())
+    groups = (settings["project"].get("optional-dependencies", {}), settings.get("dependency-groups", {}))
+    texts = [settings["project"]["dependencies"], *(texts for group in groups for texts in group.values())]
+    names = {re.split(r"[\[<>=~! ;]", text)[0] for group in texts for text in group}
+    missing = [f"{name} = {{ workspace = true }}" for name in sorted(names & LOCAL - set(SOURCES))]
+    assert not missing, f"add {missing} to [tool.uv.sources] of pyproject.toml, and run `uv lock`"
+    assert folder == ROOT or "sources" not in settings.get("tool", {}).get("uv", {}), "the root's sources are for all"
+
+
+@pytest.mark.parametrize("name", sorted(LOCAL))
+def test_the_readme_has_a_row_for_every_package(name: str) -> None:
+    rows = re.findall(r"`([\w-]+)`", "".join(re.findall(r"^\| ((?:`[\w-]+`(?:, )?)+) \|", README, re.MULTILINE)))
+    assert rows.count(name) == 1, f'add a row `{name}` to the table "Plugins here" of README.md'
+
+
+def test_the_readme_names_every_scene() -> None:
+    row = re.search(r"^\| `ibrobot-plugin-mujoco` \|.*$", README, re.MULTILINE)
+    assert row is not None
+    offers = json.loads((ROOT / "ibrobot_core/official_plugins.json").read_text())["ibrobot-plugin-mujoco"]
+    assert [scene for scene in offers["scene"] if f"`{scene}`" not in row[0]] == [], "add it to the row in README.md"
+
+
+def test_contributing_names_every_library_that_plugins_share() -> None:
+    (rule,) = re.findall(r"the libraries that plugins share \((.*?)\)", CONTRIBUTING, re.DOTALL)
+    libraries = {name for name in LOCAL if re.match("ibrobot-(?!plugin-|testing|gym|core)", name)}
+    assert set(re.findall(r"`([\w-]+)`", rule)) == libraries, "correct the list in the rule `Layout` of CONTRIBUTING.md"
 
 
 @pytest.mark.parametrize("page", ["README.md", "plugins/ibrobot/README.md"])

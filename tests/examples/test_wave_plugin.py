@@ -45,6 +45,12 @@ def test_pyproject_names_the_module() -> None:
     assert project["entry-points"]["ibrobot"] == {"wave": "ibrobot_wave"}
 
 
+@pytest.mark.parametrize("path", sorted(EXAMPLE.rglob("*.py")), ids=lambda path: path.name)
+def test_it_imports_core_through_its_api_alone(path: Path) -> None:
+    imported = re.findall(r"^(?:from|import) (ibrobot_core[\w.]*)", path.read_text(), re.MULTILINE)
+    assert set(imported) <= {"ibrobot_core.api", "ibrobot_core.app"}
+
+
 def test_readme_shows_the_plugin_as_it_is() -> None:
     assert (EXAMPLE / "ibrobot_wave/__init__.py").read_text().strip() in (ROOT / "README.md").read_text()
 

@@ -1,13 +1,17 @@
 """Writes `official_plugins.json` and `official_extras.json` of core, from the plugins in this repository.
 
-python tests/house/official_plugins.py
+    uv sync --group cluster && python tests/house/official_plugins.py
+
+All of them must be installed. It ends with an error that names those that are not.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import sys
 import tomllib
+from collections.abc import Iterable
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -15,7 +19,8 @@ from ibrobot_core.descriptors import SectionDescriptor
 from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, RECORDS, discover
 
 CORE = "ibrobot-core"
-DISTRIBUTION = Path(__file__).parents[2] / "plugins" / "ibrobot" / "pyproject.toml"
+PLUGINS = Path(__file__).parents[2] / "plugins"
+DISTRIBUTION = PLUGINS / "ibrobot" / "pyproject.toml"
 
 
 def offers() -> dict[str, dict[str, list[str]]]:
@@ -55,6 +60,11 @@ def offers() -> dict[str, dict[str, list[str]]]:
     return dict(sorted(found.items()))
 
 
+def missing(installed: Iterable[str]) -> list[str]:
+    """The plugins of this repository that are not installed."""
+    return sorted({folder.name for folder in PLUGINS.glob("ibrobot-plugin-*")} - set(installed))
+
+
 def extras() -> dict[str, list[str]]:
     """Extra of `ibrobot` -> the plugins that it installs; without those made of other extras."""
     declared: dict[str, list[str]] = tomllib.loads(DISTRIBUTION.read_text())["project"]["optional-dependencies"]
@@ -63,5 +73,8 @@ def extras() -> dict[str, list[str]]:
 
 
 if __name__ == "__main__":
-    OFFICIAL.write_text(json.dumps(offers(), indent=2) + "\n", encoding="utf-8")
+    found = offers()
+    if lacking := missing(found):
+        sys.exit(f"not installed: {', '.join(lacking)}; nothing is written. Remedy: uv sync --group cluster")
+    OFFICIAL.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
     EXTRAS.write_text(json.dumps(extras(), indent=2) + "\n", encoding="utf-8")

@@ -70,7 +70,16 @@ def test_examples_in_messages_are_default_types() -> None:
 
 @pytest.mark.integration
 def test_official_plugins_are_listed_as_they_are() -> None:
-    from official_plugins import extras, offers
+    from official_plugins import extras, missing, offers
 
+    if lacking := missing(offers()):
+        pytest.fail(f"not installed: {', '.join(lacking)}; run uv sync --group cluster")
     assert offers() == official_plugins(), "run python tests/house/official_plugins.py"
     assert extras() == json.loads(EXTRAS.read_bytes()), "run python tests/house/official_plugins.py"
+
+
+def test_plugins_that_are_not_installed_are_named() -> None:
+    from official_plugins import missing
+
+    assert missing(set(official_plugins()) - {"ibrobot-plugin-ray"}) == ["ibrobot-plugin-ray"]
+    assert missing(official_plugins()) == []

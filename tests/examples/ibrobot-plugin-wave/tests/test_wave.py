@@ -5,7 +5,7 @@ from typing import override
 from ibrobot_testing import TeleopSuite
 from ibrobot_wave import Wave, WaveOptions
 
-from ibrobot_core.interfaces import Context, Teleop
+from ibrobot_core.api import Context, Teleop
 
 
 class TestWave(TeleopSuite):
