@@ -1,0 +1,130 @@
+"""Every goal of the documentation, by page, service, program and command line: all plan the same."""
+
+from __future__ import annotations
+
+import json
+import queue
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import run_here
+from ibrobot_planning.client import Client
+from ibrobot_web.commands import Commands
+from ibrobot_web.messages import Sent, from_page
+
+from ibrobot_core.api import JointTrajectory, PlanningError
+from ibrobot_core.app import LaunchRequest, Runtime, Session, find_config, installed_plugins, load_config
+
+pytestmark = pytest.mark.integration
+type Answer = tuple[list[float], float] | str
+"""Positions at the end [rad] and duration [s], or why there is no plan."""
+
+PAGE = Path(__file__).parents[2] / "docs/how-to/move-to-a-pose.md"
+PLANNER = "control_modes.moveit_planning.planner={type: rrt_connect}"
+
+_NEAR = "beyond_reach=nearest"
+"""Five joints seldom reach an orientation."""
+
+
+def documented_goals() -> list[str]:
+    """The goals in the table and the text of the section "Goals"; parts such as `axis=up` complete the goal before."""
+    section = PAGE.read_text(encoding="utf-8").split("## Goals")[1].split("\n## ")[0]
+    goals: list[str] = []
+    for text in re.findall(r"`([^`]+)`", section):
+        if re.match(r"(axis|quaternion)=", text):
+            goals.append(" ".join((goals[-1].split()[0], text, *([_NEAR] if "quaternion" in text else []))))
+        elif "=" in text or text == "home":
+            goals.append(text if "rpy" not in text else f"{text} {_NEAR}")
+    return goals
+
+
+@pytest.fixture(scope="module")
+def run() -> Iterator[Runtime]:
+    """A simulated SO-101 at rest in its pose `rest`."""
+    registry = installed_plugins()
+    overrides = ("simulation.scene=empty", "simulation.start_pose=rest", PLANNER)
+    path = find_config("so101_blind", registry)
+    config = load_config(path, sim=True, mode="moveit_planning", registry=registry, overrides=overrides)
+    runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True)))
+    try:
+        runtime.start()
+        Client.of_run(runtime).wait(0.1)
+        yield runtime
+    finally:
+        runtime.stop()
+
+
+def by_page(run: Runtime, goal: str) -> Answer:
+    replies: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+    commands = Commands(run.session, run.session.finish, replies.put, lambda error: replies.put({"error": str(error)}))
+    try:
+        sent: Sent[Any] = from_page(json.dumps({"do": "preview", "id": 1, "stops": 0, "goal": goal}))
+        commands.take(sent)
+        reply = replies.get(timeout=60)
+    finally:
+        commands.close(60)
+    if "error" in reply:
+        return reply["error"]
+    assert reply["ok"]["joints"] == [0, 1, 2, 3, 4]
+    return reply["ok"]["rows"][-1], reply["ok"]["duration_s"]
+
+
+def by_service(run: Runtime, goal: str) -> Answer:
+    answer = run.session.bus.call("/planning/plan", {"goal": goal})
+    return answer.message or ended(answer.trajectory)
+
+
+def by_program(run: Runtime, goal: str) -> Answer:
+    try:
+        return ended(Client.of_run(run).plan(goal))
+    except PlanningError as error:
+        return str(error)
+
+
+def ended(trajectory: JointTrajectory) -> Answer:
+    last = trajectory.points[-1]
+    return last.positions.tolist(), last.time_from_start_ns / 1e9
+
+
+def by_command(goal: str) -> Answer:
+    scene = ("--set", "simulation.scene=empty", "--set", PLANNER)
+    done = run_here("plan", "so101_blind", "--sim", *scene, "--from", "rest", "--goal", goal, "--json")
+    answer = json.loads(done.stdout)
+    assert done.returncode == (0 if answer["success"] else 3)
+    return answer["message"] or (list(answer["goal_joints"].values())[:5], answer["duration_s"])
+
+
+@pytest.mark.parametrize("goal", documented_goals())
+def test_every_entrance_plans_the_same(run: Runtime, goal: str) -> None:
+    answer = by_service(run, goal)
+    assert by_program(run, goal) == answer
+    for other in (by_page(run, goal), by_command(goal)):
+        if isinstance(answer, str):
+            assert other == answer
+        else:
+            np.testing.assert_allclose(other[0], answer[0], atol=2e-3)
+            assert other[1] == pytest.approx(answer[1], abs=0.02)
+    assert not isinstance(answer, str) or "axis" in goal, (
+        "five joints do not reach every direction; all else is planned"
+    )
+
+
+def test_the_page_has_all_forms() -> None:
+    goals = documented_goals()
+    assert len(goals) >= 8
+    for word in (
+        "home",
+        "wrist_flex=",
+        "xyz=",
+        "axis=down",
+        "axis=up",
+        "axis=0,0,-1",
+        "rpy=",
+        "quaternion=",
+        "gripper=",
+    ):
+        assert any(word in each for each in goals), word
