@@ -6,6 +6,8 @@ import hashlib
 import shutil
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, override
 
@@ -19,6 +21,7 @@ from ibrobot_testing import PolicySuite
 from ibrobot_testing.contexts import START_NS, host_context
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Frame, Policy
@@ -226,6 +229,42 @@ def test_fewer_actions_on_demand(folders: dict[str, Path]) -> None:
     [frame] = frames(policy, 1)
     assert policy.spec.chunk_size == 3
     np.testing.assert_array_equal(run(policy, frame)[0], run(loaded(folders["act"]), frame)[0][:3])
+
+
+def test_identity_states_what_computes_and_how(folders: dict[str, Path]) -> None:
+    assert loaded(folders["act"]).identity().endswith(f"torch {version('torch')}, cpu")
+    assert loaded(folders["act"], dtype="bfloat16").identity().endswith(", cpu in bfloat16")
+
+
+@pytest.mark.parametrize(("dtype", "is_rounded"), [("auto", True), ("bfloat16", True), ("float32", False)])
+def test_gpu_repeats_itself_and_computes_float32_without_tf32(
+    folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch, dtype: str, is_rounded: bool
+) -> None:
+    """Torch's settings, before it finds that there is no GPU."""
+    cudnn = torch.backends.cudnn
+    for setting, before in {"benchmark": True, "deterministic": False, "allow_tf32": True}.items():
+        monkeypatch.setattr(cudnn, setting, before)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    policy = LeRobotPolicy(LeRobotPolicyOptions(folders["act"], device="cuda", dtype=dtype), host_context())
+    with suppress(RuntimeError, AssertionError):
+        policy.load()
+    assert (cudnn.benchmark, cudnn.deterministic, cudnn.allow_tf32) == (False, True, is_rounded)
+
+
+@pytest.mark.parametrize("name", ["act", "vqbet"])
+def test_network_on_a_gpu_has_all_its_inputs_there(folders: dict[str, Path], name: str) -> None:
+    """On torch's fake device, whose tensors have no values; an operation on two devices is an error."""
+    policy = loaded(folders[name])
+    batch = [policy.preprocess(frame) for frame in frames(policy, 2)]
+    model = policy._model
+    assert model is not None
+    with FakeTensorMode(allow_non_fake_inputs=True), torch.no_grad():
+        model._device = torch.device("cuda")
+        model.network.to("cuda")
+        model.steps = model.steps.of(lambda array: array.to("cuda"))
+        actions = model._run(model.inputs(batch), batch)
+        assert actions.device.type == "cuda"
+        assert actions.shape[::2] == (2, 6)
 
 
 def test_half_precision_is_near(folders: dict[str, Path]) -> None:

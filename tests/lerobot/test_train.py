@@ -67,6 +67,21 @@ def test_policy_that_would_download_weights_is_refused_before_it_starts(
     assert "did you mean 'xvla'?" in message
 
 
+def test_small_act_with_cameras_is_refused_before_it_would_download_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    writer = LeRobotDatasetWriter(LeRobotOptions(videos=False))
+    camera = Feature("image", (8, 8, 3), ("height", "width", "channels"))
+    writer.create(tmp_path / "seen", 30, FEATURES | {"observation.images.top": camera}, {"robot_type": "tester"})
+    state = {key: np.zeros(2, np.float32) for key in FEATURES}
+    writer.add_frame(state | {"observation.images.top": np.zeros((8, 8, 3), np.uint8)}, "wait")
+    writer.save_episode()
+    writer.finalize()
+    message = refused(tmp_path / "seen", tmp_path / "out")
+    assert "pretrained_backbone_weights is ResNet18_Weights.IMAGENET1K_V1" in message
+
+
 def test_policy_whose_extra_is_missing_is_refused_before_it_starts(small_dataset: Path, tmp_path: Path) -> None:
     message = refused(small_dataset, tmp_path / "out", "--policy", "groot")
     assert message.startswith("policy groot needs ")

@@ -228,6 +228,11 @@ class OnDisk:
         return [key for key, entry in self.info["features"].items() if entry["dtype"] == "video"]
 
     @property
+    def cameras(self) -> list[str]:
+        """The keys of all cameras."""
+        return [key for key, entry in self.info["features"].items() if entry["dtype"] in ("video", "image")]
+
+    @property
     def features(self) -> dict[str, Feature]:
         """The features given to `create`."""
         return features_of(self.info)

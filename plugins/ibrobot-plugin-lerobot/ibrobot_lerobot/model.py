@@ -53,6 +53,8 @@ class PolicyModel:
     ) -> None:
         self._checkpoint = checkpoint
         self._device = torch.device(_device(options.device))
+        if self._device.type == "cuda":
+            _make_repeatable(options.dtype)
         self.steps = steps.of(lambda array: torch.from_numpy(np.array(array)).to(self._device))
         """The preprocessor's steps, on the network's device."""
         self._pictures = pictures
@@ -67,7 +69,9 @@ class PolicyModel:
         self._one_by_one = False
         """Whether random draws cannot be assigned to requests."""
         self._log = log
-        log.info("%s on %s, %d threads", checkpoint.type, self._device, threads)
+        self.place = f"{self._device}" if options.dtype == "auto" else f"{self._device} in {options.dtype}"
+        """Device, and the precision if it was chosen."""
+        log.info("%s on %s, %d threads", checkpoint.type, self.place, threads)
 
     def warm_up(self, tensors: Tensors) -> NDArray[np.float32]:
         """Run the network once and check that it returns an action chunk, shape (1, N, A), which is returned.
@@ -196,6 +200,17 @@ class PolicyModel:
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _make_repeatable(dtype: str) -> None:
+    """Let cuDNN choose its algorithms without trials, so that equal requests have equal answers.
+
+    `float32` also rules out TF32, in which it computes convolutions otherwise: with 10 bits of mantissa instead of 23.
+    """
+    torch.backends.cudnn.benchmark = False
+    torch.backends.cudnn.deterministic = True
+    if dtype == "float32":
+        torch.backends.cudnn.allow_tf32 = False
 
 
 def _device(requested: str) -> str:

@@ -102,7 +102,7 @@ class LeRobotPolicy(Policy):
             for name, array in tensors.items()
         }
         self._model, self._weights = model, weights
-        self._identity = f"lerobot {version('lerobot')}, torch {version('torch')}"
+        self._identity = f"lerobot {version('lerobot')}, torch {version('torch')}, {model.place}"
 
     def _check_version(self) -> None:
         if sentence := untested(installed() or ""):
@@ -128,7 +128,7 @@ class LeRobotPolicy(Policy):
 
     @override
     def identity(self) -> str:
-        """Versions of LeRobot and torch; empty before `load`."""
+        """Versions of LeRobot and torch, device and precision; empty before `load`."""
         return self._identity
 
     @override

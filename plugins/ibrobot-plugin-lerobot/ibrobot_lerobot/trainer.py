@@ -59,7 +59,8 @@ def run_training(options: TrainOptions, follow: Follow | None) -> tuple[int, Tra
     from ibrobot_lerobot.merge import reading
 
     dataset, out, policy, steps = options.dataset, options.out, options.policy, options.steps
-    if not existing_dataset(dataset).is_current:
+    found = existing_dataset(dataset)
+    if not found.is_current:
         raise DatasetError(
             f"{dataset}: LeRobot does not train on so old a version of its format; `ibrobot datasets merge {dataset} "
             f"--out {dataset}-v3` copies it to v3.0"
@@ -70,8 +71,9 @@ def run_training(options: TrainOptions, follow: Follow | None) -> tuple[int, Tra
     with reading(dataset, "is being trained on"), owned(out, "is being trained", DatasetError):
         newest = _begun(out, chosen)
         if newest is None:
-            if policy != SMALL:
-                check_policy(policy, options.lerobot_options, download=options.download, on_page=follow is not None)
+            if policy != SMALL or found.cameras:  # without cameras, the small ACT has nothing to download
+                kind = "act" if policy == SMALL else policy
+                check_policy(kind, options.lerobot_options, download=options.download, on_page=follow is not None)
             command = [program, *chosen]
         else:
             kept = [each for each in chosen if each.partition("=")[0] in _WHEN_CONTINUING]

@@ -40,6 +40,10 @@ def dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A dataset; `ibrobot train` runs `trainer` in place of LeRobot's program."""
     program = install(tmp_path)
     monkeypatch.setattr(lerobot_train, "find_trainer", lambda: str(program))
+    weights = tmp_path / "torch/hub/checkpoints/resnet18-stand_in.pth"  # an installed LeRobot would load them
+    weights.parent.mkdir(parents=True)
+    weights.touch()
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     return write(tmp_path / "set", FEATURES, (3,), codec="h264")
 
 
