@@ -22,6 +22,8 @@ import sys
 from pathlib import Path
 from time import perf_counter
 
+from figures import report
+
 CONFIG = Path(__file__).parents[1] / "configs" / "so101_pick_cube.yaml"
 FIRST_TRAINING_SEED = 1000
 """Trials have the seeds from 0 on."""
