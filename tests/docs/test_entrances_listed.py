@@ -81,11 +81,19 @@ SENDERS = {
     "ibrobot_core/launch/session.py": "",
 }
 """Files with command sources, or that send plans or goals to control -> an entrance that this is."""
-STILL_PAGE_COMMANDS = {
-    "cancel", "episode_discard", "episode_redo", "episode_start", "episode_stop", "finish", "operate", "preview",
-    "release", "resign", "smoothing", "time",
+PAGE_COMMANDS = {
+    "jog": "page jog", "reset": "page reset", "call": "",
+    "/set_mode": "page mode", "/planning/go_to": "page goal", "/intervene": "page intervene",
+    **dict.fromkeys(
+        (
+            "/action_dispatcher/toggle_smoothing", "/planning/cancel", "/record_episode/discard",
+            "/record_episode/redo", "/record_episode/start", "/record_episode/stop", "finish", "operate", "preview",
+            "release", "resign", "time",
+        ),
+        "",
+    ),
 }  # fmt: skip
-"""Commands of pages that move nothing."""
+"""Commands of pages, and the services that they may call -> an entrance that this is; empty: it moves nothing."""
 OWN_MOTIONS = {"begin_startup": "control.startup", "begin_stop": "control.stop", "_shed": "control.load_shedding"}
 """Function of control that moves the robot to a pose -> the key of the robot YAML."""
 COMMANDS = {
@@ -104,7 +112,7 @@ COMMANDS = {
             "camera", "certs", "config", "config copy", "config import", "config new", "contract", "convert",
             "datasets", "datasets info", "description", "doctor", "episodes", "episodes delete", "episodes list",
             "episodes mark", "episodes repair", "episodes trash", "episodes trim", "export", "feetech", "gamepad",
-            "lerobot", "param", "plan", "plugins", "serve", "train",
+            "lerobot", "plan", "plugins", "serve", "train",
         ),
         "",
     ),
@@ -212,13 +220,13 @@ def test_actions_of_ros_have_rows() -> None:
 
 
 def test_commands_of_pages_have_rows_or_move_nothing() -> None:
-    tree = ast.walk(assigned("ibrobot_web/messages.py", "_COMMANDS"))
-    keys = [key for node in tree if isinstance(node, ast.Dict) for key in node.keys]
-    found = {str(key.value) for key in keys if isinstance(key, ast.Constant)}
-    assert len(found) > 10
-    rows = {name.removeprefix("page ") for name in NAMED if name.startswith("page ")}
-    assert unknown(found, rows, STILL_PAGE_COMMANDS) == []
-    assert unknown(rows | STILL_PAGE_COMMANDS, found) == [], "pages have no such command"
+    trees = [assigned("ibrobot_web/messages.py", "_COMMANDS"), assigned("ibrobot_web/messages.py", "SERVICES")]
+    nodes = (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Constant))
+    found = {node.value for node in nodes if isinstance(node.value, str)}
+    assert unknown(found, PAGE_COMMANDS) == []
+    assert unknown(set(PAGE_COMMANDS), found) == [], "pages have no such command"
+    rows = {name for name in NAMED if name.startswith("page ")}
+    assert rows == {name for name in PAGE_COMMANDS.values() if name}
 
 
 def test_motions_of_controls_own_have_rows() -> None:

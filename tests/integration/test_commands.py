@@ -87,8 +87,6 @@ WRONG_FILES = {
     "feetech torque off BAD --yes": (),
     "feetech torque off no_port --robot BAD --yes": (),
     "gamepad map BAD": (),
-    "param get /so101 control.rate_hz --config BAD": (),
-    "param list --config BAD": (),
     "param set /so101 mode teleop --config BAD": (),
     "plan BAD --from rest --goal home": (),
     "service call /a --config BAD": (),

@@ -52,7 +52,6 @@ def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
 
 _COMMANDS = {
     "action": "List actions on the network, and send goals to them.",
-    "param": "List, read and set parameters of nodes on the network.",
     "bag": "Play recorded episodes to machines on the network.",
     "topic": "List, show, measure and publish topics shared over the network.",
     "service": "List, show and call services shared over the network.",

@@ -84,7 +84,7 @@ def flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 class RosParameters(Component):
-    """Answers `ros2 param` and `ibrobot param`.
+    """Answers `ros2 param`.
 
     Args:
         session: the run.

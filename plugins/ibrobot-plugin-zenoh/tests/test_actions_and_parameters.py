@@ -1,4 +1,4 @@
-"""`ibrobot action …` and `ibrobot param …` beside a machine that serves as a robot does."""
+"""`ibrobot action …` beside a machine that serves as a robot does, and the parameters that it serves."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ import attrs
 import click
 import pytest
 from click.testing import CliRunner
-from ibrobot_ros2.interfaces import action_type, to_cdr
+from ibrobot_ros2.interfaces import action_type, service_type, to_cdr
 from ibrobot_zenoh.arrivals import Arrivals
 from ibrobot_zenoh.commands import network as network_module
 from ibrobot_zenoh.commands.action import action
-from ibrobot_zenoh.commands.param import param
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.ros_goals import Status
 from ibrobot_zenoh.ros_parameters import ParameterType, RosParameters, flat, from_parameter, to_parameter
@@ -22,8 +21,9 @@ from ibrobot_zenoh.transport import ZenohTransport
 
 from ibrobot_core.api import NotSupported, RealClock, TransportError
 
-from .pair import WAIT_S, free_endpoint, router
+from .pair import WAIT_S, client, free_endpoint, router
 
+type Ask = Callable[..., dict[str, Any]]
 GRIP = action_type("control_msgs/action/GripperCommand")
 NAME = "/grip/gripper_cmd"
 GOAL = "{command: {position: 0.5}}"
@@ -97,8 +97,8 @@ def test_goals_that_fail_are_errors(gripper: str):
 
 
 @pytest.fixture
-def robot(machine: tuple[ZenohTransport, str]) -> tuple[Any, str]:
-    """A run that shares its parameters, and its address."""
+def robot(machine: tuple[ZenohTransport, str]) -> tuple[Any, Ask]:
+    """A run that shares its parameters, and a caller of their services."""
     transport, address = machine
 
     def call(name: str, request: Any) -> None:
@@ -115,41 +115,42 @@ def robot(machine: tuple[ZenohTransport, str]) -> tuple[Any, str]:
     parameters = RosParameters(session, link, lambda name: session.shared, Arrivals(session))
     session.shared = True
     parameters.start()
-    return session, address
+    caller = client(address)
+
+    def ask(do: str, **request: Any) -> dict[str, Any]:
+        kind = service_type(f"rcl_interfaces/srv/{do.capitalize()}Parameters")
+        return caller.call_ros(f"{transport.node_name}/{do}_parameters", kind, request, WAIT_S)
+
+    return session, ask
 
 
-def test_parameters_are_listed_and_read(robot: tuple[Any, str]):
-    _, address = robot
-    node = run(param, address, "list").splitlines()[0].rstrip(":")
-    assert node.startswith("/ibrobot_")
-    names = ["  mode", "  control.rate_hz", "  control.stop", "  peripherals.0.name", "  transport"]
-    assert run(param, address, "list").splitlines() == [f"{node}:", *names]
-    assert run(param, address, "list", node, "--param-prefixes", "control").splitlines() == names[1:3]
-    assert run(param, address, "list", node, "--param-type").splitlines()[1] == "  control.rate_hz (type: double)"
-    assert run(param, address, "get", node, "control.rate_hz") == "Double value is: 100.0\n"
-    assert run(param, address, "get", node, "mode", "--hide-type") == "idle\n"
-    with pytest.raises(NotSupported, match="has no parameter x, or it is not set"):
-        run(param, address, "get", node, "x")
-    with pytest.raises(TransportError, match="nobody serves /nobody/get_parameters"):
-        run(param, address, "get", "/nobody", "x")
+def test_parameters_are_listed_and_read(robot: tuple[Any, Ask]):
+    _, ask = robot
+    names = ["mode", "control.rate_hz", "control.stop", "peripherals.0.name", "transport"]
+    assert ask("list")["result"]["names"] == names
+    assert ask("list", prefixes=["control"])["result"]["names"] == names[1:3]
+    rate, mode, unknown = ask("get", names=["control.rate_hz", "mode", "x"])["values"]
+    assert (rate["type"], from_parameter(rate), from_parameter(mode)) == (ParameterType.DOUBLE, 100.0, "idle")
+    assert from_parameter(unknown) is None
 
 
-def test_only_the_mode_can_be_set(robot: tuple[Any, str]):
-    session, address = robot
-    node = run(param, address, "list").splitlines()[0].rstrip(":")
-    assert run(param, address, "set", node, "mode", "teleop") == "Set parameter successful\n"
+def test_only_the_mode_can_be_set(robot: tuple[Any, Ask]):
+    session, ask = robot
+
+    def set_(name: str, value: str) -> dict[str, Any]:
+        (result,) = ask("set", parameters=[{"name": name, "value": to_parameter(value)}])["results"]
+        return result
+
+    assert set_("mode", "teleop")["successful"]
     assert session.mode == "teleop"
-    refused = {
-        ("mode", "dance"): "no such mode",
-        ("control.rate_hz", "5"): r"is read when a run starts: ibrobot launch … --set control\.rate_hz=…",
-        ("x", "5"): "there is no such parameter",
-    }
-    for (name, value), reason in refused.items():
-        with pytest.raises(TransportError, match=f"{name} cannot be set: {reason}"):
-            run(param, address, "set", node, name, value)
+    for name, value, reason in (
+        ("mode", "dance", "no such mode"),
+        ("control.rate_hz", "5", "is read when a run starts: ibrobot launch … --set control.rate_hz=…"),
+        ("x", "5", "there is no such parameter"),
+    ):
+        assert set_(name, value) == {"successful": False, "reason": reason}
     session.shared = False
-    with pytest.raises(TransportError, match="/set_mode is not shared"):
-        run(param, address, "set", node, "mode", "idle")
+    assert "/set_mode is not shared" in set_("mode", "idle")["reason"]
 
 
 @pytest.mark.parametrize(
