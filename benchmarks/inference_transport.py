@@ -314,7 +314,7 @@ def measured(
         # LeRobot's logger makes a folder where it runs.
         lines = subprocess.run(command, check=True, capture_output=True, text=True, cwd=folder).stdout.splitlines()
         for row in (json.loads(line) for line in lines if line.startswith('{"payload"')):
-            yield row["payload"], "lerobot", row
+            yield row["payload"], row["way"], row
 
 
 def run(given: argparse.Namespace, folder: Path) -> int:

@@ -1,8 +1,14 @@
-"""LeRobot's own asynchronous inference with a stub policy, for `inference_transport.py`, which runs this file.
+"""LeRobot's policy server with a stub policy: its own client beside our policy `lerobot_server`, and alone.
 
-It runs where `lerobot[async]==0.6.1` is installed, in two processes: its PolicyServer as it is but for a policy that
-does nothing and no artificial latency, and its RobotClient with a robot that has its observation at hand. Measured is
-`control_loop_observation`, which its control loop calls, and the time from there until the actions are in its queue.
+    python benchmarks/lerobot_async.py [--count 200] [--pause 0]
+
+It runs where `lerobot[async]==0.6.1` is installed. The server is LeRobot's PolicyServer, in a process of its own, as it
+is but for a policy that does nothing and no artificial latency. LeRobot's RobotClient has a robot that has its
+observation at hand; measured is `control_loop_observation`, which its control loop calls, and the time from there until
+the actions are in its queue. `lerobot_server` is measured from the observation to the chunk, at a server of its own.
+Both ask in pairs, each first in turn. Where the packages here are not installed, LeRobot is measured alone: so
+`inference_transport.py` runs this file. Exits with 1 if the median of the pairs' ratios, ours to LeRobot's, is over 1,
+or if a chunk is wrong.
 """
 
 from __future__ import annotations
@@ -10,17 +16,23 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import pickle
+import socket
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from concurrent import futures
+from contextlib import ExitStack, closing, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from queue import Queue
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from figures import report
 
 PAYLOADS = {
     "2x640x480 uint8": ((480, 640, 3), np.uint8),
@@ -29,6 +41,7 @@ PAYLOADS = {
 }
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 CHUNK = 50
+WARM_UP = 20
 
 
 class StubPolicy:
@@ -67,13 +80,6 @@ class StubRobot:
         return dict(self._observation)
 
 
-def features(shape: tuple[int, int, int], dtype: Any) -> Any:
-    """LeRobot's own description of the observation."""
-    from lerobot.async_inference.helpers import map_robot_keys_to_lerobot_features
-
-    return map_robot_keys_to_lerobot_features(StubRobot(shape, dtype))
-
-
 def serve(port: int, payload: str) -> None:
     """The server, until its standard input ends."""
     import grpc
@@ -81,18 +87,19 @@ def serve(port: int, payload: str) -> None:
     from lerobot.async_inference.policy_server import PolicyServer
     from lerobot.transport import services_pb2, services_pb2_grpc
 
-    shape, dtype = PAYLOADS[payload]
+    shape, _ = PAYLOADS[payload]
 
     class Server(PolicyServer):  # type: ignore[misc]  # LeRobot brings no types
         """Its policy is there from the beginning."""
 
         def SendPolicyInstructions(self, request: Any, context: Any) -> Any:
             """Nothing is loaded."""
+            self.lerobot_features = pickle.loads(request.data).lerobot_features  # noqa: S301  # from this file
             return services_pb2.Empty()
 
     servicer = Server(PolicyServerConfig(port=port, inference_latency=0.0))
     servicer.device, servicer.policy_type, servicer.actions_per_chunk = "cpu", "act", CHUNK
-    servicer.lerobot_features, servicer.policy = features(shape, dtype), StubPolicy(shape)
+    servicer.policy = StubPolicy(shape)
     servicer.preprocessor = servicer.postprocessor = lambda value: value
     server = grpc.server(futures.ThreadPoolExecutor(max_workers=4))
     services_pb2_grpc.add_AsyncInferenceServicer_to_server(servicer, server)
@@ -109,63 +116,146 @@ def cpu_s(pid: int | str = "self") -> float:
     return (int(fields[11]) + int(fields[12])) / 100
 
 
-def measure(port: int, payload: str, count: int, pause_s: float) -> dict[str, Any]:
-    """Latencies [ms], how long the control loop was blocked [ms], and processor time a request [ms]."""
-    from lerobot.async_inference import robot_client
-    from lerobot.async_inference.configs import RobotClientConfig
-
-    shape, dtype = PAYLOADS[payload]
+@contextmanager
+def served(payload: str) -> Iterator[tuple[str, int]]:
+    """A server in another process: its address and process."""
+    with closing(socket.create_server(("127.0.0.1", 0))) as free:
+        port = int(free.getsockname()[1])
     command = [sys.executable, __file__, "--serve", str(port), "--payload", payload]
     server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None
-    while "ready" not in (line := server.stdout.readline()):
-        if not line:
-            raise SystemExit("the server did not start")
-    robot_client.make_robot_from_config = lambda config: StubRobot(shape, dtype)
-    config = RobotClientConfig("act", "none", None, CHUNK, server_address=f"127.0.0.1:{port}")
-    client = robot_client.RobotClient(config)
-    client.start()
-    receiver = threading.Thread(target=client.receive_actions, daemon=True)
-    receiver.start()
-    client.start_barrier.wait()
-    latencies, blocked = [], []
-    for number in range(count + 20):
-        if number == 20:
-            begun_s = cpu_s() + cpu_s(server.pid)
-        time.sleep(pause_s)
-        with client.action_queue_lock:
-            client.action_queue = Queue()
-        client.must_go.set()
+    try:
+        while "ready" not in (line := server.stdout.readline()):
+            if not line:
+                raise SystemExit("the server did not start")
+        yield f"127.0.0.1:{port}", server.pid
+    finally:
+        server.kill()
+        server.communicate()
+
+
+class Theirs:
+    """LeRobot's own client."""
+
+    def __init__(self, address: str, payload: str) -> None:
+        from lerobot.async_inference import robot_client
+        from lerobot.async_inference.configs import RobotClientConfig
+
+        robot_client.make_robot_from_config = lambda config: StubRobot(*PAYLOADS[payload])
+        self._client = robot_client.RobotClient(RobotClientConfig("act", "none", None, CHUNK, server_address=address))
+        self._client.start()
+        threading.Thread(target=self._client.receive_actions, daemon=True).start()
+        self._client.start_barrier.wait()
+
+    def ask(self) -> float:
+        """A request; how long the control loop was blocked [s]."""
+        with self._client.action_queue_lock:
+            self._client.action_queue = Queue()
+        self._client.must_go.set()
         asked_s = time.perf_counter()
-        client.control_loop_observation("")
-        blocked.append((time.perf_counter() - asked_s) * 1e3)
-        while not client.actions_available():
+        self._client.control_loop_observation("")
+        blocked_s = time.perf_counter() - asked_s
+        while not self._client.actions_available():
             time.sleep(0.0001)
-        latencies.append((time.perf_counter() - asked_s) * 1e3)
-    used_s = cpu_s() + cpu_s(server.pid) - begun_s
-    client.shutdown_event.set()
-    server.kill()
-    server.wait()
-    return {"latencies": latencies[20:], "blocked": blocked[20:], "cpu_ms": used_s / count * 1e3}
+        return blocked_s
+
+    def close(self) -> None:
+        """Let its thread end."""
+        self._client.shutdown_event.set()
 
 
-def main() -> None:
-    """Print one JSON line for each payload."""
+class Ours:
+    """The policy `lerobot_server`."""
+
+    def __init__(self, address: str, payload: str) -> None:
+        from ibrobot_policy_servers.lerobot_server import LerobotConnection
+        from ibrobot_policy_servers.options import ActionMap, LerobotServerOptions, ObservationMap
+        from ibrobot_policy_servers.served import ServedPolicy
+        from ibrobot_testing import host_context
+
+        from ibrobot_core.interfaces import Frame
+
+        shape, _ = PAYLOADS[payload]
+        state, top, wrist = "observation.state", "observation.images.top", "observation.images.wrist"
+        options = LerobotServerOptions(
+            address=address, policy_type="act", pretrained_name_or_path="none", horizon=CHUNK, rate_hz=30.0,
+            observations=(
+                ObservationMap(state, (state,), (len(JOINTS),)), ObservationMap(top, (top,), shape),
+                ObservationMap(wrist, (wrist,), shape),
+            ),
+            actions=(ActionMap(JOINTS),),
+        )  # fmt: skip
+        pictures = np.random.default_rng(0).integers(0, 255, (2, *shape), np.uint8)
+        values = {state: np.full(len(JOINTS), 0.5, np.float32), top: pictures[0], wrist: pictures[1]}
+        self._frame = Frame(1, values, prompt="pick")
+        self._policy = ServedPolicy(options, host_context(), LerobotConnection(options))
+        self._policy.load()
+
+    def ask(self) -> float:
+        """A request, which blocks until its answer, in a thread of its own in a run."""
+        policy = self._policy
+        chunk = policy.postprocess(policy.infer(policy.preprocess(self._frame)))
+        if chunk.shape != (CHUNK, len(JOINTS)) or chunk.any():
+            raise SystemExit(f"a wrong chunk: {chunk}")
+        return 0.0
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._policy.close()
+
+
+def measure(payload: str, count: int, pause_s: float) -> Iterator[dict[str, Any]]:
+    """Latencies of each client [ms], how long the control loop was blocked [ms], and processor time a request [ms]."""
+    ways: dict[str, type[Theirs | Ours]] = {"lerobot": Theirs}
+    if find_spec("ibrobot_policy_servers") and PAYLOADS[payload][1] is np.uint8:
+        ways["lerobot_server"] = Ours
+    with ExitStack() as stack:
+        clients, servers = {}, {}
+        for way, kind in ways.items():
+            address, servers[way] = stack.enter_context(served(payload))
+            clients[way] = kind(address, payload)
+            stack.callback(clients[way].close)
+        rows: dict[str, dict[str, Any]] = {way: {"latencies": [], "blocked": [], "cpu": []} for way in ways}
+        for number in range(count + WARM_UP):
+            for way in sorted(ways, reverse=bool(number % 2)):
+                time.sleep(pause_s)
+                used_s, asked_s = cpu_s() + cpu_s(servers[way]), time.perf_counter()
+                rows[way]["blocked"].append(clients[way].ask() * 1e3)
+                rows[way]["latencies"].append((time.perf_counter() - asked_s) * 1e3)
+                rows[way]["cpu"].append(cpu_s() + cpu_s(servers[way]) - used_s)
+    for way, row in rows.items():
+        kept = {key: row[key][WARM_UP:] for key in ("latencies", "blocked")}
+        yield {"payload": payload, "way": way, **kept, "cpu_ms": sum(row["cpu"][WARM_UP:]) / count * 1e3}
+
+
+def main() -> int:
+    """Print one JSON line for each payload and client, and what the pairs say; 1 if ours is slower."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--pause", type=float, default=0.0)
-    parser.add_argument("--port", type=int, default=50171)
-    parser.add_argument("--serve", type=int)
-    parser.add_argument("--payload", default="")
+    parser.add_argument("--serve", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--payload", default="", help=argparse.SUPPRESS)
     given = parser.parse_args()
     logging.disable(logging.CRITICAL)
     if given.serve:
         serve(given.serve, given.payload)
-        return
-    for number, payload in enumerate(PAYLOADS):
-        measured = measure(given.port + number, payload, given.count, given.pause)
-        print(json.dumps({"payload": payload, **measured}), flush=True)
+        return 0
+    figures: dict[str, float] = {}
+    for payload in PAYLOADS:
+        rows = list(measure(payload, given.count, given.pause))
+        for row in rows:
+            print(json.dumps(row), flush=True)
+        if len(rows) > 1:
+            theirs, ours = (np.array(row["latencies"]) for row in rows)
+            name = payload.replace(" ", "_")
+            figures[f"{name}_ratio"] = float(np.median(ours / theirs))
+            for way, latencies in (("lerobot", theirs), ("ours", ours)):
+                for percent in (50, 99):
+                    figures[f"{name}_{way}_p{percent}_ms"] = float(np.percentile(latencies, percent))
+    if figures:
+        report(**figures)
+    return int(any(value > 1 for name, value in figures.items() if name.endswith("_ratio")))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -142,6 +142,14 @@ CLAIMS = (
         "`lerobot[async]==0.6.1`, in the interpreter PYTHON",
     ),
     Claim(
+        "lerobot_server",
+        "from observation to chunk, the policy `lerobot_server` takes no longer than LeRobot's own client (median of"
+        " pairs)",
+        "docs/how-to/run-from-policy-servers.md",
+        "lerobot_async.py",
+        "`lerobot[async]==0.6.1`",
+    ),
+    Claim(
         "smoothness",
         "with slow and lossy models no command exceeds a limit, and `rtc` halves the jerk",
         "docs/explanation/dispatch.md",
