@@ -129,7 +129,7 @@ def arguments(options: TrainOptions) -> list[str]:
         *([] if options.device == AUTO else [f"--policy.device={options.device}"]), "--policy.push_to_hub=false",
         f"--batch_size={options.batch_size}", f"--steps={steps}",
         f"--save_freq={options.save_every or saving_step(steps)}",
-        f"--log_freq={max(1, steps // _REPORTS)}", "--num_workers=0", "--wandb.enable=false",
+        f"--log_freq={max(1, steps // _REPORTS)}", "--num_workers=0",
         f"--output_dir={options.out.resolve()}",
     ]  # fmt: skip
 

@@ -274,6 +274,7 @@ def test_a_training_without_lerobot_names_the_command_that_installs_it(tmp_path:
 def test_other_policies_keep_the_settings_of_lerobot():
     asked = TrainOptions(dataset=Path("set"), out=Path("out"), policy="diffusion", steps=100, device="cuda")
     words = arguments(asked)
+    assert not [word for word in words if "wandb" in word], "LeRobot 0.7 has no such option; in others it is off"
     assert {"--policy.type=diffusion", "--policy.device=cuda", "--steps=100", "--log_freq=1"} < set(words)
     small = arguments(TrainOptions(dataset=Path("set"), out=Path("out"), steps=100, save_every=7))
     assert not any(word.startswith("--policy.device") for word in small)  # LeRobot takes a GPU if there is one
