@@ -108,11 +108,11 @@ class Bus:
         """
         with self._lock:
             before = self._expected.get(topic)
-            found = frozenset(types) & before if before is not None else frozenset(types)
-            if not found:
+            allowed = frozenset(types) & before if before is not None else frozenset(types)
+            if not allowed:
                 raise TransportError(f"topic {topic} carries {_any(before or types)}, not {_any(types)}")
-            self._expected[topic] = found
-            if self._types.get(topic) not in found:
+            self._expected[topic] = allowed
+            if self._types.get(topic) not in allowed:
                 # Messages before were of a type that nobody had stated.
                 self._types.pop(topic, None)
                 self._latched.pop(topic, None)

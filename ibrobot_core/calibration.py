@@ -223,17 +223,17 @@ def load_calibration(
     numbered = all(key.isdigit() for key in document)
     if numbered:
         document = _by_name(document, path, joints)
-    found = {}
+    joints_read = {}
     for joint, numbers in document.items():
         try:
-            found[joint] = _joint(numbers)
+            joints_read[joint] = _joint(numbers)
         except ValueError as error:
             line = _line(text, joint if f'"{joint}"' in text else str(numbers.get("id")), str(error).partition(":")[0])
             raise CalibrationError(f"{path}:{line}: {joint}: {error}") from None
-    if joints is not None and (missing := [joint for joint in joints if joint not in found]):
-        raise CalibrationError(f"{path}: has no joint {missing[0]!r}; it has: {', '.join(found)}")
+    if joints is not None and (missing := [joint for joint in joints if joint not in joints_read]):
+        raise CalibrationError(f"{path}: has no joint {missing[0]!r}; it has: {', '.join(joints_read)}")
     try:
-        calibration = Calibration(found, path=path)
+        calibration = Calibration(joints_read, path=path)
     except ValueError as error:
         raise CalibrationError(f"{path}: {error}") from None
     calibration = calibration.with_zero_at("pose" if numbered else "range")
@@ -265,8 +265,8 @@ def _line(text: str, *keys: str) -> int:
     """The line of the innermost of the nested keys that exists."""
     position = 0
     for key in keys:
-        found = re.compile(re.escape(json.dumps(key)) + r"\s*:").search(text, position)
-        position = found.start() if found else position
+        match = re.compile(re.escape(json.dumps(key)) + r"\s*:").search(text, position)
+        position = match.start() if match else position
     return text.count("\n", 0, position) + 1
 
 
@@ -299,8 +299,8 @@ def _with_meta(calibration: Calibration, path: Path, tool: str | None, *, any_nu
         return calibration
     _, meta = _document(companion)
     if not isinstance(meta, dict) or meta.get("version") != VERSION:
-        found = meta.get("version") if isinstance(meta, dict) else meta
-        raise CalibrationError(f"{companion}: version: must be {VERSION}, not {found!r}")
+        stated = meta.get("version") if isinstance(meta, dict) else meta
+        raise CalibrationError(f"{companion}: version: must be {VERSION}, not {stated!r}")
     zero_at = str(meta.get("zero_at"))
     if zero_at not in ZERO_AT:
         raise CalibrationError(f"{companion}: zero_at: must be one of {', '.join(ZERO_AT)}, not {zero_at!r}")

@@ -134,7 +134,7 @@ def is_array(kind: Any) -> bool:
 
 
 def no_files(text: str) -> Path:
-    """For values that cannot name a file.
+    """Stands for values that cannot name a file.
 
     Raises:
         ValueError: always.
@@ -258,14 +258,14 @@ class Converter:
 
     def _items(self, items: Iterable[tuple[str | int, Any, Any]]) -> list[Any]:
         """Convert items, given as key, value and kind."""
-        faults, found = Faults(), []
+        faults, values = Faults(), []
         for key, item, kind in items:
             with faults.at(key):
-                found.append(self.structure(item, kind))
+                values.append(self.structure(item, kind))
             if len(faults.found) >= self.most:
                 break
         faults.raise_any()
-        return found
+        return values
 
     def _union(self, value: Any, kind: Any) -> Any:
         members = [member for member in get_args(kind) if member is not type(None)]

@@ -149,9 +149,9 @@ class Registry:
         Raises:
             PluginError: if no installed plugin declares it; names the package to install, or the broken plugin.
         """
-        if (found := self.declarations().get(name)) is None:
+        if (declaration := self.declarations().get(name)) is None:
             raise self.not_found("command", name.partition(" ")[0])
-        return found
+        return declaration
 
     def sections(self, config: RobotConfig) -> Iterator[tuple[descriptors.SectionDescriptor, Any]]:
         """The plugins' sections for a robot with their options; None for a section that the file lacks."""
@@ -180,11 +180,11 @@ class Registry:
         Raises:
             PluginError: if none or several of the installed plugins provide a default; names a package to install.
         """
-        found = [entry for (k, _), entry in self.entries.items() if k == kind and entry.descriptor.default]
-        if len(found) == 1:
-            return found[0].descriptor.type
-        if found:
-            packages = ", ".join(f"{entry.descriptor.type} ({entry.package})" for entry in found)
+        defaults = [entry for (k, _), entry in self.entries.items() if k == kind and entry.descriptor.default]
+        if len(defaults) == 1:
+            return defaults[0].descriptor.type
+        if defaults:
+            packages = ", ".join(f"{entry.descriptor.type} ({entry.package})" for entry in defaults)
             raise PluginError(f"name the type of the {kind}: several plugins offer a default: {packages}")
         package = next(name for name, offers in official_plugins().items() if kind in offers.get("default", ()))
         raise PluginError(f"no {kind} is named, and no installed plugin has a default: pip install {package}")
@@ -297,8 +297,8 @@ class Registry:
             try:
                 checks += _offered(manager, "ibrobot_doctor")
             except BaseException as error:  # noqa: BLE001 - contained: a plugin's fault must not hide the other checks
-                found = f"its doctor check failed: {_reason(error)}"
-                checks.append(descriptors.Check(f"plugin {name}", False, found, "report it"))
+                failure = f"its doctor check failed: {_reason(error)}"
+                checks.append(descriptors.Check(f"plugin {name}", False, failure, "report it"))
         return checks
 
     def emit(self, event: str, **facts: Any) -> None:
@@ -313,8 +313,8 @@ class Registry:
 @cache
 def official_plugins() -> Mapping[str, Mapping[str, list[str]]]:
     """The content of `OFFICIAL`."""
-    found: dict[str, dict[str, list[str]]] = json.loads(OFFICIAL.read_bytes())
-    return found
+    packages: dict[str, dict[str, list[str]]] = json.loads(OFFICIAL.read_bytes())
+    return packages
 
 
 def install_command(packages: Iterable[str]) -> str:
@@ -355,15 +355,15 @@ def _offered(manager: pluggy.PluginManager, hook: str) -> list[Any]:
     """What a plugin yields for a hook: objects of the class in the hook's annotation, with names that are texts."""
     names = {"Iterable": list, "descriptors": descriptors}
     (expected,) = get_args(get_type_hints(getattr(hookspecs, hook), names)["return"])
-    found = [each for result in getattr(manager.hook, hook)() for each in result]
-    for each in found:
+    offers = [each for result in getattr(manager.hook, hook)() for each in result]
+    for each in offers:
         if not isinstance(each, expected):
             raise TypeError(f"expected a {expected.__name__}, got {each!r}")
         for field in attrs.fields(type(each)):
             if not isinstance(value := getattr(each, field.name), _CLASSES.get(field.type, object)):
                 raise TypeError(f"{expected.__name__}.{field.name} must be a {field.type}, not {value!r}")
     ((plugin, _),) = manager.list_name_plugin()
-    return [attrs.evolve(each, **_contained(each, f"plugin {plugin!r} failed in %s of {hook}: %s")) for each in found]
+    return [attrs.evolve(each, **_contained(each, f"plugin {plugin!r} failed in %s of {hook}: %s")) for each in offers]
 
 
 def _contained(offer: Any, message: str) -> dict[str, Callable[..., Any]]:
@@ -415,11 +415,11 @@ def _add(registry: Registry, plugin: str, package: str, version: str, load: Call
     registry.managers[plugin] = manager
 
 
-def discover(found: Iterable[EntryPoint] | None = None) -> Registry:
+def discover(points: Iterable[EntryPoint] | None = None) -> Registry:
     """Load core's own plugin, then others. A plugin's failure raises nothing; see `Registry.failures`.
 
     Args:
-        found: entry points of the others; None for all that are installed.
+        points: entry points of the others; None for all that are installed.
 
     Raises:
         PluginError: if the installation of core lacks its entry point, as one from before it had one.
@@ -430,7 +430,7 @@ def discover(found: Iterable[EntryPoint] | None = None) -> Registry:
         raise PluginError(
             f"the installed {CORE} has no plugin of its own: install it again, in a checkout by `uv sync`"
         )
-    others = [entry for entry in (installed if found is None else found) if entry not in own]
+    others = [entry for entry in (installed if points is None else points) if entry not in own]
     registry = Registry()
     for entry in (*own, *sorted(others, key=lambda entry: entry.name)):
         package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("?", "?")

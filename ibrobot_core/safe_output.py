@@ -46,7 +46,7 @@ def redacted(text: str) -> str:
 
 def printable(text: str) -> str:
     r"""Make a text safe to show: escape unprintable characters as in JSON and YAML, e.g. `\u001b`, and hide secrets."""
-    return _UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", redacted(text))
+    return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", redacted(text))
 
 
 def echo(message: object = "", *, err: bool = False, nl: bool = True) -> None:

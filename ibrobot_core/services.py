@@ -87,15 +87,15 @@ class Service[Q, A]:
         if isinstance(request, self.request):
             return request
         if not (faults := _too_much(request, self.limits)):
-            found: Any = {} if request is None else request
-            if self.alone and not isinstance(found, Mapping):
-                found = {self.alone: found}
-            if not isinstance(found, Mapping):
+            values: Any = {} if request is None else request
+            if self.alone and not isinstance(values, Mapping):
+                values = {self.alone: values}
+            if not isinstance(values, Mapping):
                 keys = ", ".join(fields(self.request))
                 expected = f"a mapping with {keys}" if keys else "nothing"
-                raise RequestError(f"{self.name}: expected {expected}, got {shown(found)}")
+                raise RequestError(f"{self.name}: expected {expected}, got {shown(values)}")
             try:
-                return Converter(files, MOST + 1).structure(found, self.request)  # type: ignore[no-any-return]
+                return Converter(files, MOST + 1).structure(values, self.request)  # type: ignore[no-any-return]
             except Faults as error:
                 faults = error.found
             except (ValueError, TypeError, ArithmeticError) as error:  # values that exclude each other
@@ -117,7 +117,7 @@ def _too_much(request: object, limits: RequestLimits) -> list[tuple[Key, str]]:
             if value and len(key) >= limits.depth:
                 return [(key, f"more than {limits.depth} lists and mappings within one another")]
             keys = tuple(value) if isinstance(value, Mapping) else ()
-            wrong = next((found for part in keys if (found := _key_misfit(part, limits))), "")
+            wrong = next((misfit for part in keys if (misfit := _key_misfit(part, limits))), "")
             items = value.items() if isinstance(value, Mapping) else enumerate(value)
             todo += [((*key, part), item) for part, item in items]
         if wrong:

@@ -33,8 +33,8 @@ class ConfigGroup(click.Group):
 
     @override
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        found = installed_plugins().commands.get(f"{_CONFIG}{cmd_name}")
-        return found.load() if found is not None else super().get_command(ctx, cmd_name)
+        declared = installed_plugins().commands.get(f"{_CONFIG}{cmd_name}")
+        return declared.load() if declared is not None else super().get_command(ctx, cmd_name)
 
 
 @click.group(cls=ConfigGroup)
@@ -60,10 +60,10 @@ def check(
 
     try:
         path = find_config(config, installed_plugins())
-        found = load_config(path, overrides=overrides, mode=mode, sim=sim)
-        modes = [name for name in found.control_modes if name not in found.unavailable]
-        models = check_models(found, installed_plugins(), modes) if deep else []
-        uncalibrated = list(_uncalibrated(found))
+        robot_config = load_config(path, overrides=overrides, mode=mode, sim=sim)
+        modes = [name for name in robot_config.control_modes if name not in robot_config.unavailable]
+        models = check_models(robot_config, installed_plugins(), modes) if deep else []
+        uncalibrated = list(_uncalibrated(robot_config))
         if deep and uncalibrated:
             raise ConfigError(uncalibrated)
     except ConfigError as error:
@@ -74,13 +74,13 @@ def check(
     if as_json:
         echo("[]")
         return
-    body = "simulation" if found.simulated else "hardware"
-    echo(f"{path}: ok ({found.robot.name}, {len(found.robot.joints)} joints, {body})")
-    echo(f"joints brake from full speed within {found.robot.braking_s.max() * 1e3:.0f} ms")
-    echo(f"modes: {', '.join(found.control_modes)}; starts in {found.default_control_mode}")
-    for line in (*unavailable_modes(found.unavailable), *absent_models(found.absent_models)):
+    body = "simulation" if robot_config.simulated else "hardware"
+    echo(f"{path}: ok ({robot_config.robot.name}, {len(robot_config.robot.joints)} joints, {body})")
+    echo(f"joints brake from full speed within {robot_config.robot.braking_s.max() * 1e3:.0f} ms")
+    echo(f"modes: {', '.join(robot_config.control_modes)}; starts in {robot_config.default_control_mode}")
+    for line in (*unavailable_modes(robot_config.unavailable), *absent_models(robot_config.absent_models)):
         echo(f"note: {line}")
-    if absent := describe_absent(absent_sensors(found, installed_plugins())):
+    if absent := describe_absent(absent_sensors(robot_config, installed_plugins())):
         echo(f"note: runs start without {absent}")
     for problem in uncalibrated:
         echo(f"note: {problem.path}: {problem.message}")
@@ -115,10 +115,10 @@ def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | 
     """
     from ibrobot_core.config.show import to_yaml
 
-    found = load_config(find_config(config, installed_plugins()), overrides=overrides, mode=mode, sim=sim)
-    if found.missing:
-        raise PluginError(f"{found.source}: not all defaults are known: {describe(found.missing)}")
-    echo(to_yaml(found), nl=False)
+    robot_config = load_config(find_config(config, installed_plugins()), overrides=overrides, mode=mode, sim=sim)
+    if robot_config.missing:
+        raise PluginError(f"{robot_config.source}: not all defaults are known: {describe(robot_config.missing)}")
+    echo(to_yaml(robot_config), nl=False)
 
 
 @config.command()

@@ -71,20 +71,20 @@ def realtime() -> Check:
     """Check whether the control process and the workers may use real-time priority."""
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0] if hasattr(resource, "RLIMIT_RTPRIO") else 0
     if os.geteuid() == 0:
-        found = "permitted (root)"
+        verdict = "permitted (root)"
     elif limit:
-        found = f"permitted up to {limit if limit > 0 else 99}"
+        verdict = f"permitted up to {limit if limit > 0 else 99}"
     else:
-        found = "not permitted; the control loop and images may be late under load"
-    return Check("real-time priority", os.geteuid() == 0 or limit != 0, found, _REMEDY, matters=False)
+        verdict = "not permitted; the control loop and images may be late under load"
+    return Check("real-time priority", os.geteuid() == 0 or limit != 0, verdict, _REMEDY, matters=False)
 
 
 def memory_lock() -> Check:
     """Check whether the control process may lock its memory."""
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     unlimited = os.geteuid() == 0 or limit == resource.RLIM_INFINITY
-    found = "unlimited" if unlimited else f"{limit / 1e6:.0f} MB"
-    return Check("memory lock", unlimited or limit >= MLOCK_BYTES, found, _REMEDY, matters=False)
+    allowed = "unlimited" if unlimited else f"{limit / 1e6:.0f} MB"
+    return Check("memory lock", unlimited or limit >= MLOCK_BYTES, allowed, _REMEDY, matters=False)
 
 
 def disk(folder: str) -> Check:

@@ -38,11 +38,11 @@ class LazyGroup(click.Group):
     @override
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         registry = installed_plugins()
-        if (found := registry.commands.get(cmd_name)) is None:
+        if (declared := registry.commands.get(cmd_name)) is None:
             if any(cmd_name in offers.get("command", ()) for offers in official_plugins().values()):
                 raise registry.not_found("command", cmd_name)
             return None
-        command = found.load()
+        command = declared.load()
         if registry.command_packages[cmd_name] != CORE:  # a run of core handles signals itself
             let_interrupts_raise()
         return command
@@ -125,8 +125,8 @@ def _error_lines(error: BaseException) -> tuple[list[str], int]:
         return [f"{message}{_suggestion(message, error.ctx)}{hint}"], _WRONG
     if isinstance(error, click.ClickException):
         return error.format_message().splitlines(), _WRONG if isinstance(error, click.FileError) else error.exit_code
-    if isinstance(error, OSError) and (found := _system_error(error)) is not None:
-        return found
+    if isinstance(error, OSError) and (system_error := _system_error(error)) is not None:
+        return system_error
     return [describe_bug(error)], _FAILED
 
 

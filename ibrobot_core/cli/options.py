@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 def _viewer_flags() -> dict[str, str]:
     """Type of an installed viewer -> its flag."""
-    found = (installed_plugins().find("viewer", name) for name in installed_plugins().types("viewer"))
-    return {each.type: each.flag for each in found if isinstance(each, ViewerDescriptor) and each.flag}
+    viewers = (installed_plugins().find("viewer", name) for name in installed_plugins().types("viewer"))
+    return {each.type: each.flag for each in viewers if isinstance(each, ViewerDescriptor) and each.flag}
 
 
 class EpisodePath(click.Path):

@@ -52,15 +52,15 @@ def show(type_: str, as_json: bool) -> None:
     if not entries:
         remark = did_you_mean(type_, sorted({t for _, t in registry.entries}), "installed")
         raise PluginError(f"unknown type {type_!r}{remark}{registry.broken}")
-    found = [
+    matching = [
         {**_row(registry, entry), "options": [attrs.asdict(option) for option in described(entry.descriptor.options)]}
         for entry in entries
     ]
     if as_json:
-        echo(json.dumps(found, indent=2))
+        echo(json.dumps(matching, indent=2))
         return
     columns = ("name", "type", "unit", "default", "allowed", "help")
-    for one in found:
+    for one in matching:
         echo(f"{one['kind']} type {one['type']} ({one['package']} {one['version']}): {one['summary']}")
         if one["missing"] is not None:
             echo(f"lacking: {_lacking(one)}")

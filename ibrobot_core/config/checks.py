@@ -436,6 +436,6 @@ def _place_of(value: str, at: Key, node: Any) -> Key:
     """The key in the mapping at `at` that has `value`; `at` itself if none has, e.g. for a default."""
     for name, inner in node.items() if isinstance(node, Mapping) else ():
         place = (*at, name)
-        if inner == value or (found := _place_of(value, place, inner)) != place:
-            return place if inner == value else found
+        if inner == value or (deeper := _place_of(value, place, inner)) != place:
+            return place if inner == value else deeper
     return at

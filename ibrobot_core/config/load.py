@@ -54,8 +54,8 @@ def load_config(
     """
     document = read_document(path)
     for command in (registry or installed_plugins()).commands.values():
-        if found := command.takes(document.root):
-            raise ConfigError([Problem(path, 0, "", f"this is {found}: ibrobot {command.name} {path}")])
+        if file_problem := command.takes(document.root):
+            raise ConfigError([Problem(path, 0, "", f"this is {file_problem}: ibrobot {command.name} {path}")])
     _override(document, overrides, mode)
     config = _build(document, Path(path), sim, registry or installed_plugins(), communicates)
     warn_of_secrets(document)
@@ -224,10 +224,10 @@ def shipped_configs(registry: Registry) -> dict[str, Path]:
     package = Path(ibrobot_core.__file__).parent
     in_wheel = package / "_configs"
     folder = in_wheel if in_wheel.is_dir() else package.parent / "configs"
-    found = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    configs = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
     for config in registry.configs:
-        found.setdefault(config.name, config.path)
-    return found
+        configs.setdefault(config.name, config.path)
+    return configs
 
 
 def find_config(name: str | None, registry: Registry) -> Path:

@@ -86,13 +86,13 @@ def absent_models(absent: Mapping[str, PluginNotInstalled]) -> list[str]:
 
 def describe(errors: Iterable[PluginNotInstalled]) -> str:
     """The missing plugins with one command that installs them all, and broken plugins with the reason."""
-    found = list(dict.fromkeys(errors))
-    absent = list(dict.fromkeys((error.kind, error.type) for error in found if not error.reason))
-    texts = [error.reason for error in found if error.reason]
+    distinct = list(dict.fromkeys(errors))
+    absent = list(dict.fromkeys((error.kind, error.type) for error in distinct if not error.reason))
+    texts = [error.reason for error in distinct if error.reason]
     if absent:
         names = ", ".join(plugin_type(kind, type_) for kind, type_ in absent)
         needs = "needs a plugin that is" if len(absent) == 1 else "need plugins that are"
-        command = install_command(error.package for error in found if not error.reason)
+        command = install_command(error.package for error in distinct if not error.reason)
         texts.append(f"{names} {needs} not installed: {command}")
     return "; ".join(texts)
 

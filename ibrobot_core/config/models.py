@@ -117,10 +117,10 @@ def read_xml(path: Path, root: str = "") -> XmlElement:
         raise ModelError(f"{path}:{error.lineno}: not valid XML: {expat.ErrorString(error.code)}") from None
     except (LookupError, ValueError) as error:
         raise error if isinstance(error, ModelError) else ModelError(f"{path}:1: unknown encoding: use UTF-8") from None
-    found = opened[0].children[0]
-    if root and found.tag != root:
-        raise found.error(f"begins with <{found.tag}>, must be <{root}>")
-    return found
+    top = opened[0].children[0]
+    if root and top.tag != root:
+        raise top.error(f"begins with <{top.tag}>, must be <{root}>")
+    return top
 
 
 def read_urdf(path: Path) -> DescriptionModel:
@@ -130,14 +130,14 @@ def read_urdf(path: Path) -> DescriptionModel:
         ModelError: if it is not a URDF.
     """
     root = read_xml(path, "robot")
-    found = {}
+    limits = {}
     for joint in root.children:
         if joint.tag == "joint" and joint.attributes.get("type") in ("revolute", "prismatic"):
             for limit in (each for each in joint.children if each.tag == "limit"):
                 lower, upper = (limit.numbers(name, "0", 1)[0] for name in ("lower", "upper"))
-                found[joint.attributes.get("name", "")] = Limits(lower, upper, f"{path.name}:{limit.line}")
+                limits[joint.attributes.get("name", "")] = Limits(lower, upper, f"{path.name}:{limit.line}")
     links = _names(root.children, "link")
-    return DescriptionModel(found, links, "link", links=links)
+    return DescriptionModel(limits, links, "link", links=links)
 
 
 def read_mjcf(path: Path) -> DescriptionModel:
@@ -151,7 +151,7 @@ def read_mjcf(path: Path) -> DescriptionModel:
     compilers = [element.attributes for element in root.children if element.tag == "compiler"]
     compiler = {name: value for each in compilers for name, value in each.items()}
     classes = _default_classes(root)
-    found: dict[str, Limits] = {}
+    limits: dict[str, Limits] = {}
     for joint, class_ in _mjcf_joints(root):
         name = joint.attributes.get("name")
         if class_ not in classes:
@@ -164,9 +164,9 @@ def read_mjcf(path: Path) -> DescriptionModel:
         if name is not None and kind in ("hinge", "slide") and limited == "true":
             lower, upper = attrs.evolve(joint, attributes=given).numbers("range", "0 0", 2)
             turn = math.pi / 180 if kind == "hinge" and compiler.get("angle", "degree") == "degree" else 1.0
-            found[name] = Limits(lower * turn, upper * turn, f"{joint.file.name}:{joint.line}")
+            limits[name] = Limits(lower * turn, upper * turn, f"{joint.file.name}:{joint.line}")
     sites, bodies = _names(root.below(), "site"), _names(root.below(), "body")
-    return DescriptionModel(found, sites, "site", _names((joint for joint, _ in _mjcf_joints(root)), "joint"), bodies)
+    return DescriptionModel(limits, sites, "site", _names((joint for joint, _ in _mjcf_joints(root)), "joint"), bodies)
 
 
 READERS: Mapping[str, Callable[[Path], DescriptionModel]] = {"mjcf": read_mjcf, "urdf": read_urdf}

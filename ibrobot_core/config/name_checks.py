@@ -25,9 +25,9 @@ def check_names(document: Document, sections: ParsedSections) -> None:
 def _publishers(sections: ParsedSections) -> dict[str, str]:
     """Topic -> what publishes it, whatever the options of plugins say."""
     contract: ContractConfig | None = sections.plain.get("contract")
-    found = dict.fromkeys(RUN_TOPICS, "every run")
-    found |= {spec.topic: "the actions of the contract" for spec in (contract.actions if contract else ())}
+    publishers = dict.fromkeys(RUN_TOPICS, "every run")
+    publishers |= {spec.topic: "the actions of the contract" for spec in (contract.actions if contract else ())}
     for name, part in sections.peripherals.items():
         if part.component.kind in PERIPHERAL_TOPICS:
-            found[PERIPHERAL_TOPICS[part.component.kind][0].format(name=name)] = f"peripheral {name}"
-    return found
+            publishers[PERIPHERAL_TOPICS[part.component.kind][0].format(name=name)] = f"peripheral {name}"
+    return publishers

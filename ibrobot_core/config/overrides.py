@@ -61,8 +61,8 @@ def put(document: Document, path: str, value: Document, place: Place) -> None:
         key = (*key, part)
         if last:
             holder[part] = value.root
-        elif isinstance(part, str) and isinstance(found := holder.get(part), str | None):
-            holder[part] = {} if found is None else {"type": found}  # a component in short
+        elif isinstance(part, str) and isinstance(present := holder.get(part), str | None):
+            holder[part] = {} if present is None else {"type": present}  # a component in short
             document.places[key] = place
         holder = holder[part]
     # Remove the places of keys below, so that their faults are reported as faults of the override.
@@ -106,13 +106,13 @@ def single_options[T](
     apply_overrides(document, overrides, flag)
     document.raise_problems()
     try:
-        found: T = Converter(lambda path: resolve_path(path, Path.cwd())).structure(document.root, kind)
+        options: T = Converter(lambda path: resolve_path(path, Path.cwd())).structure(document.root, kind)
     except Faults as faults:
         for key, message in faults.found:
             document.add(key, message)
     except (ValueError, TypeError) as error:  # values that exclude each other
         document.add((), error_message(error))
     else:
-        return found
+        return options
     document.raise_problems()
     raise AssertionError("not reached: there was a fault")

@@ -192,7 +192,7 @@ class SectionParser:
 
     def _plugin_section(self, sections: ParsedSections, name: str, value: Any, faults: Faults) -> None:
         """Parse a section defined by a plugin."""
-        if (found := self.registry.entries.get(("section", name))) is None:
+        if (entry := self.registry.entries.get(("section", name))) is None:
             error = self.registry.not_found("section", name)
             if isinstance(error, PluginNotInstalled):
                 self._missing.append(Missing((name,), (name,), error))
@@ -201,11 +201,11 @@ class SectionParser:
                 faults.add((name,), unknown_key(name, known) + self.registry.broken)
         elif value is not None:
             if isinstance(value, Mapping):
-                note(self.document, found.descriptor.options, value, (name,))
+                note(self.document, entry.descriptor.options, value, (name,))
             with faults.at(name):
-                options = self._converter.structure(value, found.descriptor.options)
+                options = self._converter.structure(value, entry.descriptor.options)
                 section = ComponentConfig(name, options)
-                sections.plugin_sections[name] = ParsedComponent((name,), section, found.descriptor)
+                sections.plugin_sections[name] = ParsedComponent((name,), section, entry.descriptor)
 
     def _report(self, key: Key, faults: Faults, below_sim: Collection[str] = ()) -> None:
         for inner, message in faults.found:
@@ -309,12 +309,12 @@ class SectionParser:
             return None
 
     def _named[C: NamedComponentConfig](self, section: str, kind: type[C]) -> dict[str, ParsedComponent[C]]:
-        found = {}
+        by_name = {}
         for name in self.document.names(section):
             self._check_name((section, name), name)
             if (part := self._component((section, name), kind, name=name)) is not None:
-                found[name] = part
-        return found
+                by_name[name] = part
+        return by_name
 
     def _check_name(self, key: Key, name: str) -> None:
         if not _NAME.fullmatch(name):
@@ -381,8 +381,8 @@ class SectionParser:
         if sound and as_is is not None and isinstance(as_is.descriptor, SensorDescriptor):
             kind, type_ = as_is.component.kind, as_is.component.type
             if as_is.descriptor.kind != kind:
-                found = as_is.descriptor.kind
-                self.document.add((*key, "kind"), f"sensor type {type_!r} is of kind {found!r}")
+                actual_kind = as_is.descriptor.kind
+                self.document.add((*key, "kind"), f"sensor type {type_!r} is of kind {actual_kind!r}")
             if not simulated and not self._elsewhere and self._only_simulated(kind, type_):
                 message = f"{type_!r} exists only in simulation; run with --sim, or name a real sensor"
                 self.document.add((*key, "type"), message)

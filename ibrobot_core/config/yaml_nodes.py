@@ -118,9 +118,9 @@ class Document:
             ConfigError: if there are any.
         """
         if self.problems:
-            found = (problem for _, problem in sorted(self.problems, key=lambda item: item[0]))
+            in_order = (problem for _, problem in sorted(self.problems, key=lambda item: item[0]))
             unique = dict.fromkeys(
-                attrs.evolve(each, file=redacted(str(each.file)), message=redacted(each.message)) for each in found
+                attrs.evolve(each, file=redacted(str(each.file)), message=redacted(each.message)) for each in in_order
             )
             raise ConfigError(unique)
 

@@ -67,7 +67,7 @@ class _Part:
         except ContractError as error:
             raise ContractError(f"{self.part.key}: {self.part.topic}: {error}") from None
         shape = self.part.feature.shape
-        if any(wanted not in (-1, found) for wanted, found in zip(shape, value.shape, strict=True)):
+        if any(wanted not in (-1, size) for wanted, size in zip(shape, value.shape, strict=True)):
             raise ContractError(f"{self.part.key}: {self.part.topic} gives {value.shape}, the contract says {shape}")
         if self.part.image is None and not np.isfinite(value).all():
             return None

@@ -172,16 +172,16 @@ def with_closed_ends(calibration: Mapping[str, Mapping[str, Any]], config: Robot
 
 def _position_joints(contract: Contract) -> dict[str, dict[int, str]]:
     """Key -> element -> joint, for all elements that are joint positions."""
-    found: dict[str, dict[int, str]] = {ACTION: dict(enumerate(contract.action_joints))}
+    joints_of: dict[str, dict[int, str]] = {ACTION: dict(enumerate(contract.action_joints))}
     for key in contract.observations:
         at = 0
         for part in contract.parts(key):
             if part.type == JointState.ros_type:
                 for i, path in enumerate(part.select):
                     if path.startswith(_POSITION):
-                        found.setdefault(key, {})[at + i] = path.removeprefix(_POSITION)
+                        joints_of.setdefault(key, {})[at + i] = path.removeprefix(_POSITION)
             at += part.feature.shape[0]
-    return {key: joints for key, joints in found.items() if joints}
+    return {key: joints for key, joints in joints_of.items() if joints}
 
 
 def _elements(

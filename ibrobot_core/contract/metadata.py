@@ -18,8 +18,8 @@ def robot_metadata(contract: Contract, document: Mapping[str, Any], calibrations
         calibrations: hardware -> joint -> fields of `JointCalibration`; empty if unknown.
     """
     robot = document.get("robot") or {}
-    found = {"contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint()}
+    metadata = {"contract": json.dumps(contract.canonical()), "fingerprint": contract.fingerprint()}
     if document:
-        found |= {"config": json.dumps(document)}
-        found |= {"robot": str(robot.get("name", "")), "robot_type": str(robot.get("robot_type", ""))}
-    return found | ({"calibration": json.dumps(calibrations)} if calibrations else {})
+        metadata |= {"config": json.dumps(document)}
+        metadata |= {"robot": str(robot.get("name", "")), "robot_type": str(robot.get("robot_type", ""))}
+    return metadata | ({"calibration": json.dumps(calibrations)} if calibrations else {})

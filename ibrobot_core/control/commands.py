@@ -14,7 +14,7 @@ Act = Callable[..., Mapping[str, Any] | None]
 
 
 def permitted(acts: Mapping[str, Act], do: object, arguments: Mapping[str, Any], phase: Phase, fault: str) -> Act:
-    """What executes the command `do` with these arguments.
+    """The function that executes the command `do` with these arguments.
 
     Raises:
         HardwareError: if there is no such command, the phase does not permit it, or its arguments are others.

@@ -35,13 +35,13 @@ class Health:
 
     def update(self, conditions: Sequence[Condition], now_ns: int) -> None:
         """Update with the conditions at `now_ns` [ns]."""
-        found = {(condition.joint, condition.quantity): condition for condition in conditions}
-        for key, condition in found.items():
+        present = {(condition.joint, condition.quantity): condition for condition in conditions}
+        for key, condition in present.items():
             if condition.severity is Severity.WARNING and key not in self._known:
                 self._log.warning("%s", condition.message)
-        self._known = found
+        self._known = present
         self._since_ns = {
-            key: self._since_ns.get(key, now_ns) for key, condition in found.items() if condition.sheds_load
+            key: self._since_ns.get(key, now_ns) for key, condition in present.items() if condition.sheds_load
         }
         self.conditions = conditions
 

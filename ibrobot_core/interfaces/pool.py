@@ -110,8 +110,8 @@ def shard_option() -> Any:
 
 
 def _check_shard(instance: object, attribute: object, shard: str) -> None:
-    found = re.fullmatch(r"([1-9]\d{0,5})/([1-9]\d{0,5})", shard)
-    if shard and (found is None or int(found[1]) > int(found[2])):
+    match = re.fullmatch(r"([1-9]\d{0,5})/([1-9]\d{0,5})", shard)
+    if shard and (match is None or int(match[1]) > int(match[2])):
         raise ValueError(f"{shard!r} is no part; give I/N with I from 1 to N, e.g. 2/8")
 
 

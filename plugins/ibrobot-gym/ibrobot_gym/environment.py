@@ -143,15 +143,15 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """The spaces; the run tells the size of the scene's ground truth."""
         self._start()
         first = self._begin(0)
-        found: dict[str, spaces.Space[Any]] = {}
+        by_key: dict[str, spaces.Space[Any]] = {}
         for key, value in self._observation(first).items():
             if key == "pixels":
-                found[key] = spaces.Dict(
+                by_key[key] = spaces.Dict(
                     {name: spaces.Box(0, 255, image.shape, np.uint8) for name, image in value.items()}
                 )
             else:
-                found[key] = spaces.Box(-np.inf, np.inf, value.shape, np.float32)
-        return spaces.Dict(found)
+                by_key[key] = spaces.Box(-np.inf, np.inf, value.shape, np.float32)
+        return spaces.Dict(by_key)
 
     def _start(self) -> None:
         def source(session: RunAccess, mode: Any) -> EnvironmentSource:
@@ -246,16 +246,16 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return {"is_success": success, "factors": dict(self._session.factors), "fault": self._ended_by}
 
     def _observation(self, frame: Frame) -> Observation:
-        found: Observation = {}
+        observation: Observation = {}
         pixels = {}
         for key, value in frame.values.items():
             if key == STATE:
-                found["agent_pos"] = np.array(value, dtype=np.float32)
+                observation["agent_pos"] = np.array(value, dtype=np.float32)
             elif key == SCENE:
-                found["environment_state"] = np.array(value, dtype=np.float32)
+                observation["environment_state"] = np.array(value, dtype=np.float32)
             elif key.startswith(IMAGES):
                 pixels[key.removeprefix(IMAGES)] = np.array(value)
-        return {**found, "pixels": pixels} if pixels else found
+        return {**observation, "pixels": pixels} if pixels else observation
 
     @override
     def render(self) -> NDArray[np.uint8] | None:

@@ -16,13 +16,13 @@ def add_files(app: web.Application, folder: Path, page: str = "index.html") -> N
 
     The files are listed now: no path of a request reaches the file system.
     """
-    found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.suffix in _TYPES}
+    files = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.suffix in _TYPES}
 
     async def index(request: web.Request) -> web.StreamResponse:
         return _answer(folder / page)
 
     async def file(request: web.Request) -> web.StreamResponse:
-        path = found.get(request.match_info["path"])
+        path = files.get(request.match_info["path"])
         if path is None:
             raise web.HTTPNotFound
         return _answer(path)

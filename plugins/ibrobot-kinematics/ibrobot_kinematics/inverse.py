@@ -250,7 +250,7 @@ def _placed(model: KinematicModel, start: Vector, joints: Vector) -> Vector:
 
 
 def _distinct(solutions: Vector, apart: float = _SAME, most: int | None = None) -> list[Vector]:
-    """The first of those that differ in no joint by more than `apart` [rad or m]; at most `most`."""
+    """Drop near-duplicates, whose joints all differ by at most `apart` [rad or m]; keep at most `most`."""
     kept: list[Vector] = []
     for q in solutions:
         if all(np.abs(q - other).max() > apart for other in kept):

@@ -69,8 +69,8 @@ class RobotFeatures:
 
     def values(self, radians: Vector) -> dict[str, float]:
         """Positions [rad], shape (J,), as LeRobot's features."""
-        found = (radians - self.offset) / self.factor
-        return {f"{joint}.pos": float(value) for joint, value in zip(self.joints, found, strict=True)}
+        values = (radians - self.offset) / self.factor
+        return {f"{joint}.pos": float(value) for joint, value in zip(self.joints, values, strict=True)}
 
     def numbers(self, values: Mapping[str, object]) -> dict[str, float]:
         """LeRobot's features as plain numbers.
@@ -79,17 +79,17 @@ class RobotFeatures:
             ComponentFailed: for a feature that is not one of its joints, or a value that is no finite number.
         """
         known = [f"{joint}.pos" for joint in self.joints]
-        found = {}
+        numbers = {}
         for name, value in values.items():
             if name not in known:
                 raise ComponentFailed(f"action: no feature {name!r}; the features are: {', '.join(known)}")
             try:
-                found[name] = float(value)  # type: ignore[arg-type]  # also of arrays and tensors
+                numbers[name] = float(value)  # type: ignore[arg-type]  # also of arrays and tensors
             except (TypeError, ValueError, OverflowError):
-                found[name] = math.nan
-            if isinstance(value, str | bool) or not math.isfinite(found[name]):
+                numbers[name] = math.nan
+            if isinstance(value, str | bool) or not math.isfinite(numbers[name]):
                 raise ComponentFailed(f"action: {name} is {value!r}: give a finite number, as observations have")
-        return found
+        return numbers
 
     def radians(self, values: Mapping[str, object]) -> dict[str, float]:
         """LeRobot's features as positions of joints [rad]; the errors are those of `numbers`."""

@@ -152,12 +152,12 @@ class ProgramLink:
         deadline_s = time.monotonic() + timeout_s
         while (left_s := deadline_s - time.monotonic()) > 0:
             try:
-                found = child.wait(left_s)
+                message = child.wait(left_s)
             except ComponentFailed:
                 raise ComponentFailed(f"the run has ended: {child.cause(_END_S)}") from None
-            if found is not None:
-                assert found["event"] in (READY, ANSWER)
-                return found
+            if message is not None:
+                assert message["event"] in (READY, ANSWER)
+                return message
             if child.failure is not None:
                 raise ComponentFailed(child.cause(_END_S))
         raise ComponentFailed(f"the run does not answer for {timeout_s:g} s")

@@ -82,5 +82,5 @@ def ibrobot_doctor() -> Iterable[Check]:
     from ibrobot_camera.v4l2 import cameras
 
     for camera in cameras():
-        found = camera.problem or camera.name
-        yield Check(f"camera {camera.path}", not camera.problem, found, "sudo usermod -aG video $USER, log in again")
+        state = camera.problem or camera.name
+        yield Check(f"camera {camera.path}", not camera.problem, state, "sudo usermod -aG video $USER, log in again")

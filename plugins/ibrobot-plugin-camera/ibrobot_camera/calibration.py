@@ -30,8 +30,8 @@ def load_info(path: Path) -> Callable[[Header], CameraInfo]:
         raise SensorError(f"{path}: must be a mapping, as camera_calibration writes it")
     height, width = document.get("image_height"), document.get("image_width")
     if type(height) is not int or type(width) is not int:
-        found = f"{width!r} and {height!r}"
-        raise SensorError(f"{path}: image_width and image_height must be whole numbers, not {found}")
+        stated = f"{width!r} and {height!r}"
+        raise SensorError(f"{path}: image_width and image_height must be whole numbers, not {stated}")
     d, k, r, p = (_numbers(document, key, count, str(path)) for key, count in _MATRICES.items())
     model = str(document.get("distortion_model", "plumb_bob"))
     return lambda header: CameraInfo(header, height, width, model, d, k, r, p)
@@ -40,9 +40,9 @@ def load_info(path: Path) -> Callable[[Header], CameraInfo]:
 def _numbers(document: dict[str, Any], key: str, count: int | None, where: str) -> NDArray[np.float64]:
     entry = document.get(key)
     try:
-        found = np.array(entry["data"], dtype=np.float64)  # type: ignore[index]
+        numbers = np.array(entry["data"], dtype=np.float64)  # type: ignore[index]
     except (TypeError, KeyError, ValueError):
         raise SensorError(f"{where}: {key}: must have `data`, a list of numbers, not {entry!r}") from None
-    if found.ndim != 1 or (count is not None and found.size != count):
-        raise SensorError(f"{where}: {key}: must have {count} numbers, not {found.size}")
-    return found
+    if numbers.ndim != 1 or (count is not None and numbers.size != count):
+        raise SensorError(f"{where}: {key}: must have {count} numbers, not {numbers.size}")
+    return numbers

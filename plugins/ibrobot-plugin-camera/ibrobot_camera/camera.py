@@ -78,10 +78,10 @@ class OpenCvCamera(Sensor):
     def read(self, timeout_s: float) -> Image | CompressedImage | None:
         if self._source is None:
             raise SensorError(f"camera {self._ctx.name}: not open")
-        found = self._source.read(timeout_s)
-        if found is None:
+        frame = self._source.read(timeout_s)
+        if frame is None:
             return None
-        picture, stamp_ns = found
+        picture, stamp_ns = frame
         self._check_calibration(picture.size)
         # A driver that repeats a stamp must not give two images with the same time.
         self._last_ns = stamp_ns = max(stamp_ns, self._last_ns + 1)
@@ -176,10 +176,10 @@ class _Live:
                 picture = capture.read()
                 if picture is None:
                     capture.close()
-                    found = self._reconnect()
-                    if found is None:
+                    failure = self._reconnect()
+                    if failure is None:
                         return
-                    capture = found
+                    capture = failure
                     continue
                 if capture.lacks_stamps and not warned:
                     warned = True

@@ -205,18 +205,18 @@ class Capture:
 
     def _differences(self) -> list[str]:
         options, get = self._options, self._capture.get
-        found = []
+        differences = []
         size = round(get(cv2.CAP_PROP_FRAME_WIDTH)), round(get(cv2.CAP_PROP_FRAME_HEIGHT))
         if options.width is not None and size != (options.width, options.height):
-            found.append(f"delivers {size[0]}x{size[1]} instead of {options.width}x{options.height}")
+            differences.append(f"delivers {size[0]}x{size[1]} instead of {options.width}x{options.height}")
         # The sender determines a stream's rate, and FFmpeg often only guesses it.
         rate = get(cv2.CAP_PROP_FPS) if self._device.kind != "stream" else 0.0
         if options.fps is not None and rate and not _equal(options.fps, rate):
-            found.append(f"delivers {rate:g} Hz instead of {options.fps:g}")
+            differences.append(f"delivers {rate:g} Hz instead of {options.fps:g}")
         code = self._format()
         if self._device.kind == "v4l2" and options.fourcc is not None and code != options.fourcc:
-            found.append(f"delivers format {code} instead of {options.fourcc}")
-        return found
+            differences.append(f"delivers format {code} instead of {options.fourcc}")
+        return differences
 
     def _offered(self) -> str:
         offered = modes(self._device.target) if self._device.kind == "v4l2" else ()

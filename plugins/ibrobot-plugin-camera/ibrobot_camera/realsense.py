@@ -167,11 +167,11 @@ class _Device:
 
 def _millimetres(depth: Any) -> NDArray[np.uint16]:
     """Depths in mm for any unit of the device (a D405's is 0.1 mm); shape (H, W)."""
-    found: NDArray[np.uint16] = np.array(depth.get_data())
+    millimetres: NDArray[np.uint16] = np.array(depth.get_data())
     unit_mm = depth.get_units() * 1e3
     if abs(unit_mm - 1.0) < _SAME:
-        return found
-    scaled: NDArray[np.uint16] = np.rint(np.minimum(found * unit_mm, np.iinfo(np.uint16).max)).astype(np.uint16)
+        return millimetres
+    scaled: NDArray[np.uint16] = np.rint(np.minimum(millimetres * unit_mm, np.iinfo(np.uint16).max)).astype(np.uint16)
     return scaled
 
 

@@ -61,7 +61,7 @@ class Camera:
 def cameras() -> list[Camera]:
     """The capture devices of this machine."""
     ids = {str(entry.resolve()): entry.name for entry in sorted(BY_ID.iterdir())} if BY_ID.is_dir() else {}
-    found = []
+    connected = []
     for path in sorted(Path("/dev").glob("video*"), key=lambda p: (len(p.name), p.name)):
         try:
             with _opened(path) as device:
@@ -69,10 +69,10 @@ def cameras() -> list[Camera]:
                 if not struct.unpack_from("<I", capability, 88)[0] & _CAPTURE:
                     continue
                 card = capability[16:48].split(b"\0")[0].decode(errors="replace")
-                found.append(Camera(str(path), card, ids.get(str(path), ""), tuple(_modes(device))))
+                connected.append(Camera(str(path), card, ids.get(str(path), ""), tuple(_modes(device))))
         except OSError as error:
-            found.append(Camera(str(path), "", ids.get(str(path), ""), (), error.strerror or str(error)))
-    return found
+            connected.append(Camera(str(path), "", ids.get(str(path), ""), (), error.strerror or str(error)))
+    return connected
 
 
 def modes(path: str) -> tuple[Mode, ...]:

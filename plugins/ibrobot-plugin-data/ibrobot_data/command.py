@@ -50,15 +50,15 @@ _MUCH = 0.1
 
 def _writer_flags() -> dict[str, click.Option]:
     """Option of a dataset writer -> its flag on this command line."""
-    found = {}
+    flags = {}
     for entry in installed_plugins().entries.values():
         writer = entry.descriptor
         for name in writer.flags if isinstance(writer, DatasetDescriptor) else ():
             known = attrs.fields_dict(writer.options)[name]
             off = known.default is True
             help_text = f"{writer.type}: {known.metadata['help']}."
-            found[name] = click.Option([f"--no-{name}" if off else f"--{name}", name], is_flag=off, help=help_text)
-    return found
+            flags[name] = click.Option([f"--no-{name}" if off else f"--{name}", name], is_flag=off, help=help_text)
+    return flags
 
 
 @click.command()
@@ -139,10 +139,10 @@ def _to_dataset(
         contract=Contract.from_config(robot) if robot is not None else None,
         document=json.loads(json.dumps(robot.document, default=str)) if robot is not None else None,
     )  # fmt: skip
-    found = find_episodes(options.episodes)
-    found = [found[number] for number in shard_of(options.shard, len(found))]
-    with progress(len(found)) as watch:
-        return run(request, found, watch)
+    episodes = find_episodes(options.episodes)
+    episodes = [episodes[number] for number in shard_of(options.shard, len(episodes))]
+    with progress(len(episodes)) as watch:
+        return run(request, episodes, watch)
 
 
 def _to_bags(
@@ -178,31 +178,31 @@ def _numbers(text: str | None, total: int) -> tuple[int, ...]:
     """
     if text is None:
         return tuple(range(total))
-    found: set[int] = set()
+    numbers: set[int] = set()
     for piece in text.split(","):
         ends = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", piece)
         if ends is None:
             raise click.BadParameter(
                 f"{piece!r} is neither a number nor a range; write e.g. 0,3-5", param_hint="--episodes"
             )
-        found |= set(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
-    if not found or max(found) >= total:
+        numbers |= set(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
+    if not numbers or max(numbers) >= total:
         there = f"0 to {total - 1}" if total else "none"
         raise click.BadParameter(f"{text}: the dataset's episodes are {there}", param_hint="--episodes")
-    return tuple(sorted(found))
+    return tuple(sorted(numbers))
 
 
 def _overrides(flags: Mapping[str, Any]) -> list[str]:
     """Flags of dataset writers as overrides of their options."""
     from ibrobot_core.app import Override
 
-    found: list[str] = []
+    overrides: list[str] = []
     for name, flag in _writer_flags().items():
         if (value := flags[name]) is True:
-            found.append(Override.of(flag.opts[0], f"{name}=false"))
+            overrides.append(Override.of(flag.opts[0], f"{name}=false"))
         elif value:
-            found.append(Override.of(f"{flag.opts[0]} {value}", f"{name}={value}"))
-    return found
+            overrides.append(Override.of(f"{flag.opts[0]} {value}", f"{name}={value}"))
+    return overrides
 
 
 def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:

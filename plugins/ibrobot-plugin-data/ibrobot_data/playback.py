@@ -71,10 +71,10 @@ class Playback:
             return {}
         known = (measured.times >= self.states.times[0]) & (measured.times <= self.states.times[-1])
         away = np.abs(measured.positions[known] - self.states.at(measured.times[known]))
-        found = {joint: column[np.isfinite(column)] for joint, column in zip(self.joints, away.T, strict=True)}
+        deviations = {joint: column[np.isfinite(column)] for joint, column in zip(self.joints, away.T, strict=True)}
         return {
             joint: {"rms_rad": float(np.sqrt(np.mean(each**2))), "max_rad": float(each.max())}
-            for joint, each in found.items()
+            for joint, each in deviations.items()
             if each.size
         }
 
@@ -105,12 +105,12 @@ def read_playback(reader: EpisodeReader, contract: Contract, period_ns: int) -> 
         raise RecorderError(f"{summary.path}: no message of {wanted}, so nothing to replay; available: {names}")
     joints = tuple(joint for part in parts for joint in part.joints)
     states = next((topic for topic, each in present.items() if each.type == JointState.ros_type), None)
-    found = _read(reader, {part.topic: len(part.joints) for part in parts}, states, joints)
-    first_ns = min(found[part.topic][0][0] for part in parts)
-    sent = [_track(found[part.topic], first_ns) for part in parts]
+    values = _read(reader, {part.topic: len(part.joints) for part in parts}, states, joints)
+    first_ns = min(values[part.topic][0][0] for part in parts)
+    sent = [_track(values[part.topic], first_ns) for part in parts]
     if not np.isfinite(np.concatenate([track.positions.ravel() for track in sent])).all():
         raise RecorderError(f"{summary.path}: its commands are not all finite")
-    measured = _track(found[states], first_ns) if states in found else None
+    measured = _track(values[states], first_ns) if states in values else None
     count = math.ceil(max(track.times[-1] for track in sent) * NS_PER_S / period_ns - _ROUNDING) + 1
     held = np.concatenate([_at_ticks(track, count, period_ns, sampled=reader.sampled) for track in sent], axis=1)
     if measured is not None:
@@ -126,7 +126,7 @@ def _read(
     reader: EpisodeReader, sizes: Mapping[str, int], states: str | None, joints: tuple[str, ...]
 ) -> dict[str, list[tuple[int, Vector]]]:
     """Topic -> receipt [ns] and positions [rad] of its messages; `sizes` has those of the topics of commands."""
-    found: dict[str, list[tuple[int, Vector]]] = {}
+    by_topic: dict[str, list[tuple[int, Vector]]] = {}
     for item in reader.messages({*sizes, *([states] if states is not None else ())}):
         message: Any = item.message
         if isinstance(message, JointState):
@@ -139,8 +139,8 @@ def _read(
                 f"{reader.summary().path}: {item.topic} must be a {Float64MultiArray.ros_type} with "
                 f"{sizes[item.topic]} values, got {message!r:.200}"
             )
-        found.setdefault(item.topic, []).append((item.received_ns, values))
-    return found
+        by_topic.setdefault(item.topic, []).append((item.received_ns, values))
+    return by_topic
 
 
 def _at_ticks(track: Track, count: int, period_ns: int, *, sampled: bool) -> Vector:

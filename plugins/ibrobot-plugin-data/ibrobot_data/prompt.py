@@ -19,7 +19,7 @@ def check_prompt(prompt: str) -> str:
     """
     if len(prompt) > _LONGEST:
         raise RecorderError(f"the prompt has {len(prompt)} characters; at most {_LONGEST} are allowed")
-    if found := _UNPRINTABLE.search(prompt):
-        place = f"U+{ord(found[0]):04X} at character {found.start() + 1}"
+    if unprintable := _UNPRINTABLE.search(prompt):
+        place = f"U+{ord(unprintable[0]):04X} at character {unprintable.start() + 1}"
         raise RecorderError(f"the prompt has a character that no file can hold: {place}")
     return prompt

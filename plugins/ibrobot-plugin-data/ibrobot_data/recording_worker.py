@@ -302,14 +302,14 @@ class RecordingWorker(SessionWorker):
     def silent(self) -> dict[str, float | None]:
         """Silent topics of the contract: topic -> time since the last message [s], None if there was none."""
         now_ns = self.session.clock.now_ns()
-        found: dict[str, float | None] = {}
+        silent_s: dict[str, float | None] = {}
         for topic in self._contract.topics:
             stamps = self._seen.get(topic)
             if stamps is None:
-                found[topic] = None
+                silent_s[topic] = None
             elif now_ns - stamps[-1] > _SILENT_NS:
-                found[topic] = seconds(now_ns - stamps[-1])
-        return found
+                silent_s[topic] = seconds(now_ns - stamps[-1])
+        return silent_s
 
     def lost(self) -> dict[str, int]:
         """Topic -> messages of the present episode that were not recorded, so far."""
@@ -359,9 +359,9 @@ class RecordingWorker(SessionWorker):
         `provisional`: whether it was complete at the request to end it, and is to be kept.
         """
         folder = self._owned.path if self._owned is not None else None
-        found = self._finish(end)
-        kept = found is not None and found.whole and provisional
-        replaced = found is not None and kept and again and not found.unknown and self._remove_kept()
+        episode = self._finish(end)
+        kept = episode is not None and episode.whole and provisional
+        replaced = episode is not None and kept and again and not episode.unknown and self._remove_kept()
         with self._pending_lock:
             self._provisional -= provisional and not again
             self._whole += kept and not replaced
@@ -397,17 +397,17 @@ class RecordingWorker(SessionWorker):
         lacks_end = end.outcome != "discarded" and self._lacks_end()
         told = attrs.evolve(end, outcome="unknown" if lacks_end else end.outcome, dropped=dropped)
         ended = self._did(partial(self.recorder.end, told))
-        found = None
+        episode = None
         if end.outcome != "discarded":
             if ended:
-                found = read_back(self.session, folder, end.outcome, told.outcome, lost)
+                episode = read_back(self.session, folder, end.outcome, told.outcome, lost)
             else:
-                found = WrittenEpisode(folder, end.outcome, "unknown", whole=False, error=str(self.failure))
+                episode = WrittenEpisode(folder, end.outcome, "unknown", whole=False, error=str(self.failure))
             if not self._closed:
-                self.written.append(found)
-                self.session.log.log(logging.INFO if found.whole else logging.ERROR, "%s", found.line())
+                self.written.append(episode)
+                self.session.log.log(logging.INFO if episode.whole else logging.ERROR, "%s", episode.line())
         self._give_up()
-        return found
+        return episode
 
     def _give_up(self) -> None:
         """Leave the folder of the last episode to others."""

@@ -63,14 +63,14 @@ def find_episodes(paths: Sequence[Path]) -> list[Path]:
                 if child.is_dir() and not child.name.startswith("."):  # e.g. the trash of `ibrobot episodes delete`
                     yield from below(child)
 
-    found: dict[Path, Path] = {}
+    by_real_path: dict[Path, Path] = {}
     for path in paths:
         address = EpisodeAddress.of(path)
         here = [path] if address.number is not None else list(below(path))
         if not here:
             installed_plugins().open_episode(path).close()  # raises the error that explains what an episode is
-        found |= {each.resolve(): each for each in here}
-    return list(found.values())
+        by_real_path |= {each.resolve(): each for each in here}
+    return list(by_real_path.values())
 
 
 def convert(
@@ -290,8 +290,8 @@ class _Plan:
 
     def units(self) -> list[Unit]:
         """The staged units, in the order of the episodes."""
-        found = [read_unit(self._jobs[source].unit) for source in self.sources if source in self._jobs]
-        return [unit for unit in found if unit is not None]
+        units = [read_unit(self._jobs[source].unit) for source in self.sources if source in self._jobs]
+        return [unit for unit in units if unit is not None]
 
     def run(self, watch: Watch) -> dict[str, EpisodeReport]:
         """Convert the episodes that are not staged yet; returns source -> report."""

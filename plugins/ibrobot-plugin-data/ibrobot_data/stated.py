@@ -10,14 +10,14 @@ import click
 
 def _parsed(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> Mapping[str, list[str]]:
     """Feature -> names, from texts such as `action=pan,lift`."""
-    found: dict[str, list[str]] = {}
+    by_name: dict[str, list[str]] = {}
     for text in values:
         key, _, listed = text.partition("=")
         names = [name.strip() for name in listed.split(",")]
-        if not key or not all(names) or key in found:
+        if not key or not all(names) or key in by_name:
             raise click.BadParameter(f"{text!r} must be the only FEATURE=NAME,NAME,… of its feature")
-        found[key] = names
-    return found
+        by_name[key] = names
+    return by_name
 
 
 def names_option(help_text: str) -> Callable[[Any], Any]:

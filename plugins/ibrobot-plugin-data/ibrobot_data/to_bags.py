@@ -139,9 +139,9 @@ class _Job:
         """The reason not to convert it: the target exists and is this episode."""
         with closing(installed_plugins().open_episode(self._target)) as reader:
             there = reader.summary()
-        found = there.metadata.get("source", "a recording"), there.metadata.get(_DIGEST)
-        if found != (self._source(summary), digest):
-            raise RecorderError(f"{self._target}: is another episode ({found[0]}); convert into another folder")
+        known = there.metadata.get("source", "a recording"), there.metadata.get(_DIGEST)
+        if known != (self._source(summary), digest):
+            raise RecorderError(f"{self._target}: is another episode ({known[0]}); convert into another folder")
         return "already converted"
 
     def _source(self, summary: EpisodeSummary) -> str:

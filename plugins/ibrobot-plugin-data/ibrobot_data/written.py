@@ -86,14 +86,14 @@ def lost_text(lost: Mapping[str, int]) -> str:
 
 def rows(episodes: Sequence[WrittenEpisode]) -> list[tuple[str, str]]:
     """Rows for the summary of a run: what is unfinished, what was lost, and which outcomes are unknown for that."""
-    found = [("unfinished", str(each.path)) for each in episodes if not each.whole]
+    faults = [("unfinished", str(each.path)) for each in episodes if not each.whole]
     if lost := _sum(each.lost for each in episodes):
         count = sum(bool(each.lost) for each in episodes)
-        found.append(("lost", f"{lost_text(lost)}, in {count} of {len(episodes)} {plural(len(episodes), 'episode')}"))
+        faults.append(("lost", f"{lost_text(lost)}, in {count} of {len(episodes)} {plural(len(episodes), 'episode')}"))
     if unknown := [each for each in episodes if each.unknown]:
         each = ", ".join(f"{each.path.name} (was {each.stated})" for each in unknown)
-        found.append(("unknown", f"the end was lost of {each}; `ibrobot episodes mark` sets the outcome"))
-    return found
+        faults.append(("unknown", f"the end was lost of {each}; `ibrobot episodes mark` sets the outcome"))
+    return faults
 
 
 def _sum(lost: Iterable[Mapping[str, int]]) -> Counter[str]:

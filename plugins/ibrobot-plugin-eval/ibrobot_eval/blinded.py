@@ -76,32 +76,32 @@ def power(trials: int, policies: int) -> list[str]:
     """Statistical power of this number of trials of each policy, in words for the operator; none for one policy."""
     if policies < 2:
         return []
-    needed, found = [], []
+    needed, chances = [], []
     for difference in DIFFERENCES:
         chance = decided_by(0.5 + difference / 2, 0.5 - difference / 2, trials, level_of(math.comb(policies, 2)))[-1]
         number = trials_needed(difference, policies)
         needed.append(f"{100 * difference:g} points: {number or f'more than {_MOST_TRIALS}'}")
-        found.append(f"{100 * difference:g} points: {100 * chance:.0f} %")
+        chances.append(f"{100 * difference:g} points: {100 * chance:.0f} %")
     of = "both" if policies == 2 else f"two of the {policies}"
     return [
         f"trials of each policy that detect a difference between the success rates of {of} policies with a probability "
         f"of {100 * POWER:g} %: {', '.join(needed)}",
-        f"probability with {trials} trials of each policy: {', '.join(found)}",
+        f"probability with {trials} trials of each policy: {', '.join(chances)}",
         "these numbers are for rates around 50 %, e.g. 55 and 45 %; near 0 and 100 % fewer trials are enough",
     ]
 
 
 def drift_over(results: Mapping[str, Sequence[Result]]) -> str:
     """What the trials say of a drift of success rates over time, in words; empty for fewer than four of a policy."""
-    outcomes = [[each.success for each in found] for found in results.values()]
+    outcomes = [[each.success for each in trials_of_one] for trials_of_one in results.values()]
     half = min(map(len, outcomes), default=0) // 2
     if half < 2:
         return ""
     p = drift(outcomes)
     if p > ALPHA:
         return f"no drift of the success rates over the trials was found (p {p_value(p)})"
-    early = np.mean([success for found in outcomes for success in found[:half]])
-    late = np.mean([success for found in outcomes for success in found[half:]])
+    early = np.mean([success for trials_of_one in outcomes for success in trials_of_one[:half]])
+    late = np.mean([success for trials_of_one in outcomes for success in trials_of_one[half:]])
     return (
         f"the success rates drifted over the trials (p {p_value(p)}): {100 * early:.0f} % in the first half, "
         f"{100 * late:.0f} % in the second; the comparison allows for it, since each start has a trial of each policy, "

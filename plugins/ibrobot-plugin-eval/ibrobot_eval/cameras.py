@@ -49,14 +49,14 @@ class StartPictures:
         Args:
             live: folder of the live pictures; it need not exist.
         """
-        found = []
+        sights = []
         for name, file in self._files.items():
             wanted = str(file) if file.exists() else ""
             now = live / file.name
             present = str(now) if now.exists() else ""
             if wanted or present:
-                found.append(Sight(camera=name, wanted=wanted, live=present))
-        return found
+                sights.append(Sight(camera=name, wanted=wanted, live=present))
+        return sights
 
     def taken(self, bus: Bus) -> TakenPictures:
         """Take new pictures from a run, in place of the old ones."""

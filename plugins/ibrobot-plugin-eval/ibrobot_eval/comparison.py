@@ -122,15 +122,15 @@ def compare(results: Mapping[str, Sequence[Result]], margin: float) -> list[Comp
             looks.append((test.pairs.episodes, test.pairs.difference, test.interval.low, test.interval.high))
         tests.append(test)
         courses.append((*looks[: -1 : len(looks) // _POINTS + 1], looks[-1]))
-    found = []
+    comparisons = []
     for couple, test, course in zip(couples, tests, courses, strict=True):
         pairs, verdict = test.pairs, _verdict(test, level, margin)
         p_value, fixed_p = (corrected(p, len(couples)) for p in (test.p_value, mcnemar_exact(pairs)))
         more = episodes_to_decide(pairs, margin, level) if verdict == UNDECIDED and pairs.episodes else None
         interval = agreeing(test.interval, verdict in (BETTER, WORSE), test.sign)
         fixed = agreeing(tango(pairs, level), fixed_p <= ALPHA, pairs.difference)
-        found.append(Comparison(*couple, pairs, fixed, fixed_p, interval, p_value, verdict, more, margin, course))
-    return found
+        comparisons.append(Comparison(*couple, pairs, fixed, fixed_p, interval, p_value, verdict, more, margin, course))
+    return comparisons
 
 
 def _verdict(test: PairedTest, level: float, margin: float) -> str:

@@ -62,23 +62,23 @@ def contents_of(out: Path, report: Report) -> list[ReportSection]:
     verdicts = (Text(f"{each}.", "verdict") for each in report.verdicts)
     table = Table(SUMMARY_HEAD, tuple(map(summary_row, report.summaries)))
     counted = (Text(COUNTED, "note"),) if report.broken else ()
-    found = [ReportSection("Evaluation", (*verdicts, table, *counted, Plots((plots.rates(rates),))))]
+    sections = [ReportSection("Evaluation", (*verdicts, table, *counted, Plots((plots.rates(rates),))))]
     if report.comparisons:
-        found.append(_comparison(report))
-    found.append(_outcomes(report))
+        sections.append(_comparison(report))
+    sections.append(_outcomes(report))
     if panels := list(_panels(report)):
         left_out = " Errors are left out." if report.broken else ""
         note = Text(f"Dots are successes, crosses failures. Bars are 95 % intervals.{left_out}", "note")
-        found.append(ReportSection("Where it succeeds and fails", (note, Plots(tuple(panels)))))
+        sections.append(ReportSection("Where it succeeds and fails", (note, Plots(tuple(panels)))))
     if report.notes:
-        found.append(ReportSection("Notes", tuple(map(Text, report.notes))))
+        sections.append(ReportSection("Notes", tuple(map(Text, report.notes))))
     if report.broken:
         title = f"Errors of policies ({len(report.broken)})"
-        found.append(ReportSection(title, (*map(Text, report.errors), _cases(out, report.broken))))
+        sections.append(ReportSection(title, (*map(Text, report.errors), _cases(out, report.broken))))
     failures = report.failures
     shown = _cases(out, failures) if failures else Text("None.")
-    found.append(ReportSection(f"Failures ({len(failures)})", (shown,)))
-    return found
+    sections.append(ReportSection(f"Failures ({len(failures)})", (shown,)))
+    return sections
 
 
 def _cases(out: Path, episodes: Sequence[Episode]) -> Cases:
@@ -102,15 +102,16 @@ def _outcomes(report: Report) -> ReportSection:
     """Plot outcomes and times by seed."""
     by_policy = [(each.label, _episodes(report, each.label)) for each in report.summaries]
     outcomes = [
-        (label, [(e.result.seed, e.result.success, e.result.time_s, e.result.error) for e in found])
-        for label, found in by_policy
+        (label, [(e.result.seed, e.result.success, e.result.time_s, e.result.error) for e in episodes])
+        for label, episodes in by_policy
     ]
     times = [
-        (label, [(e.result.seed, e.result.time_s) for e in found if e.result.success]) for label, found in by_policy
+        (label, [(e.result.seed, e.result.time_s) for e in episodes if e.result.success])
+        for label, episodes in by_policy
     ]
     errors = " Marks at the top alone are errors of the policy." if report.broken else ""
     blocks: list[Text | Plots] = [Plots((plots.strips(outcomes),)), Text(f"Tall marks are failures.{errors}", "note")]
-    if any(found for _, found in times):
+    if any(episodes for _, episodes in times):
         blocks.append(Plots((plots.times(times),)))
     return ReportSection("Episodes", tuple(blocks))
 

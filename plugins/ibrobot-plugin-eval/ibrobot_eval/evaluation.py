@@ -72,26 +72,30 @@ class Evaluation:
     def broken(self) -> str:
         """Why the evaluation ends: all episodes of a policy so far were errors, and these are enough; else empty."""
         for policy in self.policies:
-            found = [result for (label, _), result in self._results.items() if label == policy.label]
-            if found and len(found) >= min(_ENOUGH_ERRORS, len(self.options.seeds)) and all(e.is_error for e in found):
-                text = Counter(each.error for each in found).most_common(1)[0][0]
+            results = [result for (label, _), result in self._results.items() if label == policy.label]
+            if (
+                results
+                and len(results) >= min(_ENOUGH_ERRORS, len(self.options.seeds))
+                and all(e.is_error for e in results)
+            ):
+                text = Counter(each.error for each in results).most_common(1)[0][0]
                 folder = Place.of(self.options.out, policy, 0).result.parent
                 return (
-                    f"{policy.label}: all {len(found)} episodes so far ended in an error, so this is no evaluation: "
+                    f"{policy.label}: all {len(results)} episodes so far ended in an error, so this is no evaluation: "
                     f"{text}; after a repair that changes no file, remove {folder} to try again"
                 )
         return ""
 
     def results(self) -> dict[str, list[Result]]:
         """Label -> the results of the first seeds without a gap."""
-        found: dict[str, list[Result]] = {}
+        by_label: dict[str, list[Result]] = {}
         for policy in self.policies:
-            done = found.setdefault(policy.label, [])
+            done = by_label.setdefault(policy.label, [])
             for seed in self.options.seeds:
                 if (result := self._results.get((policy.label, seed))) is None:
                     break
                 done.append(result)
-        return found
+        return by_label
 
     def run(self, watch: Watch) -> dict[str, list[Result]]:
         """Run the missing episodes. Returns label -> results in the order of their seeds.
@@ -175,15 +179,15 @@ class Evaluation:
 
     def _kept(self) -> dict[str, list[Result]]:
         """Return the results up to the decision, and remove those beyond it."""
-        found, decided = self.results(), self._decision.after
+        by_label, decided = self.results(), self._decision.after
         if decided is None:
-            return found
+            return by_label
         for policy in self.policies:
             for seed in self.options.seeds[decided:]:
                 place = Place.of(self.options.out, policy, seed)
                 place.result.unlink(missing_ok=True)
                 shutil.rmtree(place.episode, ignore_errors=True)
-        return {label: results[:decided] for label, results in found.items()}
+        return {label: results[:decided] for label, results in by_label.items()}
 
 
 def _film(job: EpisodeJob, progress: Callable[[int], None]) -> str | None:

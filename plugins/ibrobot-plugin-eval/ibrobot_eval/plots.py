@@ -177,8 +177,8 @@ def times(rows: Sequence[tuple[str, Sequence[tuple[int, float]]]]) -> str:
         rows: label of each policy, with seed and time [s] of each success.
     """
     left = _margin(label for label, _ in rows)
-    found = [time_s for _, successes in rows for _, time_s in successes]
-    axis = Axis(0, 1.05 * max(found), left, WIDTH - _RIGHT)
+    times_s = [time_s for _, successes in rows for _, time_s in successes]
+    axis = Axis(0, 1.05 * max(times_s), left, WIDTH - _RIGHT)
     height = _TOP + 30 * len(rows) + _BOTTOM
     parts = _below(axis, _TOP, height - _BOTTOM, "time to success [s]")
     for number, (label, successes) in enumerate(rows):

@@ -85,12 +85,12 @@ class Policy:
 
     def varied(self, seed: int) -> dict[str, float]:
         """Key -> its value in the episode of a seed. Consecutive seeds go through all combinations."""
-        found = {}
+        varied = {}
         for text in self.vary:
             variation = Variation.of(text)
             seed, place = divmod(seed, len(variation.values))
-            found[variation.key] = variation.values[place]
-        return found
+            varied[variation.key] = variation.values[place]
+        return varied
 
     def varied_names(self, seed: int) -> dict[str, float]:
         """Last part of each varied key -> its value in the episode of a seed, for the factors of a result."""
@@ -148,7 +148,7 @@ def find_policies(
     Raises:
         ConfigError: for faults of a YAML, a mode without a model, an unknown model, or policies that are the same.
     """
-    found = []
+    policies = []
     for config, mode, model in itertools.product(configs, modes or (None,), models or (None,)):
         registry = installed_plugins()
         path = find_config(config, registry)
@@ -163,10 +163,10 @@ def find_policies(
         policy = Policy("", config, chosen.name, named, (*overrides, *made), sim, vary)
         for seed in range(max((len(Variation.of(text).values) for text in vary), default=0)):
             load_config(path, overrides=policy.overrides_of(seed), mode=mode, sim=sim, registry=registry)
-        if policy in found:
+        if policy in policies:
             raise _fault(path, f"control_modes.{chosen.name}", "is given twice")
-        found.append(policy)
-    return labelled(found)
+        policies.append(policy)
+    return labelled(policies)
 
 
 def _fault(path: Path, key: str, message: str) -> ConfigError:
@@ -222,13 +222,13 @@ def _leaves(value: Any) -> Iterable[Any]:
 def hash_of_files(named: Sequence[Path]) -> str:
     """Hash of the content of files, and of all files in folders; those that do not exist are left out."""
     digest = hashlib.sha256()
-    found = False
+    has_files = False
     for top in named:
         files = sorted(path for path in top.rglob("*") if path.is_file()) if top.is_dir() else [top]
         for path in files:
             if path.is_file():
-                found = True
+                has_files = True
                 digest.update(f"{path.relative_to(top)}\n".encode())
                 with path.open("rb") as file:
                     digest.update(hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest() if found else ""
+    return digest.hexdigest() if has_files else ""

@@ -63,7 +63,7 @@ class Report:
             until_decided: whether the evaluation ended with a decision.
             notes: what else is to be known.
         """
-        summaries = tuple(Summary.of(label, found) for label, found in results.items())
+        summaries = tuple(Summary.of(label, of_policy) for label, of_policy in results.items())
         return cls(summaries, tuple(compare(results, margin)), tuple(episodes), margin, until_decided, tuple(notes))
 
     @classmethod

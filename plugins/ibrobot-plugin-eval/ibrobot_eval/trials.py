@@ -132,12 +132,12 @@ class Order:
     def outcomes(self) -> dict[str, list[Trial]]:
         """Policy -> its trials of complete blocks. For decisions within the program; never show it."""
         complete = self.blocks
-        found: dict[str, list[Trial]] = {label: [] for label in self._labels}
+        by_label: dict[str, list[Trial]] = {label: [] for label in self._labels}
         judged = {(each.block, each.place): each for each in self.trials if each.outcome != VOID}
         for block in range(complete):
             for place in range(len(self._labels)):
-                found[self._policy(block, place)].append(judged[block, place])
-        return found
+                by_label[self._policy(block, place)].append(judged[block, place])
+        return by_label
 
     def open(self) -> dict[str, list[Trial]]:
         """Open the order. No trial can follow. Returns policy -> its trials of complete blocks.

@@ -128,5 +128,5 @@ def ibrobot_doctor() -> Iterable[Check]:
         yield Check("serial ports", True, "none; connect the arm if you expected one")
     remedy = "sudo usermod -aG dialout $USER, then log in again"
     for port in ports:
-        found = "readable and writable" if port.permitted else "no permission"
-        yield Check(f"serial port {port.path}", port.permitted, found, remedy)
+        access = "readable and writable" if port.permitted else "no permission"
+        yield Check(f"serial port {port.path}", port.permitted, access, remedy)

@@ -117,8 +117,8 @@ def find_servos(bus: FeetechBus, arm: Arm) -> None:
             last = error
             continue
         if model != MODEL_STS3215:
-            found = f"it is model {model}; an STS3215 is {MODEL_STS3215}"
-            raise HardwareError(f"{bus.place(servo, 'model_number')}: {found}; check that it is the right arm")
+            problem = f"it is model {model}; an STS3215 is {MODEL_STS3215}"
+            raise HardwareError(f"{bus.place(servo, 'model_number')}: {problem}; check that it is the right arm")
         firmware[servo] = bus.firmware(servo)
         check_supply(bus, servo)
     if len(missing) > 1:
@@ -140,8 +140,8 @@ def calibration_differences(bus: FeetechBus, arm: Arm) -> list[tuple[int, str, i
     differences = []
     for servo in arm.servos:
         for name, value in calibrated_registers(arm.calibration.joints[arm.names[servo]]).items():
-            if (found := bus.read_faulty(servo, name)) != value:
-                differences.append((servo, name, found, value))
+            if (stored := bus.read_faulty(servo, name)) != value:
+                differences.append((servo, name, stored, value))
     return differences
 
 
@@ -169,8 +169,8 @@ def write_eprom(bus: FeetechBus, servo: int, values: Mapping[str, int]) -> None:
     finally:
         bus.write(servo, "lock", 1, faulty=True)
     for name, value in values.items():
-        if (found := bus.read_faulty(servo, name)) != value:
-            raise FeetechError(bus.place(servo, name), f"it was set to {value} and reads {found}")
+        if (stored := bus.read_faulty(servo, name)) != value:
+            raise FeetechError(bus.place(servo, name), f"it was set to {value} and reads {stored}")
 
 
 def set_up(bus: FeetechBus, arm: Arm, tuning: Tuning, servo: int, *, torque: bool = True) -> None:

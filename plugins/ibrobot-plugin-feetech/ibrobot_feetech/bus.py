@@ -112,14 +112,14 @@ class FeetechBus:
         self.port.write(protocol.ping(BROADCAST))
         # Servos answer in turn, in the order of their ids.
         timeout_s = self.timeout(OVERHEAD, OVERHEAD * len(wanted)) + 0.001 * len(wanted)
-        found = {
+        answering = {
             p.servo for p in self._collect(OVERHEAD * (protocol.MAX_ID + 1), timeout_s, bytearray()) if not p.parameters
         }
         for servo in wanted:
             self._expect_late(servo, 0)
         model = STS3215["model_number"]
-        if found & wanted:
-            return {servo: self.read_faulty(servo, model.name) for servo in sorted(found & wanted)}
+        if answering & wanted:
+            return {servo: self.read_faulty(servo, model.name) for servo in sorted(answering & wanted)}
         models = {}
         for servo in sorted(wanted) if one_by_one else ():
             with suppress(NoReply, PacketError):
@@ -225,21 +225,21 @@ class FeetechBus:
     ) -> dict[int, tuple[bytes, int]]:
         """Collect the replies to a sync read whose first bytes are `received`, and list the missing ones."""
         wanted = set(servos)
-        found: dict[int, tuple[bytes, int]] = {}
+        replies: dict[int, tuple[bytes, int]] = {}
         expected = (OVERHEAD + length) * len(servos)
         heard, foreign = bytearray(), self.counters["late_replies"]
         for packet in self._collect(expected, self.timeout(len(request), expected, len(servos)), heard, received):
-            if packet.servo not in wanted or not self._is_answer(packet, length) or packet.servo in found:
+            if packet.servo not in wanted or not self._is_answer(packet, length) or packet.servo in replies:
                 self.counters["late_replies"] += 1
                 continue
-            found[packet.servo] = packet.parameters[skip : skip + size], packet.code
-            if len(found) == len(wanted):
+            replies[packet.servo] = packet.parameters[skip : skip + size], packet.code
+            if len(replies) == len(wanted):
                 break
         own = self.counters["late_replies"] == foreign
-        if not (own and _all_in_place(heard, servos, found, OVERHEAD + length)):
-            for servo in wanted - found.keys():
+        if not (own and _all_in_place(heard, servos, replies, OVERHEAD + length)):
+            for servo in wanted - replies.keys():
                 self._lost(servo, length)
-        return found
+        return replies
 
     def resynchronise(self) -> None:
         """Wait for `LATE_S`, after which no late reply can arrive; for use after a fault.
@@ -286,9 +286,9 @@ class FeetechBus:
             self._expect_late(servo, 0)
             self.counters["requests"] += 1
             self.port.write(request)
-        found = self._read_once(servo, target, faulty=True)
-        if found != value:
-            raise UnexpectedReply(self.place(servo, target.name), f"it was set to {value} and reads {found}")
+        stored = self._read_once(servo, target, faulty=True)
+        if stored != value:
+            raise UnexpectedReply(self.place(servo, target.name), f"it was set to {value} and reads {stored}")
 
     def _acknowledged(self, servo: int, target: Register, request: bytes, *, faulty: bool) -> None:
         extra_s = _EPROM_S if target.area == "eprom" else 0.0
@@ -389,9 +389,9 @@ class FeetechBus:
         return f"no reply; nor from any other of servos {names}"
 
 
-def _all_in_place(heard: bytearray, servos: Sequence[int], found: Container[int], size: int) -> bool:
+def _all_in_place(heard: bytearray, servos: Sequence[int], replies: Container[int], size: int) -> bool:
     """Whether exactly the expected replies arrived, each with `size` bytes and in order, valid or damaged."""
     if len(heard) != size * len(servos):
         return False
     places = enumerate(servos)
-    return all(heard[i * size + 2] == servo for i, servo in places if servo in found)
+    return all(heard[i * size + 2] == servo for i, servo in places if servo in replies)

@@ -328,10 +328,10 @@ class FeetechFollower(Hardware):
         if self._options.write_calibration:
             servos.write_calibration(self._bus, self._arm, sorted({servo for servo, *_ in differences}))
             return
-        servo, name, found, wanted = differences[0]
+        servo, name, has, wanted = differences[0]
         more = f", and {len(differences) - 1} more differ" if len(differences) > 1 else ""
         raise HardwareError(
-            f"{self._bus.place(servo, name)}: the servo has {found}, {self._arm.calibration.path} says {wanted}{more}; "
+            f"{self._bus.place(servo, name)}: the servo has {has}, {self._arm.calibration.path} says {wanted}{more}; "
             "`ibrobot feetech check` shows all, `write_calibration: true` writes the file's to the servos"
         )
 

@@ -31,7 +31,7 @@ def find(answers: Answered, guide: Guide) -> None:
 
 def port_question() -> Question:
     """The port, with the adapters of SO-101 as suggestions."""
-    arms = tuple(found.stable or found.path for found in usb_ports() if found.is_arm)
+    arms = tuple(port.stable or port.path for port in usb_ports() if port.is_arm)
     return Question("port", "Port of the arm", arms[0] if arms else "", arms, open=True)
 
 

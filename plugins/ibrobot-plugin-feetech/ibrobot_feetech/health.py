@@ -141,17 +141,17 @@ class Health:
 
     def measure(self, measured: Measured) -> bool:
         """Process a health reading; returns whether to read again soon, to confirm a new condition."""
-        found = dict(self._found(measured))
+        conditions = dict(self._found(measured))
         known, suspected = self._measured, self._suspected
         true = {
             key: condition
-            for key, condition in found.items()
+            for key, condition in conditions.items()
             if _as_severe(suspected.get(key), condition.severity) or _as_severe(known.get(key), condition.severity)
         }
-        self._measured = {key: known[key] for key in known if key in found} | true
-        self._suspected = found
+        self._measured = {key: known[key] for key in known if key in conditions} | true
+        self._suspected = conditions
         self._collect()
-        return len(true) < len(found)
+        return len(true) < len(conditions)
 
     def _collect(self) -> None:
         self.conditions = tuple({**self._measured, **self._from_errors}.values())

@@ -219,9 +219,9 @@ class LeaderTeleop(Teleop):
                 bus.write(servo, "lock", 0)
                 bus.write(servo, "return_delay", 0)
                 bus.write(servo, "lock", 1)
-        for servo, name, found, wanted in calibration_differences(bus, self._arm):
+        for servo, name, stored, wanted in calibration_differences(bus, self._arm):
             raise HardwareError(
-                f"{bus.place(servo, name)}: the servo has {found}, {self._arm.calibration.path} says {wanted}; "
+                f"{bus.place(servo, name)}: the servo has {stored}, {self._arm.calibration.path} says {wanted}; "
                 "`ibrobot feetech check` shows all differences, `ibrobot feetech calibrate` makes a new calibration"
             )
         ticks = bus.sync_read("present_position", ids)

@@ -150,7 +150,7 @@ def writable(name: str) -> Register:
         KeyError: if the name is unknown.
         ValueError: if it is read-only.
     """
-    found = register(name)
-    if not found.writable:
+    field = register(name)
+    if not field.writable:
         raise ValueError(f"{name} is read-only")
-    return found
+    return field

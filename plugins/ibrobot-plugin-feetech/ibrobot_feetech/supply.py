@@ -53,9 +53,9 @@ def check_supply(bus: FeetechBus, servo: int) -> None:
         HardwareError: if it is not; with the measured voltage and the limits.
         FeetechError: if the servo does not answer.
     """
-    found = supply(bus, servo)
-    if not found.fits:
+    volts = supply(bus, servo)
+    if not volts.fits:
         place = bus.place(servo, "present_voltage")
         raise HardwareError(
-            f"{place}: it measures {found.measured:.1f} V, and is made for {found.limits}; {found.remedy}"
+            f"{place}: it measures {volts.measured:.1f} V, and is made for {volts.limits}; {volts.remedy}"
         )

@@ -92,8 +92,8 @@ class SyncReader:
                     break
             else:
                 return Replies(self._decode(received), self._everyone, self._no_errors, True)
-        found = bus.sync_replies(received, self._request, self._servos, self._size, 0, self._size)
-        return self._slowly(found, again_until)
+        replies = bus.sync_replies(received, self._request, self._servos, self._size, 0, self._size)
+        return self._slowly(replies, again_until)
 
     def _frame(self) -> tuple[int, int]:
         """Mask and pattern of the bytes that a valid answer must have."""
@@ -109,15 +109,15 @@ class SyncReader:
             for raw, sign in zip(self._unpack(received), self._signs, strict=False)
         ]
 
-    def _slowly(self, found: dict[int, tuple[bytes, int]], again_until: float) -> Replies:
-        missing = [servo for servo in self._servos if servo not in found]
+    def _slowly(self, replies: dict[int, tuple[bytes, int]], again_until: float) -> Replies:
+        missing = [servo for servo in self._servos if servo not in replies]
         if missing and time.monotonic() < again_until:
             self._bus.counters["retries"] += 1
-            found |= self._bus.sync_read_span(self._address, self._size, missing)
-        answered = np.array([servo in found for servo in self._servos])
-        errors = np.array([found[servo][1] if servo in found else 0 for servo in self._servos], dtype=np.uint8)
+            replies |= self._bus.sync_read_span(self._address, self._size, missing)
+        answered = np.array([servo in replies for servo in self._servos])
+        errors = np.array([replies[servo][1] if servo in replies else 0 for servo in self._servos], dtype=np.uint8)
         blank = b"\x00" * self._size
-        contents = [found[servo][0] if servo in found else blank for servo in self._servos]
+        contents = [replies[servo][0] if servo in replies else blank for servo in self._servos]
         received = b"".join(b"\x00" * _HEADER + content + b"\x00" for content in contents)
         return Replies(self._decode(received), answered, errors, bool(answered.all() and not errors.any()))
 
@@ -163,7 +163,7 @@ class SyncWriter:
 def _layout(registers: Sequence[Register], address: int, size: int) -> str:
     """The `struct` format of a reply's registers."""
     layout, at = f"{_HEADER}x", address
-    for found in registers:
-        layout += f"{found.address - at}x" + ("H" if found.size == 2 else "B")
-        at = found.address + found.size
+    for entry in registers:
+        layout += f"{entry.address - at}x" + ("H" if entry.size == 2 else "B")
+        at = entry.address + entry.size
     return layout + f"{address + size - at + 1}x"

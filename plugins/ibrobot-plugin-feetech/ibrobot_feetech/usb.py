@@ -58,7 +58,7 @@ def usb_ports() -> list[UsbPort]:
 def usb_port(path: str) -> UsbPort | None:
     """The USB port at a path or symbolic link; None if it is not a USB port."""
     real = str(Path(path).resolve())
-    return next((found for found in usb_ports() if found.path == real), None)
+    return next((each for each in usb_ports() if each.path == real), None)
 
 
 def check_adapter(calibration: Calibration, port: str) -> None:
@@ -67,10 +67,12 @@ def check_adapter(calibration: Calibration, port: str) -> None:
     Raises:
         HardwareError: if it is another one, e.g. because the ports of leader and follower are swapped.
     """
-    found = usb_port(port)
-    if not calibration.adapter or found is None or found.serial_number == calibration.adapter:
+    adapter = usb_port(port)
+    if not calibration.adapter or adapter is None or adapter.serial_number == calibration.adapter:
         return
-    there = f"has the USB serial number {found.serial_number}" if found.serial_number else "has no USB serial number"
+    there = (
+        f"has the USB serial number {adapter.serial_number}" if adapter.serial_number else "has no USB serial number"
+    )
     elsewhere = next((each for each in usb_ports() if each.serial_number == calibration.adapter), None)
     where = f", which is at {elsewhere.stable or elsewhere.path}: give that port" if elsewhere else ""
     raise HardwareError(

@@ -31,12 +31,12 @@ class Finder:
 
     def find(self) -> list[Found]:
         """The connected devices."""
-        found: list[Found] = []
+        devices: list[Found] = []
         if self._hid:
-            found += find_hid(self._kind)
+            devices += find_hid(self._kind)
         if self._sdl:
-            found += find_sdl()
-        return found
+            devices += find_sdl()
+        return devices
 
     def close(self) -> None:
         """Release the libraries; close opened devices first. Safe to call twice."""
@@ -45,14 +45,14 @@ class Finder:
             self._sdl = False
 
 
-def open_first(found: Sequence[Found], wanted: str) -> tuple[Found, Device] | None:
+def open_first(devices: Sequence[Found], wanted: str) -> tuple[Found, Device] | None:
     """Open the first device that matches; None if there is none.
 
     Raises:
         TeleopError: when no matching device can be opened; names the remedy.
     """
     refused: list[str] = []
-    for each in found:
+    for each in devices:
         if each.matches(wanted):
             try:
                 return each, each.open()

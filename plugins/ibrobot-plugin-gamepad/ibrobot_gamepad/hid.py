@@ -34,12 +34,12 @@ def _hidapi() -> Any:
 
 def find_hid(kind: Kind) -> list[Found]:
     """The devices of a kind with known reports."""
-    found: dict[bytes, Found] = {}
+    by_path: dict[bytes, Found] = {}
     for entry in _hidapi().enumerate():
         model = model_of(entry["vendor_id"], entry["product_id"], entry["usage_page"], entry["usage"])
         if model is not None and model.kind == kind:
-            found.setdefault(entry["path"], _found(entry, model))
-    return list(found.values())
+            by_path.setdefault(entry["path"], _found(entry, model))
+    return list(by_path.values())
 
 
 def _found(entry: Mapping[str, Any], model: Model) -> Found:

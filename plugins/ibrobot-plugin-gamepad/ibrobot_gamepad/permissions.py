@@ -29,10 +29,10 @@ def udev_rules() -> str:
 def checks(joysticks: Path = Path("/dev/input")) -> Iterator[Check]:
     """A check for each device: of hidraw for devices with known reports, and of evdev for all others."""
     for kind in KINDS:
-        for found in find_hid(kind):
+        for pad in find_hid(kind):
             # On other systems than Linux a path is not that of a file.
-            allowed = not found.path.startswith("/dev/") or os.access(found.path, os.R_OK | os.W_OK)
-            text = f"{found.name} ({found.id}) at {found.path}"
+            allowed = not pad.path.startswith("/dev/") or os.access(pad.path, os.R_OK | os.W_OK)
+            text = f"{pad.name} ({pad.id}) at {pad.path}"
             yield Check(kind, allowed, text if allowed else f"{text}: no permission", WRITE_RULES)
     for path in sorted(joysticks.glob(_JOYSTICKS)):
         allowed = os.access(path, os.R_OK)

@@ -157,8 +157,8 @@ class JogTeleop(Teleop):
     def _look(self, finder: Finder) -> None:
         opened = open_first(finder.find(), self._options.device)
         if opened is not None:
-            found, self._device = opened
-            self._name = f"{found.name} ({found.id}, {found.model})"
+            listed, self._device = opened
+            self._name = f"{listed.name} ({listed.id}, {listed.model})"
             self._complaint = ""
 
     def _lose(self) -> None:

@@ -72,21 +72,21 @@ def import_(file: Path, out: Path | None, contract: bool) -> None:
     Comments in OUT say where each line comes from. The command lists the values that were changed, and those that have
     no counterpart, and why.
     """
-    found = convert_file(file, contract=contract)
-    target = out or Path(f"{found.name}.yaml")
-    note = write(found, file, target)
-    count = found.count()
+    converted = convert_file(file, contract=contract)
+    target = out or Path(f"{converted.name}.yaml")
+    note = write(converted, file, target)
+    count = converted.count()
     echo(
-        f"{target}: from {found.format.name}: {count[Fate.TAKEN]} values taken, {count[Fate.CHANGED]} changed, "
+        f"{target}: from {converted.format.name}: {count[Fate.TAKEN]} values taken, {count[Fate.CHANGED]} changed, "
         f"{count[Fate.REFUSED]} without a counterpart"
     )
     for fate, title in ((Fate.CHANGED, "changed:"), (Fate.REFUSED, "without a counterpart:")):
-        chosen = [each for each in found.verdicts if each.fate is fate]
+        chosen = [each for each in converted.verdicts if each.fate is fate]
         for line in (title, *(f"  {each}" for each in chosen)) if chosen else ():
             echo(line)
     if note:
         echo(f"note: {note}")
-    if found.alone:
+    if converted.alone:
         echo(f"use it: ibrobot convert BAG --config {target} --out DATASET")
         echo(f"not for ibrobot launch: {_missing(target)}. {_TO_LAUNCH}")
     else:
@@ -155,7 +155,7 @@ def _types(sections: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     return (*(("hardware", str(each["type"].value)) for each in bodies), *sensors)
 
 
-def write(found: Imported, source: Path, out: Path) -> str:
+def write(converted: Imported, source: Path, out: Path) -> str:
     """Check the new file under another name, and write it if it passes.
 
     Returns:
@@ -168,8 +168,8 @@ def write(found: Imported, source: Path, out: Path) -> str:
         raise ConfigError([Problem(out, 0, "", "exists already, and is not overwritten")])
     draft = out.with_name(f".{out.stem}.{uuid4().hex}.yaml")
     try:
-        draft.write_text(found.draft.text, encoding="utf-8")
-        note = _check(found, draft, source, out)
+        draft.write_text(converted.draft.text, encoding="utf-8")
+        note = _check(converted, draft, source, out)
         draft.rename(out)
     except OSError as error:
         raise ConfigError([Problem(out, 0, "", f"cannot be written: {error.strerror}")]) from error
@@ -178,25 +178,25 @@ def write(found: Imported, source: Path, out: Path) -> str:
     return note
 
 
-def _check(found: Imported, draft: Path, source: Path, out: Path) -> str:
+def _check(converted: Imported, draft: Path, source: Path, out: Path) -> str:
     """What could not be checked; see `write`."""
     try:
-        if found.alone:
+        if converted.alone:
             contract_alone(read_document(draft), out.absolute().parent)
         else:
             load_config(draft, sim=True)
             load_config(draft)
     except ConfigError as error:
-        if packages := _lacking(found):
+        if packages := _lacking(converted):
             at_out = ConfigError(attrs.evolve(each, file=str(out)) for each in error.problems)
             return f"{at_out}; not all could be checked: {install_command(packages)}, then ibrobot config check {out}"
-        raise ConfigError(_at_the_source(each, found.draft, source) for each in error.problems) from None
+        raise ConfigError(_at_the_source(each, converted.draft, source) for each in error.problems) from None
     return ""
 
 
-def _lacking(found: Imported) -> list[str]:
+def _lacking(converted: Imported) -> list[str]:
     """The packages of the hardware, the simulation and the recorder that are not installed."""
-    lacking = [each for each in found.types if each not in installed_plugins().entries]
+    lacking = [each for each in converted.types if each not in installed_plugins().entries]
     return [name for name, offers in official_plugins().items() if any(t in offers.get(k, ()) for k, t in lacking)]
 
 

@@ -237,7 +237,7 @@ def _hardware_section(part: _Robot) -> dict[str, Any]:
 
 
 def _peripherals(part: _Robot) -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
+    peripherals: dict[str, dict[str, Any]] = {}
     for node in part.node["peripherals"].each():
         kind, driver, name = node["type"].value, node["driver"].value or "opencv", node["name"].text()
         if kind != "camera" or driver not in ("opencv", "realsense") or name is None:
@@ -255,8 +255,8 @@ def _peripherals(part: _Robot) -> dict[str, dict[str, Any]]:
         values |= {"frame_id": optical, "transform": _transform(node, part.body)}
         node.refuse_all(_CAMERA)
         values["sim"] = so101.simulated(str(values["name"].value), part.body)
-        found[str(name.value)] = values
-    return found
+        peripherals[str(name.value)] = values
+    return peripherals
 
 
 def _usb(node: Node) -> dict[str, Any]:
@@ -380,7 +380,7 @@ def _source(part: _Robot, name: str, node: Node, executors: list[str]) -> dict[s
 
 
 def _mode_executors(part: _Robot, node: Node) -> list[str]:
-    found = []
+    executors = []
     for name in node.texts():
         match = _CONTROLLER.fullmatch(name)
         if match is None or match[1] not in part.body.groups:
@@ -390,8 +390,8 @@ def _mode_executors(part: _Robot, node: Node) -> list[str]:
         if kind == "trajectory" and len(part.body.groups[group]) == 1:
             executor, kind = f"{group}_action", "gripper"
         part.executors.setdefault(executor, (kind, group, f"line {node.line}: controller {name}", node.line))
-        found.append(executor)
-    return found
+        executors.append(executor)
+    return executors
 
 
 def _executors_of_actions(part: _Robot, contract: Mapping[str, Any]) -> None:

@@ -146,14 +146,14 @@ def _calibration(arm: Node, whole: Node, kind: str, type_: Node, side: str) -> F
         base = Path(os.environ.get("HF_LEROBOT_CALIBRATION") or cache / "lerobot" / "calibration") / kind
         single = str(type_.value).removeprefix("bi_")
         names = dict.fromkeys((re.sub(r"so10[01]", "so", single), single))
-        found = [base / each / f"{stem}.json" for each in names]
-        path = next((each for each in found if each.is_file()), found[0])
+        candidates = [base / each / f"{stem}.json" for each in names]
+        path = next((each for each in candidates if each.is_file()), candidates[0])
     note = "LeRobot's file, which stays as it is" if path.is_file() else f"LeRobot's file; it is not there: {path}"
     return name.changed(str(path), note if path.is_file() else "LeRobot's file, which is not on this machine")
 
 
 def _cameras(nodes: list[Node]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    cameras: dict[str, Any] = {}
     for node in nodes:
         for name, camera in node["cameras"].items():
             kind = camera["type"].value
@@ -185,8 +185,8 @@ def _cameras(nodes: list[Node]) -> dict[str, Any]:
             values |= {key: camera[key].whole() for key in ("width", "height")} | {"fps": camera["fps"].number()}
             camera.refuse_all(_CAMERA)
             values["sim"] = so101.simulated(plain, so101.DOUBLE if prefix in so101.DOUBLE.prefixes else so101.SINGLE)
-            found[plain] = values
-    return found
+            cameras[plain] = values
+    return cameras
 
 
 def _devices(teleop: Node, body: so101.Body) -> dict[str, Any]:

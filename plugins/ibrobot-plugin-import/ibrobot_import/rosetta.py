@@ -34,12 +34,12 @@ def convert(source: Source, *, alone: bool = False) -> dict[str, Any]:
         root["robot_interface"].wrong(f"expected ros2, got {root['robot_interface'].value!r}")
     root["robot_interface"].taken("ros2", "topics and types are those of ROS 2")
     joints = None if alone else _arm(root)
-    found = _contract_alone(root) if joints is None else _robot(root, joints)
+    converted = _contract_alone(root) if joints is None else _robot(root, joints)
     root["teleop"].refuse("an operator's device belongs to teleoperation and episodes")
     for name in ("info", "complementary_data", "signals", "rewards", "tasks"):
         root[name].refuse("datasets have the columns task, next.reward and next.done beside observations and actions")
     root["adjunct"].refuse("a bag has these topics, or not; recording.topics lists those of a run")
-    return found
+    return converted
 
 
 def _arm(root: Node) -> dict[str, str] | None:
@@ -224,7 +224,7 @@ def _align(node: Node) -> dict[str, Any] | None:
 
 
 def _signals(root: Node) -> list[dict[str, Any]]:
-    found = []
+    signals = []
     for section in ("tasks", "rewards", "signals"):
         for key, node in root[section].items():
             if key not in _SIGNALS:
@@ -240,8 +240,8 @@ def _signals(root: Node) -> list[dict[str, Any]]:
                 "align": align.text() if align.value == "hold" else None,
             }
             node["align"]["timeline"].refuse("signals are aligned by their time of receipt")
-            found.append(values | _rest(node))
-    return found
+            signals.append(values | _rest(node))
+    return signals
 
 
 def _rest(node: Node, note: str = "") -> dict[str, Any]:

@@ -124,11 +124,11 @@ def hardware_section(body: Body, ports: Sequence[From | None], calibrations: Seq
     """The section `hardware`, with a port and a calibration for each arm."""
     own = shipped(body.config)["hardware"]
     parts = {"": own} if len(body.prefixes) == 1 else own
-    found = {}
+    section = {}
     for (name, part), port, calibration in zip(parts.items(), ports, calibrations, strict=True):
         given = {"port": port, "calibration": calibration}
-        found[name] = {key: given.get(key) or body.own(value) for key, value in part.items()}
-    return found.get("", found)
+        section[name] = {key: given.get(key) or body.own(value) for key, value in part.items()}
+    return section.get("", section)
 
 
 def executor_sections(names: Mapping[str, tuple[str, str, str, int]]) -> dict[str, Any]:

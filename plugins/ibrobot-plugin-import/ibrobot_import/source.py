@@ -74,11 +74,11 @@ class Source:
     def verdicts(self, program: str) -> list[Verdict]:
         """The verdict of each value in the order of the lines; values without one are unknown to `program`."""
         unknown = (Fate.REFUSED, f"without a counterpart here; ibrobot does not know it as a key of {program}")
-        found = []
+        verdicts = []
         for leaf in _leaves(self.document.root, ()):
             fate, reason = self._fates.get(leaf, unknown)
-            found.append(Verdict(self.document.place(leaf).line, self.document.dotted(leaf), fate, reason))
-        return sorted(found, key=lambda each: each.line)
+            verdicts.append(Verdict(self.document.place(leaf).line, self.document.dotted(leaf), fate, reason))
+        return sorted(verdicts, key=lambda each: each.line)
 
 
 @attrs.frozen

@@ -41,7 +41,7 @@ class MessageReader(ABC):
     def feed(self, received: bytes) -> list[Angles]:
         """The orientations in the bytes received so far that were not returned yet, in order."""
         stream, at = self._rest + received, 0
-        found: list[Angles] = []
+        readings: list[Angles] = []
         while True:
             begin = stream.find(self.header, at)
             if begin < 0:
@@ -52,14 +52,14 @@ class MessageReader(ABC):
             message = stream[at : at + self.size]
             if len(message) < self.size:
                 self._rest = stream[at:]
-                return found
+                return readings
             if not self._is_valid(message):
                 self.refused += 1
                 at += 1
                 continue
             at += self.size
             if (angles := self._angles(message)) is not None:
-                found.append(angles)
+                readings.append(angles)
 
     def forget(self) -> None:
         """Drop an incomplete message."""

@@ -100,11 +100,11 @@ class JointLogReader(EpisodeReader):
 def _facts(path: Path) -> Mapping[str, Any]:
     """The recorder's metadata for the log; empty if there is none."""
     try:
-        found = json.loads(path.read_bytes())
+        facts = json.loads(path.read_bytes())
     except FileNotFoundError:
         return {}
     except ValueError as error:
         raise RecorderError(f"{path}: cannot be read: {error}") from None
-    if not isinstance(found, dict):
+    if not isinstance(facts, dict):
         raise RecorderError(f"{path}: must be an object")
-    return found
+    return facts

@@ -31,15 +31,15 @@ def list_devices(type_: str | None) -> None:
 
     Those of installed third-party packages are among them.
     """
-    found = _registry()
+    devices = _registry()
     if type_ is None:
-        echo(f"LeRobot {found['version']}")
+        echo(f"LeRobot {devices['version']}")
         for kind, title in _KINDS.items():
-            echo(f"{title} of type lerobot: {', '.join(found[kind]) or 'none'}")
+            echo(f"{title} of type lerobot: {', '.join(devices[kind]) or 'none'}")
         return
-    known = {kind: found[kind][type_] for kind in _KINDS if type_ in found[kind]}
+    known = {kind: devices[kind][type_] for kind in _KINDS if type_ in devices[kind]}
     if not known:
-        names = [name for kind in _KINDS for name in found[kind]]
+        names = [name for kind in _KINDS for name in devices[kind]]
         raise click.BadParameter(f"LeRobot has no {type_!r}{did_you_mean(type_, names, 'it has')}", param_hint="TYPE")
     for kind, each in known.items():
         echo(f"{kind} {type_}: {each['module']}.{each['class']}")
@@ -75,12 +75,12 @@ def new(out: Path, robot: str, id_: str | None, units: tuple[str, ...]) -> None:
             raise click.BadParameter(f"{unit!r}{did_you_mean(unit, UNITS, 'it is one of')}", param_hint="--unit")
         given[name if equals else OTHERS] = unit
     with wrong_input():
-        found = write_robot(out, robot, id_ or robot, given)
-    echo(f"{out}: {found.type}, {len(found.mapped)} joints")
-    if not found.measured:
+        written = write_robot(out, robot, id_ or robot, given)
+    echo(f"{out}: {written.type}, {len(written.mapped)} joints")
+    if not written.measured:
         echo(f"note: limits of joints are guesses, since LeRobot has no calibration {id_ or robot}: check them")
-    if found.unknown_leader:
-        echo(f"note: the file has no leader: {found.unknown_leader}")
+    if written.unknown_leader:
+        echo(f"note: the file has no leader: {written.unknown_leader}")
     echo(f"try it: ibrobot launch {out}")
 
 

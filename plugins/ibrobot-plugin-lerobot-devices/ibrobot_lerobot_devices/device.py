@@ -191,12 +191,12 @@ class Device:
 
     def connect(self) -> dict[str, Any]:
         """Make and connect the device; return what it says about itself."""
-        found = self.make()
+        made = self.make()
         if self._order["kind"] == "camera":
             self._color = self._library.color_order(self._device)
             self._device.connect()
             self._seen = Pictures(self._library.fps(self._device))
-            return found
+            return made
         device = self._device
         device.connect(calibrate=False)
         if not device.is_calibrated:
@@ -206,7 +206,7 @@ class Device:
                 f"{device.calibration_fpath}"
             )
         self.stand()  # the motors may have kept their velocities from an earlier process
-        return found | {"motors": self._library.motors(device)}
+        return made | {"motors": self._library.motors(device)}
 
     def read(self) -> dict[str, float]:
         """The plain values of an observation, or of an action of a teleoperator."""
@@ -361,18 +361,18 @@ def carry_out(device: Device, request: Mapping[str, Any], channel: Channel) -> N
         if what == "act":
             device.act(request["action"], request["made_ns"])
             return
-        found: dict[str, Any] = getattr(device, what)()
+        values: dict[str, Any] = getattr(device, what)()
     except Exception as error:  # noqa: BLE001 - contained: the answer has the error
         channel.send(answer | {"error": _one_line(error), "times": device.failures})
         return
     if what == "picture":
-        content = found.pop("content")
-        channel.send(answer | found)
+        content = values.pop("content")
+        channel.send(answer | values)
         _send(device._pictures, content)
     elif what == "read":
-        channel.send(answer | {"values": found, "made_ns": (begun_ns + time.monotonic_ns()) // 2})
+        channel.send(answer | {"values": values, "made_ns": (begun_ns + time.monotonic_ns()) // 2})
     else:
-        channel.send(answer | {"found": found})
+        channel.send(answer | {"found": values})
 
 
 def _send(pipe: int, content: memoryview) -> None:
@@ -419,8 +419,8 @@ def main(parent: int, pictures: int) -> int:
                 return 0
         requests.traffic.watch()
         try:
-            found = device.connect()
-            channel.send({"event": READY, "found": found})
+            description = device.connect()
+            channel.send({"event": READY, "found": description})
             serve(device, requests)
         finally:
             device.disconnect()

@@ -188,9 +188,9 @@ class LeRobotHardware(Hardware):
         link, standing = self._link, self._standing
         try:
             if standing is not None and (link.pid is None or standing.is_starting or standing.found is not None):
-                if (found := standing.restart(_RECONNECT_S)) is None:
+                if (answer := standing.restart(_RECONNECT_S)) is None:
                     raise self._fail(_AGAIN)
-                self._take(found, again=True)
+                self._take(answer, again=True)
                 return
             if not self._starting and link.pid is not None:
                 link.read(self._wait_s)  # the call may have returned meanwhile
@@ -200,9 +200,9 @@ class LeRobotHardware(Hardware):
             if not self._starting:
                 link.begin()
                 self._starting = True
-            if (found := link.poll_start(_RECONNECT_S)) is None:
+            if (answer := link.poll_start(_RECONNECT_S)) is None:
                 raise self._fail(_AGAIN)
-            self._take(found, again=True)
+            self._take(answer, again=True)
         except (DeviceProblem, UnitProblem) as problem:
             self._starting = False
             raise self._fail(problem) from None
@@ -218,7 +218,7 @@ class LeRobotHardware(Hardware):
     def counters(self) -> Mapping[str, int]:
         return self._counts
 
-    def _take(self, found: Mapping[str, Any], *, again: bool = False) -> None:
+    def _take(self, answer: Mapping[str, Any], *, again: bool = False) -> None:
         """Take in what the connected device says about itself.
 
         Raises:
@@ -226,21 +226,21 @@ class LeRobotHardware(Hardware):
         """
         robot, order = self._ctx.robot, self._ctx.robot.indices(self.joints)
         limits = dict(zip(self.joints, zip(robot.lower[order], robot.upper[order], strict=True), strict=True))
-        actions, choices = found["action_features"], self._options.choices()
-        axes = map_axes(actions, found["motors"], choices, self.joints)
+        actions, choices = answer["action_features"], self._options.choices()
+        axes = map_axes(actions, answer["motors"], choices, self.joints)
         rolled = [each.joint for each in axes]
         turned = [joint for joint in self.joints if joint not in rolled]
-        mapped = map_joints(actions, found["motors"], choices, turned, limits)
+        mapped = map_joints(actions, answer["motors"], choices, turned, limits)
         self._factor, self._offset = columns(mapped)
         self._turned = [self.joints.index(joint) for joint in turned]
         self._rolled = [self.joints.index(joint) for joint in rolled]
         at, period_s = robot.indices(rolled), seconds(self._ctx.period_ns)
         highest = robot.max_velocity[at], robot.max_acceleration[at]
-        base = Base(axes, driven(actions), found["observation_features"], *highest, period_s)
+        base = Base(axes, driven(actions), answer["observation_features"], *highest, period_s)
         if again:
             base.way = self._base.way
         self._base = base
-        named = {end: bases(found["observation_features"], end) for end in (POSITION, VELOCITY, EFFORT)}
+        named = {end: bases(answer["observation_features"], end) for end in (POSITION, VELOCITY, EFFORT)}
         bare = [each.feature for each in mapped]
         self._features = [bases(actions, POSITION)[base] for base in bare]
         self._columns = [[named[end].get(base) for base in bare] for end in (POSITION, VELOCITY, EFFORT)]
@@ -249,7 +249,7 @@ class LeRobotHardware(Hardware):
         self._unmapped = [name for name in bases(actions, POSITION).values() if name not in self._features]
         self._history: deque[tuple[int, Vector]] = deque(maxlen=_SPAN)
         self._newest, self._lost = None, 0
-        self._has_torque = found["torque"]
+        self._has_torque = answer["torque"]
         self._starting = False
         self._on = self._has_torque
         if again and self._relaxed:  # LeRobot has switched the torque on
@@ -259,16 +259,16 @@ class LeRobotHardware(Hardware):
         if self._base.features:
             self._link.prepare()
         if not again:
-            self._say(found)
+            self._say(answer)
 
-    def _say(self, found: Mapping[str, Any]) -> None:
+    def _say(self, answer: Mapping[str, Any]) -> None:
         log, name = self._ctx.log, self._ctx.name
         if self._unmapped:
             log.warning("%s: %s of LeRobot's robot are no joints here, and stay", name, ", ".join(self._unmapped))
         if self._rest:
             axes = ", ".join(self._rest)
             log.warning("%s: %s are always 0: the base stands, unless its axes are joints of the robot", name, axes)
-        if not found["keeps_torque"]:
+        if not answer["keeps_torque"]:
             log.warning("%s: LeRobot's %s may switch its torque off at the end", name, self._options.robot)
 
     def _wrong(self, values: Mapping[str, float]) -> str:

@@ -50,8 +50,8 @@ def choices(kind: Kind, wanted: str = "") -> Mapping[str, type[Any]]:
                 logging.getLogger("ibrobot.lerobot").info("%s.%s: %s", name, module.name, error)
     if wanted not in registry.get_known_choices():
         _import_third_parties()
-    found: Mapping[str, type[Any]] = registry.get_known_choices()
-    return dict(sorted(found.items()))
+    classes: Mapping[str, type[Any]] = registry.get_known_choices()
+    return dict(sorted(classes.items()))
 
 
 @cache
@@ -124,10 +124,10 @@ def _nested(kind: type[Any]) -> Iterator[tuple[str, type[Any]]]:
 
 def describe() -> dict[str, Any]:
     """What LeRobot has, as plain data: kind -> type -> fields, and its version."""
-    found: dict[str, Any] = {"version": version("lerobot")}
+    description: dict[str, Any] = {"version": version("lerobot")}
     for kind in KINDS:
-        found[kind] = {name: _described(each) for name, each in choices(kind).items()}
-    return found
+        description[kind] = {name: _described(each) for name, each in choices(kind).items()}
+    return description
 
 
 def _described(kind: type[Any]) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def _described(kind: type[Any]) -> dict[str, Any]:
 def _fields(kind: type[Any]) -> dict[str, Any]:
     """Each field of a dataclass: its type in words, whether it is required, its plain default, and fields within."""
     hints = get_type_hints(kind)
-    found: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
         if not field.init:
             continue
@@ -152,8 +152,8 @@ def _fields(kind: type[Any]) -> dict[str, Any]:
             row["default"] = default
         if dataclasses.is_dataclass(hint) and isinstance(hint, type):
             row["fields"] = _fields(hint)
-        found[field.name] = row
-    return found
+        fields[field.name] = row
+    return fields
 
 
 def _words(hint: Any) -> list[str]:
@@ -176,7 +176,7 @@ def motors(device: Any) -> dict[str, dict[str, Any]]:
 
     A base's axis has `rate`, its unit per second. What names of features mean is known of LeRobot's own code alone.
     """
-    found: dict[str, dict[str, Any]] = {}
+    by_name: dict[str, dict[str, Any]] = {}
     for prefix, bus in buses(device):
         for name, motor in getattr(bus, "motors", {}).items():
             mode = getattr(motor, "norm_mode", None)
@@ -190,14 +190,14 @@ def motors(device: Any) -> dict[str, dict[str, Any]]:
                     "range_max": calibration.range_max,
                     "reversed": bool(getattr(bus, "apply_drive_mode", False) and calibration.drive_mode),
                 }
-            found[f"{prefix}{name}"] = row
+            by_name[f"{prefix}{name}"] = row
     if _moves_by_lerobot(device):
         features = list(device.action_features)
         for name in bases(features, (".q",)):
-            found.setdefault(name, {"unit": RADIANS})
+            by_name.setdefault(name, {"unit": RADIANS})
         for name in driven(features):
-            found.setdefault(name, {})["rate"] = AXES.get(name)
-    return found
+            by_name.setdefault(name, {})["rate"] = AXES.get(name)
+    return by_name
 
 
 def _moves_by_lerobot(device: Any) -> bool:
@@ -247,30 +247,30 @@ def stop_base(device: Any) -> bool:
 def wheels(device: Any) -> list[tuple[Any, list[str]]]:
     """The motors of a device that no position commands, by bus."""
     driven = bases(list(device.action_features), POSITION)
-    found = [(bus, [name for name in bus.motors if f"{prefix}{name}" not in driven]) for prefix, bus in buses(device)]
-    return [(bus, names) for bus, names in found if names]
+    by_bus = [(bus, [name for name in bus.motors if f"{prefix}{name}" not in driven]) for prefix, bus in buses(device)]
+    return [(bus, names) for bus, names in by_bus if names]
 
 
 def numbers(values: Mapping[str, Any]) -> dict[str, float]:
     """The plain numbers among the values of a reading."""
-    found: dict[str, float] = {}
+    by_name: dict[str, float] = {}
     for name, value in values.items():
         if not isinstance(value, str) and getattr(value, "ndim", 0) == 0:
             with suppress(TypeError, ValueError):
-                found[name] = float(value)
-    return found
+                by_name[name] = float(value)
+    return by_name
 
 
 def taken_s(camera: Any) -> float | None:
     """When a camera's newest picture was taken, by `time.perf_counter` [s]; None if LeRobot does not say it."""
-    found = getattr(camera, "latest_timestamp", None)
-    return found if isinstance(found, float) else None
+    stamp = getattr(camera, "latest_timestamp", None)
+    return stamp if isinstance(stamp, float) else None
 
 
 def fps(camera: Any) -> float | None:
     """How many pictures a second a camera takes; None if LeRobot does not say it."""
-    found = getattr(camera, "fps", None) or getattr(getattr(camera, "config", None), "fps", None)
-    return float(found) if isinstance(found, int | float) and found > 0 else None
+    rate = getattr(camera, "fps", None) or getattr(getattr(camera, "config", None), "fps", None)
+    return float(rate) if isinstance(rate, int | float) and rate > 0 else None
 
 
 def color_order(camera: Any) -> str:
@@ -279,8 +279,8 @@ def color_order(camera: Any) -> str:
     Raises:
         DeviceError: if it is another one.
     """
-    found = getattr(camera, "color_mode", None) or getattr(getattr(camera, "config", None), "color_mode", None) or "rgb"
-    order = str(getattr(found, "value", found)).lower()
+    mode = getattr(camera, "color_mode", None) or getattr(getattr(camera, "config", None), "color_mode", None) or "rgb"
+    order = str(getattr(mode, "value", mode)).lower()
     if order not in ("rgb", "bgr"):
         raise DeviceError(f"gives pictures with color_mode {order!r}; ibrobot takes rgb and bgr")
     return order

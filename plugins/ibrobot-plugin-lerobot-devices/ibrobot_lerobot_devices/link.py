@@ -81,10 +81,10 @@ class DeviceLink:
         """
         self.begin()
         try:
-            found = self.poll_start(timeout_s)
-            if found is None:
+            answer = self.poll_start(timeout_s)
+            if answer is None:
                 raise DeviceProblem(f"LeRobot does not connect it within {timeout_s:g} s")
-            return found
+            return answer
         except BaseException:
             self.end()
             raise
@@ -238,11 +238,11 @@ class DeviceLink:
             DeviceProblem: if it fails, or takes more than `timeout_s` [s].
         """
         self._running().channel.send({"do": what})
-        found = self._await(what, timeout_s)
-        if found is None:
+        answer = self._await(what, timeout_s)
+        if answer is None:
             raise DeviceProblem(f"a call of LeRobot's blocks: {what} is not done after {timeout_s:g} s")
         self.refused = (0, "")
-        return found
+        return answer
 
     def end(self) -> None:
         """End the process; safe at any time."""
@@ -305,19 +305,19 @@ class DeviceLink:
 
     def _message(self, timeout_s: float) -> Mapping[str, Any] | None:
         try:
-            found = self._running().wait(timeout_s)
+            message = self._running().wait(timeout_s)
         except ComponentFailed:
             raise self._death() from None
-        if found is None and self._running().failure is not None:
+        if message is None and self._running().failure is not None:
             raise self._death()
-        if found is not None and found["event"] == ANSWER and found["id"] == self._number:
+        if message is not None and message["event"] == ANSWER and message["id"] == self._number:
             self._asked_s = None
-        if found is not None and found["event"] == DONE:
-            if found["do"] == "act":  # only those that fail are answered
-                self.refused = (found["times"], found["error"])
-            elif found["do"] == STAND:
-                self._stood = found.get("error", "")
-        return found
+        if message is not None and message["event"] == DONE:
+            if message["do"] == "act":  # only those that fail are answered
+                self.refused = (message["times"], message["error"])
+            elif message["do"] == STAND:
+                self._stood = message.get("error", "")
+        return message
 
     def _death(self) -> DeviceProblem:
         child = self._running()

@@ -77,10 +77,12 @@ def describe_robot(type_: str, id_: str, units: Mapping[str, str]) -> NewRobot:
         HardwareError: if it has no joints, cannot be made, or a unit is not known.
     """
     try:
-        found = registry()
-        if type_ not in found["robot"]:
-            raise HardwareError(f"LeRobot has no robot {type_!r}{did_you_mean(type_, list(found['robot']), 'it has')}")
-        config = {**_required(found["robot"][type_]["fields"], ""), "id": id_}
+        devices = registry()
+        if type_ not in devices["robot"]:
+            raise HardwareError(
+                f"LeRobot has no robot {type_!r}{did_you_mean(type_, list(devices['robot']), 'it has')}"
+            )
+        config = {**_required(devices["robot"][type_]["fields"], ""), "id": id_}
         torch = False
         try:
             facts = _facts("robot", type_, config, torch=torch)
@@ -110,8 +112,8 @@ def describe_robot(type_: str, id_: str, units: Mapping[str, str]) -> NewRobot:
     limits = {each.joint: _limits(each, facts["motors"].get(each.feature, {})) for each in mapped}
     leader = type_.replace("follower", "leader")
     known, why = "", ""
-    if leader in found["teleoperator"]:
-        why = _why_not_led(leader, {**_required(found["teleoperator"][leader]["fields"], ""), "id": leader}, torch)
+    if leader in devices["teleoperator"]:
+        why = _why_not_led(leader, {**_required(devices["teleoperator"][leader]["fields"], ""), "id": leader}, torch)
         known = "" if why else leader
     return NewRobot(type_, config, mapped, units, limits, measured, known, why, torch, axes)
 
@@ -146,14 +148,14 @@ def _facts(kind: str, type_: str, config: Mapping[str, Any], *, torch: bool) -> 
 
 def _required(fields: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     plain: Mapping[str, Any] = {"str": "", "int": 0, "float": 0.0, "bool": False}
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name, field in fields.items():
         if "fields" in field:
-            found[name] = _required(field["fields"], f"{prefix}{name.split('_')[0].upper()}_")
+            values[name] = _required(field["fields"], f"{prefix}{name.split('_')[0].upper()}_")
         elif field["required"]:
             variable = f"IBROBOT_{prefix}FOLLOWER_PORT"
-            found[name] = f"${{{variable}:{_PORT}}}" if name == "port" else plain.get(field["type"][0], {})
-    return {name: value for name, value in found.items() if value != {}}
+            values[name] = f"${{{variable}:{_PORT}}}" if name == "port" else plain.get(field["type"][0], {})
+    return {name: value for name, value in values.items() if value != {}}
 
 
 def _map(facts: Mapping[str, Any], joints: list[str], units: Mapping[str, str]) -> list[Mapped]:
@@ -190,25 +192,25 @@ def _list(names: Iterable[str]) -> str:
     return f"[{', '.join(map(_word, names))}]"
 
 
-def robot_yaml(found: NewRobot) -> str:
+def robot_yaml(made: NewRobot) -> str:
     """The robot YAML of a robot of LeRobot's."""
-    names = [each.joint for each in found.mapped]
+    names = [each.joint for each in made.mapped]
     gripper = [name for name in names if "gripper" in name]
     arm = [name for name in names if name not in gripper] or names
     gripper = [name for name in gripper if name not in arm]
-    members = {"arm": arm, "gripper": gripper, "base": found.axes}
+    members = {"arm": arm, "gripper": gripper, "base": made.axes}
     groups = ", ".join(f"{name}: {_list(each)}" for name, each in members.items() if each)
     joints = "\n".join(
-        f"    - {{name: {_word(name)}, lower: {found.limits[name][0]:.4f}, upper: {found.limits[name][1]:.4f}, "
+        f"    - {{name: {_word(name)}, lower: {made.limits[name][0]:.4f}, upper: {made.limits[name][1]:.4f}, "
         "max_velocity: 1.5, max_acceleration: 15.0}"
         for name in names
     )
     joints += "".join(
         f"\n    - {{name: {name}, lower: {-_WAY}, upper: {_WAY}, {_SPEEDS[AXES[name] != METRES]}}}"
-        for name in found.axes
+        for name in made.axes
     )
     streams = ["arm_position", *(["gripper_position"] if gripper else [])]
-    moved = [*streams, *(["base_position"] if found.axes else [])]
+    moved = [*streams, *(["base_position"] if made.axes else [])]
     executors = "\n".join(f"  {name}: {{type: position, group: {name.split('_')[0]}}}" for name in moved)
     actions = "\n".join(
         f"    - {{key: action, executor: {name}, topic: /{name}_controller/commands, "
@@ -216,33 +218,33 @@ def robot_yaml(found: NewRobot) -> str:
         for name in streams
     )
     limits = (
-        "limits are the ends of the calibrated ranges" if found.measured else "limits are guesses: LeRobot says none"
+        "limits are the ends of the calibrated ranges" if made.measured else "limits are guesses: LeRobot says none"
     )
-    extra = f", units: {json.dumps(dict(found.units))}" if found.units else ""
-    extra += ", torch: true" if found.torch else ""
+    extra = f", units: {json.dumps(dict(made.units))}" if made.units else ""
+    extra += ", torch: true" if made.torch else ""
     extra += f", anchored: {_list(gripper)}" if gripper and gripper != ["gripper"] else ""
     scaled = f", scaled: {_list(gripper)}" if gripper and gripper != ["gripper"] else ""
-    options = f"config: {_leader_config(found)}{scaled}"
-    leader = f"{{type: lerobot, teleop: {_word(found.leader)}, {options}}}"
-    devices = f"  leader: {leader}\n" if found.leader else ""
-    mode = f"  teleop:\n    executors: [{', '.join(streams)}]\n    teleop: leader\n" if found.leader else ""
-    if found.axes:
+    options = f"config: {_leader_config(made)}{scaled}"
+    leader = f"{{type: lerobot, teleop: {_word(made.leader)}, {options}}}"
+    devices = f"  leader: {leader}\n" if made.leader else ""
+    mode = f"  teleop:\n    executors: [{', '.join(streams)}]\n    teleop: leader\n" if made.leader else ""
+    if made.axes:
         devices += "  cmd_vel: {type: cmd_vel}\n"
         mode += "  drive:                                  # by twists on /cmd_vel; the arm holds\n"
         mode += f"    executors: [{', '.join(moved)}]\n    teleop: {{base: cmd_vel}}\n"
     devices = f"teleoperation:\n{devices}\n" if devices else ""
     return f"""\
-# {found.type} of LeRobot, made by `ibrobot config new --lerobot {found.type}`. Units are SI: radians, seconds.
+# {made.type} of LeRobot, made by `ibrobot config new --lerobot {made.type}`. Units are SI: radians, seconds.
 # Check all joints before the first motion: {limits}; max_velocity and
 # max_acceleration are guesses, too. LeRobot reports no torque, temperature or voltage.
 robot:
-  name: {_word(found.type)}
-  robot_type: {_word(found.type)}
+  name: {_word(made.type)}
+  robot_type: {_word(made.type)}
   joints:                                 # order here = order in every vector
 {joints}
   groups: {{{groups}}}
 
-hardware: {{type: lerobot, robot: {_word(found.type)}, config: {json.dumps(dict(found.config))}{extra}}}
+hardware: {{type: lerobot, robot: {_word(made.type)}, config: {json.dumps(dict(made.config))}{extra}}}
 
 executors:
 {executors}
@@ -263,8 +265,8 @@ control: {{rate_hz: 100, stop: hold}}
 """
 
 
-def _leader_config(found: NewRobot) -> str:
-    text = json.dumps({**found.config, "id": found.leader})
+def _leader_config(made: NewRobot) -> str:
+    text = json.dumps({**made.config, "id": made.leader})
     return text.replace("FOLLOWER_PORT", "LEADER_PORT").replace(_PORT, "/dev/ttyACM1").replace("follower", "leader")
 
 
@@ -278,10 +280,10 @@ def write_robot(out: Path, type_: str, id_: str, units: Mapping[str, str]) -> Ne
     """
     if out.exists():
         raise HardwareError(f"{out} exists already, and is not overwritten")
-    found = describe_robot(type_, id_, units)
+    made = describe_robot(type_, id_, units)
     draft = out.with_name(f".{out.stem}.{uuid4().hex}.yaml")
     try:
-        draft.write_text(robot_yaml(found), encoding="utf-8")
+        draft.write_text(robot_yaml(made), encoding="utf-8")
         load_config(draft)
         draft.rename(out)
     except ConfigError as error:
@@ -290,4 +292,4 @@ def write_robot(out: Path, type_: str, id_: str, units: Mapping[str, str]) -> Ne
         raise HardwareError(f"{out} cannot be written: {error.strerror}") from error
     finally:
         draft.unlink(missing_ok=True)
-    return found
+    return made

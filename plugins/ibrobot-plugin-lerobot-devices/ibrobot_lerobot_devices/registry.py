@@ -54,29 +54,29 @@ def registry() -> Mapping[str, Any]:
 def _registry(key: str) -> Mapping[str, Any]:
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ibrobot" / f"lerobot-{key}.json"
     try:
-        found: Mapping[str, Any] = json.loads(cache.read_text(encoding="utf-8"))
+        devices: Mapping[str, Any] = json.loads(cache.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         # Packages of others may use torch.
         link = DeviceLink("describe", "LeRobot", {}, torch=bool(third_parties(distributions())))
         try:
-            found = link.start(_TIMEOUT_S)
+            devices = link.start(_TIMEOUT_S)
         finally:
             link.end()
         try:
             cache.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(cache, json.dumps(found).encode())
+            replace_file(cache, json.dumps(devices).encode())
         except OSError:
             pass  # it is read again the next time
-    return found
+    return devices
 
 
 def _installed() -> str:
     """A fingerprint of LeRobot and the packages that add to it, with their versions."""
     names = {"lerobot", *third_parties(distributions())}
-    found = sorted(
+    installed = sorted(
         (_module(each), each.version, str(each.locate_file(""))) for each in distributions() if _module(each) in names
     )
-    return hashlib.sha256(json.dumps(found).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(installed).encode()).hexdigest()[:16]
 
 
 def third_parties(installed: Iterable[Distribution]) -> list[str]:

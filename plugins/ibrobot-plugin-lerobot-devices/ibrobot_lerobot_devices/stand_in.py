@@ -46,9 +46,9 @@ class _Module(ModuleType):
     __version__ = "0"
 
     def __getattr__(self, name: str) -> Any:
-        found = _placeholder(name, self.__name__)
-        setattr(self, name, found)
-        return found
+        placeholder = _placeholder(name, self.__name__)
+        setattr(self, name, placeholder)
+        return placeholder
 
 
 class _Finder(MetaPathFinder, Loader):

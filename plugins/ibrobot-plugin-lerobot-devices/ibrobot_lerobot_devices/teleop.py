@@ -48,8 +48,8 @@ class LeRobotTeleop(Teleop):
                 "redirecting its input, or set deadman: none, so that the robot follows once the device is moved"
             )
         try:
-            found = self._link.start(options.start_timeout)
-            self._map(found)
+            answer = self._link.start(options.start_timeout)
+            self._map(answer)
         except (DeviceProblem, UnitProblem) as problem:
             self.disconnect()
             raise self._error(problem) from None
@@ -102,13 +102,13 @@ class LeRobotTeleop(Teleop):
         paused = self._approach.setpoint is None
         return f"PAUSED: {start[deadman]}" if paused else f"following the device{pause[deadman]}"
 
-    def _map(self, found: Mapping[str, Any]) -> None:
+    def _map(self, answer: Mapping[str, Any]) -> None:
         """Map the device's joints to the robot's.
 
         Raises:
             UnitProblem: if the device has no joint positions, or none of a joint of the robot.
         """
-        features, robot, options = found["action_features"], self._ctx.robot, self._options
+        features, robot, options = answer["action_features"], self._ctx.robot, self._options
         positions = bases(features, POSITION)
         if not positions:
             raise UnitProblem(
@@ -118,7 +118,7 @@ class LeRobotTeleop(Teleop):
         limits = dict(zip(robot.joint_names, zip(robot.lower, robot.upper, strict=True), strict=True))
         known = {options.joints.get(base, base) for base in positions}
         self._joints = tuple(joint for joint in robot.joint_names if joint in known) or robot.joint_names
-        mapped = map_joints(features, found["motors"], options.choices(), self._joints, limits)
+        mapped = map_joints(features, answer["motors"], options.choices(), self._joints, limits)
         self._names = [positions[each.feature] for each in mapped]
         self._factor, self._offset = columns(mapped)
         self._columns = robot.indices(self._joints)

@@ -103,7 +103,7 @@ def map_axes(
     """
     axes = driven(features)
     by_joint = {choices.joints.get(base, base): base for base in axes}
-    found = []
+    mapped = []
     for joint in wanted:
         if (base := by_joint.get(joint)) is None:
             continue
@@ -114,8 +114,8 @@ def map_axes(
                 "metres, radians or degrees, each a second"
             )
         turned = -1.0 if joint in choices.inverted else 1.0
-        found.append(Mapped(base, joint, unit, Scale(turned * _DRIVEN[unit])))
-    return found
+        mapped.append(Mapped(base, joint, unit, Scale(turned * _DRIVEN[unit])))
+    return mapped
 
 
 def map_joints(
@@ -139,7 +139,7 @@ def map_joints(
     """
     positions = bases(features, POSITION)
     by_joint = {choices.joints.get(base, base): base for base in positions}
-    found = []
+    joints = []
     for joint in wanted:
         base = by_joint.get(joint)
         if base is None:
@@ -154,8 +154,8 @@ def map_joints(
                 f"LeRobot does not say the unit of {base!r}: give it as units: {{{base}: UNIT}}, or {{'*': UNIT}} for "
                 f"all, with one of {', '.join(UNITS)}"
             )
-        found.append(Mapped(base, joint, unit, _scale(unit, motor, joint, choices, limits[joint])))
-    return found
+        joints.append(Mapped(base, joint, unit, _scale(unit, motor, joint, choices, limits[joint])))
+    return joints
 
 
 def _scale(unit: str, motor: Mapping[str, Any], joint: str, choices: Choices, limits: tuple[float, float]) -> Scale:

@@ -192,10 +192,10 @@ def _largest_difference(module: Any, inputs: Mapping[str, Any], file: Path) -> f
         drawn = {name: _like(value, 1 + i % 3, random) for name, value in inputs.items()}
         with torch.no_grad():
             expected = module(*drawn.values()).numpy()
-        [found] = session.run(None, {name: value.numpy() for name, value in drawn.items() if name in taken})
-        if found.shape != expected.shape:
-            raise PolicyError(f"{file.name}: ONNX Runtime returns shape {found.shape}, torch {expected.shape}")
-        largest = max(largest, float(np.abs(found - expected).max()))
+        [output] = session.run(None, {name: value.numpy() for name, value in drawn.items() if name in taken})
+        if output.shape != expected.shape:
+            raise PolicyError(f"{file.name}: ONNX Runtime returns shape {output.shape}, torch {expected.shape}")
+        largest = max(largest, float(np.abs(output - expected).max()))
     if not largest <= _LARGEST_DIFFERENCE:
         raise PolicyError(
             f"{file.name}: ONNX Runtime's outputs differ from torch's by {largest:.2g}, must be at most "

@@ -21,33 +21,33 @@ def join_datasets(parts: Sequence[Path], out: Path) -> int:
             or only some are from `ibrobot convert`.
     """
     with ExitStack() as stack:
-        found = []
+        sources = []
         for part in parts:
             stack.enter_context(reading(part, "is being merged"))
-            found.append((part, layout.existing_dataset(part)))
+            sources.append((part, layout.existing_dataset(part)))
         if layout.open_dataset(out) is not None or (out.exists() and any(out.iterdir())):
             raise DatasetError(f"{out}: exists already; choose a new folder")
-        metadata = _joined(found)
+        metadata = _joined(sources)
         merge(out, parts, metadata)
-        return sum(each.info["total_episodes"] for _, each in found)
+        return sum(each.info["total_episodes"] for _, each in sources)
 
 
-def _joined(found: Sequence[tuple[Path, OnDisk]]) -> dict[str, Any]:
+def _joined(sources: Sequence[tuple[Path, OnDisk]]) -> dict[str, Any]:
     """The metadata of the whole, after checks that the parts fit."""
-    first, one = found[0]
-    for part, other in found[1:]:
+    first, one = sources[0]
+    for part, other in sources[1:]:
         if _is_ours(other) != _is_ours(one):
             ours, theirs = (part, first) if _is_ours(other) else (first, part)
             raise DatasetError(f"{theirs}: was not made by ibrobot convert, as {ours} was; they cannot be one dataset")
         _compare_settings(part, other, first, one)
     if not _is_ours(one):
         return {}
-    _check_copies(found)
+    _check_copies(sources)
     metadata = dict(one.metadata)
     for name in ("episodes", "runs"):
-        metadata[name] = [each for _, other in found for each in other.metadata.get(name, ())]
+        metadata[name] = [each for _, other in sources for each in other.metadata.get(name, ())]
     for name in ("calibrations", "configs"):
-        metadata[name] = {key: each for _, other in found for key, each in other.metadata.get(name, {}).items()}
+        metadata[name] = {key: each for _, other in sources for key, each in other.metadata.get(name, {}).items()}
     return metadata
 
 
@@ -77,10 +77,10 @@ def _compare_settings(part: Path, other: OnDisk, first: Path, one: OnDisk) -> No
             raise DatasetError(f"{part}: its {what} is {theirs}; that of {first} is {ours}")
 
 
-def _check_copies(found: Sequence[tuple[Path, OnDisk]]) -> None:
+def _check_copies(sources: Sequence[tuple[Path, OnDisk]]) -> None:
     """Refuse an episode that two datasets have, under whatever name, or in two states."""
     seen: dict[str, tuple[Path, str]] = {}
-    for part, other in found:
+    for part, other in sources:
         mine: dict[str, tuple[Path, str]] = {}
         for episode in other.metadata["episodes"]:
             for mark in _marks(episode):

@@ -185,12 +185,12 @@ class _Merge:
         """Check that a part is compatible; an empty dataset adopts the first part's description."""
         if not self._info:
             self._info = part.info if part.is_current else layout.current_info(part.info)
-        for name, found, wanted in (
+        for name, present, wanted in (
             ("fps", part.info["fps"], self._info["fps"]),
             ("features", _stored(part.info), _stored(self._info)),
         ):
-            if not _fits(found, wanted):
-                raise DatasetError(f"{part.root} does not fit: its {name} are {_difference(found, wanted)}")
+            if not _fits(present, wanted):
+                raise DatasetError(f"{part.root} does not fit: its {name} are {_difference(present, wanted)}")
 
     def _append(self, part: OnDisk) -> None:
         self._count_known(part)
@@ -381,17 +381,19 @@ def _stored(info: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     }
 
 
-def _fits(found: Any, wanted: Any) -> bool:
+def _fits(present: Any, wanted: Any) -> bool:
     """Whether what two datasets store is equal, as far as both say it."""
-    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
-        return found.keys() == wanted.keys() and all(_fits(found[key], wanted[key]) for key in found)
-    return found == wanted or None in (found, wanted)
+    if isinstance(present, Mapping) and isinstance(wanted, Mapping):
+        return present.keys() == wanted.keys() and all(_fits(present[key], wanted[key]) for key in present)
+    return present == wanted or None in (present, wanted)
 
 
-def _difference(found: Any, wanted: Any) -> str:
-    if not isinstance(found, Mapping):
-        return f"{found}, the others' {wanted}"
+def _difference(present: Any, wanted: Any) -> str:
+    if not isinstance(present, Mapping):
+        return f"{present}, the others' {wanted}"
     keys = [
-        key for key in {**wanted, **found} if not (key in found and key in wanted and _fits(found[key], wanted[key]))
+        key
+        for key in {**wanted, **present}
+        if not (key in present and key in wanted and _fits(present[key], wanted[key]))
     ]
-    return "; ".join(f"{key} {found.get(key)}, the others' {wanted.get(key)}" for key in keys)
+    return "; ".join(f"{key} {present.get(key)}, the others' {wanted.get(key)}" for key in keys)

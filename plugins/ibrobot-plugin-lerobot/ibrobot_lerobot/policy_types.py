@@ -96,8 +96,8 @@ def import_others(path: Path, kind: str) -> None:
     failed = _import_packages()
     known = PreTrainedConfig.get_known_choices()
     if kind not in known:
-        found = "; ".join(failed) or f"packages named {_PREFIX}* add types: is the one of {kind!r} installed here?"
-        raise PolicyError(f"{path}: LeRobot has no policy type {kind!r}; {found}")
+        reason = "; ".join(failed) or f"packages named {_PREFIX}* add types: is the one of {kind!r} installed here?"
+        raise PolicyError(f"{path}: LeRobot has no policy type {kind!r}; {reason}")
 
 
 def _import_packages() -> tuple[str, ...]:

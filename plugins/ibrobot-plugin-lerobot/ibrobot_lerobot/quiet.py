@@ -64,8 +64,8 @@ class _Held:
 
     def lines(self, error: str) -> list[str]:
         """The newest lines, each once, without those that the error repeats."""
-        found = [line.rpartition("\r")[2].strip() for line in "".join(self.text).splitlines()]
-        return [line for line in dict.fromkeys(found) if line and line not in error and error not in line][-_MOST:]
+        lines = [line.rpartition("\r")[2].strip() for line in "".join(self.text).splitlines()]
+        return [line for line in dict.fromkeys(lines) if line and line not in error and error not in line][-_MOST:]
 
 
 @contextmanager
@@ -109,5 +109,5 @@ def cause(error: BaseException) -> str:
 def _handlers() -> set[logging.Handler]:
     """The handlers of all loggers, ibrobot's own among them."""
     loggers = [each for each in logging.root.manager.loggerDict.values() if isinstance(each, logging.Logger)]
-    found = {handler for logger in (logging.root, *loggers) for handler in logger.handlers}
-    return found | ({logging.lastResort} if logging.lastResort is not None else set())
+    handlers = {handler for logger in (logging.root, *loggers) for handler in logger.handlers}
+    return handlers | ({logging.lastResort} if logging.lastResort is not None else set())

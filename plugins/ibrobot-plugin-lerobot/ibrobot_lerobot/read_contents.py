@@ -87,15 +87,15 @@ def _joined_stats(dataset: layout.OnDisk) -> dict[str, dict[str, Any]]:
 
 def _texts(dataset: layout.OnDisk, key: str) -> tuple[str, ...]:
     """The first different texts of a feature that has no numbers."""
-    found: dict[str, None] = {}
+    texts: dict[str, None] = {}
     for path in dataset.tables():
         with pq.ParquetFile(path) as file:
             for batch in file.iter_batches(1000, columns=[key]) if key in file.schema_arrow.names else ():
                 for value in batch.column(0).to_pylist():
-                    found.setdefault(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))
-                    if len(found) > _TEXTS:
-                        return (*list(found)[:_TEXTS], "…")
-    return tuple(found)
+                    texts.setdefault(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))
+                    if len(texts) > _TEXTS:
+                        return (*list(texts)[:_TEXTS], "…")
+    return tuple(texts)
 
 
 def _notes(dataset: layout.OnDisk) -> tuple[str, ...]:

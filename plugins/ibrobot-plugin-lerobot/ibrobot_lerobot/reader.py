@@ -134,28 +134,28 @@ class LeRobotReader(EpisodeReader):
 def _check_features(root: Path, features: Mapping[str, Feature], origin: Origin) -> None:
     """Check that the dataset has the contract's features, with the same elements in the same order."""
     for key, wanted in origin.contract.features().items():
-        found = features.get(key)
-        if found is None:
+        feature = features.get(key)
+        if feature is None:
             raise ContractError(
                 f"{root}: lacks {key} of the contract; available: {', '.join(features)}; "
                 f"the contract: {', '.join(origin.contract.features())}"
             )
-        shapes = zip(wanted.shape, found.shape, strict=False)
-        same = len(wanted.shape) == len(found.shape) and all(a in (-1, b) for a, b in shapes)
+        shapes = zip(wanted.shape, feature.shape, strict=False)
+        same = len(wanted.shape) == len(feature.shape) and all(a in (-1, b) for a, b in shapes)
         if same and (len(wanted.shape) > 1 or not wanted.names):
             continue
-        names = origin.names.get(key, found.names)
+        names = origin.names.get(key, feature.names)
         if same and _are_same(names, wanted.names):
             continue
         problem = f"{key} does not match the contract:"
-        if same and not (len(names) == len(set(names)) == found.shape[0]):
+        if same and not (len(names) == len(set(names)) == feature.shape[0]):
             problem = (
                 f"{key} does not name its elements, so their order is unknown; if you know it, state it with "
                 f"--names {key}={','.join(wanted.names[:2])},…:"
             )
         raise ContractError(
             f"{root}: {problem}\n"
-            f"   dataset: {found.shape} {', '.join(names)}\n"
+            f"   dataset: {feature.shape} {', '.join(names)}\n"
             f"  contract: {wanted.shape} {', '.join(wanted.names)}"
         )
 

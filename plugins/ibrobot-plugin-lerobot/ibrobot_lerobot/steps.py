@@ -129,10 +129,10 @@ def read_steps(checkpoint: Checkpoint, file: str) -> Steps:
                 raise PolicyError(f"{checkpoint.path / file}: step {name!r} cannot be read: {error!r}") from None
         elif not _does_nothing(name, config):
             others.append(name)
-    found = Steps(steps, others)
+    read = Steps(steps, others)
     if not others:  # others may normalise, too
-        _check_coverage(checkpoint, file, found)
-    return found
+        _check_coverage(checkpoint, file, read)
+    return read
 
 
 def _does_nothing(name: str, config: Mapping[str, Any]) -> bool:
@@ -183,15 +183,15 @@ def _features(
     checkpoint: Checkpoint, config: Mapping[str, Any], *, inverse: bool
 ) -> dict[str, tuple[str, Sequence[int]]]:
     """Key -> type and shape, of what a step converts: those of its features that the policy has, and any action."""
-    found: dict[str, tuple[str, Sequence[int]]] = {}
+    features: dict[str, tuple[str, Sequence[int]]] = {}
     action: Sequence[int] = (checkpoint.action_size,)
     for name, feature in config["features"].items():
         kind, shape = feature["type"], feature["shape"]  # e.g. evo1 pads them
         if kind == "ACTION":
             action = shape
         elif not inverse and name in checkpoint.inputs:
-            found[name] = (kind, shape)
-    return {**found, ACTION: ("ACTION", action)}
+            features[name] = (kind, shape)
+    return {**features, ACTION: ("ACTION", action)}
 
 
 def _check_coverage(checkpoint: Checkpoint, file: str, steps: Steps) -> None:

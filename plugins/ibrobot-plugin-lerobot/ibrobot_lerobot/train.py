@@ -73,11 +73,11 @@ def _report(output: Iterable[str], begun: int, steps: int) -> None:
     for line in output:
         for text in (text for mark, text in _PHASES.items() if mark in line):
             emit(TRAIN, Phase(text))
-        if (found := progress(line, reports, steps, begun)) is None:
+        if (event := progress(line, reports, steps, begun)) is None:
             echo(line.rstrip("\n"), err=True)
             continue
         reports += 1
-        step, loss, rate = found
+        step, loss, rate = event
         seconds, left_s = round(time.monotonic() - begin, 1), None
         if first is None:
             first = step, seconds
@@ -91,12 +91,12 @@ def trainings(options: TrainOptions) -> list[TrainOptions]:
     named = [
         [f"{key}={value}" for value in values.split(",")] for key, _, values in (e.partition("=") for e in options.each)
     ]
-    found = []
+    runs = []
     for chosen in itertools.product(*named):
         out = options.out / ",".join(chosen) if chosen else options.out
         passed = (*options.lerobot_options, *(f"--{each}" for each in chosen))
-        found.append(attrs.evolve(options, out=out, lerobot_options=passed, each=(), on=""))
-    return found
+        runs.append(attrs.evolve(options, out=out, lerobot_options=passed, each=(), on=""))
+    return runs
 
 
 def train_several(options: TrainOptions, *, events: bool) -> None:
@@ -140,10 +140,10 @@ def train_in_pool(options: TrainOptions, count: Callable[[int], None]) -> Path:
             for line in output:
                 file.write(line)
                 file.flush()
-                if found := progress(line, reports, steps, begun):
+                if event := progress(line, reports, steps, begun):
                     reports += 1
-                    count(found[0] - step)
-                    step = found[0]
+                    count(event[0] - step)
+                    step = event[0]
 
     code, newest = run_training(options, follow)
     if code or newest is None:

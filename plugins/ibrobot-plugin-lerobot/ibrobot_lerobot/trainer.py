@@ -59,8 +59,8 @@ def run_training(options: TrainOptions, follow: Follow | None) -> tuple[int, Tra
     from ibrobot_lerobot.merge import reading
 
     dataset, out, policy, steps = options.dataset, options.out, options.policy, options.steps
-    found = existing_dataset(dataset)
-    if not found.is_current:
+    source = existing_dataset(dataset)
+    if not source.is_current:
         raise DatasetError(
             f"{dataset}: LeRobot does not train on so old a version of its format; `ibrobot datasets merge {dataset} "
             f"--out {dataset}-v3` copies it to v3.0"
@@ -71,7 +71,7 @@ def run_training(options: TrainOptions, follow: Follow | None) -> tuple[int, Tra
     with reading(dataset, "is being trained on"), owned(out, "is being trained", DatasetError):
         newest = _begun(out, chosen)
         if newest is None:
-            if policy != SMALL or found.cameras:  # without cameras, the small ACT has nothing to download
+            if policy != SMALL or source.cameras:  # without cameras, the small ACT has nothing to download
                 kind = "act" if policy == SMALL else policy
                 check_policy(kind, options.lerobot_options, download=options.download, on_page=follow is not None)
             command = [program, *chosen]
@@ -143,12 +143,12 @@ def progress(line: str, reports: int, steps: int, begun: int = 0) -> tuple[int, 
         steps: steps of the training.
         begun: the step from which it continues.
     """
-    found = _PROGRESS.search(line)
-    if found is None:
+    match = _PROGRESS.search(line)
+    if match is None:
         return None
     every = max(1, steps // _REPORTS)
     step = min(steps, (begun // every + reports + 1) * every)
-    loss, rate = float(found["loss"]), found["lr"]
+    loss, rate = float(match["loss"]), match["lr"]
     return step, loss if math.isfinite(loss) else None, float(rate) if rate else None
 
 

@@ -33,10 +33,10 @@ def find_trainer() -> str:
         MissingDependency: if LeRobot is not installed.
     """
     beside = Path(sys.executable).with_name("lerobot-train")
-    found = str(beside) if beside.exists() else shutil.which("lerobot-train")
-    if found is None:
+    program = str(beside) if beside.exists() else shutil.which("lerobot-train")
+    if program is None:
         raise MissingDependency("LeRobot is not installed", remedy=f"pip install '{LEROBOT}'")
-    return found
+    return program
 
 
 def check_trainer() -> None:

@@ -33,29 +33,29 @@ def installed() -> str | None:
         return "of unknown version"
 
 
-def tested(found: str) -> str | None:
+def tested(version: str) -> str | None:
     """The tested version with the same minor one as `found`; None if there is none."""
     try:
-        minor = Version(found).release[:2]
+        minor = Version(version).release[:2]
     except InvalidVersion:
         return None
     return next((each for each in TESTED if Version(each).release[:2] == minor), None)
 
 
-def untested(found: str) -> str:
+def untested(version: str) -> str:
     """A sentence on a version that is not tested; empty for the others."""
-    if tested(found) is not None:
+    if tested(version) is not None:
         return ""
-    return f"LeRobot {found} is not one of the tested versions, {', '.join(TESTED)}"
+    return f"LeRobot {version} is not one of the tested versions, {', '.join(TESTED)}"
 
 
 def check() -> Check:
     """The line of `ibrobot doctor`."""
-    name, found = "LeRobot's version", installed()
-    if found is None:
+    name, version = "LeRobot's version", installed()
+    if version is None:
         return Check(name, False, "not installed; training and policies need it", INSTALL, matters=False)
-    alike = tested(found)
+    alike = tested(version)
     if alike is None:
-        return Check(name, False, f"{untested(found)}; it is tried nevertheless", INSTALL, matters=False)
+        return Check(name, False, f"{untested(version)}; it is tried nevertheless", INSTALL, matters=False)
     note = f"; {TESTED[alike]}" if TESTED[alike] else ""
-    return Check(name, True, f"{found}, tested with {alike}{note}")
+    return Check(name, True, f"{version}, tested with {alike}{note}")

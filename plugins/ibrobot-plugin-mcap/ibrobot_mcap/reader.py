@@ -142,18 +142,20 @@ class Rosbag2Reader(EpisodeReader):
 
         `messages` of all topics raises an error about them after it has yielded those of the others.
         """
-        found: dict[str, str] = {}
+        reasons: dict[str, str] = {}
         for topic, type_ in self.source.types.items():
             if not self.source.counts.get(topic, 0):
                 continue
             if (encoding := self._encodings.get(topic)) is not None:
-                found[topic] = f"its messages are serialised as {encoding!r}; ibrobot reads {CDR!r}, as ROS 2 writes it"
+                reasons[topic] = (
+                    f"its messages are serialised as {encoding!r}; ibrobot reads {CDR!r}, as ROS 2 writes it"
+                )
                 continue
             try:
                 self._codec.type_hash(type_)
             except CodecError as error:
-                found[topic] = str(error)
-        return found
+                reasons[topic] = str(error)
+        return reasons
 
     def _unreadable(self, topics: Mapping[str, str]) -> RecorderError:
         return RecorderError("\n".join(f"{self._path}: {topic} cannot be read: {why}" for topic, why in topics.items()))

@@ -65,11 +65,11 @@ class Source(ABC):
 
 def _by_topic(file: McapFile, counts: Mapping[int, int]) -> Counter[str]:
     """Numbers of messages by channel as those by topic, which may have several channels."""
-    found: Counter[str] = Counter()
+    by_topic: Counter[str] = Counter()
     for key, count in counts.items():
         if key in file.channels:
-            found[file.channels[key].topic] += count
-    return found
+            by_topic[file.channels[key].topic] += count
+    return by_topic
 
 
 class McapSource(Source):

@@ -32,14 +32,14 @@ def parents_of(model: mujoco.MjModel, joints: Sequence[str]) -> dict[str, str | 
     of_body: dict[int, list[str]] = {}
     for name in joints:
         of_body.setdefault(int(model.joint(name).bodyid[0]), []).append(name)
-    found: dict[str, str | None] = {}
+    parents: dict[str, str | None] = {}
     for body, names in of_body.items():
         above = int(model.body_parentid[body])
         while above and above not in of_body:
             above = int(model.body_parentid[above])
         for first, second in zip([of_body[above][-1] if above else None, *names], names, strict=False):
-            found[second] = first
-    return found
+            parents[second] = first
+    return parents
 
 
 def chains_of(parents: Mapping[str, str | None], grips: Sequence[str]) -> tuple[Chain, ...]:
@@ -94,15 +94,15 @@ def _names(parts: Sequence[Sequence[str]]) -> list[str]:
     if len(parts) == 1:
         return ["arm"]
     words = [set.intersection(*({*_words(name)} for name in part)) for part in parts]
-    found = []
+    names = []
     for i, part in enumerate(parts):
         others = {word for j, other in enumerate(parts) if j != i for name in other for word in _words(name)}
         own = [word for word in _words(part[0]) if word in words[i] and word not in others]
         named = next((word for word in own if not word.isdigit()), next(iter(own), ""))
-        found.append(f"arm_{named}" if named.isdigit() else named)
-    if not all(found) or len({*found}) < len(found) or {"body", "arm", "gripper"} & {*found}:
+        names.append(f"arm_{named}" if named.isdigit() else named)
+    if not all(names) or len({*names}) < len(names) or {"body", "arm", "gripper"} & {*names}:
         return [f"chain_{i}" for i in range(1, len(parts) + 1)]
-    return found
+    return names
 
 
 def _words(name: str) -> list[str]:

@@ -54,14 +54,14 @@ def usable() -> tuple[str, ...]:
     """The backends that work on this machine, best first."""
     if sys.platform == "darwin":
         return ("cgl",)
-    found = [
+    platforms = [
         backend
         for backend, groups in _LIBRARIES.items()
         if all(any(_loads(name) for name in group) for group in groups) and (backend != "egl" or _egl_has_a_driver())
     ]
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-        found.append("glfw")
-    return tuple(found)
+        platforms.append("glfw")
+    return tuple(platforms)
 
 
 def check_asked() -> str:
@@ -95,11 +95,11 @@ def choose() -> str:
     asked = check_asked()
     if asked:
         return asked
-    found = usable()
-    if not found:
+    platforms = usable()
+    if not platforms:
         missing = "no OpenGL that renders without a display, neither EGL with a driver nor OSMesa"
         raise MissingDependency(missing, apt=PACKAGES)
-    return found[0]
+    return platforms[0]
 
 
 def from_module(module: str, name: str) -> Callable[..., Any]:

@@ -67,8 +67,8 @@ class Meshes:
             ("Meshes in other units are converted to metres, as their files say: {}.", self._scaled),
             ("Flat meshes have no volume and are left out: {}.", self._flat),
         )
-        found = [text.format(several(list(dict.fromkeys(names)))) for text, names in texts if names]
-        return [*found, *(["The shapes are the convex hulls of the URDF's collision meshes."] if self._files else [])]
+        notes = [text.format(several(list(dict.fromkeys(names)))) for text, names in texts if names]
+        return [*notes, *(["The shapes are the convex hulls of the URDF's collision meshes."] if self._files else [])]
 
     def _find(self, shape: Shape, link: str) -> Path:
         name, at = unquote(shape.mesh), f"{shape.place}: link {link!r}"

@@ -86,9 +86,9 @@ def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]) -> tupl
     for joint in moving:
         if not joint.name:
             raise HardwareError("the MJCF has a joint without a name")
-        found = model.joint(joint.name)
-        lower, upper = map(float, found.range)
-        if not model.jnt_limited[found.id]:
+        mujoco_joint = model.joint(joint.name)
+        lower, upper = map(float, mujoco_joint.range)
+        if not model.jnt_limited[mujoco_joint.id]:
             lower, upper = -TURN_RAD, TURN_RAD
             turn = math.degrees(TURN_RAD) if spec.compiler.degree else TURN_RAD
             joint.limited, joint.range = True, [-turn, turn]

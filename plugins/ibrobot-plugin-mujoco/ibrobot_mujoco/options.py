@@ -66,8 +66,8 @@ class SceneThing:
         needed = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "height")}[self.shape]
         for key, value in (("size", self.size), ("radius", self.radius), ("height", self.height)):
             if (value is None) == (key in needed):
-                found = "missing" if value is None else "given"
-                raise ValueError(f"a {self.shape} takes {' and '.join(needed)}; {key} is {found}")
+                state = "missing" if value is None else "given"
+                raise ValueError(f"a {self.shape} takes {' and '.join(needed)}; {key} is {state}")
         if self.size is not None and min(self.size) <= 0:
             raise ValueError(f"size is {list(self.size)}, must be three lengths above 0")
 

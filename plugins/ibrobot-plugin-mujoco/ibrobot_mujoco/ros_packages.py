@@ -34,13 +34,13 @@ class Packages:
         """
         if name in self.folders:
             return self.folders[name]
-        found = next((each for each in self._candidates(name) if each.is_dir()), None)
-        if not name or found is None:
+        folder = next((each for each in self._candidates(name) if each.is_dir()), None)
+        if not name or folder is None:
             raise HardwareError(
                 f"no folder of the package {name!r} is above or beside {self.file}: "
                 f"give --package {name or 'NAME'}=FOLDER"
             )
-        return found
+        return folder
 
     def _candidates(self, name: str) -> Iterator[Path]:
         above = self.file.resolve().parents
@@ -57,10 +57,10 @@ class Packages:
 def _package_name(folder: Path) -> str:
     """The name in the `package.xml` of a folder; empty without one."""
     try:
-        found = _NAME.search((folder / "package.xml").read_text(encoding="utf-8", errors="replace"))
+        match = _NAME.search((folder / "package.xml").read_text(encoding="utf-8", errors="replace"))
     except OSError:
         return ""
-    return found[1] if found else ""
+    return match[1] if match else ""
 
 
 def _folders(folder: Path) -> list[Path]:

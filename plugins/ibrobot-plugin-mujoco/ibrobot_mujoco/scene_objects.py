@@ -25,13 +25,13 @@ def scene_objects(options: MujocoOptions, robot: Robot) -> tuple[SceneObject, ..
     signals = {name: (OBJECTS_TOPIC, POSE_SIZE * i) for i, name in enumerate(free)}
     signals |= {name: (SCENE_TOPIC, first) for name, first in scene.poses.items()}
     robots = bodies_of(model, robot.joint_names)
-    found = []
+    objects = []
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])
         if body not in robots and (model.geom_contype[geom] or model.geom_conaffinity[geom]):
             topic, first = signals.get(model.body(body).name, ("", 0))
-            found.append(_object(model, physics, geom, topic, first))
-    return tuple(found)
+            objects.append(_object(model, physics, geom, topic, first))
+    return tuple(objects)
 
 
 def _object(model: mujoco.MjModel, physics: mujoco.MjData, geom: int, topic: str, first: int) -> SceneObject:

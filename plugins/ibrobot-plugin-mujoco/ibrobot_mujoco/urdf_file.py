@@ -176,12 +176,12 @@ class _Reader:
             raise root.error(
                 "has no <link>; a xacro file that only defines macros is included by another one: give that"
             )
-        found = {name: (each, self._joint(name, each, links)) for name, each in _named(root, "joint").items()}
-        joints = self._tree(links, found, root)
+        by_name = {name: (each, self._joint(name, each, links)) for name, each in _named(root, "joint").items()}
+        joints = self._tree(links, by_name, root)
         top = next(name for name in links if name not in joints)
         if "world" in links and top != "world":
             raise HardwareError(f"{links['world'].place}: the link 'world' must be the one without a parent joint")
-        self._mimics(joints, found)
+        self._mimics(joints, by_name)
         for joint in joints.values():
             if joint.type in ("floating", "planar") and joint.parent != top:
                 raise HardwareError(
@@ -273,11 +273,11 @@ class _Reader:
         return UrdfJoint(name, type_, place, ends[0], ends[1], xyz, rpy, direction, limits, effort, velocity, mimic)
 
     def _tree(
-        self, links: Mapping[str, Link], found: Mapping[str, tuple[XmlElement, UrdfJoint]], root: XmlElement
+        self, links: Mapping[str, Link], by_name: Mapping[str, tuple[XmlElement, UrdfJoint]], root: XmlElement
     ) -> dict[str, UrdfJoint]:
         """The joints by child link, parents first."""
         above: dict[str, UrdfJoint] = {}
-        for element, joint in found.values():
+        for element, joint in by_name.values():
             if joint.child in above:
                 first = above[joint.child].name
                 raise element.error(
@@ -292,7 +292,7 @@ class _Reader:
                 "joints"
             )
         if not tops:
-            raise root.error(f"each link has a parent, so the joints form a circle: {several(list(found))}")
+            raise root.error(f"each link has a parent, so the joints form a circle: {several(list(by_name))}")
         below: dict[str, list[UrdfJoint]] = {}
         for joint in above.values():
             below.setdefault(joint.parent, []).append(joint)
@@ -306,9 +306,9 @@ class _Reader:
             raise root.error(f"joints form a circle: {several(circle)}")
         return ordered
 
-    def _mimics(self, joints: dict[str, UrdfJoint], found: Mapping[str, tuple[XmlElement, UrdfJoint]]) -> None:
+    def _mimics(self, joints: dict[str, UrdfJoint], by_name: Mapping[str, tuple[XmlElement, UrdfJoint]]) -> None:
         """Let joints that mimic follow one that mimics none."""
-        names = {name: joint for name, (_, joint) in found.items()}
+        names = {name: joint for name, (_, joint) in by_name.items()}
         for child, joint in joints.items():
             mimic, passed = joint.mimic, [joint.name]
             if joint.type in _STILL:
@@ -320,9 +320,9 @@ class _Reader:
                     reason = (
                         "which is fixed" if leader else f"unknown{did_you_mean(mimic.joint, list(names), 'it has')}"
                     )
-                    raise found[joint.name][0].error(f"joint {joint.name!r} mimics {mimic.joint!r}, {reason}")
+                    raise by_name[joint.name][0].error(f"joint {joint.name!r} mimics {mimic.joint!r}, {reason}")
                 if leader.name in passed:
-                    raise found[joint.name][0].error(f"joint {joint.name!r} mimics itself: {' -> '.join(passed)}")
+                    raise by_name[joint.name][0].error(f"joint {joint.name!r} mimics itself: {' -> '.join(passed)}")
                 passed.append(leader.name)
                 joints[child] = attrs.evolve(joint, mimic=mimic)
                 if leader.mimic is None:
@@ -332,7 +332,7 @@ class _Reader:
 
 
 def _named(root: XmlElement, tag: str) -> dict[str, XmlElement]:
-    found: dict[str, XmlElement] = {}
+    by_name: dict[str, XmlElement] = {}
     for each in root.children:
         if each.tag != tag:
             continue
@@ -343,10 +343,10 @@ def _named(root: XmlElement, tag: str) -> dict[str, XmlElement]:
             raise each.error(f"<{tag}>: its name has characters that cannot be printed: {name!r}")
         if "${" in name:
             raise each.error(f"<{tag}>: its name, {name!r}, has ${{, which begins a variable in a robot YAML")
-        if name in found:
-            raise each.error(f"a second {tag} named {name!r}; the first is in line {found[name].line}")
-        found[name] = each
-    return found
+        if name in by_name:
+            raise each.error(f"a second {tag} named {name!r}; the first is in line {by_name[name].line}")
+        by_name[name] = each
+    return by_name
 
 
 def _child(element: XmlElement, tag: str) -> XmlElement | None:
@@ -354,11 +354,11 @@ def _child(element: XmlElement, tag: str) -> XmlElement | None:
 
 
 def _numbers(element: XmlElement, name: str, default: str, count: int) -> tuple[float, ...]:
-    found = tuple(element.numbers(name, default, count))
-    for value in found:
+    numbers = tuple(element.numbers(name, default, count))
+    for value in numbers:
         if abs(value) > _MOST:
             raise element.error(f"{name} is {value:g}, must be within -{_MOST:g} to {_MOST:g}")
-    return found
+    return numbers
 
 
 def _origin(element: XmlElement) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -175,9 +175,9 @@ def _bodies(robot: Urdf, meshes: Meshes, notes: list[str]) -> mujoco.MjSpec:
 
 def _quaternion(rpy: Sequence[float]) -> Pose:
     """Roll, pitch and yaw about fixed axes as a quaternion wxyz, shape (4,)."""
-    found = np.zeros(4)
-    mujoco.mju_euler2Quat(found, np.array(rpy), "XYZ")
-    return found
+    quaternion = np.zeros(4)
+    mujoco.mju_euler2Quat(quaternion, np.array(rpy), "XYZ")
+    return quaternion
 
 
 def _shapes(spec: mujoco.MjSpec, body: mujoco.MjsBody, link: Link, meshes: Meshes) -> bool:
@@ -252,11 +252,11 @@ def _moves(name: str, robot: Urdf, moving: set[str]) -> bool:
 
 def _rigid(name: str, robot: Urdf, moving: set[str]) -> set[str]:
     """The links that are one solid with a link and those below it."""
-    found = {name}
+    rigid = {name}
     for child, joint in robot.joints.items():  # parents come first
-        if joint.parent in found and child not in moving:
-            found.add(child)
-    return found
+        if joint.parent in rigid and child not in moving:
+            rigid.add(child)
+    return rigid
 
 
 def _weigh(body: mujoco.MjsBody, mass: float, centre: Sequence[float]) -> None:

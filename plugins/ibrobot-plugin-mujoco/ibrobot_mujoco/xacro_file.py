@@ -42,7 +42,7 @@ def expand_xacro(path: Path, packages: Packages, arguments: Mapping[str, str]) -
             text: str = xacro.process_file(str(path), mappings=dict(arguments)).toxml()
         except Exception as fault:  # xacro evaluates expressions in Python, which can raise anything
             raise _error(fault, path, files) from fault
-    known = sorted({name for each in files for found in _ARGUMENT.findall(_text(each)) for name in found if name})
+    known = sorted({name for each in files for groups in _ARGUMENT.findall(_text(each)) for name in groups if name})
     for name in arguments:
         if name not in known:
             raise HardwareError(f"{path} has no argument {name!r}{did_you_mean(name, known, 'it has')}")
@@ -55,12 +55,12 @@ def _patched(xacro: Any, packages: Packages, files: list[Path]) -> Iterator[None
     from xacro import substitution_args
 
     def parse(document: Any, filename: str | None = None) -> Any:
-        found = original(document, filename)
+        parsed = original(document, filename)
         if filename is not None:
             file = Path(os.path.abspath(filename))
             files.append(file)
-            _stamp(found, file)
-        return found
+            _stamp(parsed, file)
+        return parsed
 
     def find(package: str) -> str:
         return str(packages.find(package))
@@ -126,14 +126,14 @@ def _causes(fault: BaseException | None) -> Iterator[BaseException]:
 
 def _place(traceback: TracebackType | None) -> str:
     """The place of the innermost element that xacro was at."""
-    found = ""
+    place = ""
     while traceback is not None:
         for name in ("node", "elt", "elem"):
             element = traceback.tb_frame.f_locals.get(name)
             if isinstance(element, Element):
-                found = vars(element).get("ibrobot_place") or element.getAttribute(PLACE) or found
+                place = vars(element).get("ibrobot_place") or element.getAttribute(PLACE) or place
         traceback = traceback.tb_next
-    return found
+    return place
 
 
 def _open_file(path: Path) -> str:

@@ -112,8 +112,8 @@ class RayPool(Pool):
 
     def _resources(self) -> Mapping[str, float]:
         resources: Any = ray.cluster_resources  # without types
-        found: Mapping[str, float] = resources()
-        return found
+        available: Mapping[str, float] = resources()
+        return available
 
     @override
     def run[R](self, jobs: Iterable[Job[R]], watch: Callable[[int], None] = lambda count: None) -> Generator[Done[R]]:
@@ -164,7 +164,7 @@ class RayPool(Pool):
 def _outcome(reference: Any) -> tuple[int, tuple[Any, IbrobotError | None]]:
     """Progress and outcome of a job that Ray has done, or given up."""
     try:
-        found: tuple[int, tuple[Any, IbrobotError | None]] = ray.get(reference)
+        outcome: tuple[int, tuple[Any, IbrobotError | None]] = ray.get(reference)
     except ray.exceptions.RayTaskError as error:  # before the job began
         found_ip = re.search(r"ip=([^,)\s]+)", str(error))
         machine = f"machine {found_ip[1]}" if found_ip else "a machine"
@@ -173,7 +173,7 @@ def _outcome(reference: Any) -> tuple[int, tuple[Any, IbrobotError | None]]:
         lines = str(error).strip().splitlines() or [""]
         reason = f"its process was lost {RETRIES + 1} times: {type(error).__name__}: {lines[0]}"
         return 0, (None, ComponentFailed(reason))
-    return found
+    return outcome
 
 
 @contextmanager

@@ -25,8 +25,8 @@ def checks() -> Iterator[Check]:
         interpreter = find_interpreter(options)
         node = NodeProcess(options, "ibrobot_doctor", probe=True)
     except (MissingDependency, ComponentFailed) as error:
-        found = error.missing if isinstance(error, MissingDependency) else str(error)
-        yield Check("ros", False, found, REMEDY, matters=False)
+        problem = error.missing if isinstance(error, MissingDependency) else str(error)
+        yield Check("ros", False, problem, REMEDY, matters=False)
         return
     node.end()
     yield Check("ros", True, f"{node.hello}, rclpy {node.hello.rclpy} ({interpreter.found})")

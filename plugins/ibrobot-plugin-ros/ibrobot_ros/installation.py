@@ -47,23 +47,23 @@ def find_interpreter(options: RosInstallation) -> Interpreter:
             raise MissingDependency(f"ros.setup: no such file: {options.setup}", remedy=REMEDY)
         return _sourced(options.setup, options.python or "python3", "ros.setup")
     if options.python is not None:
-        found = shutil.which(options.python)
-        if found is None:
+        python = shutil.which(options.python)
+        if python is None:
             raise MissingDependency(f"ros.python: no such program: {options.python}", remedy=REMEDY)
-        return Interpreter((found,), "ros.python", beside(found))
+        return Interpreter((python,), "ros.python", beside(python))
     if find_spec("rclpy") is not None:
         return Interpreter((sys.executable,), "the interpreter of ibrobot", beside(sys.executable))
-    if os.environ.get("AMENT_PREFIX_PATH") and (found := shutil.which("python3")) is not None:
-        return Interpreter((found,), "the sourced ROS")
+    if os.environ.get("AMENT_PREFIX_PATH") and (python := shutil.which("python3")) is not None:
+        return Interpreter((python,), "the sourced ROS")
     for setup in sorted(DISTROS.glob("*/setup.bash"), key=lambda path: path.parent.name != PREFERRED):
         return _sourced(setup, "python3", str(setup))
     raise MissingDependency("no ROS 2 was found", remedy=REMEDY)
 
 
-def _sourced(setup: Path, python: str, found: str) -> Interpreter:
+def _sourced(setup: Path, python: str, program: str) -> Interpreter:
     """The interpreter of an environment that a script sets up."""
     script = 'set +u; . "$0" && exec "$@"'
-    return Interpreter(("bash", "-c", script, str(setup), python), found)
+    return Interpreter(("bash", "-c", script, str(setup), python), program)
 
 
 def beside(python: str) -> dict[str, str]:
@@ -72,25 +72,25 @@ def beside(python: str) -> dict[str, str]:
     prefix = Path(python).absolute().parent.parent
     if not (prefix / "share/ament_index").is_dir():
         return {}
-    found = {}
+    variables = {}
     for name, folder in (("AMENT_PREFIX_PATH", prefix), ("LD_LIBRARY_PATH", prefix / "lib")):
         others = [each for each in os.environ.get(name, "").split(os.pathsep) if each and Path(each) != folder]
-        found[name] = os.pathsep.join([str(folder), *others])
-    return found
+        variables[name] = os.pathsep.join([str(folder), *others])
+    return variables
 
 
 def environment(options: RosInstallation, interpreter: Interpreter) -> dict[str, str]:
     """The environment of the node."""
-    found = {**os.environ, **interpreter.environment}
+    variables = {**os.environ, **interpreter.environment}
     if options.domain is not None:
-        found["ROS_DOMAIN_ID"] = str(options.domain)
+        variables["ROS_DOMAIN_ID"] = str(options.domain)
     if options.discovery != "system_default":
-        found["ROS_AUTOMATIC_DISCOVERY_RANGE"] = options.discovery.upper()
-        found.pop("ROS_LOCALHOST_ONLY", None)
+        variables["ROS_AUTOMATIC_DISCOVERY_RANGE"] = options.discovery.upper()
+        variables.pop("ROS_LOCALHOST_ONLY", None)
         if options.discovery == "localhost":
-            found.pop("ROS_STATIC_PEERS", None)
+            variables.pop("ROS_STATIC_PEERS", None)
     if options.rmw is not None:
-        found["RMW_IMPLEMENTATION"] = options.rmw
-    if not any(name in found for name in (*_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")):
-        found |= dict.fromkeys(_PROFILES, str(Path(__file__).with_name("fast_dds.xml")))
-    return found
+        variables["RMW_IMPLEMENTATION"] = options.rmw
+    if not any(name in variables for name in (*_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")):
+        variables |= dict.fromkeys(_PROFILES, str(Path(__file__).with_name("fast_dds.xml")))
+    return variables

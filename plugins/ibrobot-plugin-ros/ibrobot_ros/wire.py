@@ -133,7 +133,7 @@ class Wire:
         return self._frames()
 
     def _frames(self) -> list[Frame]:
-        found: list[Frame] = []
+        frames: list[Frame] = []
         begin = 0
         while len(self._received) - begin >= _SIZES.size:
             head, body = _SIZES.unpack_from(self._received, begin)
@@ -144,7 +144,7 @@ class Wire:
             if len(self._received) < middle + body:
                 break
             text = bytes(self._received[begin + _SIZES.size : middle])
-            found.append((json.loads(text), bytes(self._received[middle : middle + body])))
+            frames.append((json.loads(text), bytes(self._received[middle : middle + body])))
             begin = middle + body
         del self._received[:begin]
-        return found
+        return frames

@@ -311,8 +311,8 @@ def _transport_type(path: Path, overrides: Sequence[str]) -> str:
     """The type in the `transport` section, read before any checks; empty if there is none."""
     document = read_document(path)
     apply_overrides(document, overrides)
-    found = str(document.get("transport", "type") or "")
-    return "" if found == "local" else found
+    type_name = str(document.get("transport", "type") or "")
+    return "" if type_name == "local" else type_name
 
 
 def _listening(registry: Registry, transport: str, endpoints: Sequence[str], section: str = "") -> list[str]:

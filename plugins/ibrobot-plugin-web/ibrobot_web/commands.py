@@ -162,12 +162,12 @@ class Commands:
 
 def _waiting[T](waiting: queue.SimpleQueue[T]) -> list[T]:
     """All items of a queue."""
-    found = []
+    commands = []
     while True:
         try:
-            found.append(waiting.get_nowait())
+            commands.append(waiting.get_nowait())
         except queue.Empty:
-            return found
+            return commands
 
 
 def _jog(session: RunView, sent: Sent[messages.Jog]) -> None:

@@ -53,11 +53,11 @@ class SceneObjects:
     def _placed(self, thing: SceneObject) -> dict[str, Any]:
         vector = self._newest.get(thing.topic)
         place = vector[thing.first : thing.first + _POSE_SIZE] if vector is not None else ()
-        found = place_of(thing)
+        pose = place_of(thing)
         if len(place) == _POSE_SIZE:
-            found["pos"] = [round(float(each), 4) for each in place[:3]]
-            found["quat"] = [round(float(each), 3) for each in place[3:]]
-        return found
+            pose["pos"] = [round(float(each), 4) for each in place[:3]]
+            pose["quat"] = [round(float(each), 3) for each in place[3:]]
+        return pose
 
 
 def place_of(thing: SceneObject) -> dict[str, Any]:
@@ -96,12 +96,12 @@ def simulated_objects(config: RobotConfig, registry: Registry) -> list[SceneObje
 
 def mounts(peripherals: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The mounts of sensors as JSON, for `make_scene`: parents may be frames of other mounts."""
-    found = []
+    cameras = []
     for name, each in peripherals.items():
         if (mount := each.transform) is not None:
-            found.append({
+            cameras.append({
                 "name": name, "camera": each.kind == "camera", "frame": mount.frame or f"{name}_frame",
                 "parent": mount.parent, "xyz": list(mount.xyz), "rpy": list(mount.rpy or (0.0, 0.0, 0.0)),
                 "quaternion": list(mount.quaternion) if mount.quaternion is not None else None,
             })  # fmt: skip
-    return found
+    return cameras

@@ -47,18 +47,18 @@ def to_payload(message: Message) -> bytes | None:
 
 def _rgb(message: Image) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     """The pixels, shape (H, W, 3), RGB; depth from white (near) to black."""
-    found: Any = pixels(message)
+    array: Any = pixels(message)
     match message.encoding:
         case "rgb8" | "rgba8":
-            shown = found[..., :3]
+            shown = array[..., :3]
         case "bgr8" | "bgra8":
-            shown = found[..., 2::-1]
+            shown = array[..., 2::-1]
         case "mono8":
-            shown = found.repeat(3, axis=2)
+            shown = array.repeat(3, axis=2)
         case "mono16":
-            shown = (found >> 8).repeat(3, axis=2)
+            shown = (array >> 8).repeat(3, axis=2)
         case _:
-            metres = found * (1e-3 if message.encoding == "16UC1" else 1.0)
+            metres = array * (1e-3 if message.encoding == "16UC1" else 1.0)
             near = np.where(np.isfinite(metres) & (metres > 0), 1.0 - metres / _DEPTH_M, 0.0)
             shown = (255 * np.clip(near, 0.0, 1.0)).repeat(3, axis=2)
     return np.ascontiguousarray(shown, dtype=np.uint8)

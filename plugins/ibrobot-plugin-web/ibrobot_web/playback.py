@@ -62,8 +62,8 @@ class _Stream:
             self.current, self.following = None, next(self.items, None)
         while self.following is not None and self.following.received_ns <= stamp_ns:
             self.current, self.following = self.following, next(self.items, None)
-        found = self.current
-        return found if found is not None and found.received_ns >= stamp_ns - _BACK_NS else None
+        newest = self.current
+        return newest if newest is not None and newest.received_ns >= stamp_ns - _BACK_NS else None
 
 
 class Playback:
@@ -156,8 +156,8 @@ class Playback:
                 self._streams[topic] = _Stream(installed_plugins().open_episode(self._path))
             stream = self._streams[topic]
         with stream.lock:
-            found = stream.at(topic, self.summary.start_ns + round(at_s * NS_PER_S))
-        return to_picture(found.message) if found is not None else None
+            message = stream.at(topic, self.summary.start_ns + round(at_s * NS_PER_S))
+        return to_picture(message.message) if message is not None else None
 
     def description(self, find: Callable[[str], Path]) -> dict[str, Any]:
         """The robot's files, as `make_scene` takes them.
@@ -169,9 +169,9 @@ class Playback:
             IbrobotError: if the episode does not say which robot it is of, or a file is missing.
         """
         try:
-            found = json.loads(self.summary.metadata["config"])["robot"]["description"]
-            texts = {kind: found[kind] for kind in ("mjcf", "urdf") if isinstance(found.get(kind), str)}
-            tip, arms = str(found.get("tip", "")), dict(found.get("arms") or {})
+            description = json.loads(self.summary.metadata["config"])["robot"]["description"]
+            texts = {kind: description[kind] for kind in ("mjcf", "urdf") if isinstance(description.get(kind), str)}
+            tip, arms = str(description.get("tip", "")), dict(description.get("arms") or {})
         except (KeyError, TypeError, ValueError, AttributeError):
             raise IbrobotError("the episode does not contain the robot's model") from None
         return {"tip": tip, "arms": arms, **{kind: str(_file(text, find)) for kind, text in texts.items()}}
@@ -193,15 +193,15 @@ class Playback:
         if not moving:
             return []
         tracks = {topic: self._track(topic) for topic in moving}
-        found = []
+        objects = []
         for thing in things:
             placed = {**place_of(thing), "times": [], "poses": []}
             if thing.topic in moving:
                 times, vectors = tracks[thing.topic]
                 placed["times"] = times
                 placed["poses"] = [row[thing.first : thing.first + 7] for row in vectors]
-            found.append(placed)
-        return found
+            objects.append(placed)
+        return objects
 
     def _track(self, topic: str) -> tuple[list[float], list[list[float]]]:
         """The vectors of a topic over time, thinned."""
@@ -255,13 +255,13 @@ class Playback:
 
 def problems_of(summary: EpisodeSummary) -> list[str]:
     """The problems of an episode that its summary shows."""
-    found = [] if summary.finished else ["unfinished: its recorder was killed, or the file is cut off"]
+    problems = [] if summary.finished else ["unfinished: its recorder was killed, or the file is cut off"]
     for topic, known in summary.topics.items():
         if known.dropped:
-            found.append(f"{topic}: {known.dropped} messages were lost while recording")
+            problems.append(f"{topic}: {known.dropped} messages were lost while recording")
         if known.missing:
-            found.append(f"{topic}: {known.missing} recorded messages cannot be read")
-    return found
+            problems.append(f"{topic}: {known.missing} recorded messages cannot be read")
+    return problems
 
 
 def _file(text: str, find: Callable[[str], Path]) -> Path:

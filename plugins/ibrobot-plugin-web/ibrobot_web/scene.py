@@ -147,7 +147,7 @@ def _geom(model: Any, geom: int, meshes: list[int]) -> dict[str, Any]:
     kind = int(model.geom_type[geom])
     material = int(model.geom_matid[geom])
     rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
-    found: dict[str, Any] = {
+    drawn: dict[str, Any] = {
         "type": _SHAPES[kind],
         "size": model.geom_size[geom].tolist(),
         "pos": model.geom_pos[geom].tolist(),
@@ -155,8 +155,8 @@ def _geom(model: Any, geom: int, meshes: list[int]) -> dict[str, Any]:
         "rgba": [round(float(value), 4) for value in rgba],
     }
     if kind == _MESH:
-        found["mesh"] = meshes.index(int(model.geom_dataid[geom]))
-    return found
+        drawn["mesh"] = meshes.index(int(model.geom_dataid[geom]))
+    return drawn
 
 
 def _mesh(model: Any, mesh: int, grid: float) -> dict[str, str]:

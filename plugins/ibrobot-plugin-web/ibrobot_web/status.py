@@ -125,15 +125,15 @@ def _jogs(session: RunView) -> list[str]:
 
 def _panels(session: RunView) -> list[dict[str, Any]]:
     """The tables of plugins; the error of one takes the place of its rows."""
-    found = []
+    panels = []
     for panel in session.registry.panels:
         try:
             rows = [[str(cell) for cell in row] for row in panel.rows(session)]
         except Exception as error:  # noqa: BLE001 - contained: a plugin's table must not end the run
             rows = [[error_text(error)]]
         if rows:
-            found.append({"title": panel.title, "columns": list(panel.columns), "rows": rows})
-    return found
+            panels.append({"title": panel.title, "columns": list(panel.columns), "rows": rows})
+    return panels
 
 
 def plan_json(session: RunView, now_ns: int) -> dict[str, Any]:
@@ -160,12 +160,12 @@ def numbers_of(message: Message, joints: tuple[str, ...] = ()) -> dict[str, floa
     """
     if isinstance(message, JointState):
         joints = message.name
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
     for path, value in _leaves(message, ""):
-        if len(found) >= _LEAVES:
+        if len(numbers) >= _LEAVES:
             break
-        found[_by_name(path, joints)] = value
-    return found
+        numbers[_by_name(path, joints)] = value
+    return numbers
 
 
 def _by_name(path: str, joints: tuple[str, ...]) -> str:

@@ -290,10 +290,10 @@ class WebViewer(Viewer):
                 if len(self._samples) >= _SAMPLED:
                     break
                 self._samples[topic] = bus.subscribe(topic, 1)
-        found = {}
+        sampled = {}
         for topic, subscription in self._samples.items():
             arrived = subscription.drain()
             numbers = numbers_of(arrived[-1].message) if arrived else {}
             if numbers:
-                found[topic] = numbers
-        return found
+                sampled[topic] = numbers
+        return sampled

@@ -183,5 +183,5 @@ def _endpoints(tokens: Iterable[str], offers: str, uses: str) -> list[tuple[str,
                 counts[parts[9].replace("%", "/"), ros_type(parts[10]), parts[5]] += 1
             except TransportError:
                 continue
-    found = sorted({(name, type_name) for name, type_name, _ in counts})
-    return [(name, kind, counts[name, kind, offers], counts[name, kind, uses]) for name, kind in found]
+    endpoints = sorted({(name, type_name) for name, type_name, _ in counts})
+    return [(name, kind, counts[name, kind, offers], counts[name, kind, uses]) for name, kind in endpoints]

@@ -74,9 +74,9 @@ class SentGoal:
             raise
 
     def _feed(self, type_name: str, data: bytes) -> None:
-        found = from_cdr(self._kind.feedback, data)
-        if found["goal_id"] == self._id and self._take_feedback is not None:
-            self._take_feedback(found["feedback"])
+        feedback = from_cdr(self._kind.feedback, data)
+        if feedback["goal_id"] == self._id and self._take_feedback is not None:
+            self._take_feedback(feedback["feedback"])
 
     def result(self, timeout_s: float) -> Ended:
         """Wait for the end of the goal.

@@ -34,18 +34,18 @@ def installed_code(providers: Iterable[str]) -> dict[str, str]:
     Args:
         providers: names of packages, e.g. those that provide plugins. Their optional requirements count too.
     """
-    found = dict[str, str]()
+    versions = dict[str, str]()
     optional = {canonicalize_name(name) for name in providers}
     todo = [*optional, *OPTIONAL]
     while todo:
         name = canonicalize_name(todo.pop())
-        if name not in found and (package := _package(name, tuple(sys.path))) is not None:
+        if name not in versions and (package := _package(name, tuple(sys.path))) is not None:
             source = f" (source {_source_hash(package.folder)})" if package.folder else ""
-            found[name] = f"{package.version}{source}"
+            versions[name] = f"{package.version}{source}"
             todo += package.requirements
             if name in optional:
                 todo += package.optional
-    return {"Python": platform.python_version(), **dict(sorted(found.items()))}
+    return {"Python": platform.python_version(), **dict(sorted(versions.items()))}
 
 
 def differing_code(wanted: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
@@ -80,11 +80,11 @@ class _Package:
 def _package(name: str, path: tuple[str, ...]) -> _Package | None:
     """An installed package, as long as the import path is the same; None if it is not installed."""
     try:
-        found = distribution(name)
+        package = distribution(name)
     except PackageNotFoundError:
         return None
     # The head alone: the description below it is long, and parsing it is slow.
-    head = HeaderParser().parsestr((found.read_text("METADATA") or "").partition("\n\n")[0])
+    head = HeaderParser().parsestr((package.read_text("METADATA") or "").partition("\n\n")[0])
     required: dict[str, list[str]] = {}
     extras = ["", *head.get_all("Provides-Extra", ())]
     for text in head.get_all("Requires-Dist", ()):
@@ -96,7 +96,7 @@ def _package(name: str, path: tuple[str, ...]) -> _Package | None:
             if each.marker is None or each.marker.evaluate({"extra": extra}):
                 required.setdefault(extra, []).append(each.name)
     optional = tuple(dict.fromkeys(itertools.chain(*required.values())))
-    return _Package(*_origin(found), tuple(required.get("", ())), optional)
+    return _Package(*_origin(package), tuple(required.get("", ())), optional)
 
 
 def _origin(package: Distribution) -> tuple[str, Path | None]:

@@ -44,10 +44,10 @@ def parse_definition(type_name: str, text: str) -> dict[str, Any]:
     try:
         if not is_idl(text):
             return _of_services(get_types_from_msg(_with_event(type_name, text), type_name))
-        found: dict[str, Any] = {}
+        fields: dict[str, Any] = {}
         for part in text.split(_SEPARATOR)[1:]:
-            found.update(get_types_from_idl(part.partition("\n")[2]))
-        return found
+            fields.update(get_types_from_idl(part.partition("\n")[2]))
+        return fields
     except TypesysError as error:
         raise CodecError(f"{type_name}: its definition cannot be read: {error}") from error
 

@@ -195,12 +195,12 @@ class Actions:
     def cancel(self, wire: Wire, number: int) -> bool:
         """Cancel a goal for its client; returns whether it is canceled."""
         with self._lock:
-            found = self._goals.get(self._name(number))
-            if found is not None:
-                found.canceled = True
-        if found is None:
+            goal = self._goals.get(self._name(number))
+            if goal is not None:
+                goal.canceled = True
+        if goal is None:
             return self._calls.cancel(wire, number)
-        return self._stop(found.executor)
+        return self._stop(goal.executor)
 
     def abandon(self, why: str) -> None:
         """Cancel all goals, since nobody can cancel them any more: the robot holds."""

@@ -121,8 +121,8 @@ def from_cdr(type_name: str, data: bytes) -> dict[str, Any]:
         made = store.deserialize_cdr(data, type_name)
     except (SerdeError, struct.error, ValueError, IndexError, AssertionError) as error:
         raise CodecError(f"{type_name}: {len(data)} bytes cannot be decoded: {error}") from error
-    found: dict[str, Any] = _to_plain(store, type_name, made)
-    return found
+    plain: dict[str, Any] = _to_plain(store, type_name, made)
+    return plain
 
 
 def fields_of(type_name: str) -> list[str]:
@@ -140,9 +140,9 @@ def _service(name: str, request: str, response: str) -> ServiceType:
 
 def _text(name: str, kind: str, count: int) -> list[str]:
     """The parts of an interface's text; what it needs of its package is defined first."""
-    package, found, base = ([*name.split("/"), "", ""])[:3]
+    package, folder, base = ([*name.split("/"), "", ""])[:3]
     file = FOLDER / package / kind / f"{base}.{kind}"
-    if found != kind or not base.isidentifier() or not package.isidentifier() or not file.is_file():
+    if folder != kind or not base.isidentifier() or not package.isidentifier() or not file.is_file():
         raise CodecError(f"{name!r} is not defined here; defined are {', '.join(sorted(interfaces(kind)))}")
     messages = FOLDER / package / "msg"
     for each in messages.iterdir() if messages.is_dir() else ():
@@ -233,11 +233,11 @@ def _number(kind: str, value: Any, where: str) -> Any:
 
 
 def _to_plain(store: Typestore, type_name: str, made: Any) -> dict[str, Any]:
-    found = {}
+    plain = {}
     for name, desc in store.fielddefs[type_name][1]:
         if name != "structure_needs_at_least_one_member":
-            found[name] = _plain_field(store, desc, getattr(made, name))
-    return found
+            plain[name] = _plain_field(store, desc, getattr(made, name))
+    return plain
 
 
 def _plain_field(store: Typestore, desc: Any, value: Any) -> Any:

@@ -59,16 +59,16 @@ class Offers:
 
     def found(self) -> dict[str, Offer]:
         """The services that are served at present, by full name."""
-        found = {}
+        offers = {}
         for name, service in self._session.bus.services().items():
             if not self._is_chosen(name):
                 continue
             if name == SET_MODE.name:
                 for mode in self._session.config.control_modes:
-                    found[f"{name}/{mode}"] = Offer(TRIGGER, name, {"mode": mode})
+                    offers[f"{name}/{mode}"] = Offer(TRIGGER, name, {"mode": mode})
             elif (kind := ros_type(service)) is not None:
-                found[name] = Offer(kind[0], name, {}, kind[1], service.urgent)
-        named = {self._named(name): offer for name, offer in found.items()}
+                offers[name] = Offer(kind[0], name, {}, kind[1], service.urgent)
+        named = {self._named(name): offer for name, offer in offers.items()}
         return {name: offer for name, offer in named.items() if _NAME.fullmatch(name)}
 
     def answer(self, offer: Offer, request: Mapping[str, Any]) -> dict[str, Any]:
@@ -109,13 +109,13 @@ def time_of(stamp_ns: int) -> dict[str, int]:
 def with_ns(value: Any) -> Any:
     """A plain request of ROS as runs take them: a time `x` is `x_ns` [ns]."""
     if isinstance(value, Mapping):
-        found = {}
+        stamped = {}
         for name, each in value.items():
             if isinstance(each, Mapping) and set(each) == {"sec", "nanosec"}:
-                found[f"{name}_ns"] = each["sec"] * NS_PER_S + each["nanosec"]
+                stamped[f"{name}_ns"] = each["sec"] * NS_PER_S + each["nanosec"]
             else:
-                found[name] = with_ns(each)
-        return found
+                stamped[name] = with_ns(each)
+        return stamped
     return [with_ns(each) for each in value] if isinstance(value, list) else value
 
 

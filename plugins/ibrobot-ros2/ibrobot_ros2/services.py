@@ -98,24 +98,24 @@ def plain(value: Any) -> Any:
     """
     match value:
         case Enum():
-            found: Any = value.name
+            plain_value: Any = value.name
         case None | bool() | int() | float() | str():
-            found = value
+            plain_value = value
         case np.ndarray() | np.generic():
-            found = value.tolist()
+            plain_value = value.tolist()
         case Path():
-            found = str(value)
+            plain_value = str(value)
         case Mapping():
-            found = {str(key): plain(each) for key, each in value.items()}
+            plain_value = {str(key): plain(each) for key, each in value.items()}
         case list() | tuple():
-            found = [plain(each) for each in value]
+            plain_value = [plain(each) for each in value]
         case AbstractSet():
-            found = sorted(plain(each) for each in value)
+            plain_value = sorted(plain(each) for each in value)
         case _ if attrs.has(type(value)):
-            found = {name: plain(each) for name, each in attrs.asdict(value, recurse=False).items()}
+            plain_value = {name: plain(each) for name, each in attrs.asdict(value, recurse=False).items()}
         case _:
             raise CodecError(f"a {type(value).__name__} cannot be sent to another process")
-    return found
+    return plain_value
 
 
 def _bytes(value: Mapping[str, Any]) -> bytes:

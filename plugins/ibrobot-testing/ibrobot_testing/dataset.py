@@ -46,9 +46,9 @@ class DatasetSuite(Suite[DatasetWriter]):
             writer.add_frame(self.frame(i), "pick")
 
     def _check(self, root: Path, episodes: Sequence[Sequence[int]]) -> None:
-        found = self.read_back(root)
-        assert len(found) == len(episodes), f"{len(found)} episodes, not {len(episodes)}"
-        for values, numbers in zip(found, episodes, strict=True):
+        frames = self.read_back(root)
+        assert len(frames) == len(episodes), f"{len(frames)} episodes, not {len(episodes)}"
+        for values, numbers in zip(frames, episodes, strict=True):
             for key in self.features:
                 wanted = np.stack([self.frame(i)[key] for i in numbers])
                 np.testing.assert_array_equal(values[key], wanted, err_msg=key)

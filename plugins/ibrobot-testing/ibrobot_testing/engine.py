@@ -125,8 +125,8 @@ class EngineSuite(Suite[Engine]):
         ctx.model.policy.close()
 
 
-def _check_equal(found: Tensors, expected: Tensors) -> None:
-    assert set(found) == set(expected)
+def _check_equal(answer: Tensors, expected: Tensors) -> None:
+    assert set(answer) == set(expected)
     for name, array in expected.items():
-        assert found[name].dtype == array.dtype, f"{name} is {found[name].dtype}, not {array.dtype}"
-        np.testing.assert_array_equal(found[name], array, err_msg=name, strict=True)
+        assert answer[name].dtype == array.dtype, f"{name} is {answer[name].dtype}, not {array.dtype}"
+        np.testing.assert_array_equal(answer[name], array, err_msg=name, strict=True)

@@ -241,13 +241,13 @@ class HardwareSuite(Suite[Hardware]):
             for _ in range(3):
                 self.elapse(hardware, ctx, 0.5)
                 hardware.read()
-                found = hardware.health()
-                for condition in found:
+                conditions = hardware.health()
+                for condition in conditions:
                     assert condition.joint in hardware.joints, f"{condition.joint!r} is not a joint of this hardware"
                     assert condition.quantity
                     assert np.isfinite(condition.value), f"{condition.quantity} of {condition.joint} is not finite"
                     assert condition.joint in condition.message, f"{condition.message!r} does not name its joint"
-                keys = [(condition.joint, condition.quantity) for condition in found]
+                keys = [(condition.joint, condition.quantity) for condition in conditions]
                 assert len(set(keys)) == len(keys), f"two conditions of one quantity: {keys}"
 
     def test_relax_ends_with_the_next_write(self) -> None:

@@ -109,7 +109,7 @@ class _Found:
 
 def _open_files() -> dict[int, str]:
     """Descriptor -> its target; empty if the system does not provide it."""
-    found: dict[int, str] = {}
+    files: dict[int, str] = {}
     directory = Path("/proc/self/fd")
     for name in os.listdir(directory) if directory.exists() else ():
         try:
@@ -117,29 +117,29 @@ def _open_files() -> dict[int, str]:
         except FileNotFoundError:  # the one that listed the directory
             continue
         if not target.startswith(_SHARED):
-            found[int(name)] = target
-    return found
+            files[int(name)] = target
+    return files
 
 
 def _child_processes() -> dict[int, str]:
     """Process id -> command line of every child, including zombies."""
-    found: dict[int, str] = {}
+    processes: dict[int, str] = {}
     for children in Path("/proc/self/task").glob("*/children"):
         pids: list[str] = []
         with suppress(FileNotFoundError, ProcessLookupError):  # threads and processes end while this looks at them
             pids = children.read_text().split()
         for pid in pids:
             with suppress(FileNotFoundError, ProcessLookupError):
-                found[int(pid)] = Path(f"/proc/{pid}/cmdline").read_text(errors="replace").replace("\0", " ")
-    return found
+                processes[int(pid)] = Path(f"/proc/{pid}/cmdline").read_text(errors="replace").replace("\0", " ")
+    return processes
 
 
 def _describe(fd: int, target: str) -> tuple[Kind, str]:
     """Kind and description of an open descriptor: sockets by their port."""
     if target.startswith("socket:"):
-        with suppress(OSError), socket.socket(fileno=os.dup(fd)) as found:
-            if found.family in {socket.AF_INET, socket.AF_INET6} and found.getsockname()[1]:
-                host, port, *_ = found.getsockname()
+        with suppress(OSError), socket.socket(fileno=os.dup(fd)) as opened:
+            if opened.family in {socket.AF_INET, socket.AF_INET6} and opened.getsockname()[1]:
+                host, port, *_ = opened.getsockname()
                 return "port", f"port {port} on {host}"
     return "file", f"open file {fd}: {target}"
 

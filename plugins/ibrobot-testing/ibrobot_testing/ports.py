@@ -9,11 +9,11 @@ import socket
 
 def _reserve() -> socket.socket:
     """Bind a port without listening on it."""
-    found = socket.socket()
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    found.bind(("127.0.0.1", 0))
-    atexit.register(found.close)
-    return found
+    reserved = socket.socket()
+    reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    reserved.bind(("127.0.0.1", 0))
+    atexit.register(reserved.close)
+    return reserved
 
 
 # Here, so that no test opens them; far more than one test uses.

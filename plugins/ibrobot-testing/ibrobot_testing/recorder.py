@@ -135,8 +135,8 @@ class RecorderSuite(Suite[Recorder]):
             for topic, message in others.items():
                 recorder.write(topic, message, ctx.clock.now_ns())
             path = self._saved(recorder, self._end(ctx, "success"))
-        found = {topic: list(kept) for topic, kept in self.read_back(path).items() if kept}
-        assert found == {topic: [(ctx.clock.now_ns(), message)] for topic, message in others.items()}
+        by_topic = {topic: list(kept) for topic, kept in self.read_back(path).items() if kept}
+        assert by_topic == {topic: [(ctx.clock.now_ns(), message)] for topic, message in others.items()}
 
     def test_keeps_what_was_lost_before(self, tmp_path: Path) -> None:
         """The recording contains the counts of messages that did not reach the recorder."""
@@ -230,9 +230,9 @@ class RecorderSuite(Suite[Recorder]):
             records = self.records(ctx)
             self._write(recorder, records)
             shutil.copytree(tmp_path / "episode", tmp_path / "crashed")
-            found = list(self.read_back(tmp_path / "crashed")[self.topic])
+            messages = list(self.read_back(tmp_path / "crashed")[self.topic])
             kept = [r for r in records if r[0] <= records[-1][0] - self.max_loss_s * NS_PER_S]
-            assert found[: len(kept)] == kept
+            assert messages[: len(kept)] == kept
 
     def test_messages_are_taken_as_they_were(self, tmp_path: Path) -> None:
         """An array that changes after `write` does not change the recording."""

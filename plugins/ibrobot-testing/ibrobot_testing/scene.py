@@ -99,15 +99,15 @@ class SceneSuite[Spec, World](Suite[Scene[Spec, World]]):
         """Whatever happened before, and in whichever object, equal seeds give equal factors, states and looks."""
         scene, world = self.built()
         twin, other = self.built()
-        found: list[list[Vector]] = []
+        states: list[list[Vector]] = []
         for of, there, seeds in ((scene, world, (7, 8, 7)), (twin, other, (7,))):
             for seed in seeds:
                 factors = self.begin(of, there, seed)
                 if seed == 7:
-                    found.append([factors, self.observed(of, there), self.state(there).copy(), self.looks(there)])
+                    states.append([factors, self.observed(of, there), self.state(there).copy(), self.looks(there)])
                 self.advance(there, 0.1)
-        for again in found[1:]:
-            for a, b in zip(found[0], again, strict=True):
+        for again in states[1:]:
+            for a, b in zip(states[0], again, strict=True):
                 np.testing.assert_array_equal(a, b)
 
     def test_factors_stay_within_their_ranges(self) -> None:

@@ -21,7 +21,7 @@ def declared_services() -> dict[str, Service[Any, Any]]:
 
     It imports the modules that declare them.
     """
-    found: dict[str, Service[Any, Any]] = {}
+    services: dict[str, Service[Any, Any]] = {}
     names = {module.name for module in iter_modules() if module.name.startswith("ibrobot_")}
     for package in sorted(names - {"ibrobot_testing"}):
         for module in walk_packages(import_module(package).__path__, f"{package}."):
@@ -30,8 +30,8 @@ def declared_services() -> dict[str, Service[Any, Any]]:
             assert spec.origin is not None
             if _DECLARES.search(Path(spec.origin).read_text(encoding="utf-8")):
                 mine = vars(import_module(module.name)).values()
-                found |= {each.name: each for each in mine if isinstance(each, Service) and each.name}
-    return dict(sorted(found.items()))
+                services |= {each.name: each for each in mine if isinstance(each, Service) and each.name}
+    return dict(sorted(services.items()))
 
 
 @attrs.frozen(eq=False)

@@ -49,7 +49,7 @@ class Site:
 
     def entry_points(self) -> list[EntryPoint]:
         """The entry points of the added distributions only."""
-        return [entry for found in distributions(path=[str(self.folder)]) for entry in found.entry_points]
+        return [entry for distribution in distributions(path=[str(self.folder)]) for entry in distribution.entry_points]
 
 
 @contextmanager

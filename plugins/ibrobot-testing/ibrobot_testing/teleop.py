@@ -214,8 +214,8 @@ class TeleopSuite(Suite[Teleop]):
             operate(teleop, self._measure(ctx, pose))
             for event in (*self.events, *self.events):
                 self.press(teleop, event)
-                found = [each for _ in range(3) for each in operate(teleop, self._measure(ctx, pose)).events]
-                assert found == [event]
+                events = [each for _ in range(3) for each in operate(teleop, self._measure(ctx, pose)).events]
+                assert events == [event]
 
     def test_approach_arrives(self) -> None:
         """`approach` returns True within ten seconds of ticks; then the device begins where the robot is."""

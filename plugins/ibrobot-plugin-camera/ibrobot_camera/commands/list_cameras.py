@@ -19,15 +19,15 @@ def list_cameras(as_json: bool) -> None:
 
     It shows path, stable id, name, and formats, sizes and rates of each.
     """
-    found = v4l2.cameras()
+    connected = v4l2.cameras()
     if as_json:
-        echo(json.dumps([attrs.asdict(camera) for camera in found], indent=2))
+        echo(json.dumps([attrs.asdict(camera) for camera in connected], indent=2))
         return
-    if not found:
+    if not connected:
         echo("no camera: there is no /dev/video*; is it plugged in, and does `lsusb` show it?")
         return
     console = Screen()
-    for camera in found:
+    for camera in connected:
         console.print(styled(camera.path, "bold") + styled(f"  {camera.name}"))
         if camera.stable_id:
             console.print(f"  device: {camera.stable_id}", soft_wrap=True)

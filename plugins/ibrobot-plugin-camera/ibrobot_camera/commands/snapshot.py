@@ -37,7 +37,7 @@ def snapshot(source: str, output: Path | None, seconds: float) -> None:
         raise click.BadParameter(f"{output}: must end in .png or .jpg", param_hint="--output")
     with opened(source) as cameras, ThreadPoolExecutor(len(cameras)) as pool:
         watched = {name: pool.submit(_watch, name, camera.read, seconds) for name, camera in cameras.items()}
-        pictures = {name: found.result() for name, found in watched.items()}
+        pictures = {name: future.result() for name, future in watched.items()}
     for name, (image, rate_hz) in pictures.items():
         path = output if len(pictures) == 1 else output.with_stem(f"{output.stem}_{name}")
         with wrong_input():

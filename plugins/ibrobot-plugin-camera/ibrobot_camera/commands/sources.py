@@ -46,10 +46,10 @@ def _options(source: str) -> dict[str, OpenCvOptions]:
     if not source.endswith((".yaml", ".yml")):
         return {"camera": OpenCvOptions(device=source, strict=False)}
     config = load_config(find_config(source, registry), registry=registry)
-    found = {name: p.options for name, p in config.peripherals.items() if isinstance(p.options, OpenCvOptions)}
-    if not found:
+    by_name = {name: p.options for name, p in config.peripherals.items() if isinstance(p.options, OpenCvOptions)}
+    if not by_name:
         raise SensorError(f"{source}: has no camera of type opencv")
-    return found
+    return by_name
 
 
 def decoded(message: Image | CompressedImage) -> Image:
@@ -71,5 +71,5 @@ def pixels(image: Image) -> Pixels:
         return image.data.view(np.uint16).reshape(image.height, image.width)
     conversion = _TO_BGR[image.encoding]
     shape = (image.height, image.width) if image.encoding == "mono8" else (image.height, image.width, 3)
-    found = image.data.reshape(shape)
-    return found if conversion is None else np.asarray(cv2.cvtColor(found, conversion), dtype=np.uint8)
+    array = image.data.reshape(shape)
+    return array if conversion is None else np.asarray(cv2.cvtColor(array, conversion), dtype=np.uint8)

@@ -91,7 +91,7 @@ def calibrate_arm(
             measurement = Measurement(
                 bus, guide, joints, full_turn=turning, compared=compared, zero_at=zero_at, answers=answers or Answers()
             )
-            found = measurement.run()
+            measured = measurement.run()
         except BaseException:
             guide.say("Nothing was written. The torque is off, and the servos' calibration is unchanged.", warning=True)
             raise
@@ -100,11 +100,11 @@ def calibrate_arm(
         date = datetime.now(UTC).isoformat(timespec="seconds")
         if kept := backup(path):
             guide.say(f"the old file is kept: {kept}")
-        made = Calibration(found, robot=arm or adapter or Path(name).stem, date=date, adapter=adapter)
+        made = Calibration(measured, robot=arm or adapter or Path(name).stem, date=date, adapter=adapter)
         save_calibration(made, path, overwrite=True)
         guide.say(f"saved: {path}")
         guide.say(zero_text(made))
-        _write(bus, guide, found, name)
+        _write(bus, guide, measured, name)
     guide.say(f"written to servos {', '.join(str(joint.servo) for joint in joints)}")
 
 
@@ -136,14 +136,14 @@ def _prepare(bus: FeetechBus, guide: Guide, yes: bool) -> None:
     relax(bus, servos)
 
 
-def _write(bus: FeetechBus, guide: Guide, found: dict[str, JointCalibration], name: str) -> None:
+def _write(bus: FeetechBus, guide: Guide, measured: dict[str, JointCalibration], name: str) -> None:
     done: list[str] = []
     try:
-        for joint, numbers in found.items():
+        for joint, numbers in measured.items():
             write_eprom(bus, numbers.id, calibrated_registers(numbers))
             done.append(joint)
     except (IbrobotError, KeyboardInterrupt):
-        left = ", ".join(joint for joint in found if joint not in done)
+        left = ", ".join(joint for joint in measured if joint not in done)
         guide.say(
             f"The file is saved, but not all servos have it (not: {left}). "
             f"`ibrobot feetech check {bus.port.path} --name {name} --write` writes the rest.",

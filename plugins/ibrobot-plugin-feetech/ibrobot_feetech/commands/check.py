@@ -68,19 +68,19 @@ def check_arm(
     guide.say(zero_text(calibration))
     with opened(port, joints={joint.id: each for each, joint in calibration.joints.items()}) as bus:
         check_adapter(calibration, bus.port.path)
-        found = list(differences(bus, calibration))
-        if write and (wrong := [each for each in found if not each.remedy]):
-            _print(guide, found)
+        differing = list(differences(bus, calibration))
+        if write and (wrong := [each for each in differing if not each.remedy]):
+            _print(guide, differing)
             servos = sorted({each.servo for each in wrong})
             guide.say("The torque of these servos will be switched off, and the arm may fall: hold it.")
             if not (yes or guide.confirm(f"Write to servos {', '.join(map(str, servos))}?", flag="--yes")):
                 raise Declined
             for servo in servos:
                 write_eprom(bus, servo, {each.register: int(each.wanted) for each in wrong if each.servo == servo})
-            found = list(differences(bus, calibration))
-    if found:
-        _print(guide, found)
-    if any(each.matters for each in found):
+            differing = list(differences(bus, calibration))
+    if differing:
+        _print(guide, differing)
+    if any(each.matters for each in differing):
         return False
     guide.say(f"{len(calibration.joints)} servos match the calibration")
     return True
@@ -109,12 +109,12 @@ def differences(bus: FeetechBus, calibration: Calibration) -> Iterator[Differenc
             yield Difference(joint, servo, "present_voltage", measured, power.limits, power.remedy)
         versions[joint] = bus.firmware(servo)
         for register, value in {**calibrated_registers(numbers), "operating_mode": 0}.items():
-            if (found := bus.read_faulty(servo, register)) != value:
-                yield Difference(joint, servo, register, str(found), str(value), "")
+            if (stored := bus.read_faulty(servo, register)) != value:
+                yield Difference(joint, servo, register, str(stored), str(value), "")
         for register in _TUNING:
-            if (found := bus.read_faulty(servo, register)) != options[register].default:
+            if (stored := bus.read_faulty(servo, register)) != options[register].default:
                 default = str(options[register].default)
-                yield Difference(joint, servo, register, str(found), default, "set at each start", matters=False)
+                yield Difference(joint, servo, register, str(stored), default, "set at each start", matters=False)
     common = max(versions.values(), key=list(versions.values()).count, default="")
     for joint, version in versions.items():
         if version != common:
@@ -122,9 +122,9 @@ def differences(bus: FeetechBus, calibration: Calibration) -> Iterator[Differenc
             yield Difference(joint, servo, "firmware", version, common, "update the older servos")
 
 
-def _print(guide: Guide, found: list[Difference]) -> None:
+def _print(guide: Guide, wrong: list[Difference]) -> None:
     rows = [
         (str(each.servo), each.joint, each.register, each.found, each.wanted, each.remedy or "--write")
-        for each in found
+        for each in wrong
     ]
     guide.show((">id", "joint", "register", ">servo", ">file", "remedy"), rows)

@@ -84,12 +84,12 @@ def emulate(
         faults.silent, faults.blocked = set(silent), set(blocked)
         faults.overloaded, faults.disconnected = set(overloaded), set(disconnected)
         faults.errors = dict(errors)
-        found = _calibrate(emulator, calibration, joints, config.robot if config is not None else None)
+        calibrated = _calibrate(emulator, calibration, joints, config.robot if config is not None else None)
         echo(str(link) if link is not None else emulator.port)
         arm = None
         if config is not None:
-            assert found is not None
-            arm = _physics(config, found, emulator, seed)
+            assert calibrated is not None
+            arm = _physics(config, calibrated, emulator, seed)
             arm.start()
             stack.callback(arm.stop)
         _hurry()
@@ -162,7 +162,7 @@ def _calibrate(emulator: Emulator, name: str | None, joints: Sequence[str], robo
 def _ranges(joints: Sequence[str], robot: Robot | None) -> dict[str, JointCalibration]:
     """Ranges that match the joints' limits, centred on the turn; those of an SO-101 if no robot is given."""
     limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints} if robot is not None else {}
-    found = {}
+    ranges = {}
     for number, joint in enumerate(joints, 1):
         lower, upper = limits.get(joint) or next(ends for name, ends in SO101.items() if joint.endswith(name))
         if joint.endswith(_GRIPPER):  # anchored at its closed end, but centred on the turn as well
@@ -170,5 +170,5 @@ def _ranges(joints: Sequence[str], robot: Robot | None) -> dict[str, JointCalibr
             lower, upper = -half, half
         low = math.floor(MIDDLE_TICK + lower * TICKS_PER_RADIAN)
         high = math.ceil(MIDDLE_TICK + upper * TICKS_PER_RADIAN)
-        found[joint] = JointCalibration(number, 0, 0, max(0, low), min(TICKS_PER_TURN - 1, high))
-    return found
+        ranges[joint] = JointCalibration(number, 0, 0, max(0, low), min(TICKS_PER_TURN - 1, high))
+    return ranges

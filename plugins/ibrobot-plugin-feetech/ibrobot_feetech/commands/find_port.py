@@ -24,12 +24,12 @@ def find_port(only_list: bool) -> None:
 
 def list_ports(guide: Guide) -> list[UsbPort]:
     """Show the USB serial ports, and return them."""
-    found = usb_ports()
-    for port in found:
+    ports = usb_ports()
+    for port in ports:
         _show(guide, port)
-    if not found:
+    if not ports:
         guide.say("There is no USB serial port.")
-    return found
+    return ports
 
 
 def find_arm(guide: Guide, before: Sequence[UsbPort]) -> None:

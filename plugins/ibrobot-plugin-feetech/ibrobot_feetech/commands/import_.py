@@ -43,12 +43,12 @@ def import_calibration(
     """
     path = calibration_path(name or file)
     wanted = joints_of(robot, name, "" if robot else prefix)
-    found, left_out = _load(file, wanted, prefix, zero_at)
-    doubts = _doubts(found, wanted)
+    imported, left_out = _load(file, wanted, prefix, zero_at)
+    doubts = _doubts(imported, wanted)
     if path.exists() and not yes and not TerminalGuide().confirm(f"{path} exists already. Overwrite it?", flag="--yes"):
         raise Declined
-    adapter = found.adapter if port is None else _adapter(port)
-    made = attrs.evolve(found, robot=arm or found.robot, adapter=adapter)
+    adapter = imported.adapter if port is None else _adapter(port)
+    made = attrs.evolve(imported, robot=arm or imported.robot, adapter=adapter)
     if kept := backup(path):
         echo(f"the old file is kept: {kept}")
     save_calibration(made, path, overwrite=True)
@@ -69,16 +69,16 @@ def _load(file: str, wanted: Sequence[Joint], prefix: str, zero_at: str | None) 
     plain = [joint.name.removeprefix(prefix) for joint in wanted]
     names = [f"{prefix}{each}" for each in plain]
     try:
-        found = load_calibration(file, names, zero_at=zero_at)
+        imported = load_calibration(file, names, zero_at=zero_at)
     except CalibrationError as error:
         try:
-            found, names = load_calibration(file, plain, zero_at=zero_at), plain
+            imported, names = load_calibration(file, plain, zero_at=zero_at), plain
         except CalibrationError:
             raise CalibrationError(f"{error}{_hint(file, plain)}") from None
     ours = dict(zip(names, (joint.name for joint in wanted), strict=True))
-    left_out = [name for name in found.joints if name not in ours]
-    joints = {ours[name]: numbers for name, numbers in found.joints.items() if name in ours}
-    return attrs.evolve(found, joints=joints), left_out
+    left_out = [name for name in imported.joints if name not in ours]
+    joints = {ours[name]: numbers for name, numbers in imported.joints.items() if name in ours}
+    return attrs.evolve(imported, joints=joints), left_out
 
 
 def _hint(file: str, plain: Sequence[str]) -> str:
@@ -96,7 +96,7 @@ def _hint(file: str, plain: Sequence[str]) -> str:
     return ""
 
 
-def _doubts(found: Calibration, joints: Sequence[Joint]) -> list[str]:
+def _doubts(imported: Calibration, joints: Sequence[Joint]) -> list[str]:
     """What does not fit the limits of the joints.
 
     Raises:
@@ -104,16 +104,16 @@ def _doubts(found: Calibration, joints: Sequence[Joint]) -> list[str]:
     """
     doubts = []
     for joint in joints:
-        numbers = found.joints[joint.name]
+        numbers = imported.joints[joint.name]
         measured = Range(numbers.range_min, numbers.range_min, numbers.range_max)
         if fault := impossible(joint.name, measured):
-            raise CalibrationError(f"{found.path}: {fault}")
-        doubts.append(doubtful(joint, measured, found.zero_at))
+            raise CalibrationError(f"{imported.path}: {fault}")
+        doubts.append(doubtful(joint, measured, imported.zero_at))
     return [each for each in doubts if each is not None]
 
 
 def _adapter(port: str) -> str:
-    found = usb_port(port)
-    if found is None:
+    adapter = usb_port(port)
+    if adapter is None:
         raise HardwareError(f"{port}: there is no USB adapter; `ibrobot feetech find-port --list` lists them")
-    return found.serial_number
+    return adapter.serial_number

@@ -66,10 +66,10 @@ class Measurement:
         ranges = self._ranges(offsets)
         whole = Range(0, 0, TICKS_PER_TURN - 1)
         inverted = {joint.name: self._is_inverted(joint) for joint in self._joints} if self._answers.check_signs else {}
-        found = {}
+        by_joint = {}
         for joint in self._joints:
             measured = ranges.get(joint.name, whole)
-            found[joint.name] = JointCalibration(
+            by_joint[joint.name] = JointCalibration(
                 id=joint.servo,
                 drive_mode=int(inverted.get(joint.name, False)),
                 homing_offset=offsets[joint.servo],
@@ -77,7 +77,7 @@ class Measurement:
                 range_max=measured.greatest,
                 zero_at=self._zero_at,
             )
-        return found
+        return by_joint
 
     def _encoders(self) -> dict[int, int]:
         """Servo id -> its encoder's position [ticks], 0 to 4095."""
@@ -166,8 +166,8 @@ class Measurement:
 def _rows(joints: Sequence[Joint], ranges: Mapping[str, Range]) -> list[tuple[str, ...]]:
     made = []
     for joint in joints:
-        found = ranges[joint.name]
-        numbers = (found.least, found.now, found.greatest, found.span)
-        remark = "crosses 0/4095" if found.crosses else ""
+        span = ranges[joint.name]
+        numbers = (span.least, span.now, span.greatest, span.span)
+        remark = "crosses 0/4095" if span.crosses else ""
         made.append((str(joint.servo), joint.name, *map(str, numbers), remark))
     return made

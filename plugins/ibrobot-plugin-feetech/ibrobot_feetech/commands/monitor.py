@@ -69,7 +69,7 @@ def monitor(port: str | None, robot: str | None, period: float, once: bool, as_j
 def reading(reader: SyncReader, joints: Sequence[Joint]) -> list[dict[str, Any]]:
     """A reading of each servo, in human units; for a servo that does not answer, only an error."""
     replies = reader.read()
-    found: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     for row, joint in enumerate(joints):
         servo: dict[str, Any] = {"id": joint.servo, "joint": joint.name, "answers": bool(replies.answered[row])}
         if servo["answers"]:
@@ -78,8 +78,8 @@ def reading(reader: SyncReader, joints: Sequence[Joint]) -> list[dict[str, Any]]
             servo["position_deg"] = round((values["present_position"] - MIDDLE_TICK) * 360 / TICKS_PER_TURN, 2)
             servo |= {name: round(values[register] * unit, 3) for name, (register, unit) in _UNITS.items()}
             servo["errors"] = list(faults(int(replies.errors[row]) | values["status"]))
-        found.append(servo)
-    return found
+        rows.append(servo)
+    return rows
 
 
 def _panel(bus: FeetechBus, reader: SyncReader, joints: Sequence[Joint]) -> Group:

@@ -27,7 +27,7 @@ def the_port(port: str | None) -> str:
     """
     if port is not None:
         return port
-    arms = [found.stable or found.path for found in usb_ports() if found.is_arm]
+    arms = [adapter.stable or adapter.path for adapter in usb_ports() if adapter.is_arm]
     if not arms:
         raise HardwareError(
             f"no port given, and no adapter of an SO-101 (USB id {ADAPTER_VENDOR:04x}) is plugged in; "

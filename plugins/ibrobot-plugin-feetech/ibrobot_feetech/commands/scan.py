@@ -62,7 +62,7 @@ def search(bus: FeetechBus, rates: Sequence[int]) -> dict[tuple[int, int], int]:
         PortError: if the port is gone.
     """
     for one_by_one in (False, True):
-        found: dict[tuple[int, int], int] = {}
+        models: dict[tuple[int, int], int] = {}
         for rate in rates:
             try:
                 bus.port.set_baud_rate(rate)
@@ -70,7 +70,7 @@ def search(bus: FeetechBus, rates: Sequence[int]) -> dict[tuple[int, int], int]:
                 if len(rates) == 1:
                     raise
                 continue
-            found |= {(servo, rate): model for servo, model in bus.scan(one_by_one=one_by_one).items()}
-        if found:
+            models |= {(servo, rate): model for servo, model in bus.scan(one_by_one=one_by_one).items()}
+        if models:
             break
-    return found
+    return models

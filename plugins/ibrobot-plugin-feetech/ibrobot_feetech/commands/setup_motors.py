@@ -80,16 +80,16 @@ def _the_only_one(bus: FeetechBus, joint: Joint, rates: Sequence[int]) -> tuple[
         HardwareError: if none or several answer, or it is another model.
     """
     damaged = bus.counters["bad_packets"]
-    found = search(bus, rates)
+    models = search(bus, rates)
     where = f"{bus.port.path}, {joint.name}"
-    if not found:
+    if not models:
         if bus.counters["bad_packets"] > damaged:
             raise HardwareError(f"{where}: the answers are damaged, so several servos share an id; connect only one")
         raise HardwareError(f"{where}: no servo answers at {len(rates)} baud rates; check its power and its cable")
-    if len(found) > 1:
-        who = ", ".join(f"id {servo} at {rate} baud" for servo, rate in found)
-        raise HardwareError(f"{where}: {len(found)} servos answer ({who}); connect only that of {joint.name}")
-    (servo, rate), model = next(iter(found.items()))
+    if len(models) > 1:
+        who = ", ".join(f"id {servo} at {rate} baud" for servo, rate in models)
+        raise HardwareError(f"{where}: {len(models)} servos answer ({who}); connect only that of {joint.name}")
+    (servo, rate), model = next(iter(models.items()))
     if model != MODEL_STS3215:
         raise HardwareError(f"{where}: servo {servo} is model {model}; an STS3215 is {MODEL_STS3215}")
     return servo, rate
@@ -108,6 +108,6 @@ def _assign(bus: FeetechBus, servo: int, rate: int, joint: Joint) -> None:
         bus.write(joint.servo, "baud_rate", BAUD_RATES[_RATE])
     bus.port.set_baud_rate(_RATE)
     bus.write(joint.servo, "lock", 1)
-    found = bus.read(joint.servo, "id"), bus.read(joint.servo, "baud_rate")
-    if found != (joint.servo, BAUD_RATES[_RATE]):
-        raise HardwareError(f"{bus.place(joint.servo)}: its id and rate code are {found} after being set; try again")
+    stored = bus.read(joint.servo, "id"), bus.read(joint.servo, "baud_rate")
+    if stored != (joint.servo, BAUD_RATES[_RATE]):
+        raise HardwareError(f"{bus.place(joint.servo)}: its id and rate code are {stored} after being set; try again")

@@ -107,13 +107,13 @@ class EmulatedServo:
 
     def get(self, name: str) -> int:
         """The decoded value of a register."""
-        found = register(name)
-        return found.decode(bytes(self.table[found.address : found.address + found.size]))
+        field = register(name)
+        return field.decode(bytes(self.table[field.address : field.address + field.size]))
 
     def set(self, name: str, value: int) -> None:
         """Set a register, even if it is read-only or locked."""
-        found = register(name)
-        self.table[found.address : found.address + found.size] = found.encode(value)
+        field = register(name)
+        self.table[field.address : field.address + field.size] = field.encode(value)
 
     def turn(self, encoder: float) -> None:
         """Move the joint by hand to an encoder position [ticks]; only with torque off.
@@ -268,10 +268,10 @@ class EmulatedServo:
 
 def _read_only() -> list[bool]:
     table = [False] * 256
-    found: Register
-    for found in STS3215.values():
-        for address in range(found.address, found.address + found.size):
-            table[address] = not found.writable
+    entry: Register
+    for entry in STS3215.values():
+        for address in range(entry.address, entry.address + entry.size):
+            table[address] = not entry.writable
     return table
 
 

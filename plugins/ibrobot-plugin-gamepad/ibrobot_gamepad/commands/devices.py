@@ -20,12 +20,12 @@ _POLL_S = 0.01
 
 def find_all(kinds: tuple[Kind, ...] = KINDS) -> list[tuple[Kind, Found]]:
     """All connected devices, with their kinds; a pad found by both hidapi and SDL appears once."""
-    found: list[tuple[Kind, Found]] = []
+    devices: list[tuple[Kind, Found]] = []
     for kind in kinds:
         with closing(Finder(kind)) as finder:
-            found += [(kind, each) for each in finder.find()]
-    read = {(each.vendor, each.product) for _, each in found if each.via == "hid"}
-    return [(kind, each) for kind, each in found if each.via == "hid" or (each.vendor, each.product) not in read]
+            devices += [(kind, each) for each in finder.find()]
+    read = {(each.vendor, each.product) for _, each in devices if each.via == "hid"}
+    return [(kind, each) for kind, each in devices if each.via == "hid" or (each.vendor, each.product) not in read]
 
 
 @contextmanager
@@ -39,9 +39,9 @@ def opened(wanted: str) -> Iterator[tuple[Kind, Found, Device]]:
         with closing(Finder(kind)) as finder:
             result = open_first(finder.find(), wanted)
             if result is not None:
-                found, device = result
+                listed, device = result
                 with closing(device):
-                    yield kind, found, device
+                    yield kind, listed, device
                 return
     which = f" {wanted}" if wanted else ""
     raise TeleopError(f"no gamepad or SpaceMouse{which} is plugged in; `ibrobot gamepad list` shows all")

@@ -50,8 +50,8 @@ def map_controls(config: str | None, device: str, wait: float) -> None:
     """
     registry = installed_plugins()
     robot = load_config(find_config(config, registry), registry=registry).robot
-    with opened(device) as (kind, found, open_device):
-        echo(f"{found.name} ({found.id}): let go of all controls")
+    with opened(device) as (kind, listed, open_device):
+        echo(f"{listed.name} ({listed.id}): let go of all controls")
         learner = _Learner(open_device, wait)
         joints = {
             name: f"Move what moves {name} towards its upper limit"
@@ -64,11 +64,11 @@ def map_controls(config: str | None, device: str, wait: float) -> None:
             "buttons": learner.buttons({name: f"Press the button {_PRESSES[name]} ({name})" for name in FUNCTIONS}),
         }
     echo("")
-    echo(dump_yaml({"teleoperation": {kind: _section(kind, found, learned)}}).rstrip())
+    echo(dump_yaml({"teleoperation": {kind: _section(kind, listed, learned)}}).rstrip())
 
 
-def _section(kind: str, found: Found, learned: Mapping[str, Mapping[str, str]]) -> dict[str, object]:
-    device = f"{found.vendor:04x}:{found.product:04x}"
+def _section(kind: str, listed: Found, learned: Mapping[str, Mapping[str, str]]) -> dict[str, object]:
+    device = f"{listed.vendor:04x}:{listed.product:04x}"
     return {"type": kind, "device": device, **{name: dict(pairs) for name, pairs in learned.items() if pairs}}
 
 

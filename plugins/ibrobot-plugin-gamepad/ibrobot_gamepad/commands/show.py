@@ -23,7 +23,7 @@ def list_devices(as_json: bool) -> None:
 
     It shows name, id for the option `device`, model, and how each is read.
     """
-    found = find_all()
+    devices = find_all()
     if as_json:
         rows = [
             {
@@ -34,14 +34,14 @@ def list_devices(as_json: bool) -> None:
                 "via": each.via,
                 "path": each.path,
             }
-            for kind, each in found
+            for kind, each in devices
         ]
         echo(json.dumps(rows, indent=2))
         return
-    if not found:
+    if not devices:
         echo("no gamepad or SpaceMouse is plugged in; `ibrobot doctor` names those without permission")
         return
-    table = [(kind, each.name, each.id, each.model, f"read by {_VIA[each.via]}") for kind, each in found]
+    table = [(kind, each.name, each.id, each.model, f"read by {_VIA[each.via]}") for kind, each in devices]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     for row in table:
         echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
@@ -62,8 +62,8 @@ def show(device: str, seconds: float) -> None:
             echo(line)
         return False
 
-    with opened(device) as (_, found, open_device):
-        echo(f"{found.name} ({found.id}, {found.model}): move its axes, press its buttons")
+    with opened(device) as (_, listed, open_device):
+        echo(f"{listed.name} ({listed.id}, {listed.model}): move its axes, press its buttons")
         watch(open_device, seconds, tell)
 
 

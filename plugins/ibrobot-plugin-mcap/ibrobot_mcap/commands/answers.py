@@ -45,18 +45,18 @@ def answers(episode: Path, as_json: bool) -> None:
 
     with opened(episode) as reader:
         start_ns = reader.summary().start_ns
-        found = list(executed(reader))
-    if not found:
+        listed = list(executed(reader))
+    if not listed:
         raise RecorderError(f"{episode}: has no answers of a model: {MODEL_ANSWERS} is missing or empty")
     if as_json:
-        echo(json.dumps([_json(each) for each in found], indent=2))
+        echo(json.dumps([_json(each) for each in listed], indent=2))
         return
     console = Screen(width=None if sys.stdout.isatty() else 1000)
     table = Table(box=None, padding=(0, 1))
     for heading in ("request", "asked s", "ms", "model ms", "queue ms", "outcome", "actions", "executed", "rad off"):
         table.add_column(heading, justify="left" if heading == "outcome" else "right")
     source = None
-    for each in found:
+    for each in listed:
         answer = each.answer
         if source != (source := (answer.model, answer.server, answer.weights, answer.prompt)):
             console.print(_source(answer), soft_wrap=True)
@@ -76,19 +76,19 @@ def executed(reader: EpisodeReader) -> Iterator[Executed]:
     joints_of = actions_of(summary.metadata, summary.topics)
     commands: dict[str, tuple[list[int], list[float]]] = {}
     """Joint -> times [ns] and positions [rad]."""
-    found: list[ModelAnswer] = []
+    kept: list[ModelAnswer] = []
     for item in reader.messages({MODEL_ANSWERS, *joints_of}):
         message = item.message
         if isinstance(message, ModelAnswer):
-            found.append(message)
+            kept.append(message)
         elif isinstance(message, Float64MultiArray):
             for joint, position in zip(joints_of[item.topic], message.data.tolist(), strict=False):
                 times, positions = commands.setdefault(joint, ([], []))
                 times.append(item.received_ns)
                 positions.append(position)
     tracks = {joint: (np.array(times), np.array(positions)) for joint, (times, positions) in commands.items()}
-    next_ns = _next_used(found, summary.end_ns)
-    for answer, until_ns in zip(found, next_ns, strict=True):
+    next_ns = _next_used(kept, summary.end_ns)
+    for answer, until_ns in zip(kept, next_ns, strict=True):
         joints = answer.joint_names
         chunk = answer.actions.reshape(-1, len(joints)) if joints else np.empty((0, 0))
         times_ns = answer.observed_ns + np.arange(len(chunk)) * answer.step_ns
@@ -104,11 +104,11 @@ def executed(reader: EpisodeReader) -> Iterator[Executed]:
         yield Executed(answer, chunk, count, max(deviations, default=None))
 
 
-def _next_used(found: Iterable[ModelAnswer], end_ns: int) -> list[int]:
+def _next_used(in_order: Iterable[ModelAnswer], end_ns: int) -> list[int]:
     """For each answer, the time at which the next one was used, or the end [ns]."""
     times: list[int] = []
     next_ns = end_ns
-    for answer in reversed([*found]):
+    for answer in reversed([*in_order]):
         times.append(next_ns)
         if answer.outcome == "used":
             next_ns = answer.header.stamp_ns

@@ -60,11 +60,11 @@ class Hand:
         Raises:
             UnreachableError: if a part of it is out of reach.
         """
-        found = [start]
+        points = [start]
         steps = max(1, round(float(np.linalg.norm(motion)) / _STEP_M))
         for done in np.linspace(0.0, 1.0, steps + 1)[1:]:
-            found.append(self.reach(position + done * motion, rotation, found[-1], gripper, GRASP_TURN_RAD))
-        return found[1:]
+            points.append(self.reach(position + done * motion, rotation, points[-1], gripper, GRASP_TURN_RAD))
+        return points[1:]
 
     def grip(self, joints: Vector, gripper: float) -> Vector:
         """Return the joints with another position of the gripper."""

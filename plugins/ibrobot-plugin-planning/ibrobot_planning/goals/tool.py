@@ -223,10 +223,10 @@ class Tool:
                 with suppress(UnreachableError):
                     seeds += solve_all(self.model, Target(position, axis=axis), start, position_tolerance=tolerance)
             begin = np.array(_distinct(seeds))
-            found = search(self.model, target, begin, position_weight=_POSITION_WEIGHT, iterations=_TURNS)
-            if found.within(tolerance, _SAME).any():
+            result = search(self.model, target, begin, position_weight=_POSITION_WEIGHT, iterations=_TURNS)
+            if result.within(tolerance, _SAME).any():
                 break
-        candidates = map(Candidate, found.joints, found.off.tolist(), found.turned.tolist())
+        candidates = map(Candidate, result.joints, result.off.tolist(), result.turned.tolist())
         placed = sorted(
             (each for each in candidates if each.position_error <= tolerance), key=lambda each: each.orientation_error
         )

@@ -94,26 +94,26 @@ class Topics:
 
     def add_subscriber(self, head: dict[str, Any], payload: bytes) -> None:
         """Subscribe to a topic for the run."""
-        found = _Input(head["topic"], head["type"], head["rate_hz"])
+        subscriber = _Input(head["topic"], head["type"], head["rate_hz"])
 
         def take(message: bytes) -> None:
-            if self._wire.backlog < BACKLOG and found.passes():
-                self._wire.send({"op": "message", "topic": found.topic}, message)
+            if self._wire.backlog < BACKLOG and subscriber.passes():
+                self._wire.send({"op": "message", "topic": subscriber.topic}, message)
             else:
-                found.dropped += 1
+                subscriber.dropped += 1
 
         def incompatible(event: Any) -> None:
-            self._report(found.topic, "a publisher offers another QoS than this subscriber asks for; set qos")
+            self._report(subscriber.topic, "a publisher offers another QoS than this subscriber asks for; set qos")
 
         def make() -> None:
-            kind = find_message(found.type_name, head.get("fields", ()))
+            kind = find_message(subscriber.type_name, head.get("fields", ()))
             self._node.create_subscription(
-                kind, found.topic, take, profile(head["qos"]), raw=True,
+                kind, subscriber.topic, take, profile(head["qos"]), raw=True,
                 event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
             )  # fmt: skip
-            self._inputs.append(found)
+            self._inputs.append(subscriber)
 
-        self._try(found.topic, make)
+        self._try(subscriber.topic, make)
 
     def finish(self) -> None:
         """Wait until reliable subscribers have everything, at most for a moment."""

@@ -19,12 +19,12 @@ def find_type(name: str) -> Any:
     """
     package, kind, base = name.split("/")
     try:
-        found = getattr(importlib.import_module(f"{package}.{kind}"), base)
+        loaded = getattr(importlib.import_module(f"{package}.{kind}"), base)
         if kind == "msg":
-            check_for_type_support(found)
+            check_for_type_support(loaded)
     except (ImportError, AttributeError) as error:
         raise LookupError(f"this ROS has no {name}: {error}") from error
-    return found
+    return loaded
 
 
 def find_message(name: str, fields: Sequence[str]) -> Any:
@@ -33,11 +33,11 @@ def find_message(name: str, fields: Sequence[str]) -> Any:
     Raises:
         LookupError: as `find_type`, or if its fields are not the run's `fields`, in their order.
     """
-    found = find_type(name)
-    theirs = list(found.get_fields_and_field_types())
+    loaded = find_type(name)
+    theirs = list(loaded.get_fields_and_field_types())
     if fields and theirs != list(fields):
         raise LookupError(f"{name} has other fields in this ROS: {', '.join(theirs)}")
-    return found
+    return loaded
 
 
 def fill(message: Any, values: Mapping[str, Any]) -> Any:

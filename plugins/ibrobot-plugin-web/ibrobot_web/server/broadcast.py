@@ -104,12 +104,12 @@ class Broadcast:
     @property
     def wanted(self) -> frozenset[int] | None:
         """Channels that any page shows; None for all."""
-        found: set[int] = set()
+        channels: set[int] = set()
         for page in self.pages:
             if page.wanted is None:
                 return None
-            found |= page.wanted
-        return frozenset(found)
+            channels |= page.wanted
+        return frozenset(channels)
 
     async def serve(self, socket: web.WebSocketResponse) -> None:
         """Stream to a page until it is gone."""

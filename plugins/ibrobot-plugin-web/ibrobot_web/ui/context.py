@@ -28,8 +28,8 @@ class Ui:
 
     def keep[T](self, kind: type[T]) -> T:
         """The one object of a class that requests share until the server ends, which closes it. Thread-safe."""
-        found: T = self._kept.setdefault(kind, kind())
-        return found
+        kept: T = self._kept.setdefault(kind, kind())
+        return kept
 
     def close(self) -> None:
         """End what views and jobs have started."""

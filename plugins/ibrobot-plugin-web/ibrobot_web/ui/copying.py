@@ -29,10 +29,10 @@ def variables_of(source: Path) -> dict[str, str]:
     """
     text = _read(source)
     lines = (line.partition(" #")[0] for line in text.splitlines() if not line.lstrip().startswith("#"))
-    found: dict[str, str] = {}
+    variables: dict[str, str] = {}
     for name, default in VARIABLE.findall("\n".join(lines)):
-        found.setdefault(name, default)
-    return found
+        variables.setdefault(name, default)
+    return variables
 
 
 def write_copy(source: Path, copy: Path, defaults: Mapping[str, str]) -> None:
@@ -96,6 +96,6 @@ def config_copy(config: str, copy: Path, values: tuple[str, ...], defaults: bool
             if name not in chosen:
                 chosen[name] = click.prompt(name, default=default or None, err=True)
     write_copy(source, copy, chosen)
-    found = load_config(copy)
-    body = "simulation" if found.simulated else "hardware"
-    echo(f"{copy}: ok ({found.robot.name}, {len(found.robot.joints)} joints, {body})")
+    loaded = load_config(copy)
+    body = "simulation" if loaded.simulated else "hardware"
+    echo(f"{copy}: ok ({loaded.robot.name}, {len(loaded.robot.joints)} joints, {body})")

@@ -18,8 +18,8 @@ def listing(ui: Ui) -> list[str]:
 
 def info(ui: Ui, path: str) -> dict[str, Any]:
     """What a dataset contains."""
-    (found,) = run_command(ui, "datasets info", dataset=path)
-    return {**attrs.asdict(found), "path": ui.folders.name(ui.folders.find(path))}
+    (dataset,) = run_command(ui, "datasets info", dataset=path)
+    return {**attrs.asdict(dataset), "path": ui.folders.name(ui.folders.find(path))}
 
 
 ROUTES: Routes = {

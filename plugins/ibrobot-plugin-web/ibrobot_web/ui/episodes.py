@@ -25,18 +25,18 @@ def _some(instance: object, attribute: object, paths: tuple[str, ...]) -> None:
 
 def listing(ui: Ui) -> dict[str, Any]:
     """All episodes in the opened folders."""
-    found = find_recordings(ui.folders)
-    rows = [ui.keep(Episodes).row(ui, path) for path in found.episodes]
-    trashes = [ui.folders.name(path) for path in found.trashes]
+    recordings = find_recordings(ui.folders)
+    rows = [ui.keep(Episodes).row(ui, path) for path in recordings.episodes]
+    trashes = [ui.folders.name(path) for path in recordings.trashes]
     outcomes = choices_of("episodes mark", "outcome")
-    return {"episodes": rows, "complete": found.complete, "trashes": trashes, "outcomes": outcomes}
+    return {"episodes": rows, "complete": recordings.complete, "trashes": trashes, "outcomes": outcomes}
 
 
 def trash(ui: Ui, path: str) -> list[dict[str, Any]]:
     """What can be undone in a folder, newest first."""
-    found = run_command(ui, "episodes trash", path=path)
+    trashed = run_command(ui, "episodes trash", path=path)
     folder = ui.folders.name(ui.folders.find(path))
-    rows = [{**attrs.asdict(each), "what": each.shown().text} for each in found]
+    rows = [{**attrs.asdict(each), "what": each.shown().text} for each in trashed]
     return [{**row, "path": ui.folders.name(Path(row["path"])), "folder": folder} for row in rows[::-1]]
 
 

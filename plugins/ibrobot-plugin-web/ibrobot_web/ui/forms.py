@@ -61,7 +61,7 @@ def form_of(ui: Ui, command: str) -> dict[str, Any]:
     shown = _shown(declared)
     wanted = {field.metadata["names"] for field in shown.values()}
     form["summary"] = declared.summary
-    form["known"] = {names: found for names, found in _known(ui).items() if names in wanted}
+    form["known"] = {names: values for names, values in _known(ui).items() if names in wanted}
     form["fields"] = [_field_json(name, field) for name, field in shown.items()]
     try:
         declared.check()
@@ -123,15 +123,15 @@ def in_page_words(text: str, command: Command | None = None) -> str:
     options = fields(command.options) if command is not None else {}
     known = {flag_of(name, field): (name, field) for name, field in options.items()}
 
-    def labelled(found: re.Match[str]) -> str:
-        if found["flag"] not in known:
-            return found[0]
-        name, field = known[found["flag"]]
-        label, value = label_of(name, field), found["value"] or ""
+    def labelled(match: re.Match[str]) -> str:
+        if match["flag"] not in known:
+            return match[0]
+        name, field = known[match["flag"]]
+        label, value = label_of(name, field), match["value"] or ""
         words = field.metadata["words"].get(value)
         return f"“{label}: {words}”" if words else f"“{label}”{f' {value}' if value else ''}"
 
-    text = _COMMAND.sub(lambda found: f"“{title_of(found[1])}”" if found[1] in declared else found[0], text)
+    text = _COMMAND.sub(lambda match: f"“{title_of(match[1])}”" if match[1] in declared else match[0], text)
     return _FLAG.sub(labelled, text)
 
 
@@ -164,8 +164,8 @@ def choices_of(name: str, option: str) -> list[list[str]]:
     command = installed_plugins().declarations().get(name)
     if command is None:
         return []
-    found: list[list[str]] = _field_json(option, fields(command.options)[option])["choices"]
-    return found
+    choices: list[list[str]] = _field_json(option, fields(command.options)[option])["choices"]
+    return choices
 
 
 def _shown(command: Command) -> dict[str, attrs.Attribute[Any]]:
@@ -175,9 +175,9 @@ def _shown(command: Command) -> dict[str, attrs.Attribute[Any]]:
 
 def _known(ui: Ui) -> dict[str, list[dict[str, str]]]:
     """What the opened folders have, by what paths name: the value of each, and its words."""
-    found = find_recordings(ui.folders)
+    recordings = find_recordings(ui.folders)
     counts: dict[str, int] = {}
-    for path in found.episodes:
+    for path in recordings.episodes:
         name = ui.folders.name(_dataset_of(ui, path))
         counts[name] = counts.get(name, 0) + 1
     return {
@@ -185,7 +185,7 @@ def _known(ui: Ui) -> dict[str, list[dict[str, str]]]:
             {"value": name, "text": f"{name}: {count} episode{'' if count == 1 else 's'}"}
             for name, count in counts.items()
         ],
-        "dataset": [{"value": name, "text": name} for name in map(ui.folders.name, found.datasets)],
+        "dataset": [{"value": name, "text": name} for name in map(ui.folders.name, recordings.datasets)],
         "policy": [{"value": name, "text": name} for name in (ui.folders.name(path) for path, _ in find_policies(ui))],
         "robot": [{"value": name, "text": name} for name in robot_names(ui)],
     }

@@ -67,10 +67,10 @@ class PageGuide(Guide):
             nonlocal next_s
             if rows is None:
                 return
-            found, now_s = rows(), time.monotonic()
+            rows_now, now_s = rows(), time.monotonic()
             if now_s >= next_s:
                 next_s = now_s + _ROWS_S
-                self._channel.send({"event": "rows", "ask": number, "columns": columns, "rows": found})
+                self._channel.send({"event": "rows", "ask": number, "columns": columns, "rows": rows_now})
 
         self._ask("wait", request, meanwhile, until_s)
 

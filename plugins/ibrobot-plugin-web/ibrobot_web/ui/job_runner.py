@@ -240,9 +240,9 @@ class Jobs:
         with self._lock:
             for line in lines:
                 text = _CONTROL.sub("", line.decode(errors="replace"))
-                found = read(text) if read is not None else None
-                job.facts.update(found or {})
-                if found is None or not text.startswith("{"):
+                event = read(text) if read is not None else None
+                job.facts.update(event or {})
+                if event is None or not text.startswith("{"):
                     job.lines.append(without_tokens(text[:_LONGEST]))
                     job.count += 1
         if lines:

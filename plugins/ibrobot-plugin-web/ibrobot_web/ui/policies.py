@@ -85,14 +85,14 @@ def _problems(content: str, target: Path) -> list[str]:
     """What the check of configurations says about the new text, without writing it."""
     try:
         document = parse_yaml(content, str(target))
-        found = [problem for _, problem in document.problems]
-        if not found:
+        problems = [problem for _, problem in document.problems]
+        if not problems:
             from_document(document.root, source=target, sim="simulation" in document.root)
     except ConfigError as error:
-        found = list(error.problems)
+        problems = list(error.problems)
     except IbrobotError as error:
         return [str(error)]
-    return [f"{each.path}: {each.message}" for each in found]
+    return [f"{each.path}: {each.message}" for each in problems]
 
 
 ROUTES: Routes = {

@@ -50,7 +50,7 @@ def start(ui: Ui, robot: str, values: Mapping[str, Any], sim: bool = False, mode
         _COMMAND,
         f"Record {folder.name}",
         [_COMMAND, "--events", *run_arguments(ui, robot, sim, mode), *place, *arguments(options)],
-        read=lambda line: found if (found := read_event(line)) is not None else read_address(line),
+        read=lambda line: event if (event := read_event(line)) is not None else read_address(line),
         done_codes=RUN_DONE,
     )
     return {"number": job.number}

@@ -64,7 +64,7 @@ def find_recordings(opened: Folders) -> Found:
             continue
         folders.clear()
     once = [tuple(dict.fromkeys(each)) for each in (episodes, datasets, trashes)]
-    return Found(once[0], once[1], once[2], left > 0, {kind: tuple(found) for kind, found in reports.items()})
+    return Found(once[0], once[1], once[2], left > 0, {kind: tuple(of_kind) for kind, of_kind in reports.items()})
 
 
 def policy_type(path: Path) -> str | None:
@@ -79,12 +79,12 @@ def policy_type(path: Path) -> str | None:
 
 def find_policies(ui: Ui) -> list[tuple[Path, str]]:
     """The folders with a trained policy in the opened folders, and the type of each; the newest first."""
-    found = []
+    policies = []
     for parent, folders, _ in ui.folders.walk(_POLICY_DEPTH):
         if (type_ := policy_type(parent)) is not None:
-            found.append((parent, type_))
+            policies.append((parent, type_))
             folders.clear()
-    return sorted(found, key=lambda each: each[0].stat().st_mtime_ns, reverse=True)[:_MOST_POLICIES]
+    return sorted(policies, key=lambda each: each[0].stat().st_mtime_ns, reverse=True)[:_MOST_POLICIES]
 
 
 class Episodes:
@@ -116,10 +116,10 @@ class Episodes:
         with self._lock:
             if key not in self._open:
                 self._open[key] = Playback(path)
-            found = self._open[key] = self._open.pop(key)  # the newest is last
+            episode = self._open[key] = self._open.pop(key)  # the newest is last
             while len(self._open) > _OPEN:
                 self._open.pop(next(iter(self._open))).close()
-        return found
+        return episode
 
     def close(self) -> None:
         """Close all episodes, at the end and before one is changed."""

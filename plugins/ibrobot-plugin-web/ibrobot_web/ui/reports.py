@@ -25,9 +25,9 @@ def _kind(name: str) -> ReportDescriptor:
 def listing(ui: Ui, kind: str) -> list[dict[str, Any]]:
     """The folders of a kind in the opened folders, the newest first."""
     descriptor = _kind(kind)
-    found = find_recordings(ui.folders).reports.get(descriptor.name, ())
+    reports = find_recordings(ui.folders).reports.get(descriptor.name, ())
     rows = []
-    for folder in found:
+    for folder in reports:
         try:
             lines, problem = list(descriptor.lines(folder)), ""
         except IbrobotError as error:
@@ -78,10 +78,10 @@ def _name(ui: Ui, path: Path | None) -> str:
 
 def video(ui: Ui, path: str) -> File:
     """A video."""
-    found = ui.folders.find(path)
-    if found.suffix != _VIDEO or not found.is_file():
-        raise IbrobotError(f"{ui.folders.name(found)}: there is no such video")
-    return File(found, "video/mp4")
+    file = ui.folders.find(path)
+    if file.suffix != _VIDEO or not file.is_file():
+        raise IbrobotError(f"{ui.folders.name(file)}: there is no such video")
+    return File(file, "video/mp4")
 
 
 ROUTES: Routes = {

@@ -42,14 +42,14 @@ _checking = threading.Lock()
 
 def listing(ui: Ui) -> list[dict[str, str]]:
     """The robots to choose from: `robot`, its summary, and where it is from."""
-    found = []
+    robots = []
     plugins = {config.name: config.summary for config in installed_plugins().configs}
     for name, path in shipped_configs(installed_plugins()).items():
         source = "plugin" if name in plugins else "ibrobot"
-        found.append({"robot": name, "source": source, "summary": plugins.get(name) or _summary(_head(path))})
+        robots.append({"robot": name, "source": source, "summary": plugins.get(name) or _summary(_head(path))})
     for path in _yamls(ui):
-        found.append({"robot": ui.folders.name(path), "source": "folder", "summary": _summary(_head(path))})
-    return found
+        robots.append({"robot": ui.folders.name(path), "source": "folder", "summary": _summary(_head(path))})
+    return robots
 
 
 def robot_names(ui: Ui) -> list[str]:
@@ -146,14 +146,14 @@ def copying(ui: Ui, robot: str) -> dict[str, Any]:
     A variable such as `IBROBOT_LEADER_PORT` is offered what the guides' question `port` offers.
     """
     source = find_config(robot_of(ui, robot), installed_plugins())
-    found: dict[str, tuple[str, ...]] = {}
+    variables: dict[str, tuple[str, ...]] = {}
     for guide in installed_plugins().guides:
         for question in guide.questions():
-            found.setdefault(question.name, tuple(each for each in question.choices if "/" in each))
+            variables.setdefault(question.name, tuple(each for each in question.choices if "/" in each))
     return {
         "file": f"my_{source.stem}.yaml",
         "variables": [
-            {"name": name, "default": default, "found": found.get(name.rpartition("_")[2].lower(), ())}
+            {"name": name, "default": default, "found": variables.get(name.rpartition("_")[2].lower(), ())}
             for name, default in variables_of(source).items()
         ],
     }
@@ -190,8 +190,8 @@ def run_arguments(ui: Ui, robot: str, sim: bool, mode: str) -> list[str]:
 
 def read_address(line: str) -> Mapping[str, Any] | None:
     """The addresses of a run's page, from a line of its output."""
-    found = _PAGE.search(line)
-    return found.groupdict() if found is not None else None
+    match = _PAGE.search(line)
+    return match.groupdict() if match is not None else None
 
 
 ROUTES: Routes = {

@@ -98,12 +98,12 @@ async def _answer(handler: Handler, guard: Guard, request: web.Request) -> web.S
         if guard.role(request) != "drive":
             raise IbrobotError("this link is for watching only")
         facts = read_facts(handler, await _body(request))
-    found = await asyncio.to_thread(handler, request.app[_UI], **facts)
-    if isinstance(found, Picture):
-        return web.Response(body=found.content, content_type=found.content_type)
-    if isinstance(found, File):
-        return web.FileResponse(found.path, headers={"Content-Type": found.content_type})
-    return web.json_response(found, dumps=_dumps)
+    answer = await asyncio.to_thread(handler, request.app[_UI], **facts)
+    if isinstance(answer, Picture):
+        return web.Response(body=answer.content, content_type=answer.content_type)
+    if isinstance(answer, File):
+        return web.FileResponse(answer.path, headers={"Content-Type": answer.content_type})
+    return web.json_response(answer, dumps=_dumps)
 
 
 async def _body(request: web.Request) -> Mapping[str, Any]:

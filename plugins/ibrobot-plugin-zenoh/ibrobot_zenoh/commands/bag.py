@@ -138,15 +138,15 @@ def commands(summary: EpisodeSummary) -> dict[str, str]:
     """The topics of an episode that command a robot -> why."""
     contract = Contract.of_episode(summary.metadata)
     actions = {part.topic for part in contract.action_parts} if contract is not None else set()
-    found = {}
+    reasons = {}
     for topic, about in summary.topics.items():
         if topic in actions:
-            found[topic] = "an action of the recorded contract"
+            reasons[topic] = "an action of the recorded contract"
         elif about.type in _COMMAND_TYPES:
-            found[topic] = f"a {about.type}"
+            reasons[topic] = f"a {about.type}"
         elif _COMMAND_NAME.search(topic):
-            found[topic] = "by its name"
-    return found
+            reasons[topic] = "by its name"
+    return reasons
 
 
 def choose(
@@ -196,7 +196,7 @@ def readable(reader: EpisodeReader, chosen: Mapping[str, str], start_ns: int, as
     Raises:
         RecorderError: for a topic that the operator has named, or if none can be read.
     """
-    found, errors = dict(chosen), []
+    topics, errors = dict(chosen), []
     for topic in chosen:
         try:
             next(reader.messages_since(start_ns, [topic]), None)
@@ -204,12 +204,12 @@ def readable(reader: EpisodeReader, chosen: Mapping[str, str], start_ns: int, as
             if topic in asked:
                 raise
             errors.append(error)
-            del found[topic]
-    if errors and not found:
+            del topics[topic]
+    if errors and not topics:
         raise errors[0]
     for each in errors:
         echo(f"not played: {each}", err=True)
-    return found
+    return topics
 
 
 def _renaming(text: str) -> tuple[str, str]:
