@@ -1,4 +1,4 @@
-"""The plugin of core: its commands, executor `position`, engine `monolithic`, and transport `local`, that is none."""
+"""The plugin of core: its commands, executor `position`, engine `monolithic`, and the no-op transport `local`."""
 
 from __future__ import annotations
 

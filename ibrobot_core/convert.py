@@ -134,7 +134,7 @@ def is_array(kind: Any) -> bool:
 
 
 def no_files(text: str) -> Path:
-    """Stands for values that cannot name a file.
+    """Refuse to name a file, for values from outside.
 
     Raises:
         ValueError: always.

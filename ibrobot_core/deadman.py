@@ -47,7 +47,7 @@ class Deadman:
         self._made_ns = 0
         self._reported = False
         self._braking: tuple[int, int] | None = None
-        """From when until when a motion that a release or a silence ended may slow down [ns]; None after others."""
+        """Start and end of the time in which a motion may slow down after a release or silence [ns]; None otherwise."""
         self._asked_ns: int | None = None
 
     @property

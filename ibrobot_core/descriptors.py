@@ -342,9 +342,9 @@ class ReportDescriptor:
     """Folders with results that pages list, and show as a report."""
 
     name: str
-    """As in `Shown.made`, e.g. `evaluation`."""
+    """Kind of the report, as in `Shown.made`, e.g. `evaluation`."""
     title: str
-    """Of the page's view, e.g. `Evaluations`."""
+    """Title of the page's view, e.g. `Evaluations`."""
     reads: Callable[[Path], bool]
     """Returns whether a folder is one, by the names of its files."""
     lines: Callable[[Path], Sequence[str]]

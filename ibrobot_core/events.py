@@ -20,7 +20,7 @@ _BEGIN = '{"event": '
 
 @attrs.frozen
 class Shown:
-    """What a person is shown of an event."""
+    """An event in words for a person."""
 
     text: str = ""
     """The state of the work in one line; empty if the event does not change it."""
@@ -39,7 +39,7 @@ class Event:
     """Base of the events of commands: frozen attrs classes, whose fields (`option`) are plain data."""
 
     def shown(self) -> Shown:
-        """What a person is shown of it; by default nothing."""
+        """The event in words for a person; by default none."""
         return Shown()
 
 

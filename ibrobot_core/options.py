@@ -14,7 +14,7 @@ import attrs
 
 @attrs.frozen
 class NoOptions:
-    """For implementations without options."""
+    """Options of implementations that have none."""
 
 
 @attrs.frozen

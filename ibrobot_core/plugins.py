@@ -352,7 +352,7 @@ def _check_names(plugin: Any) -> None:
 
 
 def _offered(manager: pluggy.PluginManager, hook: str) -> list[Any]:
-    """What a plugin yields for a hook: objects of the class in the hook's annotation, with names that are texts."""
+    """Objects that a plugin yields for a hook; their class is in the hook's annotation, their names are texts."""
     names = {"Iterable": list, "descriptors": descriptors}
     (expected,) = get_args(get_type_hints(getattr(hookspecs, hook), names)["return"])
     offers = [each for result in getattr(manager.hook, hook)() for each in result]

@@ -46,7 +46,7 @@ class Cases:
 
 @attrs.frozen
 class Case:
-    """One of them."""
+    """An episode worth a look."""
 
     title: str
     text: str

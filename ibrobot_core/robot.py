@@ -17,7 +17,7 @@ Vector = NDArray[np.float64]
 """Floats, e.g. one for each joint: shape (J,)."""
 
 FARTHEST = 1e4
-"""No position of a joint is further from 0 [rad, m]: beyond it are mistakes, and numbers that overflow."""
+"""Largest position of a joint [rad, m]; larger values are mistakes, or would overflow."""
 LAG_S = 0.1
 """How long after its setpoint a servo may be at a place [s]; ADR 0016 has what was measured."""
 _LEAD_AT_REST = 0.2

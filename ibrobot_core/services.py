@@ -16,7 +16,7 @@ from ibrobot_core.errors import RequestError
 from ibrobot_core.options import fields
 
 type Plain = bool | int | float | str | Sequence[Plain] | Mapping[str, Plain] | None
-"""What JSON can say. Nothing in it is expanded: neither `${NAME}`, nor `~`, nor YAML in a text."""
+"""A JSON value. Nothing in it is expanded: neither `${NAME}`, nor `~`, nor YAML in a text."""
 
 _UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """Control characters, and halves of characters, which no file and no terminal takes."""

@@ -43,7 +43,7 @@ _ASK, _REPORT_ALL, _REPORT_NO_MORE = b"\x1b[?u", b"\x1b[>27u", b"\x1b[<u"
 keys with the text that they type; and as before."""
 _ANSWER = re.compile(r"\?\d{1,5}")
 _REPORT = re.compile(r"(\d{1,7})(?::[\d:]*)?(?:;(\d{0,5})(?::([123]))?)?(?:;(\d{1,7})[\d:]*)?")
-"""Of the same: the code of a key, its modifiers, the kind of the event, and the first character typed."""
+"""Report of a key in that protocol: its code, its modifiers, the kind of the event, and the first character typed."""
 _PLAIN = {27: "esc", 13: "enter", 9: "tab", 127: "backspace", 57414: "enter"} | dict(
     enumerate(("left", "right", "up", "down", "page_up", "page_down", "home", "end", "insert", "delete"), 57417)
 )

@@ -37,7 +37,7 @@ _INTERRUPTED_TWICE = 130
 _PANEL_HZ = 8
 _PLAIN_PERIOD_S = 2.0
 _READER_S = 1.0
-"""Time for which a run that a signal ended waits for a reader of its output that pauses [s]."""
+"""Wait for a stalled stdout reader after a signal [s]."""
 _KEYS_BLOCKED_S = 2.0
 _STOP_BLOCKED_S = 6.0
 """Times without a sign of life of the threads that read and handle keys, after which the run ends [s]. The answer of
@@ -328,7 +328,7 @@ class _Panel:
 
 
 def _try(session: Session, act: Callable[[], object]) -> None:
-    """Do what the run survives if it fails."""
+    """Run a step; log its failure."""
     try:
         act()
     except IbrobotError as error:

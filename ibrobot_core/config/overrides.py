@@ -20,7 +20,7 @@ class Override(str):
 
     @classmethod
     def of(cls, typed: str, text: str) -> Override:
-        """The override `text` for what the user typed."""
+        """An override made from a flag; errors name `typed`, as the user typed it."""
         made = cls(text)
         made.typed = typed
         return made

@@ -51,9 +51,9 @@ class ParsedSections:
     models: dict[str, ParsedComponent[schema.ModelConfig]] = attrs.field(factory=dict)
     teleoperation: dict[str, ParsedComponent[schema.TeleopConfig]] = attrs.field(factory=dict)
     planners: dict[str, ParsedComponent[schema.PlannerConfig]] = attrs.field(factory=dict)
-    """By control mode."""
+    """Per control mode."""
     inference: dict[str, ParsedComponent[schema.InferenceConfig]] = attrs.field(factory=dict)
-    """By control mode."""
+    """Per control mode."""
     recording: ParsedComponent[schema.RecordingConfig] | None = None
     transport: ParsedComponent[schema.TransportConfig] | None = None
     viewer: ParsedComponent[schema.ViewerConfig] | None = None

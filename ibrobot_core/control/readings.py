@@ -1,4 +1,4 @@
-"""Readings of the joints: those that are believed, and for how long there was none."""
+"""Filter of implausible readings of the joints, and the time since the last plausible one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Readings:
 
     Args:
         hardware: the joints.
-        robot: the joints' limits, for what is plausible.
+        robot: the limits that make a reading plausible.
         clock: the source of stamps.
         period_ns: the control period [ns].
         timeout_ns: time without a new state after which it is a fault [ns].

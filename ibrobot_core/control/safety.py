@@ -49,7 +49,7 @@ class SafetyLayer:
         braking = robot.max_velocity**2 / (2 * robot.max_acceleration)
         usable = robot.max_lead - np.minimum(braking, robot.max_lead) / 4
         self._leads = np.array((robot.max_lead, usable))
-        """Of commands, and of setpoints; the difference suffices to change the speed by half of its limit."""
+        """Leads of commands and of setpoints; the difference suffices to change the speed by half of its limit."""
         # Velocities are steps [rad per tick] and accelerations changes of step, so that dt adds no rounding.
         max_step = robot.max_velocity * self._period_s
         self._change = robot.max_acceleration * self._period_s**2
@@ -199,7 +199,7 @@ class SafetyLayer:
     def _next(self, wanted: Vector, follow: NDArray[np.bool_], lower: Vector, upper: Vector) -> Vector:
         """Advance by a tick towards `wanted` [rad] where `follow`, to a stop elsewhere; shapes (J,) but for the bounds.
 
-        The command never leaves the first bounds. Where `follow`, it brakes for the second ones, and returns to them.
+        The command never leaves the outer bounds. The inner bounds are soft: where `follow`, it brakes towards them.
         """
         slack, low, high = self._half_slack, lower[0], upper[0]
         position = _limited(self._position, low, high)

@@ -347,7 +347,7 @@ class Dispatcher:
 
     @property
     def _slack_ns(self) -> int:
-        """One tick until the request is sent and one for rounding [ns]."""
+        """Margin of the deadline: a tick until the request is sent, and one for rounding [ns]."""
         return 2 * self._contract.step_ns
 
     def _wait_for(self, frame: Frame) -> None:

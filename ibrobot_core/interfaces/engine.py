@@ -22,7 +22,7 @@ class EngineStats:
     weights: str = ""
     """Hash of the weights in use, as in `Policy.weights`."""
     server: str = ""
-    """What computes the answers, as in `Policy.identity`."""
+    """Name and version of the program that computes the answers, as in `Policy.identity`."""
     requests: int = 0
     failures: int = 0
     """Number of failed requests; requests in flight at the time of a failure are counted with it as one."""

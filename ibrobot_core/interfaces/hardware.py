@@ -58,7 +58,7 @@ class SceneObject:
     """Lengths of a box along x, y and z; radius of a sphere; radius and height of a cylinder or capsule (without the
     half spheres); nothing for a plane [m]."""
     pose: Pose
-    """At the beginning, in the base frame."""
+    """Pose at the beginning, in the base frame."""
     topic: str = ""
     """The `Signal` that has its pose during a run; empty for an object that stands still."""
     first: int = 0

@@ -102,7 +102,7 @@ class PlanResult:
     """A trajectory, and how well it meets the goal."""
 
     trajectory: JointTrajectory
-    """From rest to rest, its first point at time zero."""
+    """The motion from rest to rest; its first point is at time zero."""
     fraction: float = 1.0
     """Fraction of the path of a `LinearGoal` that it covers."""
     alternative: int = 0

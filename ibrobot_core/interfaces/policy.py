@@ -210,7 +210,7 @@ class Policy(ABC):
         return ""
 
     def identity(self) -> str:
-        """What computes the answers, with its version, for recordings: a server, or a library. By default empty.
+        """Name and version of the server or library that computes the answers, for recordings. By default empty.
 
         At most 1,024 bytes; available after `load`.
         """

@@ -28,5 +28,5 @@ class Viewer(ABC):
         """Close it. Safe to call twice."""
 
     def where(self) -> str:
-        """Where to look, e.g. a URL."""
+        """Address of the view, e.g. a URL."""
         return ""

@@ -37,7 +37,7 @@ class Episodes:
         self.faults = (*self.faults, fault)
 
     def judged(self, outcome: str) -> str:
-        """The outcome of the present episode, of which `outcome` is said: one with a fault or stop is no success."""
+        """Final outcome of the present episode, judged as `outcome`; never success after a fault or stop."""
         return "failure" if outcome == "success" and self.faults else outcome
 
     def end(self, outcome: str) -> None:

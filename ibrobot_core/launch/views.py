@@ -1,4 +1,4 @@
-"""What the parts of a run may read of it, and do to it: views of its `Session`, which documents the attributes."""
+"""Views of a run's `Session`, which documents the attributes: what each part of a run may read and do."""
 
 # ruff: noqa: D102
 

@@ -56,6 +56,23 @@ OUT = {
     r"\bso many \w+ at a time\b": "at most N at once",
     r"\b[Ll]ead(?:s|ing)? over\b|\bled over\b": "lead-in, transition",
     r"\bas (?:it|he) is asked\b|\bas it is told\b": "as configured, as requested",
+    r"\b[Dd]o what .* if it fails\b": "run a step; log its failure",
+    r"\bof which .* is said\b": "name it: the outcome of the episode",
+    r"\bfor what (?:the|an|a) (?:user|operator|caller)\b": "made from the flag, from the text",
+    r"\bdiffer in no\b": "near-duplicates, equal",
+    r"\bwith it ends what\b|\bwhat others record\b": "external recordings",
+    r"\bnothing of what\b": "none of the messages, no complete message",
+    r"\bof the same memory\b": "a reused buffer",
+    r"\b(?:JSON|all|publishes \w+) but for\b": "except; or a table",
+    r"\bof what it (?:works on|acts on)\b": "of its input",
+    r"\bby which (?:its|his) \w+ \w+ \w+": "name the motion: a retreat",
+    r"\bthose that are (?:believed|trusted|taken)\b": "plausible, accepted",
+    r"\b(?:transport|engine|pool) .{1,12} that is none\b": "the no-op",
+    r"\bis an error of its own\b": "fails alone",
+    r"\bfor the second ones\b|\bthe (?:first|second) bounds\b": "outer and inner bounds",
+    r"\bFrom when until when\b|\bUntil when a\b": "start and end of the time",
+    r"\bWhat (?:has )?(?:became|become) of\b": "the state, the fate, the outcome of",
+    r"\bwhat else is to be known\b": "notes",
 }
 """Pattern -> what to write."""
 
@@ -119,6 +136,61 @@ def test_code_uses_plain_words_in_docstrings_comments_and_messages() -> None:
 
 def test_test_names_use_plain_words() -> None:
     assert [fault for path in TESTS for fault in _faults(path, _test_names(path))] == []
+
+
+def _vague_names(text: str) -> list[int]:
+    """Lines that assign a variable or declare an argument named `found`, which does not tell what it holds.
+
+    The columns of reports may have that name: fields of classes, e.g. of `Check`.
+    """
+    tree = ast.parse(text)
+    fields = {
+        id(each.target)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+        for each in node.body
+        if isinstance(each, ast.AnnAssign)
+    }
+    return [
+        node.lineno
+        for node in ast.walk(tree)
+        if (isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id == "found")
+        or (isinstance(node, ast.arg) and node.arg == "found")
+        if id(node) not in fields
+    ]
+
+
+def test_variables_are_named_after_what_they_hold() -> None:
+    vague = [f"{path.relative_to(ROOT)}:{n}" for path in CODE for n in _vague_names(path.read_text(encoding="utf-8"))]
+    assert vague == [], "name `found` after what it holds, e.g. episodes, match, by_topic"
+
+
+def test_vague_names_are_seen() -> None:
+    text = "class A:\n    found: str\n\ndef f(found):\n    if (found := 1):\n        found: int = 2\n"
+    assert _vague_names(text) == [4, 5, 6]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Do what the run survives if it fails.",
+        "The outcome, of which success is said.",
+        "The override for what the user typed.",
+        "The first of those that differ in no joint.",
+        "Send the rest: with it ends what others record.",
+        "Nothing; nothing of what came was a message.",
+        "Bytes, usually of the same memory as before.",
+        "Channels, JSON but for pictures.",
+        "After the view of what it works on.",
+        "Motion by which its fixed jaw leaves.",
+        "Readings: those that are believed.",
+        "An engine and transport local, that is none.",
+        "A job is an error of its own.",
+        "It brakes for the second ones.",
+    ],
+)
+def test_sentences_that_readers_stumbled_over_are_found(text: str) -> None:
+    assert any(re.search(pattern.replace(" ", r"\s+"), text) for pattern in OUT)
 
 
 def test_words_in_code_are_found_with_their_lines(tmp_path: Path) -> None:

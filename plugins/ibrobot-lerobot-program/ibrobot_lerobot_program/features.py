@@ -29,7 +29,7 @@ class RobotFeatures:
     pictures: Mapping[str, tuple[int, int, int]]
     """Name -> height, width [px] and channels."""
     rate_hz: float
-    """Of the contract."""
+    """Rate of the contract [Hz]."""
 
     @classmethod
     def of_config(cls, config: RobotConfig, *, use_degrees: bool, calibration: str = "") -> Self:
@@ -110,7 +110,7 @@ def _scale(
         return (upper - lower) / 100, lower
     if not use_degrees:
         return (upper - lower) / 200, (upper + lower) / 2
-    # Without a calibration there are no ticks, of which LeRobot counts one less for a turn.
+    # LeRobot: 4095 ticks per turn. Without a calibration there are no ticks.
     degree = math.radians(1.0) if calibration is None else 2 * math.pi / _TURN * (_TURN - 1) / 360
     turned = calibration is not None and calibration.inverted
     return (-degree if turned else degree), (upper + lower) / 2

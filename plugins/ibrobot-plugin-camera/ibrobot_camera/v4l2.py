@@ -22,7 +22,7 @@ _CAPTURE = 1
 """V4L2_BUF_TYPE_VIDEO_CAPTURE, and V4L2_CAP_VIDEO_CAPTURE."""
 _DISCRETE = 1
 COLUMNS = ("format", "size", "rates [Hz]")
-"""What the columns of `Mode.row` are called."""
+"""Headings of the columns of `Mode.row`."""
 
 
 @attrs.frozen
@@ -41,7 +41,7 @@ class Mode:
 
     @property
     def row(self) -> tuple[str, str, str]:
-        """As texts."""
+        """The columns as texts."""
         return self.fourcc, f"{self.width}x{self.height}", ", ".join(f"{rate:g}" for rate in self.rates_hz)
 
 

@@ -46,7 +46,7 @@ INTERVENE = Service(
 _RELEASE_S = 0.2
 """Longest time between two repeats of a held key [s]."""
 _ANSWER_S = 60.0
-"""How long the arm holds while the policy does not answer, before its setpoints count as stale [s]."""
+"""Longest hold while the policy does not answer; later its setpoints count as stale [s]."""
 
 
 class Corrections(SourceWorker):

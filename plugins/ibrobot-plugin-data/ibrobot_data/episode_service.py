@@ -79,7 +79,7 @@ class RecordEpisode:
 @documented
 @attrs.frozen
 class RecordedEpisode:
-    """What has become of an episode."""
+    """State of an episode."""
 
     success: bool = option(help="whether it is complete and kept")
     message: str = option(help="where it is, or why it is not kept")

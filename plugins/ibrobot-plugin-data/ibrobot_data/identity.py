@@ -17,7 +17,7 @@ UUID_KEY = "uuid"
 
 
 TRIMMED_FROM = "trimmed_from"
-"""Key of the metadata of a part of an episode: the recordings of which it is a part, see `recording_of`."""
+"""Key of the metadata of a part of an episode: the recordings that contain it, see `recording_of`."""
 
 
 def identity(reader: EpisodeReader, summary: EpisodeSummary) -> str:
@@ -55,7 +55,7 @@ class _Known:
     identity: str
     recording: str
     trimmed_from: frozenset[str]
-    """The recordings of which it is a part."""
+    """The recordings that contain it."""
 
     @classmethod
     def of(cls, kept: Mapping[str, Any]) -> _Known:

@@ -202,7 +202,7 @@ class Operator(RunHooks):
 
     @override
     def summary_rows(self) -> list[tuple[str, str]]:
-        """For the summary of the run."""
+        """Rows for the summary of the run."""
         self._tell(ended=True)
         episodes = plural(self._service.saved if self._count is None else self._count, "episode")
         return [("recorded", f"{self._saved()} {episodes} into {self._service.folder}"), *rows(self._service.written)]

@@ -52,11 +52,11 @@ class Playback:
     """Measured positions; None if the episode has no joint states."""
     outcome: str
     seed: int | None
-    """Of the scene; None if the episode does not have it."""
+    """Seed of the scene; None if the episode does not have it."""
 
     @property
     def duration(self) -> float:
-        """From the first to the last command [s]."""
+        """Time from the first to the last command [s]."""
         return float(self.commands.times[-1])
 
     def tracking(self, measured: Track) -> dict[str, dict[str, float]]:

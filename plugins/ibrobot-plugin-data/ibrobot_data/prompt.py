@@ -7,7 +7,7 @@ import re
 from ibrobot_core.api import RecorderError
 
 _LONGEST = 1000
-"""As of a text in a request to a service."""
+"""Maximum length, the same as of a text in a request to a service [characters]."""
 _UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 

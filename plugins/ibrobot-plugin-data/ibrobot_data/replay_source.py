@@ -169,6 +169,6 @@ class ReplaySource(SourceWorker):
 
 
 def _ease(share: Vector) -> Vector:
-    """From 0 to 1, at rest at both ends."""
+    """A smooth ramp from 0 to 1, at rest at both ends."""
     eased: Vector = share * share * (3 - 2 * share)
     return eased

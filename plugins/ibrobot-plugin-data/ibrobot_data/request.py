@@ -58,7 +58,7 @@ class ConversionRequest:
 
 
 def _pairs(lists: Iterable[Iterable[int]]) -> tuple[tuple[int, int], ...]:
-    """From JSON, which has no tuples."""
+    """Pairs of a JSON list, as tuples."""
     return tuple((first, second) for first, second in lists)
 
 
@@ -90,7 +90,7 @@ class EpisodeReport:
     outcome: str = "unknown"
     prompt: str = ""
     start_ns: int = 0
-    """Of the episode's first message [ns]."""
+    """Stamp of the episode's first message [ns]."""
     identity: str = ""
     """Hash that identifies the episode; see `identity`."""
     error: str = ""
@@ -110,9 +110,9 @@ class Report:
 
     out: Path
     episodes: tuple[EpisodeReport, ...]
-    """In the order of the request."""
+    """Reports in the order of the request."""
     size_bytes: int
-    """Of the whole dataset; 0 if there is none."""
+    """Size of the whole dataset; 0 if there is none."""
     seconds: float
     resumed: int
     """Episodes that an earlier, interrupted run had converted."""
@@ -128,7 +128,7 @@ class Report:
         return tuple(each for each in self.episodes if each.error)
 
     def summary(self) -> dict[str, Any]:
-        """As JSON values, for the whole; the fields of the event of the same name."""
+        """JSON values of the whole: the fields of the event of the same name."""
         done = self.converted
         episodes = sum(len(each.stretches) or 1 for each in done)
         return {

@@ -212,7 +212,7 @@ class _Plan:
         self._expected: dict[str, int] = {}
         """Source -> number of frames, estimated from its length."""
         self._copies: dict[str, str] = {}
-        """Source -> the source of which it is a copy; not converted unless that one fails."""
+        """Copy -> its original; a copy is converted only if the original fails."""
         self._alike: dict[Any, list[tuple[Job, str]]] = {}
         """Properties in which the summaries of copies agree -> new episodes, with identity if a summary tells it."""
         self.resumed = 0

@@ -32,7 +32,7 @@ ACTION = "action"
 _LONGEST_SILENCE_S = 60
 """Maximum time without a message of any topic [s]; a damaged stamp could otherwise produce years of rows."""
 _ANY_AGE = Align("asof", "receive", 1e12)
-"""For signals, which may pause."""
+"""Alignment of signals, which may pause: a value of any age counts."""
 
 
 type _Incomplete = tuple[int, frozenset[str]]
@@ -163,7 +163,7 @@ class _Source:
             yield recorded.topic, recorded.message, recorded.received_ns
 
     def ticks(self, step_ns: int) -> Iterator[int]:
-        """From the first message to the last."""
+        """Times of the ticks, from the first message to the last [ns]."""
         t_ns = self.first_ns
         while self._newest_ns >= t_ns or self._read_on():
             if self._newest_ns >= t_ns:

@@ -47,7 +47,7 @@ class Report:
     margin: float
     until_decided: bool
     notes: tuple[str, ...] = ()
-    """What else is to be known, e.g. of videos that were not made, or of a drift over time."""
+    """Notes, e.g. on videos that were not made, or of a drift over time."""
 
     @classmethod
     def of(
@@ -61,7 +61,7 @@ class Report:
             episodes: the episodes to list.
             margin: a difference below it counts as none.
             until_decided: whether the evaluation ended with a decision.
-            notes: what else is to be known.
+            notes: to print, e.g. on videos that were not made.
         """
         summaries = tuple(Summary.of(label, of_policy) for label, of_policy in results.items())
         return cls(summaries, tuple(compare(results, margin)), tuple(episodes), margin, until_decided, tuple(notes))

@@ -25,7 +25,7 @@ class Supply:
 
     @property
     def limits(self) -> str:
-        """As text."""
+        """The limits as text."""
         return f"{self.least:.1f} to {self.greatest:.1f} V"
 
     @property

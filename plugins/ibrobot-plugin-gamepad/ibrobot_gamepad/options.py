@@ -12,7 +12,7 @@ from ibrobot_core.api import did_you_mean, documented, option
 from ibrobot_gamepad.controls import MOUSE_AXES, MOUSE_BUTTONS, PAD_AXES, PAD_BUTTONS
 
 NONE = "none"
-"""In a mapping: this function has no control."""
+"""Value in a mapping of a function without control."""
 TOOL_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 FUNCTIONS = (
     "deadman", "toggle", "gripper_open", "gripper_close", "gripper", "estop",

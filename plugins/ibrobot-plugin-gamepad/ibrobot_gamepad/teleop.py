@@ -56,7 +56,7 @@ class JogTeleop(Teleop):
         self._jog = VelocityJog(self._arm, options.follow)
         self._mode = options.start
         self._finder: Finder | None = None
-        """From `connect` to `disconnect`."""
+        """Exists from `connect` to `disconnect`."""
         self._device: Device | None = None
         self._name = ""
         self._looked_ns: int | None = None

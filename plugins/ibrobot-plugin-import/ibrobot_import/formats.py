@@ -17,7 +17,7 @@ class Format:
     """A format."""
 
     name: str
-    """What such a file is, for messages."""
+    """Name of the format, for messages."""
     program: str
     """The program whose format it is."""
     reads: Callable[[Mapping[str, Any]], bool]

@@ -19,7 +19,7 @@ _ARMS = ("so101_hardware/SO101SystemHardware", "lekiwi_hardware/LeKiwiSystemHard
 _CONTROLLER = re.compile(r"(\w+?)_(position|trajectory)_controller")
 _FORMATS = {"mjpeg2rgb": "MJPG", "mjpeg": "MJPG", "yuyv": "YUYV", "yuyv2rgb": "YUYV"}
 _AUTOMATIC = -1
-"""What stands for a value that the camera chooses."""
+"""Placeholder of a value that the camera chooses."""
 _TELEOP = {"leader_arm": "so101_leader", "xbox_controller": "gamepad", "phone": "webxr"}
 _SECTIONS = {
     "type": "selects nothing here; robot_type is what datasets have",

@@ -40,7 +40,7 @@ class Body:
     config: str
     """The config that ibrobot ships."""
     prefixes: tuple[str, ...]
-    """What the joints' names begin with, for each arm."""
+    """Prefix of the joints' names of each arm."""
 
     @property
     def origin(self) -> str:

@@ -17,7 +17,7 @@ _LENGTH = 60
 
 
 class Fate(StrEnum):
-    """What became of a value."""
+    """Fate of a value: taken, changed or refused."""
 
     TAKEN = "taken"
     CHANGED = "changed"
@@ -26,7 +26,7 @@ class Fate(StrEnum):
 
 @attrs.frozen
 class Verdict:
-    """What became of one value of the file, and why."""
+    """Fate of one value of the file, and the reason."""
 
     line: int
     key: str

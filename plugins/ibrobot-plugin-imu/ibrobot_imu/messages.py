@@ -98,7 +98,7 @@ class Bno08xReader(MessageReader):
 
 
 class WitMotionReader(MessageReader):
-    """WitMotion sensors: messages of 11 bytes, of which those of type 0x53 have angles.
+    """WitMotion sensors: messages of 11 bytes; those of type 0x53 have angles.
 
     0x55, the type, four int16 little-endian, and the sum of all bytes before. Type 0x53 has roll, pitch and yaw in
     units of 180 / 32768 degrees, and the version. Times (0x50), accelerations (0x51), angular rates (0x52) and the

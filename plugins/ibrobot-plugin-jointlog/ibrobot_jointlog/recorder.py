@@ -35,9 +35,9 @@ class _Episode:
     start: EpisodeStart
     descriptor: int
     checksum: int = 0
-    """Of the last row."""
+    """Checksum up to the last row."""
     written_checksum: int = 0
-    """Of the last row on the disk."""
+    """Checksum up to the last row on the disk."""
     size: int = 0
     rows: list[str] = attrs.field(factory=list)
     oldest_ns: int = 0

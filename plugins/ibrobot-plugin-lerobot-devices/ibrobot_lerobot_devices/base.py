@@ -59,7 +59,7 @@ class Base:
         self._change = max_acceleration * period_s
         self._period_s = period_s
         self.velocity: Vector = np.zeros(len(axes))
-        """As measured [m/s, rad/s], shape (B,)."""
+        """Measured velocity [m/s, rad/s], shape (B,)."""
         self.way: Vector = np.zeros(len(axes))
         """[m, rad], shape (B,)."""
         self._stamp_ns: int | None = None

@@ -55,7 +55,7 @@ class CmdVelTeleop(Teleop):
         self._wanted: Vector = np.zeros(len(self._joints))
         """The newest twist [m/s, rad/s]."""
         self._velocity: Vector = np.zeros(len(self._joints))
-        """Of the setpoint, if the base keeps up [m/s, rad/s]."""
+        """Velocity of the setpoint, if the base keeps up [m/s, rad/s]."""
         self._pace = 1.0
         """Share of that velocity at which the setpoint moves, for a base that is behind."""
         self._setpoint: Vector | None = None

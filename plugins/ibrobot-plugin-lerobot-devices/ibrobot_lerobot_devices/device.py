@@ -49,7 +49,7 @@ _NEWEST = ("act", "read", STAND)
 
 @attrs.define
 class Traffic:
-    """What the present call of LeRobot's has received from serial ports."""
+    """Traffic from serial ports during the present call of LeRobot's."""
 
     reads: int = 0
     received: int = 0
@@ -128,7 +128,7 @@ class Pictures:
 
     fps: float | None
     _pixels: Any = None
-    """Of the newest one, shape (H, W) or (H, W, C)."""
+    """Pixels of the newest picture, shape (H, W) or (H, W, C)."""
     _taken_s: float | None = None
 
     def is_new(self, pixels: Any, taken_s: float | None) -> bool:
@@ -282,18 +282,18 @@ class Device:
         raise self._library.DeviceError(f"LeRobot cannot stop the base: {why}")
 
     def _stand_by_action(self, rest: Mapping[str, float]) -> bool:
-        """By an action that leaves the arm where it was sent, or where it is."""
+        """Stop by an action that leaves the arm where it was sent, or where it is."""
         features = self._device.action_features
         arm = self._acted or {name: value for name, value in self.read().items() if name in features}
         self._device.send_action({**arm, **rest})
         return True
 
     def _stand_by_lerobot(self, rest: Mapping[str, float]) -> bool:
-        """By LeRobot's own call, if the robot has one, as LeKiwi."""
+        """Stop by LeRobot's own call, if the robot has one, as LeKiwi."""
         return bool(self._library.stop_base(self._device))
 
     def _stand_without_torque(self, rest: Mapping[str, float]) -> bool:
-        """By switching off the torque of the wheels."""
+        """Stop by switching off the torque of the wheels."""
         wheels = self._library.wheels(self._device)
         for bus, names in wheels:
             bus.disable_torque(names)

@@ -100,7 +100,7 @@ def make(kind: Kind, wanted: str, config: Mapping[str, Any]) -> Any:
 
 
 def _cause(error: BaseException) -> BaseException:
-    """What an error began with: draccus repeats the whole config before it."""
+    """The cause of an error: draccus repeats the whole config before it."""
     while error.__cause__ is not None:
         error = error.__cause__
     return error

@@ -18,7 +18,7 @@ _MODULE = "ibrobot_lerobot_devices.device"
 _END_S = 1.5
 """How long a device process may take to end [s]; then it is killed."""
 _TRAFFIC_S = 0.02
-"""How long a fault waits for what the ports received [s]."""
+"""Wait of a fault for the report of the ports' traffic [s]."""
 _MANY = 1 << 16
 """Unread bytes from which on actions are dropped: LeRobot's call has blocked for seconds."""
 
@@ -179,7 +179,7 @@ class DeviceLink:
             return str(problem)
 
     def _traffic(self) -> str:
-        """What has come from the device's ports during the present call."""
+        """Traffic from the device's ports during the present call, in words."""
         self._running().channel.send({"do": TRAFFIC})
         deadline_s = time.monotonic() + _TRAFFIC_S
         while (left_s := deadline_s - time.monotonic()) > 0:

@@ -1,4 +1,4 @@
-"""What the installed LeRobot has, read once in a process of its own and kept in a file; checks of options by it."""
+"""Device types of the installed LeRobot, read once in a separate process and cached in a file; checks of options."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from typing import Any, NoReturn, override
 
 _NAME = "torch"
 NEEDS_TORCH = "torch is not loaded for this device: set torch: true"
-"""In the error of what calls a name of the stand-in."""
+"""Text in the error of a call of the stand-in."""
 
 
 class _Placeholder(type):

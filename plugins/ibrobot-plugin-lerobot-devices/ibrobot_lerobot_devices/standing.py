@@ -15,7 +15,7 @@ _PATIENCE_S = 0.15
 _TRY_S = 1.0
 """How long a process that answers may try [s]."""
 _HOPE_S = 0.5
-"""How long nobody is warned that the base may still be driving [s]."""
+"""Delay of the warning that the base may still be driving [s]."""
 _PAUSE_S = 1.0
 """Time until another process is started after one that could not connect [s]."""
 
@@ -29,7 +29,7 @@ class Standing:
 
     Args:
         link: the device process.
-        log: for what happens to the base.
+        log: receives the events of the base.
 
     Attributes:
         is_starting: whether a new process connects; it takes nothing but the order to end.

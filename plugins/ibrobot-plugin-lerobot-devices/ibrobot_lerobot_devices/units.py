@@ -176,7 +176,7 @@ def _scale(unit: str, motor: Mapping[str, Any], joint: str, choices: Choices, li
 
 
 def _by_calibration(unit: str, motor: Mapping[str, Any], joint: str, choices: Choices, lower: float) -> Scale:
-    """By way of the encoder's ticks, as LeRobot counts them."""
+    """Scale by the encoder's ticks, as LeRobot counts them."""
     resolution, first, last = motor["resolution"], motor["range_min"], motor["range_max"]
     span, backwards = last - first, motor["reversed"]
     # ticks = slope * value + start

@@ -34,7 +34,7 @@ def installed() -> str | None:
 
 
 def tested(version: str) -> str | None:
-    """The tested version with the same minor one as `found`; None if there is none."""
+    """The tested version with the same minor one as `version`; None if there is none."""
     try:
         minor = Version(version).release[:2]
     except InvalidVersion:

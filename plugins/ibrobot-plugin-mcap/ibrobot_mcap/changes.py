@@ -22,7 +22,7 @@ DONE = {
 
 @attrs.frozen(kw_only=True)
 class MarkOptions:
-    """How episodes went."""
+    """Outcomes of episodes."""
 
     episodes: tuple[Path, ...] = option(argument=True, names="episodes", help="episodes to judge")
     outcome: str = option(argument=True, choices=OUTCOMES, help="how they went")
@@ -51,7 +51,7 @@ class DeleteOptions:
 
 @attrs.frozen(kw_only=True)
 class TrashOptions:
-    """What to do with a trash."""
+    """Actions on a trash."""
 
     path: Path = option(Path("episodes"), argument=True, names="episodes", help="folder of episodes")
     restore: str | None = option(None, help="put back the one with this id")

@@ -13,7 +13,7 @@ COMPRESSIONS = ("none", "lz4", "zstd")
 @documented
 @attrs.frozen
 class McapOptions:
-    """How episodes are written."""
+    """Options of writing episodes."""
 
     compression: str = option("none", choices=COMPRESSIONS, help="compression of chunks; useless for JPEG images")
     chunk_size: int = option(MIB, unit="bytes", ge=1024, le=256 * MIB, help="a chunk of this size is written")

@@ -54,7 +54,7 @@ class Output:
         return len(data)
 
     def tell(self) -> int:
-        """As `size`."""
+        """Like `size`."""
         return self.size
 
     def flush(self) -> None:

@@ -22,7 +22,7 @@ from ibrobot_mcap.storage import Storage
 REPAIRED = "repaired"
 """Key of `custom_data` that states that an episode was repaired."""
 TRIMMED_FROM = "trimmed_from"
-"""Key of the recordings of which an episode is a part, newest last, by UUID or, without one, by digest."""
+"""Key of the recordings that contain an episode, newest last, by UUID or, without one, by digest."""
 
 
 def rewrite(
@@ -83,7 +83,7 @@ def rewrite(
 def _of_a_part(
     reader: Rosbag2Reader, summary: EpisodeSummary, begin_ns: int | None, end_ns: int | None
 ) -> dict[str, str]:
-    """Metadata of a part of an episode: its own UUID, and the recordings of which it is a part."""
+    """Metadata of a part of an episode: its own UUID, and the recordings that contain it."""
     uuid = summary.metadata.get("uuid", summary.path.name)
     own = str(uuid5(NAMESPACE_OID, f"{uuid} {begin_ns} {end_ns}"))
     whole = uuid if _is_random(uuid) else reader.digest()

@@ -28,7 +28,7 @@ class Chain:
 
 
 def parents_of(model: mujoco.MjModel, joints: Sequence[str]) -> dict[str, str | None]:
-    """For each joint the next one towards the base that is among them; None for the first ones."""
+    """Joint -> the next of these joints towards the base; None if there is none."""
     of_body: dict[int, list[str]] = {}
     for name in joints:
         of_body.setdefault(int(model.joint(name).bodyid[0]), []).append(name)

@@ -19,7 +19,7 @@ from ibrobot_mujoco.urdf_file import Shape, several
 _READS = (".stl", ".obj", ".msh")
 """Meshes that MuJoCo reads."""
 _FLAT = ("coplanar", "at least 4 vertices")
-"""What MuJoCo says of a mesh without a volume."""
+"""MuJoCo's error for a mesh without a volume."""
 _INSTALL = "pip install 'ibrobot-plugin-mujoco[urdf]'"
 
 
@@ -61,7 +61,7 @@ class Meshes:
         return name
 
     def notes(self) -> list[str]:
-        """What was changed."""
+        """Notes on what was changed."""
         texts = (
             ("Meshes that MuJoCo does not read are converted to STL: {}.", self._converted),
             ("Meshes in other units are converted to metres, as their files say: {}.", self._scaled),

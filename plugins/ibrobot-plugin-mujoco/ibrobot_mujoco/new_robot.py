@@ -157,7 +157,7 @@ def _limits(lower: float, upper: float) -> tuple[str, str]:
 
 
 def _joint(joint: DrivenJoint, *, grips: bool) -> str:
-    """A joint; `grips` says so of those of a gripper, whose group is not named gripper."""
+    """A joint; `grips` marks a gripper's joint whose group is not named gripper."""
     lower, upper = _limits(joint.lower, joint.upper)
     return (
         f"{{name: {_word(joint.name)}, lower: {lower}, upper: {upper}, max_velocity: {joint.max_velocity:.6g}, "

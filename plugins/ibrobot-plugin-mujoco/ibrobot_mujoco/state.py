@@ -17,7 +17,7 @@ the episode."""
 SCENE_TOPIC = "/simulation/scene"
 """Ground truth of the scene; see its `values`."""
 OBJECTS_TOPIC = "/simulation/objects"
-"""Of each object of `simulation.objects` that has a mass, in file order: position [m] (3), quaternion wxyz (4)."""
+"""Pose of each object of `simulation.objects` that has a mass, in file order: position [m] (3), quaternion wxyz (4)."""
 POSE_SIZE = 7
 _STAMP_SIZE = 2
 # Positions are sufficient for rendering.

@@ -27,7 +27,7 @@ _SIZES: Mapping[str, tuple[tuple[str, int], ...]] = {
 }
 """Shape -> its attributes, with the number of values of each."""
 _MOST = 1e6
-"""No value of a robot is larger, in any unit of the SI."""
+"""Largest value of a robot, in any unit of the SI."""
 _WHEEL = re.compile(r"wheel|caster", re.IGNORECASE)
 _TURNS = 100.0
 """Limits beyond it are those of a joint without end [rad]."""

@@ -29,7 +29,7 @@ class Interpreter:
     """An interpreter that has rclpy."""
 
     command: tuple[str, ...]
-    """Runs a script, with what follows as its arguments."""
+    """Command that runs a script; the arguments follow."""
     found: str
     """How it was found."""
     environment: Mapping[str, str] = attrs.field(factory=dict)

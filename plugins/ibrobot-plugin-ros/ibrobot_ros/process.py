@@ -23,7 +23,7 @@ _START_S = 30.0
 _GLANCE_S = 0.1
 _END_S = 2.0
 _SAID = 2000
-"""Characters of what the node printed that its cause of death contains."""
+"""Number of characters of the node's output that its cause of death quotes."""
 
 
 @attrs.frozen

@@ -161,7 +161,7 @@ class RosNode(Component):
                 self.topics.send_next(wire, _GLANCE_S)
 
     def _send_rest(self, wire: Wire) -> None:
-        """Send what waits at the end: with it ends what others record."""
+        """Flush, so external recordings are complete."""
         deadline_s = time.monotonic() + _END_S
         while not wire.closed and time.monotonic() < deadline_s and self.topics.send_next(wire, 0.0):
             pass

@@ -16,7 +16,7 @@ from ibrobot_core.api import Frame, Policy, PolicyError
 from ibrobot_core.app import check_finite
 
 _WORDS = {"actions": "joints", "rate_hz": "rate"}
-"""Key of what a model may not know -> word for it."""
+"""Key that a model may leave unknown -> word for it in messages."""
 
 
 class ClientModel:

@@ -16,7 +16,7 @@ class FairQueue[T]:
     def __init__(self, depth: int) -> None:
         self._depth = depth
         self._waiting: dict[str, T] = {}
-        """In the order of their turns."""
+        """Robot -> its request, in the order of their turns."""
         self._changed = threading.Condition()
         self._ended = False
 

@@ -150,7 +150,7 @@ class Choice:
 
     robot: str
     _avoided: dict[str, tuple[float, float]] = attrs.field(factory=dict, init=False)
-    """Until when a server is avoided [s], and how long the pause was [s]."""
+    """End of the time in which a server is avoided [s], and its length [s]."""
 
     def avoid(self, server: str, now_s: float) -> None:
         """Try other servers first from now on, for a while."""

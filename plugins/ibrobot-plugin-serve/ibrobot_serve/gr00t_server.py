@@ -75,7 +75,7 @@ class Gr00tServer:
         while not self._closed.is_set():
             if not self._socket.poll(_GLANCE_MS):
                 continue
-            with suppress(zmq.Again):  # nothing of what came was a message
+            with suppress(zmq.Again):  # no complete message
                 sender, *frames = self._socket.recv_multipart(zmq.NOBLOCK)
                 if len(frames) == 2 and not frames[0]:  # from a socket of kind REQ
                     self._socket.send_multipart([sender, b"", pack_npy(self._answer(frames[1]))], zmq.NOBLOCK)

@@ -112,12 +112,12 @@ class WireMessage:
 
     kind: WireKind
     id: int
-    """Of the request; its answer carries the same."""
+    """Number of the request; its answer carries the same."""
     tensors: Tensors = attrs.field(factory=dict)
     robot: str = ""
     """Name of the sender, unique among a server's robots."""
     fingerprint: str = ""
-    """Of the sender's policy."""
+    """Fingerprint of the sender's policy."""
     text: str = ""
     stamp_ns: int = 0
     """When the robot sent the request, by its own clock; the answer repeats it."""
@@ -266,7 +266,7 @@ class Buffer:
         self._memory = bytearray()
 
     def allocate(self, size: int) -> memoryview:
-        """Return `size` bytes, usually of the same memory as before: a frame is valid until the next one is made."""
+        """Return `size` bytes of a reused buffer; a frame is valid until the next call."""
         try:
             if size < len(self._memory):
                 del self._memory[size:]
@@ -337,7 +337,7 @@ class WireDecoder:
         self._limits = limits
         self._codec = codec
         self._layouts: _Layouts[bytes] = _Layouts()
-        """By the bytes of `head`."""
+        """Bytes of `head` -> layout."""
 
     def decode(self, payload: Payload) -> WireMessage:
         """Decode a frame. Tensors are read-only views of `payload`, except for JPEG pictures. Thread-safe.

@@ -43,7 +43,7 @@ INTERESTING = (0, 1, 7, 8, 127, 128, 255, 256, 2**15, 2**16 - 1, 2**31, 2**32 - 
 
 
 class Adds(FakePolicy):
-    """Adds one; whatever it cannot add to is an error of its own."""
+    """Adds one; whatever it cannot add to fails alone."""
 
     def __init__(self) -> None:
         super().__init__(host_context())

@@ -12,8 +12,16 @@ import struct
 import threading
 
 STATE, STATUS, SAMPLES, PLAN, FIRST_PICTURE = 0, 1, 2, 3, 16
-"""Channels, JSON but for pictures: joint states; everything else about the run; topics to plot; the plan; pictures of
-the first camera, and then of the others."""
+"""Channels of the stream:
+
+| channel | content | encoding |
+|---|---|---|
+| `STATE` | joint states | JSON |
+| `STATUS` | everything else about the run | JSON |
+| `SAMPLES` | topics to plot | JSON |
+| `PLAN` | the plan | JSON |
+| `FIRST_PICTURE` and up | pictures, a channel per camera | binary, see `PICTURE_HEAD` |
+"""
 PICTURE_HEAD = struct.Struct("<qHHB")
 """Before a picture's bytes: stamp [ns], width and height [px], encoding."""
 JPEG, RGB, PNG = 0, 1, 2

@@ -13,7 +13,7 @@ from ibrobot_webxr.one_euro import PoseFilter
 from ibrobot_webxr.options import WebxrOptions
 
 _TO_ROBOT = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""From WebXR's axes (right, up, back) to the robot's (forward, left, up)."""
+"""Rotation from WebXR's axes (right, up, back) to the robot's (forward, left, up)."""
 _REST_S = 0.5
 """A hand that stays within the dead zone for that long is at rest [s]."""
 _DRIFT_S = 1.0

@@ -58,5 +58,5 @@ type Query = zenoh.Query | OwnQuery
 
 
 def attachment_of(query: Query) -> bytes:
-    """What is attached to a query; empty if nothing is."""
+    """The attachment of a query; empty without one."""
     return query.attachment.to_bytes() if query.attachment is not None else b""

@@ -18,7 +18,7 @@ NO_HASH = "TypeHashNotSupported"
 """ROS 2 Humble's placeholder for the hash of a type."""
 
 HIDDEN = "/_"
-"""What is in names that ros2 does not list, e.g. those of the services of an action."""
+"""Part of names that ros2 does not list, e.g. of the services of an action."""
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _ATTACHMENT = struct.Struct("<qqB16s")
 _PUBLISHER, _SUBSCRIBER, _SERVER, _CLIENT = "MP", "MS", "SS", "SC"

@@ -28,7 +28,7 @@ _ENDED_KEPT = 100
 _LOOK_S = 0.5
 """How often to look for services that a mode has brought."""
 _CHECK = Offer(TRIGGER, CHECK_ESTOP.name, {})
-"""What tries out an emergency stop."""
+"""Service that tries out an emergency stop."""
 _CANCELED, _REJECTED, _UNKNOWN, _OVER = 0, 1, 2, 3
 """Return codes of action_msgs/srv/CancelGoal."""
 
@@ -160,7 +160,7 @@ class RosSharing(SessionWorker):
         self._publish_status(server)
 
     def _contain(self, handle: Callable[..., None], server: _Server, request: dict[str, Any], reply: Reply) -> None:
-        """Handle an urgent call that is no emergency stop: a bug in it does not end the run."""
+        """Handle an urgent call other than an emergency stop: a bug in it does not end the run."""
         try:
             handle(server, request, reply)
         except Exception:

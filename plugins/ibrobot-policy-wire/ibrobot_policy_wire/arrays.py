@@ -128,12 +128,12 @@ type Unpack = Callable[[bytes], Any]
 """Unpacks a message; its arrays are read-only. Raises PolicyError if it is damaged."""
 
 pack: Pack = partial(msgpack.packb, default=_packed)
-"""For openpi."""
+"""Codec of openpi."""
 unpack: Unpack = partial(_unpack, hook=_unpacked)
 pack_npy: Pack = partial(msgpack.packb, default=_packed_npy)
-"""With arrays as .npy files, for GR00T."""
+"""Codec of GR00T, with arrays as .npy files."""
 unpack_npy: Unpack = partial(_unpack, hook=_unpacked_npy)
 """Descriptions of modalities become dictionaries."""
 pack_named: Pack = partial(msgpack.packb, default=_packed_named)
-"""With arrays under text keys, for vla-eval."""
+"""Codec of vla-eval, with arrays under text keys."""
 unpack_named: Unpack = partial(_unpack, hook=_unpacked_named)

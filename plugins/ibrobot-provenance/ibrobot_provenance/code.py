@@ -67,7 +67,7 @@ class _Package:
     """An installed package."""
 
     version: str
-    """Its version, with what else identifies its content."""
+    """Its version, with its commit or hash if it has one."""
     folder: Path | None
     """The folder of the source of an editable package."""
     requirements: tuple[str, ...]
@@ -100,7 +100,7 @@ def _package(name: str, path: tuple[str, ...]) -> _Package | None:
 
 
 def _origin(package: Distribution) -> tuple[str, Path | None]:
-    """The version of a package, with what else identifies it, and the folder of an editable one."""
+    """The version of a package with its commit or hash, and the folder of an editable one."""
     version = package.version
     try:
         direct = json.loads(package.read_text("direct_url.json") or "{}")

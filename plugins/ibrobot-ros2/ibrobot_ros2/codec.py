@@ -36,7 +36,7 @@ class Codec:
 
     @cached_property
     def _types(self) -> Typestore:
-        """The types; a store takes too long to make for a bag of which only the summary is read."""
+        """The types; a store takes too long to make where only the summary of a bag is read."""
         # First needed with `DEFINING` held, so that it is made once.
         return make_typestore() if self._definitions else standard_types()
 

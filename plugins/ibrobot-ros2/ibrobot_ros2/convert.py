@@ -58,7 +58,7 @@ def make_class(type_name: str, types: Typestore) -> type[Any]:
 
 
 def encoder(type_name: str, types: Typestore) -> Convert:
-    """What makes the store's object of one of core's."""
+    """Make the function that converts an object of core to the store's."""
     ros_class = types.types[type_name]
     left_out = _LEFT_OUT.get(type_name, {})
     parts = [
@@ -113,7 +113,7 @@ def _encode_array(get: Convert, dtype: np.dtype[Any], size: int) -> Convert:
 
 
 def decoder(type_name: str, cls: type[Any], types: Typestore, class_of: Callable[[str], type[Any]]) -> Convert:
-    """What makes a `cls` of the store's object; `class_of` gives the classes of its parts."""
+    """Make the function that converts an object of the store to a `cls`; `class_of` gives the classes of its parts."""
     parts: list[tuple[str, Convert]] = []
     for name, desc in types.fielddefs[type_name][1]:
         if name in _LEFT_OUT.get(type_name, {}) and cls is core_class(type_name):

@@ -27,7 +27,7 @@ from ibrobot_ros2.definitions import DEFINING, EVENT, CodecError, known, registe
 FOLDER = files(__package__) / "interfaces"
 """The texts of services, actions and messages that ROS 2 nodes often have: PACKAGE/KIND/NAME.KIND."""
 _EMPTY = "uint8 structure_needs_at_least_one_member\n"
-"""What ROS 2 puts into a message without fields."""
+"""Field that ROS 2 puts into a message without fields."""
 _PARTS = "{name}_Request request_message\n{name}_Response response_message\n{name}_Event event_message\n"
 _UUID = "unique_identifier_msgs/UUID goal_id\n"
 _LITTLE_ENDIAN = b"\x00\x01"

@@ -18,7 +18,7 @@ _SPACES = {"rgb8": ("RGB", 3), "bgr8": ("BGR", 3), "mono8": ("GRAY", 1)}
 _HARMLESS = "extraneous bytes before marker"
 """libjpeg's warning of padding, which cheap webcams leave in whole pictures."""
 _MOST_PIXELS = 1 << 26
-"""What a damaged header may make us allocate."""
+"""Limit of the memory that a damaged header can make us allocate."""
 _SMALLEST = 8
 """An eighth of the size: every byte is read, and few pixels are made."""
 

@@ -24,9 +24,9 @@ class Offer:
     type: str
     service: str
     request: Mapping[str, Any]
-    """What is sent with every call."""
+    """Fields sent with every call."""
     field: str = ""
-    """The key of the request that SetBool's `data` is."""
+    """Field of the request filled from `SetBool.data`; empty without one."""
     urgent: bool = False
 
 

@@ -14,14 +14,14 @@ from ibrobot_core.api import CompressedImage, ContractError, Image
 
 _BEGINS = b"\x89PNG\r\n\x1a\n"
 _KIND = slice(24, 26)
-"""Where a PNG says its bits per sample and type of colour."""
+"""Offsets of a PNG's bits per sample and colour type."""
 _ENCODINGS = {b"\x08\x00": "mono8", b"\x08\x02": "rgb8", b"\x08\x06": "rgba8", b"\x10\x00": "16UC1"}
 _COLOURS = {0: "grey", 2: "RGB", 3: "a palette", 4: "grey with alpha", 6: "RGBA"}
 _CHUNK = struct.Struct(">I4s")
 _CRC = struct.Struct(">I")
 _DEPTH = "compressedDepth"
 _DEPTH_HEADER = struct.Struct("<iff")
-"""Of image_transport: a number for the format, and A and B of the quantisation."""
+"""Header of image_transport: a number for the format, and A and B of the quantisation."""
 
 
 def is_png(image: CompressedImage) -> bool:
@@ -52,7 +52,7 @@ def from_png(image: CompressedImage) -> Image:
 
 
 def _begin(image: CompressedImage) -> int:
-    """Where the PNG begins."""
+    """Offset of the PNG."""
     return _DEPTH_HEADER.size if _DEPTH in image.format else 0
 
 

@@ -78,7 +78,7 @@ class PoolSuite(Suite[Pool]):
         assert (type(error).__name__, str(error), error.exit_code) == ("DatasetError", "1 is odd", 7)
 
     def test_bug_in_a_job_is_an_error(self) -> None:
-        """An exception that is no error of ibrobot is reported, too."""
+        """An exception of another class than ibrobot's errors is reported, too."""
         with self.opened(1) as pool:
             (done,) = pool.run([Job(divide, Order(0))])
         assert "ZeroDivisionError" in str(done.error)
@@ -92,7 +92,7 @@ class PoolSuite(Suite[Pool]):
         assert counts[-1] == 3, "the progress of a process that died does not count"
 
     def test_job_that_kills_each_process_fails_and_others_do_not(self) -> None:
-        """A job with which several processes have died is an error of its own."""
+        """A job with which several processes have died fails alone."""
         with self.opened(2) as pool:
             done = {each.job.argument.number: each for each in pool.run([Job(die_if_odd, Order(n)) for n in range(3)])}
         assert (done[0].result(), done[2].result()) == (0, 2)

@@ -9,7 +9,7 @@ _FIRST = ("south", "east", "", "west", "north", "", "left_shoulder", "right_shou
 _SECOND = ("", "", "back", "start", "guide", "left_stick", "right_stick")
 _OLD_SECOND = ("left_trigger", "right_trigger", *_SECOND[2:])
 _NUMBERS = (0x01, 0x03, 0x04)
-"""Of reports over Bluetooth, by old and by new firmware over USB."""
+"""Ids of reports over Bluetooth, and over USB by old and by new firmware."""
 
 
 def parse_8bitdo(report: bytes) -> Controls | None:

@@ -17,7 +17,7 @@ _ENOUGH_M = 0.085
 
 
 class DrawerTask(Task):
-    """For scene `drawer`."""
+    """The scripted policy of scene `drawer`."""
 
     @override
     def plan(self, way: Way, scene: Vector, home: Vector) -> None:

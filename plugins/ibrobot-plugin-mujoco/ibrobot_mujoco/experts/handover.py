@@ -33,7 +33,7 @@ _HELD_M = _GRIP_M + 0.035
 
 
 class HandoverTask(Task):
-    """For scene `handover`."""
+    """The scripted policy of scene `handover`."""
 
     sides: ClassVar[tuple[str, ...]] = ("left_", "right_")
 

@@ -26,7 +26,7 @@ DELIVERED_M = 0.07
 
 
 class PickTask(Task):
-    """For scene `pick_cube`; the base of the experts that put cubes into bins."""
+    """The scripted policy of scene `pick_cube`; the base of the experts that put cubes into bins."""
 
     @override
     def plan(self, way: Way, scene: Vector, home: Vector) -> None:

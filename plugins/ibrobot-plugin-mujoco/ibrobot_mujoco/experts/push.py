@@ -26,7 +26,7 @@ of the tip against the heading, so that the middle of the face pushes [m]."""
 
 
 class PushTask(Task):
-    """For scene `push`."""
+    """The scripted policy of scene `push`."""
 
     @override
     def plan(self, way: Way, scene: Vector, home: Vector) -> None:

@@ -17,7 +17,7 @@ _BINS = 6
 
 
 class SortTask(PickTask):
-    """For scene `sort`."""
+    """The scripted policy of scene `sort`."""
 
     @override
     def plan(self, way: Way, scene: Vector, home: Vector) -> None:

@@ -25,11 +25,11 @@ PAD_M = 0.0124
 _DROP_M = 0.003
 """Height from which the cube is let go [m]."""
 _LOOSE_M = 0.006
-"""Motion of the open gripper by which its fixed jaw leaves the cube [m]."""
+"""Retreat after release, which frees the cube from the fixed jaw [m]."""
 
 
 class StackTask(Task):
-    """For scene `stack`."""
+    """The scripted policy of scene `stack`."""
 
     @override
     def plan(self, way: Way, scene: Vector, home: Vector) -> None:

@@ -18,7 +18,7 @@ from ibrobot_mujoco.world import World
 
 CABINET, DRAWER = "cabinet", "drawer"
 _DEPTH, _WIDTH, _HEIGHT, _PANEL = 0.13, 0.12, 0.05, 0.004
-"""Of the cabinet, and thickness of its panels [m]."""
+"""Sizes of the cabinet, and thickness of its panels [m]."""
 _TRAVEL = 0.12
 """Distance by which the drawer opens at most [m]."""
 _HANDLE = np.array([-0.036, 0.0, 0.03])

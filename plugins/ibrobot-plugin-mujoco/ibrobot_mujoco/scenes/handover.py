@@ -26,7 +26,7 @@ _HALF_WAY_M = 0.05
 
 
 class _Stage(enum.Enum):
-    """What has happened to the bar."""
+    """State of the bar."""
 
     LIES = enum.auto()
     """No hand holds it, or something else touches it."""

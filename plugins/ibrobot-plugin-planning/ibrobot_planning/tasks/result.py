@@ -16,7 +16,7 @@ class StepResult:
     """The result of a step."""
 
     number: int
-    """From 1."""
+    """Number of the step, from 1."""
     kind: str
     """E.g. `move`."""
     name: str
@@ -52,5 +52,5 @@ class TaskResult:
         return self.outcome == "SUCCEEDED"
 
     def as_json(self) -> dict[str, Any]:
-        """As JSON values."""
+        """The result as JSON values."""
         return {**attrs.asdict(self), "success": self.success}

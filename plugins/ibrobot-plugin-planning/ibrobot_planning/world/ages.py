@@ -1,4 +1,4 @@
-"""Ages of what the world is made of, and what follows when one passes its limit."""
+"""Ages of the parts of the world, and the reaction to one that is too old."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ class Age:
 
     @property
     def remedy(self) -> str:
-        """What to do about a refusal."""
+        """Remedy of a refusal."""
         return f"mend what measures it, or set {self.limit.when_stale_key}, which is {self.limit.when_stale}"
 
     @property

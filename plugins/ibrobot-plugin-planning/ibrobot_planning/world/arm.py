@@ -39,7 +39,7 @@ class LinkShape:
     joint: int
     """Pinocchio's number of the joint that moves it; 0: none."""
     placement: Vector
-    """In the frame of the joint, shape (4, 4)."""
+    """Pose in the frame of the joint, shape (4, 4)."""
     geometry: Any
     """The shape in Coal."""
 

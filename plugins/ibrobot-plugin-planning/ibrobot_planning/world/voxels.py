@@ -74,7 +74,7 @@ def is_measured(points: Vector) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
 def is_depth(depth: np.ndarray[tuple[int, ...], Any]) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """Which pixels of a depth image [m or, as whole numbers, mm] are measurements: those that are finite and above 0.
 
-    The largest whole number counts as missing, too: some drivers write it for what they do not see.
+    The largest whole number counts as missing, too: some drivers write it for unseen pixels.
     """
     if np.issubdtype(depth.dtype, np.integer):
         return np.asarray((depth > 0) & (depth < np.iinfo(depth.dtype).max))

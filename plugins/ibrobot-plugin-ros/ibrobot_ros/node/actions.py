@@ -25,7 +25,7 @@ class _Goal:
         self.number = number
         self.type = kind
         self.address = address
-        """What of the run it is for."""
+        """Executor or service of the run that performs it."""
         self.handle: Any = None
         self.decided: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self.ended: dict[str, Any] | None = None

@@ -40,7 +40,7 @@ class Ui:
 
 @attrs.frozen
 class File:
-    """An answer that is a file, of which browsers may ask for parts, e.g. a video."""
+    """An answer that is a file, e.g. a video; browsers may request parts of it."""
 
     path: Path
     content_type: str

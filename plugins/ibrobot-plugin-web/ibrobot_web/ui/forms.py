@@ -71,7 +71,7 @@ def form_of(ui: Ui, command: str) -> dict[str, Any]:
 
 
 def takes(name: str) -> dict[str, str]:
-    """What a command works on: what its arguments name, e.g. `dataset` -> the field; empty if it is not installed."""
+    """Inputs of a command, as its arguments name them, e.g. `dataset` -> the field; empty if it is not installed."""
     command = installed_plugins().declarations().get(name)
     if command is None:
         return {}
@@ -174,7 +174,7 @@ def _shown(command: Command) -> dict[str, attrs.Attribute[Any]]:
 
 
 def _known(ui: Ui) -> dict[str, list[dict[str, str]]]:
-    """What the opened folders have, by what paths name: the value of each, and its words."""
+    """Paths in the opened folders, by kind: the value of each, and its text."""
     recordings = find_recordings(ui.folders)
     counts: dict[str, int] = {}
     for path in recordings.episodes:

@@ -52,7 +52,7 @@ class Job:
 
     number: int
     kind: str
-    """What the views look for, e.g. `run` or `convert`."""
+    """Kind of the job, by which views select it, e.g. `run` or `convert`."""
     title: str
     command: tuple[str, ...]
     """Arguments of the command, for the page."""

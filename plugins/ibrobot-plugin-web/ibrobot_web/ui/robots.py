@@ -141,7 +141,7 @@ def launch(ui: Ui, robot: str, sim: bool = False, mode: str = "") -> dict[str, i
 
 
 def copying(ui: Ui, robot: str) -> dict[str, Any]:
-    """What a copy of a robot YAML may have of its own: a name, and variables with what was found for them.
+    """Values that a copy of a robot YAML may change: its name, and variables with the devices connected here.
 
     A variable such as `IBROBOT_LEADER_PORT` is offered what the guides' question `port` offers.
     """

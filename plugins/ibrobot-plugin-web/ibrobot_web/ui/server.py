@@ -28,7 +28,7 @@ VIEWS = ("robots", "devices", "record", "episodes", "datasets", "policies", "job
 that runs as a job has a view, too, all by `static/ui/command.js`; each kind of report has one, all by
 `static/ui/reports.js`."""
 SHOWN = {"episodes": "episodes", "dataset": "datasets", "policy": "policies"}
-"""What a command works on -> the view that shows it."""
+"""Kind of a command's input -> the view that shows it."""
 ROUTED = (*VIEWS, "reports")
 """The modules with `ROUTES`."""
 LARGEST_REQUEST = 1 << 20
@@ -62,7 +62,7 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
             {"name": f"report-{each.name}", "title": each.title, "module": "reports", "report": each.name}
             for each in installed_plugins().reports
         ]
-        for job in jobs:  # after the view of what it works on, in the order of the work
+        for job in jobs:  # after its input's view, in the order of the work
             names = [view["name"] for view in views]
             taken = next((SHOWN[kind] for kind in job["takes"] if kind in SHOWN), names[-2])
             views.insert(names.index(taken) + 1, job)

@@ -1,4 +1,4 @@
-"""`ibrobot bag play`: publishes a recorded episode at its times, but for what commands a robot."""
+"""`ibrobot bag play`: publishes a recorded episode at its times, without the topics that command a robot."""
 
 from __future__ import annotations
 
