@@ -33,7 +33,9 @@ PAGES = [
     )
     if page not in GENERATED and page.parent.name != "decisions"
 ]
-OF_OTHER_PROGRAMS = {"CONTRIBUTING.md", "come-from-lerobot.md", "use-ibrobot-from-lerobot.md"}
+OF_OTHER_PROGRAMS = {
+    "CONTRIBUTING.md", "come-from-lerobot.md", "lerobot-versions.md", "use-ibrobot-from-lerobot.md",
+}  # fmt: skip
 """Pages with options of nox and of LeRobot."""
 OF_OTHERS = {"--cap-add", "--ulimit", "--pause", "--find-links", "--save", "--teleop"}
 """Options in the running text that are of other programs."""
@@ -132,7 +134,9 @@ def all_options(command: click.Command, context: click.Context) -> Iterator[str]
 
 
 def test_every_option_in_the_text_exists() -> None:
-    known = {*all_options(cli, click.Context(cli)), *OF_OTHERS, "--help"}
+    scripts = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "benchmarks").glob("*.py"))
+    own = re.findall(r'"(--[a-z][a-z-]*)"', scripts)
+    known = {*all_options(cli, click.Context(cli)), *OF_OTHERS, *own, "--help"}
     named = [
         (option, f"{page.relative_to(ROOT)}:{line}")
         for page in PAGES
