@@ -246,7 +246,7 @@ _OF_THE_MACHINE = frozenset(
 def wrong_input() -> Iterator[None]:
     """A context and decorator with which errors make a command exit with 2, because the user gave invalid input.
 
-    Errors of the machine, such as a full disk, of what others use, and of components that died keep their exit code.
+    Errors of the machine (a full disk), of resources in use, and of components that died keep their exit code.
     """
     try:
         yield

@@ -10,8 +10,8 @@ import attrs
 PLOT_CLASSES = (
     "ok", "bad", "bad-fill", "faint", "range", "band", "estimate", "grid", "zero", "margin", "label",
 )  # fmt: skip
-"""Classes of the shapes in plots, which get their colours from what shows them: `ok` and `faint` are fills of what went
-well, `bad` is a stroke and `bad-fill` a fill of what did not, `range` and `estimate` are strokes, `band` is a fill."""
+"""Classes of the shapes in plots, coloured by the page: `ok` and `faint` fill successes, `bad` is the stroke of failures and
+`bad-fill` their fill, `range` and `estimate` are strokes, `band` is a fill."""
 
 
 @attrs.frozen

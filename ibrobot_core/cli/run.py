@@ -122,7 +122,7 @@ def _run(runtime: Runtime, hooks: RunHooks, signals: _Signals, *, live: bool, as
 
 
 def _watch_keys(session: Session, keys: KeyReader) -> None:
-    """Have the run end if the terminal's keys, the emergency stop among them, are read no more."""
+    """End the run when the terminal's keys, including the emergency stop, are no longer read."""
     pulse = Pulse("keys of the terminal", _KEYS_BLOCKED_S)
     session.pulses.add(pulse)
     keys.beat = pulse.beat

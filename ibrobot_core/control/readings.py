@@ -30,7 +30,7 @@ class Readings:
         timeout_ns: time without a new state after which it is a fault [ns].
 
     Attributes:
-        newest: the newest reading; stale if this tick brought none that is believed.
+        newest: the newest reading; stale if this tick brought no plausible one.
         counts: failed reads, ticks without a new state, and readings that were not believed.
     """
 

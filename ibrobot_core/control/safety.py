@@ -25,7 +25,7 @@ class SafetyLayer:
     so that braking never ends beyond a position limit, nor further than max_lead from the measured position.
 
     The inequalities are in order of precedence. The first two always hold, the first before the second. Setpoints use
-    max_lead but for a reserve, in which the command still follows within the last two if an obstacle or a person moves
+    max_lead minus a reserve, in which the command still follows within the last two if an obstacle or a person moves
     a joint away from it. Beyond the reserve, the last two yield; if p' itself is too far from m, p starts at rest at
     max_lead from m.
 
@@ -197,7 +197,7 @@ class SafetyLayer:
         return _limited(seen - lead, lower, upper), _limited(seen + lead, lower, upper)
 
     def _next(self, wanted: Vector, follow: NDArray[np.bool_], lower: Vector, upper: Vector) -> Vector:
-        """Advance by a tick towards `wanted` [rad] where `follow`, to a stop elsewhere; shapes (J,) but for the bounds.
+        """Advance by a tick towards `wanted` [rad] where `follow`, to a stop elsewhere; shapes (J,), except the bounds.
 
         The command never leaves the outer bounds. The inner bounds are soft: where `follow`, it brakes towards them.
         """

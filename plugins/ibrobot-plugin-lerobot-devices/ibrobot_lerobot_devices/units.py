@@ -129,7 +129,7 @@ def map_joints(
 
     Args:
         features: names of LeRobot's features.
-        motors: what is known of the motors, by feature.
+        motors: properties of the motors, by feature.
         choices: the options.
         wanted: the joints to map.
         limits: joint -> its limits [rad].

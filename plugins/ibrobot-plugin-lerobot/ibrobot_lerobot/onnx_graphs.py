@@ -172,7 +172,7 @@ def _drawing_with(noise: torch.Tensor) -> Iterator[None]:
 
 
 def _coefficients(scheduler: Any, t: int) -> list[float]:
-    """A step of the scheduler, as `DenoisingStep` of the manifest has it; all are linear but for the clipping."""
+    """A step of the scheduler, as `DenoisingStep` of the manifest has it; all are linear except for the clipping."""
     config, kind = scheduler.config, type(scheduler).__name__
     before = t - config.num_train_timesteps // scheduler.num_inference_steps
     last = scheduler.final_alpha_cumprod if kind == "DDIMScheduler" else scheduler.one

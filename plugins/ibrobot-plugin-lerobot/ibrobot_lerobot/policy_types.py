@@ -64,7 +64,7 @@ POLICY_TYPES: Mapping[str, PolicyType] = {
     "wall_x": PolicyType("refused", _DOWNLOADS),
     "xvla": PolicyType("runs"),
 }
-"""LeRobot's name -> what is known of it."""
+"""LeRobot's name -> properties of the type."""
 OTHER = PolicyType("unproved")
 """A type of another package."""
 
@@ -84,7 +84,7 @@ def check_type(path: Path, kind: object) -> str:
 
 
 def import_others(path: Path, kind: str) -> None:
-    """Import the packages that add policy types to LeRobot, if `kind` is none of LeRobot's own.
+    """Import the packages that add policy types to LeRobot, if `kind` is not one of LeRobot's own.
 
     Raises:
         PolicyError: if none of them adds it.

@@ -182,7 +182,7 @@ def _normalise(checkpoint: Checkpoint, file: str, entry: Mapping[str, Any], *, i
 def _features(
     checkpoint: Checkpoint, config: Mapping[str, Any], *, inverse: bool
 ) -> dict[str, tuple[str, Sequence[int]]]:
-    """Key -> type and shape, of what a step converts: those of its features that the policy has, and any action."""
+    """Key -> type and shape of the inputs of a step: those of its features that the policy has, and any action."""
     features: dict[str, tuple[str, Sequence[int]]] = {}
     action: Sequence[int] = (checkpoint.action_size,)
     for name, feature in config["features"].items():

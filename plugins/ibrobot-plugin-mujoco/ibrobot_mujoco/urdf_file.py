@@ -79,7 +79,7 @@ class Mimic:
 
 @attrs.frozen
 class UrdfJoint:
-    """A joint; limits are None where the URDF has none, or none that bind."""
+    """A joint; limits are None where the URDF has none, or they never bind."""
 
     name: str
     type: str

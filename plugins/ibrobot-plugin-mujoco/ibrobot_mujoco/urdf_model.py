@@ -34,7 +34,7 @@ _STRENGTH = 2.0
 """A guessed effort holds at least this multiple of the weight."""
 TURN_RAD = 2 * math.pi
 _SHORT_M = 0.15
-"""A sliding joint with a longer way is none of a gripper."""
+"""A sliding joint with a longer way is not a gripper's."""
 _DENSITY = 1000.0
 """Guessed density of shapes whose link has no mass [kg/m^3]."""
 _LEAST_KG, _LEAST_KGM2 = 1e-9, 1e-12

@@ -45,7 +45,7 @@ def copy(*arguments: str) -> Result:
     return CliRunner().invoke(config_copy, ["mini.yaml", "desk.yaml", *arguments])
 
 
-def test_the_copy_has_the_same_text_but_for_the_values_given(source: Path) -> None:
+def test_the_copy_has_the_same_text_except_for_the_values_given(source: Path) -> None:
     ran = copy("--value", "MINI_PORT=/dev/zero")
     assert ran.output.startswith("desk.yaml: ok (mini, 1 joints, hardware)\n")
     assert Path("desk.yaml").read_text() == source.read_text().replace("/dev/null", "/dev/zero")

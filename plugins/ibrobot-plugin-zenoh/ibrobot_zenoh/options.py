@@ -142,7 +142,7 @@ class Share:
     )
     parameters: bool = option(
         False,
-        help="whether others may read this file's values, but for secrets, as parameters of the ROS 2 node "
+        help="whether others may read this file's values, except secrets, as parameters of the ROS 2 node "
         "ibrobot_NAME; the parameter mode can be set if services has /set_mode",
     )
 

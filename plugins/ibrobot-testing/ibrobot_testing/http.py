@@ -230,7 +230,7 @@ class HttpSuite(Suite[Served]):
                         assert self.ask(served, path, headers, cookie=cookie).status == 403, path
 
     def test_nothing_is_served_without_a_session(self) -> None:
-        """Neither without one, nor with one that is made up, nor with a wrong token, nor with one in a wrong place."""
+        """Nor with an empty, made-up or truncated cookie, a wrong name, or a token in the wrong place."""
         with self.served() as (served, cookie):
             name = cookie.partition("=")[0]
             for wrong in ("", f"{name}=", f"{name}=x", cookie[:-1], f"x{cookie}") if served.links else ():

@@ -41,7 +41,7 @@ class TableScene[O: SceneOptions](Scene[mujoco.MjSpec, World]):
 
     Attributes:
         moving: the bodies that move; their poses, position [m] and quaternion wxyz, begin the observation.
-        further: names of what the observation has after these.
+        further: names of further observations, in order.
         placed: names of the factors that `arrange` returns.
         sizes: factor of an edge -> cubes that have it.
         colours: factor of a hue -> geoms that have it.

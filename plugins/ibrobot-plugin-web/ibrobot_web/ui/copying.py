@@ -1,4 +1,4 @@
-"""`ibrobot config copy`: copies of robot YAMLs with the same text, but for the defaults of `${NAME:default}`."""
+"""`ibrobot config copy`: copies of robot YAMLs with the same text, except for the defaults of `${NAME:default}`."""
 
 from __future__ import annotations
 
