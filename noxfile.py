@@ -297,7 +297,8 @@ def release(session: nox.Session) -> None:
     """A version from its number to checked wheels: `-- X.Y.Z`. Uploads nothing; CONTRIBUTING.md says what follows."""
     session.install("towncrier", "twine")
     session.run("python", "tests/house/set_version.py", *session.posargs)
-    session.run("towncrier", "build", "--yes", "--version", session.posargs[0])
+    if f"\n## {session.posargs[0]}\n" not in Path("CHANGELOG.md").read_text(encoding="utf-8"):
+        session.run("towncrier", "build", "--yes", "--version", session.posargs[0])
     folder = Path(session.create_tmp()).absolute()
     shutil.rmtree(folder / "dist", ignore_errors=True)
     session.run("uv", "build", "--quiet", "--all-packages", "--out-dir", str(folder / "dist"))
