@@ -10,8 +10,8 @@ import attrs
 PLOT_CLASSES = (
     "ok", "bad", "bad-fill", "faint", "range", "band", "estimate", "grid", "zero", "margin", "label",
 )  # fmt: skip
-"""Classes of the shapes in plots, coloured by the page: `ok` and `faint` fill successes, `bad` is the stroke and `bad-fill`
-the fill of failures, `range` and `estimate` are strokes, `band` is a fill."""
+"""Classes of the shapes in plots, coloured by the page: `ok` and `faint` fill successes, `bad` is the stroke and
+`bad-fill` the fill of failures, `range` and `estimate` are strokes, `band` is a fill."""
 
 
 @attrs.frozen
