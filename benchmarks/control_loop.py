@@ -122,7 +122,8 @@ def compare(repetitions: int, seconds: float) -> int:
             )
     for line in found["bare"][0]["refused"]:
         print(f"note: {line}")
-    failed, measured = False, {}
+    failed = False
+    measured: dict[str, float] = {}
     for loop in ("system", "busy", "pages"):
         pairs = zip(found[loop], found["bare"], strict=True)
         ratio = statistics.median(

@@ -2,7 +2,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from evaluation_statistics import covered, decided_at, mcnemar_power, reached, significant
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_eval.statistics import (
@@ -21,6 +20,7 @@ from ibrobot_eval.statistics import (
     wilson,
 )
 from scipy.stats import binom
+from simulated_experiments import covered, decided_at, mcnemar_power, reached, significant
 
 EPISODES = 50
 RATES = (0.02, 0.1, 0.25, 0.5, 0.7, 0.9, 0.95, 0.99)
