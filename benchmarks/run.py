@@ -85,7 +85,7 @@ CLAIMS = (
     Claim(
         "record_kill",
         "a recording killed by `kill -9` keeps all but its last second",
-        "plugins/ibrobot-plugin-mcap/README.md",
+        "docs/decisions/0015-recordings-beside-the-page-cache.md",
         "record_kill.py --parallel 6",
     ),
     Claim(

@@ -21,7 +21,7 @@ _SOURCE = re.compile(r'^\[`([\w./-]+)`\]\(((?:\.\./)+\S+?\.(?:py|toml))(?: "(.*)
 and options of the directive."""
 _INCLUDED = re.compile(r"^\[[^\]]+\]\((\.\./\.\./[A-Z]+\.md)\)$", re.MULTILINE)
 _TESTED = re.compile(r"^<!-- doctest -->\n```pycon$", re.MULTILINE)
-_LINK = re.compile(r"\]\(([\w-]+(?:/index)?)\.md\)")
+_LINK = re.compile(r"\]\(([\w-]+(?:/index|\.zh)?)\.md\)")
 SPLIT = ("reference/interfaces", "reference/testing")
 """Pages whose sections on one source file each are pages of their own on the site."""
 _TERM = re.compile(r"^- \*\*(.+)\*\*: ", re.MULTILINE)
