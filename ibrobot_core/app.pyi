@@ -132,7 +132,6 @@ from ibrobot_core.interfaces.policy import (
 )
 
 # Episodes and datasets
-from ibrobot_core.ownership import Ownership as Ownership, owned as owned
 from ibrobot_core.interfaces.reader import find_episode as find_episode
 from ibrobot_core.contract.metadata import robot_metadata as robot_metadata
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, FrameSampler as FrameSampler

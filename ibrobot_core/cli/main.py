@@ -78,6 +78,9 @@ def main() -> None:
             sys.stdout.flush()
     except click.exceptions.Exit as end:
         code = end.exit_code
+    except click.exceptions.NoArgsIsHelpError as error:  # a group without a command
+        echo(error.format_message(), err=True)
+        code = _WRONG
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the end of the process: nothing else can tell it
         lines, code = _error_lines(error)
         for line in lines:

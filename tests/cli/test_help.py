@@ -80,3 +80,12 @@ def test_every_command_explains_itself(ibrobot: Ibrobot, command: str) -> None:
 
     assert ran.code == 0
     assert ran.out.startswith(f"Usage: ibrobot {command}")
+
+
+@pytest.mark.parametrize("command", [(), ("config",)])
+def test_a_group_without_a_command_shows_its_help(ibrobot: Ibrobot, command: tuple[str, ...]) -> None:
+    ran = ibrobot(*command)
+
+    assert (ran.code, ran.out) == (2, "")
+    assert ran.err.splitlines() == ibrobot(*command, "--help").out.splitlines()
+    assert ran.err.startswith(" ".join(("Usage: ibrobot", *command)))

@@ -19,13 +19,13 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import run_here
 from ibrobot_data.run import STAGING
+from ibrobot_provenance import Ownership
 from ibrobot_ros2 import encode
 from ibrobot_testing.terminal import Terminal
 from recordings import CONTRACT, JOINTS, SIZE, START_NS, numbered, record
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ibrobot_core.app import Ownership
 from ibrobot_core.messages import (
     Float64MultiArray,
     Header,

@@ -22,10 +22,11 @@ from ibrobot_data import run as run_module
 from ibrobot_data.episode import make_writer
 from ibrobot_data.run import STAGING
 from ibrobot_lerobot.layout import open_dataset
+from ibrobot_provenance import Ownership
 from killed_process import KILLED, killing
 from recordings import record
 
-from ibrobot_core.app import Ownership, installed_plugins
+from ibrobot_core.app import installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 

@@ -16,6 +16,7 @@ from uuid import uuid4
 
 import attrs
 import numpy as np
+from ibrobot_provenance import Ownership
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
@@ -37,7 +38,7 @@ from ibrobot_core.api import (
     Robot,
     sync,
 )
-from ibrobot_core.app import TASK_KEY, DiskFull, Ownership, installed_plugins
+from ibrobot_core.app import TASK_KEY, DiskFull, installed_plugins
 from ibrobot_data.commanders import Commanders, stretches
 from ibrobot_data.identity import identity
 from ibrobot_data.options import OPERATOR, POLICY

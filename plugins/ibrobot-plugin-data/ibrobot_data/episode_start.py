@@ -8,9 +8,11 @@ from contextlib import suppress
 from pathlib import Path
 from uuid import NAMESPACE_OID, uuid4, uuid5
 
+from ibrobot_provenance import Ownership
+
 import ibrobot_core
 from ibrobot_core.api import MODEL_ANSWERS, Contract, EpisodeStart, ModelAnswer, RecorderError, String
-from ibrobot_core.app import InUse, Ownership, RecordingConfig, RobotConfig, RunAccess, calibrations
+from ibrobot_core.app import InUse, RecordingConfig, RobotConfig, RunAccess, calibrations
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.options import COMMANDER
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import override
 
 import attrs
+from ibrobot_provenance import Ownership
 
 from ibrobot_core.api import (
     NS_PER_S,
@@ -26,16 +27,7 @@ from ibrobot_core.api import (
     RecorderError,
     seconds,
 )
-from ibrobot_core.app import (
-    Component,
-    ComponentFailed,
-    Ownership,
-    Received,
-    RecordingConfig,
-    RunAccess,
-    SessionWorker,
-    error_line,
-)
+from ibrobot_core.app import Component, ComponentFailed, Received, RecordingConfig, RunAccess, SessionWorker, error_line
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.episode_start import episode_start, is_kept, model_topics, take_next_folder
 from ibrobot_data.written import WrittenEpisode, lost_text, read_back

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_provenance import Ownership
 
 from ibrobot_core.api import Contract, DatasetError, DatasetSummary, EpisodeAddress, IbrobotError, seconds
-from ibrobot_core.app import DiskFull, Ownership, Pool, installed_plugins, set_malloc
+from ibrobot_core.app import DiskFull, Pool, installed_plugins, set_malloc
 from ibrobot_core.app import Job as PoolJob
 from ibrobot_data.commanders import is_labelled
 from ibrobot_data.episode import (

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_provenance import Ownership
 
 import ibrobot_core
 from ibrobot_core.api import (
@@ -28,7 +29,7 @@ from ibrobot_core.api import (
     Robot,
     SteppedClock,
 )
-from ibrobot_core.app import DiskFull, Ownership, installed_plugins
+from ibrobot_core.app import DiskFull, installed_plugins
 from ibrobot_data.episode import stop_if_full
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_start import episode_folder

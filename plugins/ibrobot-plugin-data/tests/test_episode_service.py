@@ -25,9 +25,10 @@ from ibrobot_data.episode_service import (
     EpisodeService,
     RecordedEpisode,
 )
+from ibrobot_provenance import Ownership
 
 from ibrobot_core.api import Contract, IbrobotError, NotSupported, RecorderError
-from ibrobot_core.app import ESTOP, RESET, ConfigError, DiskFull, InUse, Ownership, RequestError
+from ibrobot_core.app import ESTOP, RESET, ConfigError, DiskFull, InUse, RequestError
 
 if TYPE_CHECKING:
     from fake_runs import Runs

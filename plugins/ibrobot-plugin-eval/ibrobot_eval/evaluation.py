@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_provenance import owned
 
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import ComponentFailed, Done, Job, installed_plugins, owned
+from ibrobot_core.app import ComponentFailed, Done, Job, installed_plugins
 from ibrobot_eval.comparison import Decision
 from ibrobot_eval.episodes import SCRATCH, EpisodeJob, Place, Result, code_here, hide_messages, run_episode, write
 from ibrobot_eval.film import can_film, film

@@ -10,9 +10,10 @@ from typing import Any, override
 
 import attrs
 import click
+from ibrobot_provenance import Ownership
 
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import Ownership, echo, wrong_input
+from ibrobot_core.app import echo, wrong_input
 from ibrobot_eval.episodes import Place, Result, write
 from ibrobot_eval.evaluation import ASKED, differences, read_settings
 from ibrobot_eval.options import SETTINGS

@@ -14,8 +14,10 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
+from ibrobot_provenance import owned
+
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import echo, owned
+from ibrobot_core.app import echo
 from ibrobot_lerobot.layout import existing_dataset
 from ibrobot_lerobot.pretrained import check_policy
 from ibrobot_lerobot.training import AUTO, SMALL, TrainOptions, find_trainer

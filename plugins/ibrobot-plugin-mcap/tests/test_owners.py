@@ -10,10 +10,11 @@ import pytest
 from click.testing import CliRunner
 from ibrobot_mcap import trash
 from ibrobot_mcap.commands import episodes
+from ibrobot_provenance import Ownership
 from killed_process import KILLED, killing
 
 from ibrobot_core.api import RecorderError
-from ibrobot_core.app import InUse, Ownership
+from ibrobot_core.app import InUse
 
 from .conftest import Bench, read, summary
 

@@ -1,5 +1,6 @@
-"""The installed code that results depend on."""
+"""The installed code that results depend on, and folders of results with one owner at a time."""
 
 from ibrobot_provenance.code import differing_code, installed_code
+from ibrobot_provenance.ownership import Ownership, owned
 
-__all__ = ["differing_code", "installed_code"]
+__all__ = ["Ownership", "differing_code", "installed_code", "owned"]

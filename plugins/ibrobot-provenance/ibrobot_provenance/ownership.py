@@ -11,7 +11,8 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import override
 
-from ibrobot_core.errors import IbrobotError, InUse
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import InUse
 
 _LONGEST = 200
 """Longer names are replaced by a hash, since the name of the lock file would be too long [bytes]."""

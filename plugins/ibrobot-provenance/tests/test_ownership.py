@@ -10,14 +10,14 @@ import threading
 from pathlib import Path
 
 import pytest
+from ibrobot_provenance.ownership import Ownership, lock_file, owned
 
 from ibrobot_core.errors import DatasetError, InUse, wrong_input
-from ibrobot_core.ownership import Ownership, lock_file, owned
 
 HOLD = """
 import sys
 from pathlib import Path
-from ibrobot_core.ownership import Ownership
+from ibrobot_provenance.ownership import Ownership
 owned = Ownership(Path(sys.argv[1]), "is being recorded")
 print("owned", flush=True)
 sys.stdin.read()
