@@ -64,6 +64,8 @@ def _offers(manager: pluggy.PluginManager) -> Iterator[tuple[str, str, str]]:
             yield kind, f"[`{descriptor.type}`](#options-{kind}-{descriptor.type})", descriptor.summary
     for reader in _yielded(manager, "ibrobot_readers"):
         yield "reader", f"`{reader.type}`", reader.summary
+    for feature in _yielded(manager, "ibrobot_features"):
+        yield "feature", f"`{feature.name}`", "paths of `select` in the contract"
     for decoder in _yielded(manager, "ibrobot_decoders"):
         yield "decoder", f"`{', '.join(decoder.formats)}`", "compressed images"
     for config in _yielded(manager, "ibrobot_configs"):

@@ -10,6 +10,7 @@ from ibrobot_core.descriptors import (
     ReportDescriptor as ReportDescriptor,
     ConfigFile as ConfigFile,
     PoolDescriptor as PoolDescriptor,
+    FeatureDescriptor as FeatureDescriptor,
 )
 
 # The robot YAML
@@ -29,11 +30,19 @@ from ibrobot_core.config.schema import (
     Align as Align,
     ImageSpec as ImageSpec,
     TASK_KEY as TASK_KEY,
+    SECTIONS as SECTIONS,
 )
 from ibrobot_core.config.load import (
     shipped_configs as shipped_configs,
     read_document as read_document,
     contract_alone as contract_alone,
+)
+from ibrobot_core.component_config import ComponentConfig as ComponentConfig, component_of as component_of
+from ibrobot_core.convert import (
+    is_literal as is_literal,
+    is_mapping as is_mapping,
+    is_sequence as is_sequence,
+    is_union as is_union,
 )
 from ibrobot_core.config.overrides import (
     Override as Override,
@@ -42,7 +51,7 @@ from ibrobot_core.config.overrides import (
 )
 from ibrobot_core.config.missing import unavailable_modes as unavailable_modes
 from ibrobot_core.config.yaml_nodes import Document as Document, parse_yaml as parse_yaml
-from ibrobot_core.config.show import dump_yaml as dump_yaml
+from ibrobot_core.config.show import dump_yaml as dump_yaml, plain as plain
 from ibrobot_core.config.models import (
     ModelError as ModelError,
     XmlElement as XmlElement,
@@ -135,9 +144,18 @@ from ibrobot_core.interfaces.policy import (
 from ibrobot_core.interfaces.reader import find_episode as find_episode
 from ibrobot_core.contract.metadata import robot_metadata as robot_metadata
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, FrameSampler as FrameSampler
-from ibrobot_core.selection import Selection as Selection, Leaf as Leaf, value_at as value_at
+from ibrobot_core.selection import (
+    Selection as Selection,
+    Leaf as Leaf,
+    JointFeature as JointFeature,
+    value_at as value_at,
+)
 from ibrobot_core.contract.specs import SignalPart as SignalPart
-from ibrobot_core.contract.joint_units import calibrations as calibrations, with_closed_ends as with_closed_ends
+from ibrobot_core.contract.joint_units import (
+    calibrations as calibrations,
+    with_closed_ends as with_closed_ends,
+    policy_units as policy_units,
+)
 from ibrobot_core.units import NORM_MODES as NORM_MODES
 
 # Commands

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ibrobot_core import interfaces
     from ibrobot_core.component import Component
     from ibrobot_core.config.schema import RobotConfig
+    from ibrobot_core.contract.joint_units import JointUnits
     from ibrobot_core.events import Event
     from ibrobot_core.launch.sources.source_worker import SourceWorker
     from ibrobot_core.launch.transport import TransportLink
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from ibrobot_core.messages import CompressedImage, Image
     from ibrobot_core.reports import ReportSection
     from ibrobot_core.robot import Robot
+    from ibrobot_core.selection import JointFeature
 
 
 @attrs.frozen
@@ -310,6 +312,23 @@ class DecoderDescriptor:
     Equal bytes give equal pixels, in a run and in a conversion. The decoder raises `ContractError` if an image is
     damaged.
     """
+
+
+@attrs.frozen
+class FeatureDescriptor:
+    """Numbers that are computed from positions of joints; `select` in the contract names them `NAME.PART`."""
+
+    name: str
+    """The first word of the paths, e.g. `tool`."""
+    model: Callable[[Robot, Sequence[str]], Mapping[str, Any]]
+    """Robot and paths -> all that the numbers depend on beside the joints, as plain values. The contract has it in its
+    fingerprint, and recordings have it. Raises ContractError."""
+    make: Callable[[Mapping[str, Any], Sequence[str], Sequence[str]], JointFeature]
+    """Model, paths, and for an action the joints that it moves -> the numbers. Raises ContractError."""
+    vectors: Callable[..., JointUnits]
+    """The class of the conversion of vectors for contracts whose actions have such paths; arguments as `JointUnits`."""
+    check_config: Callable[[RobotConfig], Iterable[OptionFault]] = attrs.field(default=lambda config: (), kw_only=True)
+    """As `SectionDescriptor.check_config`."""
 
 
 @attrs.frozen

@@ -95,6 +95,11 @@ def ibrobot_decoders() -> Iterable[descriptors.DecoderDescriptor]:  # type: igno
 
 
 @hookspec
+def ibrobot_features() -> Iterable[descriptors.FeatureDescriptor]:  # type: ignore[empty-body]
+    """Numbers that this plugin computes from positions of joints, for the contract."""
+
+
+@hookspec
 def ibrobot_datasets() -> Iterable[descriptors.DatasetDescriptor]:  # type: ignore[empty-body]
     """Dataset writers."""
 

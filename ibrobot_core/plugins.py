@@ -54,7 +54,7 @@ KINDS: Mapping[str, str] = {
 }
 """Plugin kind -> its registration hook."""
 _UNTYPED = tuple(
-    f"ibrobot_{objects}" for objects in ("readers", "decoders", "configs", "commands", "panels", "guides", "reports")
+    f"ibrobot_{name}s" for name in ("reader", "decoder", "feature", "config", "command", "panel", "guide", "report")
 )
 """Registration hooks for objects that the YAML does not name by `type`."""
 
@@ -112,6 +112,7 @@ class Registry:
     guides: list[descriptors.GuideDescriptor] = attrs.field(factory=list)
     reports: list[descriptors.ReportDescriptor] = attrs.field(factory=list)
     decoders: list[descriptors.DecoderDescriptor] = attrs.field(factory=list)
+    features: dict[str, descriptors.FeatureDescriptor] = attrs.field(factory=dict)
     commands: dict[str, descriptors.Command] = attrs.field(factory=dict)
     command_packages: dict[str, str] = attrs.field(factory=dict)
     """Command -> the package that offers it."""
@@ -412,6 +413,7 @@ def _add(registry: Registry, plugin: str, package: str, version: str, load: Call
         else:
             reason = f"command {each.name!r} is offered by {registry.command_packages[each.name]} already"
             registry.failures.append(Failure(plugin, package, "ibrobot_commands", reason))
+    registry.features |= {each.name: each for each in offers["ibrobot_features"]}
     registry.managers[plugin] = manager
 
 

@@ -30,7 +30,20 @@ _WHOLE: dict[str, tuple[str, ...]] = {
 }
 _LEROBOT_SUFFIX = {"position": "pos", "velocity": "vel", "effort": "eff"}
 
+_NONE: Mapping[str, Any] = {}
+
 type _Read = Callable[[Any], NDArray[np.generic]]
+
+
+@attrs.frozen(eq=False)
+class JointFeature:
+    """Numbers computed from positions of joints, e.g. the position of the tool."""
+
+    joints: tuple[str, ...]
+    names: tuple[str, ...]
+    """One for each number, as in datasets."""
+    values: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    """Positions of `joints`, shape (J,) -> the numbers, shape (N,); None if they are these positions."""
 
 
 @attrs.frozen
@@ -39,13 +52,17 @@ class Leaf:
 
     field: str
     kind: str
-    """`number`, `element`, `joint`, `array` or `foreign`."""
+    """`number`, `element`, `joint`, `array`, `foreign` or `feature`."""
     part: str = ""
     """Element number or joint name."""
+    name: str = ""
+    """Name of the number, if a `JointFeature` has given one."""
 
     @property
     def label(self) -> str:
         """LeRobot's name if it has one, e.g. `shoulder_pan.pos`; else the path."""
+        if self.name:
+            return self.name
         if self.kind == "joint":
             return f"{self.part}.{_LEROBOT_SUFFIX[self.field]}"
         return f"{self.field}.{self.part}" if self.part else self.field
@@ -66,12 +83,16 @@ class Selection:
         type_name: the ROS 2 message type, e.g. `sensor_msgs/msg/JointState`.
         select: the paths, in the order of the vector.
         joints: the robot's joints.
+        features: the paths into a JointState that name computed numbers.
 
     Raises:
         ContractError: for an unknown type without paths, or a path that leads to no number of a known type.
     """
 
-    def __init__(self, type_name: str, select: Sequence[str] = (), joints: Sequence[str] = ()) -> None:
+    def __init__(
+        self, type_name: str, select: Sequence[str] = (), joints: Sequence[str] = (),
+        features: Mapping[str, JointFeature] = _NONE,
+    ) -> None:  # fmt: skip
         message_type = MESSAGE_TYPES.get(type_name)
         if message_type is None and select:
             self.paths = tuple(select)
@@ -82,7 +103,11 @@ class Selection:
             )
         else:
             self.paths = tuple(select) or _default(message_type, joints)
-            leaves = [leaf for path in self.paths for leaf in _resolve(message_type, path)]
+            leaves = [
+                leaf
+                for path in self.paths
+                for leaf in (_computed(path, features[path]) if path in features else _resolve(message_type, path))
+            ]
         self.leaves = tuple(leaves)
         """One leaf per number of the vector, in order; one for a whole array."""
         unknown = any(leaf.kind == "array" for leaf in leaves)
@@ -91,7 +116,10 @@ class Selection:
         self.names: tuple[str, ...] = () if unknown else tuple(leaf.label for leaf in leaves)
         """One name per element; empty if the length is unknown."""
         runs = groupby(leaves, lambda leaf: (leaf.kind, leaf.field if leaf.kind not in ("number", "foreign") else ""))
-        self._reads = [_reader(kind, list(run)) for (kind, _), run in runs]
+        self._reads = [
+            _feature_reader(features[field]) if kind == "feature" else _reader(kind, list(run))
+            for (kind, field), run in runs
+        ]
 
     def __call__(self, message: Message) -> NDArray[np.float32]:
         """The vector, float32, shape (size,).
@@ -167,6 +195,18 @@ def _array_leaf(message_type: type[Any], path: str, field: str, rest: str) -> Le
     if not (rest.isascii() and rest.isdigit()):
         raise ContractError(f"{path!r}: {field} is an array; select an element by number, e.g. {field}.0")
     return Leaf(field, "element", rest)
+
+
+def _computed(path: str, feature: JointFeature) -> list[Leaf]:
+    if feature.values is None:
+        return [Leaf("position", "joint", *each) for each in zip(feature.joints, feature.names, strict=True)]
+    return [Leaf(path, "feature", name=name) for name in feature.names]
+
+
+def _feature_reader(feature: JointFeature) -> _Read:
+    assert feature.values is not None
+    read, compute = _joint_reader("position", list(feature.joints)), feature.values
+    return lambda message: compute(np.asarray(read(message), dtype=np.float64))
 
 
 def _reader(kind: str, leaves: list[Leaf]) -> _Read:

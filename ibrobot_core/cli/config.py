@@ -119,14 +119,3 @@ def show(config: str | None, sim: bool, overrides: tuple[str, ...], mode: str | 
     if robot_config.missing:
         raise PluginError(f"{robot_config.source}: not all defaults are known: {describe(robot_config.missing)}")
     echo(to_yaml(robot_config), nl=False)
-
-
-@config.command()
-def schema() -> None:
-    """Print a JSON Schema of robot YAMLs, for editors.
-
-    It has the options of every installed plugin.
-    """
-    from ibrobot_core.config.jsonschema import json_schema
-
-    echo(json.dumps(json_schema(installed_plugins()), indent=2))

@@ -174,8 +174,9 @@ def _facts(session: Session, rates: RecentRates) -> Iterator[tuple[str, str]]:
         stats = session.acting.dispatch
         yield (
             "plan",
-            f"{stats.plan_length} actions by {stats.strategy}, latency p50 {stats.latency_p50_ms:.0f}, "
-            f"p99 {stats.latency_p99_ms:.0f} ms, holds {stats.holds}, failures {stats.failures}",
+            f"{stats.plan_length} actions by {stats.strategy}, latency p50 {stats.latency_p50_ms:.0f}, p99 "
+            f"{stats.latency_p99_ms:.0f} ms, holds {stats.holds}, "
+            f"unreachable {stats.unreachable}, failures {stats.failures}",
         )
     if (model := _model_text(session)) is not None:
         yield "model", model

@@ -16,6 +16,7 @@ from ibrobot_core.convert import Key
 from ibrobot_core.descriptors import StreamOptions
 from ibrobot_core.errors import ContractError
 from ibrobot_core.options import did_you_mean
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.selection import Selection
 
 PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
@@ -33,6 +34,7 @@ SIGNAL_TYPES: Mapping[str, str] = {
 _IMAGES = (messages.Image.ros_type, messages.CompressedImage.ros_type)
 _IMAGE_KEYS = "observation.images."
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", re.ASCII)
+_NO_FEATURE = "{0!r} is computed by no installed plugin; paths into messages are for foreign bags: set foreign: true"
 _JOINT_FIELDS = ("position", "velocity", "effort")
 
 
@@ -153,6 +155,8 @@ class ContractChecks:
             self._select((*key, "select", i), path, spec)
 
     def _select(self, key: Key, path: str, spec: ObservationSpec) -> None:
+        if spec.type == messages.JointState.ros_type and path.partition(".")[0] in installed_plugins().features:
+            return  # its plugin checks it
         if spec.type in _IMAGES:
             self.document.add(key, "images have no numbers to select")
             return
@@ -222,6 +226,8 @@ class ContractChecks:
     def _commands(self, key: Key, spec: ActionSpec) -> None:
         """Check type and paths: of messages that this robot publishes, or of foreign ones."""
         own = messages.Float64MultiArray.ros_type
+        if any(path.partition(".")[0] in installed_plugins().features for path in spec.select):
+            spec = attrs.evolve(spec, select=())  # their plugin checks them
         if not spec.foreign:
             if spec.type != own:
                 message = (
@@ -229,7 +235,7 @@ class ContractChecks:
                 )
                 self.document.add((*key, "type"), message)
             elif spec.select:
-                self.document.add((*key, "select"), "applies only to the commands of foreign bags; set foreign: true")
+                self.document.add((*key, "select"), _NO_FEATURE.format(spec.select[0]))
         elif not _TYPE_NAME.fullmatch(spec.type):
             self.document.add((*key, "type"), f"expected PACKAGE/msg/NAME, got {spec.type!r}")
         elif not spec.select and spec.type not in (own, messages.JointState.ros_type):

@@ -185,8 +185,8 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         missing=missing, absent_models=sections.absent_models, source=source, document=shown, complete=document.root,
         secrets=secrets,
     )  # fmt: skip
-    for section, _ in registry.sections(config):
-        for fault in section.check_config(config):
+    for each in (*(section for section, _ in registry.sections(config)), *registry.features.values()):
+        for fault in each.check_config(config):
             document.add(fault.option, fault.message)
     document.raise_problems()
     return config

@@ -30,11 +30,11 @@ def check_policy(contract: Contract, spec: PolicySpec, norm_mode: str = "radians
             faults.append(_fault(key, f"{tuple(wanted)}", f"has no such observation; it has: {has}"))
         elif not _fits(wanted, feature.shape):
             faults.append(_fault(key, f"{tuple(wanted)}", f"{feature.shape}"))
-    joints = contract.action_joints
-    if spec.actions is not None and tuple(spec.actions) != joints:
-        faults.append(_fault("action", ", ".join(spec.actions), ", ".join(joints)))
-    elif spec.action_size != len(joints):
-        faults.append(_fault("action", f"{spec.action_size} numbers", f"{len(joints)}: {', '.join(joints)}"))
+    names = contract.action_names
+    if spec.actions is not None and tuple(spec.actions) != names:
+        faults.append(_fault("action", ", ".join(spec.actions), ", ".join(names)))
+    elif spec.action_size != len(names):
+        faults.append(_fault("action", f"{spec.action_size} numbers", f"{len(names)}: {', '.join(names)}"))
     if spec.norm_mode not in (None, norm_mode):
         faults.append(_fault("norm_mode", f"trained in {spec.norm_mode}", f"the model's norm_mode is {norm_mode}"))
     if spec.contract is not None and not faults:

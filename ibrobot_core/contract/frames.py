@@ -18,7 +18,6 @@ from ibrobot_core.contract.specs import Contract, ObservationPart
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.policy import Frame
 from ibrobot_core.messages import MESSAGE_TYPES, CompressedImage, Message
-from ibrobot_core.selection import Selection
 from ibrobot_core.units import ns
 
 _IMAGE_DEPTH = 32
@@ -34,7 +33,7 @@ class _Part:
         self.part = part
         self.stream: Stream[Message] = Stream(part.align, contract.step_ns, ns(contract.max_age))
         self._read: Callable[[Any], _Array] = (
-            Selection(part.type, part.select) if part.image is None else partial(decode_image, spec=part.image)
+            part.selection if part.image is None else partial(decode_image, spec=part.image)
         )
         self._sample: Sample[Message] | None = None
         self._value: _Array | None = None

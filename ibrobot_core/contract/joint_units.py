@@ -14,8 +14,10 @@ from ibrobot_core.calibration import JointCalibration, load_calibration
 from ibrobot_core.config.schema import RobotConfig
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import CalibrationError
-from ibrobot_core.interfaces import Frame
+from ibrobot_core.interfaces import Frame, PolicySpec
 from ibrobot_core.messages import JointState
+from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.robot import Vector
 
 ACTION = "action"
 """Key of the action vector."""
@@ -26,7 +28,6 @@ _UNKNOWN_ENDS = (
     "{0}: does joint {1!r} range from 0 to 100, as LeRobot's grippers do in every unit? The robot YAML has no hardware "
     "that states it: add `hardware`, or name those joints with --anchored gripper ('' if none does)"
 )
-_POSITION = "position."
 _DEGREES_PER_RADIAN = 360 / (JointCalibration.TICKS_PER_TURN - 1) * JointCalibration.TICKS_PER_TURN / (2 * math.pi)
 """LeRobot counts a tick less for a turn."""
 
@@ -103,6 +104,9 @@ class JointUnits:
         ValueError: for an unknown unit.
     """
 
+    needs: tuple[str, ...] = ()
+    """Keys of observations that `commands` needs, whatever the policy reads."""
+
     def __init__(
         self,
         norm_mode: str,
@@ -134,6 +138,19 @@ class JointUnits:
         history = tuple(self.frame(each) for each in frame.history)
         return attrs.evolve(frame, values=self(frame.values), prefix=prefix, history=history)
 
+    def commands(self, actions: Vector, seen: Mapping[str, NDArray[Any]], start: Vector) -> tuple[Vector, int]:
+        """The positions of the joints [rad], shape (N, A), that actions of a policy command, and how many it held.
+
+        Args:
+            actions: in the policy's units, shape (N, F).
+            seen: the observations for which the policy gave them, in radians.
+            start: the joints' commands before them [rad], shape (A,).
+        """
+        return self.radians(ACTION, actions), 0
+
+    def check(self, spec: PolicySpec) -> None:
+        """Raise ContractError if a policy cannot give actions of this form; any can give positions of joints."""
+
     def radians(self, key: str, value: NDArray[Any]) -> NDArray[Any]:
         """Convert the vectors of one key from the unit to radians; joints on the last axis."""
         return self._converted(key, value, lerobot_to_radians)
@@ -145,6 +162,12 @@ class JointUnits:
         for group in self._elements[key]:
             vector[..., group.indices] = convert(vector[..., group.indices], group.mode, **group.calibration)
         return vector.astype(value.dtype)
+
+
+def policy_units(contract: Contract) -> type[JointUnits]:
+    """The class of the conversion for a contract: `JointUnits`, or that of its actions' features."""
+    words = (part.features[0].partition(".")[0] for part in contract.action_parts if part.features)
+    return next((installed_plugins().features[word].vectors for word in words), JointUnits)  # type: ignore[return-value]
 
 
 def calibrations(config: RobotConfig) -> dict[str, dict[str, dict[str, Any]]]:
@@ -172,14 +195,15 @@ def with_closed_ends(calibration: Mapping[str, Mapping[str, Any]], config: Robot
 
 def _position_joints(contract: Contract) -> dict[str, dict[int, str]]:
     """Key -> element -> joint, for all elements that are joint positions."""
-    joints_of: dict[str, dict[int, str]] = {ACTION: dict(enumerate(contract.action_joints))}
+    plain = [name if not part.features else "" for part in contract.action_parts for name in part.names]
+    joints_of: dict[str, dict[int, str]] = {ACTION: {i: name for i, name in enumerate(plain) if name}}
     for key in contract.observations:
         at = 0
         for part in contract.parts(key):
             if part.type == JointState.ros_type:
-                for i, path in enumerate(part.select):
-                    if path.startswith(_POSITION):
-                        joints_of.setdefault(key, {})[at + i] = path.removeprefix(_POSITION)
+                for i, leaf in enumerate(part.selection.leaves):
+                    if (leaf.kind, leaf.field) == ("joint", "position"):
+                        joints_of.setdefault(key, {})[at + i] = leaf.part
             at += part.feature.shape[0]
     return {key: joints for key, joints in joints_of.items() if joints}
 

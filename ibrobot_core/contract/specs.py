@@ -16,7 +16,9 @@ from ibrobot_core.config.schema import MAX_AGE, ActionSpec, Align, ImageSpec, Ob
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.dataset import Feature
 from ibrobot_core.messages import MESSAGE_TYPES, CompressedImage, Image, JointState
-from ibrobot_core.selection import Selection
+from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.robot import Robot
+from ibrobot_core.selection import JointFeature, Selection
 from ibrobot_core.units import NS_PER_S
 
 _IMAGE_DTYPES = {"16UC1": "uint16", "32FC1": "float32"}
@@ -36,6 +38,13 @@ class ObservationPart:
     """Its `stamp` is `receive` for message types without a header."""
     feature: Feature
     """Shape of this part alone; -1 for a dimension that only the messages determine."""
+    model: Mapping[str, Any] = attrs.field(factory=dict)
+    """What computed numbers depend on: first word of their paths -> `FeatureDescriptor.model`."""
+
+    @property
+    def selection(self) -> Selection:
+        """Reads the vector from a message."""
+        return _selection(self.type, self.select, self.model)
 
 
 @attrs.frozen
@@ -53,6 +62,15 @@ class ActionPart:
     """The command that is a tick's action: `hold`, the newest sent by the tick; `next`, the first sent after it."""
     max_age: float | None = None
     """How far a command may be from the tick whose action it is [s]; None for the contract's."""
+    features: tuple[str, ...] = ()
+    """Paths to numbers computed from the joints, which are the action instead of them, e.g. `tool.position`."""
+    model: Mapping[str, Any] = attrs.field(factory=dict)
+    """As `ObservationPart.model`."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its numbers in the action vector: its joints, or as the features name them."""
+        return _made(self.model, self.features, self.joints).names if self.features else self.joints
 
 
 @attrs.frozen
@@ -155,6 +173,11 @@ class Contract:
         return tuple(joint for part in self.action_parts for joint in part.joints)
 
     @cached_property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the numbers of the action vector: `action_joints`, unless it has features."""
+        return tuple(name for part in self.action_parts for name in part.names)
+
+    @cached_property
     def topics(self) -> Mapping[str, str]:
         """Topic -> message type, for all observations, actions and signals."""
         parts: Iterable[ObservationPart | ActionPart | SignalPart]
@@ -171,7 +194,8 @@ class Contract:
 
     def features(self) -> dict[str, Feature]:
         """Columns of a dataset with this contract, in LeRobot's format: observations, then `action`."""
-        names = tuple(f"{joint}.pos" for joint in self.action_joints)
+        joints = self.action_joints
+        names = tuple(f"{name}.pos" if name in joints else name for name in self.action_names)
         action = {"action": Feature("float32", (len(names),), names)} if names else {}
         return {**self.observations, **action}
 
@@ -192,6 +216,7 @@ class Contract:
                 | ({"select": list(p.select)} if p.select else {})
                 | ({"align": p.align} if p.align != "hold" else {})
                 | ({"max_age": p.max_age} if p.max_age is not None else {})
+                | ({"features": list(p.features), "model": p.model} if p.features else {})
                 for p in self.action_parts
             ],
         } | ({"signals": [attrs.asdict(p) for p in self.signal_parts]} if self.signal_parts else {})
@@ -232,34 +257,52 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
         image = spec.image or ImageSpec()
         size = peripheral.picture if peripheral is not None else None
         return ObservationPart(spec.key, spec.topic, type_, (), image, align, _image_feature(image, size))
-    return _vector(spec.key, spec.topic, type_, Selection(type_, spec.select, config.robot.joint_names), align)
+    model = _model(config.robot, spec.select)
+    return _vector(spec.key, spec.topic, type_, spec.select, align, model, config.robot.joint_names)
 
 
-def _vector(key: str, topic: str, type_: str, selection: Selection, align: Align) -> ObservationPart:
+def _vector(
+    key: str, topic: str, type_: str, paths: Sequence[str], align: Align, model: Mapping[str, Any],
+    joints: Sequence[str] = (),
+) -> ObservationPart:  # fmt: skip
+    selection = _selection(type_, paths, model, joints)
     feature = Feature("float32", (selection.size,), selection.names)
-    return ObservationPart(key, topic, type_, selection.paths, None, align, feature)
+    return ObservationPart(key, topic, type_, selection.paths, None, align, feature, model)
+
+
+def _model(robot: Robot, paths: Sequence[str]) -> dict[str, Any]:
+    """What the computed numbers among the paths depend on."""
+    features = installed_plugins().features
+    names = dict.fromkeys(name for path in paths if (name := path.partition(".")[0]) in features)
+    return {name: features[name].model(robot, [p for p in paths if p.startswith(f"{name}.")]) for name in names}
+
+
+def _made(model: Mapping[str, Any], paths: Sequence[str], joints: Sequence[str] = ()) -> JointFeature:
+    name = paths[0].partition(".")[0]
+    if (descriptor := installed_plugins().features.get(name)) is None:
+        raise installed_plugins().not_found("feature", name)
+    return descriptor.make(model.get(name, {}), paths, joints)
+
+
+def _selection(type_: str, paths: Sequence[str], model: Mapping[str, Any], joints: Sequence[str] = ()) -> Selection:
+    computed = {path: _made(model, [path]) for path in paths if path.partition(".")[0] in model}
+    return Selection(type_, paths, joints, computed)
 
 
 def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
     """The observation part of a canonical form."""
     align = Align(**part["align"])
     if part["encoding"] is None:
-        return _vector(key, part["topic"], part["type"], Selection(part["type"], part["select"]), align)
+        return _vector(key, part["topic"], part["type"], part["select"], align, part.get("model", {}))
     height, width, _ = part["shape"]
     image = ImageSpec((height, width) if min(height, width) > 0 else None, part["encoding"])
     return ObservationPart(key, part["topic"], part["type"], (), image, align, _image_feature(image, None))
 
 
-def _recorded_action(
-    topic: str,
-    type: str,
-    joints: Sequence[str],
-    select: Sequence[str] = (),
-    align: str = "hold",
-    max_age: float | None = None,
-) -> ActionPart:
+def _recorded_action(topic: str, max_age: float | None = None, **part: Any) -> ActionPart:
+    lists = {name: tuple(part.pop(name, ())) for name in ("joints", "select", "features")}
     max_age = None if max_age is None else _recorded_age(max_age)
-    return ActionPart(topic, topic, type, "hold", tuple(joints), tuple(select), align, max_age)
+    return ActionPart(topic, topic, safety_behavior="hold", max_age=max_age, **lists, **part)
 
 
 def _recorded_age(value: Any) -> float:
@@ -277,12 +320,14 @@ def _image_feature(image: ImageSpec, size: tuple[int, int] | None) -> Feature:
 
 def _action(spec: ActionSpec, config: RobotConfig) -> ActionPart:
     executor = config.executors[spec.executor]
-    select = spec.select
+    model = _model(config.robot, spec.select)
+    select, features = ((), spec.select) if model else (spec.select, ())
     if not select and spec.type == JointState.ros_type:
         select = tuple(f"position.{joint}" for joint in executor.joints)
     return ActionPart(
-        executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints, select, spec.align, spec.max_age
-    )
+        executor.name, spec.topic, spec.type, spec.safety_behavior, executor.joints, select, spec.align, spec.max_age,
+        features, model,
+    )  # fmt: skip
 
 
 def _joined(features: list[Feature]) -> Feature:
@@ -303,7 +348,7 @@ def _canonical(part: ObservationPart) -> dict[str, Any]:
         "encoding": part.image.encoding if part.image else None,
         "shape": list(part.feature.shape),
         "align": {"strategy": part.align.strategy, "stamp": part.align.stamp, "tol_ms": tol_ms},
-    }
+    } | ({"model": part.model} if part.model else {})
 
 
 def _flat(canonical: Mapping[str, Any]) -> dict[str, str]:

@@ -6,11 +6,12 @@ import logging
 from collections.abc import Callable
 
 import attrs
+import numpy as np
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.config.schema import DispatchConfig
 from ibrobot_core.contract.frames import FrameSampler
-from ibrobot_core.contract.joint_units import ACTION, JointUnits
+from ibrobot_core.contract.joint_units import JointUnits
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.latency import LatencyEstimate
 from ibrobot_core.dispatch.resume import LeadIn
@@ -65,6 +66,8 @@ class DispatchStats:
     failures: int = 0
     """Requests without a chunk, including timeouts; all requests in flight during one outage count as one."""
     timeouts: int = 0
+    unreachable: int = 0
+    """Actions that no position of the joints gives; the one before is held instead."""
     holds: int = 0
     """Times the plan ran dry."""
 
@@ -102,7 +105,8 @@ class Dispatcher:
         report: called with each answer, the time [ns], and what became of it: used, late, dropped or failed.
         request_timeout_s: time after which a request counts as failed.
         prompt: the task, for policies that take one.
-        units: of the policy's vectors; None for radians.
+        units: conversion of the policy's vectors; None for positions of joints in radians.
+        position: returns the joints' measured positions [rad], shape (A,).
 
     Raises:
         ContractError: as `check_strategy`.
@@ -112,6 +116,7 @@ class Dispatcher:
         self, contract: Contract, spec: PolicySpec, options: DispatchConfig, robot: Robot, bus: Bus,
         client: InferenceClient, send: SendPlan, request_timeout_s: float, prompt: str = "",
         units: JointUnits | None = None, report: Report = lambda *_: None,
+        position: Callable[[], Vector] | None = None,
     ) -> None:  # fmt: skip
         check_strategy(options, spec)
         self._contract = contract
@@ -123,7 +128,8 @@ class Dispatcher:
         self._report = report
         self._timeout_ns = ns(request_timeout_s)
         self._prompt = prompt
-        self._units = units
+        self._units = units or JointUnits("radians", contract, {}, {})
+        self._position = position or (lambda: np.zeros(len(contract.action_joints)))
         self.step_ns = step_ns = round(1e9 / (spec.rate_hz or contract.rate_hz))
         """Time from an action of a chunk to the next [ns]."""
         joints = contract.action_joints
@@ -144,6 +150,8 @@ class Dispatcher:
         self._log = logging.getLogger("ibrobot.dispatch")
         self._request_id = 0
         self._sampler: FrameSampler | None = None
+        self._seen: dict[int, Frame] = {}
+        """The observations of open requests."""
         self._open: dict[int, int] = {}
         """Requests that may still be answered, oldest first: id -> time of the observation [ns]."""
         self._pause_ns = self._overdue_ns = self._pace_ns = self._queued_ns = 0
@@ -155,7 +163,8 @@ class Dispatcher:
         """Start an episode or a mode: discard plan, requests and observations, and start requesting."""
         if self._sampler is not None:
             self._sampler.close()
-        self._sampler = FrameSampler(self._contract, self._bus, tuple(self._spec.observations), self._spec.history)
+        keys = dict.fromkeys((*self._spec.observations, *self._units.needs))
+        self._sampler = FrameSampler(self._contract, self._bus, tuple(keys), self._spec.history)
         self._seed = seed
         self.resume()
 
@@ -236,7 +245,9 @@ class Dispatcher:
             return
         self._smoother.trim(now_ns)
         try:
-            actions = chunk.actions if self._units is None else self._units.radians(ACTION, chunk.actions)
+            before = self._smoother.ahead(chunk.start_ns, 1)
+            start = self._position() if before is None else before[0]
+            actions, unreachable = self._units.commands(chunk.actions, self._seen[chunk.id].values, start)
             joined = self._smoother.update(actions, chunk.start_ns)
         except (ValueError, IndexError) as error:
             self._fail(attrs.evolve(chunk, error=str(error)), now_ns)
@@ -245,6 +256,7 @@ class Dispatcher:
         self._open = {number: stamp_ns for number, stamp_ns in self._open.items() if number > chunk.id}
         self._count(chunk, now_ns, now_ns - asked_ns)
         self._settle()
+        self.stats.unreachable += unreachable if joined else 0
         self._report(chunk, now_ns, "used" if joined else "late")
         if not joined:
             self.stats.late_chunks += 1
@@ -265,10 +277,11 @@ class Dispatcher:
         self._asked_ns = t_ns
         self._request_id += 1
         self.stats.requests += 1
+        self._seen = {number: self._seen[number] for number in self._open} | {self._request_id: frame}
         self._open[self._request_id] = t_ns
         prefix, delay_steps = self._continued(t_ns)
         frame = attrs.evolve(frame, prompt=self._prompt, prefix=prefix, delay_steps=delay_steps)
-        self._client.submit(DispatchInfer(self._request_id, frame if self._units is None else self._units.frame(frame)))
+        self._client.submit(DispatchInfer(self._request_id, self._units.frame(frame)))
         return True
 
     def _continued(self, t_ns: int) -> tuple[Vector | None, int]:

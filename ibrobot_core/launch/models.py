@@ -10,7 +10,7 @@ from ibrobot_core.calibration import load_calibration
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.schema import ModelConfig
 from ibrobot_core.contract.check import check_policy
-from ibrobot_core.contract.joint_units import JointUnits, calibrations, with_closed_ends
+from ibrobot_core.contract.joint_units import JointUnits, calibrations, policy_units, with_closed_ends
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import check_strategy
 from ibrobot_core.errors import ConfigError, ContractError, IbrobotError, Problem
@@ -19,7 +19,7 @@ from ibrobot_core.interfaces import PolicySpec
 from ibrobot_core.plugins import Registry
 
 
-def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: logging.Logger) -> JointUnits | None:
+def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: logging.Logger) -> JointUnits:
     """Compare a policy with the contract, and with the modes that use it.
 
     Args:
@@ -29,15 +29,17 @@ def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: 
         log: receives warnings.
 
     Returns:
-        The conversion to the policy's unit of joint positions; None for radians.
+        The conversion of vectors between the robot and the policy.
 
     Raises:
         ContractError: for a difference; shows both sides.
         CalibrationError: if the unit needs a calibration that is missing.
     """
     contract = Contract.from_config(config, model.extra_observations)
+    units = _units(config, model, contract)
     try:
         check_policy(contract, spec, model.norm_mode)
+        units.check(spec)
     except ContractError as error:
         raise ContractError(f"model {model.name!r} does not fit the contract of {config.source}\n{error}") from None
     for mode in config.control_modes.values():
@@ -55,7 +57,7 @@ def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: 
             )
         if mode.inference.prompt and not spec.prompt:
             log.warning("%s.inference.prompt: model %r takes no prompt", where, model.name)
-    return _units(config, model, contract) if model.norm_mode != "radians" else None
+    return units
 
 
 def check_models(config: RobotConfig, registry: Registry, modes: Iterable[str]) -> list[str]:
@@ -89,12 +91,14 @@ def _line(name: str, spec: PolicySpec) -> str:
     trained = "" if spec.contract is not None else "; what it was trained on is not known"
     return (
         f"model {name} fits the contract: {', '.join(spec.observations) or 'no observations'} -> "
-        f"{spec.action_size} joints in chunks of {spec.chunk_size}{rate}{trained}"
+        f"{spec.action_size} numbers in chunks of {spec.chunk_size}{rate}{trained}"
     )
 
 
 def _units(config: RobotConfig, model: ModelConfig, contract: Contract) -> JointUnits:
     name = model.calibration
-    each = {"model": with_closed_ends(load_calibration(name).numbers(), config)} if name else calibrations(config)
+    each = {} if model.norm_mode == "radians" else calibrations(config) if name is None else {
+        "model": with_closed_ends(load_calibration(name).numbers(), config)
+    }  # fmt: skip
     joined = {joint: numbers for joints in each.values() for joint, numbers in joints.items()}
-    return JointUnits(model.norm_mode, contract, joined, config.document)
+    return policy_units(contract)(model.norm_mode, contract, joined, config.document)

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jsonschema
 import pytest
 
 from ibrobot_core.config.yaml_nodes import parse_yaml
@@ -95,13 +94,3 @@ def test_show_fills_in_the_defaults_and_loads_again(ibrobot: Ibrobot, robot: Pat
     }
     robot.write_text(shown.out)
     assert ibrobot("config", "show", "mini.yaml").out == shown.out
-
-
-def test_schema_has_the_options_of_plugins(ibrobot: Ibrobot, robot: Path) -> None:
-    schema = json.loads(ibrobot("config", "schema").out)
-
-    jsonschema.Draft202012Validator.check_schema(schema)
-    validator = jsonschema.Draft202012Validator(schema)
-    validator.validate(parse_yaml(robot.read_text(), "mini.yaml").root)
-    wrong = parse_yaml(robot.read_text().replace("port: /dev/null", "port: 5"), "mini.yaml").root
-    assert [list(error.absolute_path) for error in validator.iter_errors(wrong)] == [["hardware", "port"]]

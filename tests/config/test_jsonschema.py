@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import attrs
 import jsonschema
 import pytest
 
-from ibrobot_core.config.jsonschema import json_schema
 from ibrobot_core.config.yaml_nodes import parse_yaml
-from ibrobot_core.plugins import Registry
+from ibrobot_core.descriptors import SectionDescriptor
+from ibrobot_core.options import option
+from ibrobot_core.plugins import Entry, Registry
+
+json_schema = pytest.importorskip("ibrobot_import.schema").json_schema
+pytestmark = pytest.mark.integration
 
 INFERENCE = ("control_modes", "policy", "inference")
 
@@ -94,3 +99,22 @@ def test_options_carry_unit_default_and_summary(registry: Registry) -> None:
         "description": "speed limit of the servos [rad/s]",
         "default": 3.0,
     }
+
+
+@attrs.frozen
+class Around:
+    """Options of a section that a plugin adds."""
+
+    padding: float = option(0.0, ge=0, help="added around the robot")
+
+
+def test_sections_of_plugins_are_in_it(registry: Registry) -> None:
+    section = SectionDescriptor("around", "what is around the robot", make=lambda *_: None, options=Around)  # type: ignore[arg-type, return-value]
+    registry.entries["section", "around"] = Entry("section", section, "fake", "ibrobot-plugin-fake", "1.0")
+    schema = json_schema(registry)["properties"]["around"]
+    assert schema["description"] == "what is around the robot"
+    jsonschema.validate({"padding": 0.1}, schema)
+    with pytest.raises(jsonschema.ValidationError, match="less than the minimum"):
+        jsonschema.validate({"padding": -1}, schema)
+    with pytest.raises(jsonschema.ValidationError, match="Additional properties"):
+        jsonschema.validate({"paddign": 1}, schema)

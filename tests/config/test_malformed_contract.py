@@ -246,7 +246,10 @@ CASES = {
     "contract_action_select": (
         "executor: arm_position, topic",
         "executor: arm_position, select: [data.1, data.0], topic",
-        ("robot.yaml:38: contract.actions.0.select: applies only to the commands of foreign bags; set foreign: true"),
+        (
+            "robot.yaml:38: contract.actions.0.select: 'data.1' is computed by no installed plugin; paths into "
+            "messages are for foreign bags: set foreign: true"
+        ),
     ),
     "contract_foreign_action_whole": (
         "executor: arm_position, topic",

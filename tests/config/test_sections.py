@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import attrs
-import jsonschema
 import pytest
 import yaml
 
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.jsonschema import json_schema
 from ibrobot_core.config.show import to_yaml
 from ibrobot_core.descriptors import SectionDescriptor
 from ibrobot_core.errors import ConfigError
@@ -129,15 +126,3 @@ def test_a_secret_of_a_section_is_not_shown(load_text: Load, base: str) -> None:
 def test_config_show_has_the_section_with_its_defaults(load_text: Load, base: str) -> None:
     shown = to_yaml(load_text(base + "around: {padding: 0.01}\n"))
     assert yaml.safe_load(shown)["around"] == {"table": True, "padding": 0.01, "boxes": {}, "tip": "pan", "code": "***"}
-
-
-def test_json_schema_has_the_section(registry: Registry) -> None:
-    schema = json_schema(registry)
-    section = schema["properties"]["around"]
-    assert section["description"] == "what is around the robot"
-    jsonschema.validate({"padding": 0.1}, section)
-    with pytest.raises(jsonschema.ValidationError, match="less than the minimum"):
-        jsonschema.validate({"padding": -1}, section)
-    with pytest.raises(jsonschema.ValidationError, match="Additional properties"):
-        jsonschema.validate({"paddign": 1}, section)
-    assert json.dumps(schema)

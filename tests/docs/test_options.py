@@ -11,12 +11,12 @@ import attrs
 import pytest
 
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.jsonschema import json_schema
 from ibrobot_core.options import fields
 from ibrobot_core.plugins import Entry, installed_plugins
 
 pytestmark = pytest.mark.integration
 
+json_schema = pytest.importorskip("ibrobot_import.schema").json_schema
 ENTRIES = list(installed_plugins().entries.values())
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -31,7 +31,7 @@ def offers() -> dict[str, dict[str, list[str]]]:
     found: dict[str, dict[str, list[str]]] = {}
     for entry in entry_points(group="ibrobot"):
         package = entry.dist.name if entry.dist is not None else ""
-        if not package.startswith("ibrobot-plugin-"):
+        if not package.startswith("ibrobot-") or package == CORE:
             continue
         registry = discover([entry])
         assert not registry.failures, registry.failures
@@ -50,6 +50,8 @@ def offers() -> dict[str, dict[str, list[str]]]:
                 kinds[RECORDS] = kinds[kind]
         if registry.readers:
             kinds["reader"] = sorted(reader.type for reader in registry.readers)
+        if registry.features:
+            kinds["feature"] = sorted(registry.features)
         if registry.guides:
             kinds["guide"] = sorted(guide.name for guide in registry.guides)
         if commands := sorted(name for name, owner in registry.command_packages.items() if owner == package):

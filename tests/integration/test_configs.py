@@ -9,10 +9,10 @@ import attrs
 import jsonschema
 import pytest
 from click.testing import CliRunner
+from ibrobot_import.schema import json_schema
 
 from ibrobot_core.cli.main import cli
 from ibrobot_core.config import load_config
-from ibrobot_core.config.jsonschema import json_schema
 from ibrobot_core.config.show import to_yaml
 from ibrobot_core.plugins import installed_plugins
 
@@ -72,3 +72,11 @@ def test_check_reads_a_calibration_whose_joints_are_numbers_as_a_run_does(tmp_pa
         assert done.exit_code == 0, done.exception
     else:
         assert "shoulder_pan: its range, " in str(done.exception)
+
+
+def test_schema_is_printed_with_the_keys_of_a_robot_yaml() -> None:
+    schema = json.loads(CliRunner().invoke(cli, ["config", "schema"], catch_exceptions=False).output)
+    jsonschema.Draft202012Validator.check_schema(schema)
+    assert {"robot", "contract", "control_modes", "hardware"} <= set(schema["properties"])
+    wrong = jsonschema.Draft202012Validator(schema["properties"]["control"]).iter_errors({"rate_hz": "fast"})
+    assert [list(each.absolute_path) for each in wrong] == [["rate_hz"]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import NoneType
-from typing import override
+from typing import Any, override
 
 import attrs
 import numpy as np
@@ -13,7 +13,7 @@ from ibrobot_core.component import Component
 from ibrobot_core.config.schema import ControlMode, InferenceConfig
 from ibrobot_core.contract.joint_units import ACTION, JointUnits
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.dispatch.dispatcher import Dispatcher
+from ibrobot_core.dispatch.dispatcher import Dispatcher, DispatchStats
 from ibrobot_core.errors import wrong_input
 from ibrobot_core.inference.client import Chunk, EngineClient, InferenceClient, LockstepClient
 from ibrobot_core.interfaces import Engine, ModelContext, Policy
@@ -55,8 +55,8 @@ class LoadedModel(Component):
         self._inference = inference
         self._model = model
         self.contract = Contract.from_config(session.config, model.extra_observations)
-        self.units: JointUnits | None = None
-        """The unit conversion of the policy's vectors, once started; None for radians."""
+        self.units: JointUnits
+        """The conversion of the policy's vectors, once started."""
         self._policy: Policy | None = None
         self._engine: Engine | None = None
 
@@ -123,6 +123,7 @@ class PolicySource(SourceWorker):
         super().__init__(session, mode, summary, (*needs, model.name))
         self._inference = inference
         self._model = model
+        self._stats = DispatchStats()
 
     @override
     def setup(self) -> None:
@@ -134,13 +135,24 @@ class PolicySource(SourceWorker):
         self.on_end.callback(self._client.close)
         self._dispatcher = Dispatcher(
             contract, policy.spec, self.mode.dispatch, self.session.config.robot, self.session.bus, self._client,
-            self._send, timeout_s, self._inference.prompt, self._model.units, self._publish,
+            self._send, timeout_s, self._inference.prompt, self._model.units, self._publish, self._measured,
         )  # fmt: skip
+        self._stats = self._dispatcher.stats
         self._step_ns = contract.step_ns
+        self._columns = self.session.config.robot.indices(contract.action_joints)
 
     @override
     def described(self) -> Mapping[str, str]:
         return self._model.described()
+
+    @override
+    def summary_rows(self) -> list[tuple[str, str]]:
+        count = self._stats.unreachable
+        return [("unreachable", f"{count} actions, for which the robot held the one before")] if count else []
+
+    @override
+    def facts(self) -> dict[str, Any]:
+        return {"unreachable": self._stats.unreachable}
 
     def toggle_smoothing(self, enabled: bool) -> None:
         """Enable or disable the blending of chunks, from the next chunk on."""
@@ -162,9 +174,8 @@ class PolicySource(SourceWorker):
 
     def resume(self, position: Vector) -> None:
         """Request a plan again, which begins at `position` [rad], shape (J,), where the robot is held."""
-        columns = self.session.config.robot.indices(self._model.contract.action_joints)
         with self.lock:
-            self._dispatcher.resume(position[columns])
+            self._dispatcher.resume(position[self._columns])
 
     @override
     def end_mode(self) -> None:
@@ -191,17 +202,20 @@ class PolicySource(SourceWorker):
 
     def _publish(self, chunk: Chunk, now_ns: int, outcome: str) -> None:
         """Publish a request and its answer."""
-        joints, model = self._model.contract.action_joints, self._model
+        names, model = self._model.contract.action_names, self._model
         engine, lockstep = model.engine.stats, self.session.request.lockstep
-        actions: Vector = np.empty((0, len(joints)))
-        if chunk.actions is not None and chunk.actions.shape[1:] == (len(joints),):
-            actions = chunk.actions if model.units is None else model.units.radians(ACTION, chunk.actions)
+        actions: Vector = np.empty((0, len(names)))
+        if chunk.actions is not None and chunk.actions.shape[1:] == (len(names),):
+            actions = model.units.radians(ACTION, chunk.actions)
         took_ms = (0.0, 0.0) if lockstep else (engine.infer_ms, chunk.queued_ns / 1e6)
         self.session.bus.publish(MODEL_ANSWERS, ModelAnswer(
             Header(now_ns), chunk.id, chunk.start_ns, self._inference.model, engine.server, engine.weights,
             self._inference.prompt, outcome, chunk.error, (now_ns - chunk.start_ns) / 1e6, *took_ms,
-            self._dispatcher.step_ns, joints, actions.ravel(),
+            self._dispatcher.step_ns, names, actions.ravel(),
         ))  # fmt: skip
+
+    def _measured(self) -> Vector:
+        return self.session.measured().position[self._columns]
 
     def _send(self, start_ns: int, step_ns: int, positions: Vector) -> None:
         self.session.send_plan(start_ns, step_ns, self._model.contract.action_joints, positions)

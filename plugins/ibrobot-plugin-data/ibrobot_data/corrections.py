@@ -178,7 +178,11 @@ class Corrections(SourceWorker):
 
     @override
     def facts(self) -> dict[str, object]:
-        return {"takeovers": self._takeovers, "operator_s": round(seconds(self._commanded_ns), 3)}
+        return {
+            **self._policy.facts(),
+            "takeovers": self._takeovers,
+            "operator_s": round(seconds(self._commanded_ns), 3),
+        }
 
     def _is_key_pressed(self) -> bool:
         """Whether the key for takeovers was pressed.

@@ -32,13 +32,12 @@ from ibrobot_core.api import (
     Feature,
     IbrobotError,
     JointCalibration,
-    JointUnits,
     RealClock,
     RecorderError,
     Robot,
     sync,
 )
-from ibrobot_core.app import TASK_KEY, DiskFull, installed_plugins
+from ibrobot_core.app import TASK_KEY, DiskFull, installed_plugins, policy_units
 from ibrobot_data.commanders import Commanders, stretches
 from ibrobot_data.identity import identity
 from ibrobot_data.options import OPERATOR, POLICY
@@ -247,7 +246,7 @@ def _write(
     document = request.document or _recorded(summary, "config")
     recorded = _joined(_recorded(summary, "calibration"))
     calibration = recorded if request.calibration is None else _completed(request.calibration, recorded)
-    units = JointUnits(request.norm_mode, contract, calibration, document)
+    units = policy_units(contract)(request.norm_mode, contract, calibration, document)
     robot_type = (document.get("robot") or {}).get("robot_type") or summary.metadata.get("robot_type", "")
     if request.success and report.outcome == "unknown":
         raise DatasetError(f"{SUCCESS} cannot be determined: the episode's outcome is unknown")

@@ -1,4 +1,4 @@
-"""The plugin's hook: `ibrobot config import`."""
+"""The plugin's hook: `ibrobot config import` and `ibrobot config schema`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ def _takes(values: Mapping[str, Any]) -> str:
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """`ibrobot config import`."""
+    """`ibrobot config import` and `ibrobot config schema`."""
     summary = "Make a robot YAML from a config of IB-Robot, Rosetta or LeRobot."
     yield Command("config import", summary, Late("ibrobot_import.command:import_").load, takes=_takes)
+    summary = "Print a JSON Schema of robot YAMLs, for editors."
+    yield Command("config schema", summary, Late("ibrobot_import.schema:print_schema").load)

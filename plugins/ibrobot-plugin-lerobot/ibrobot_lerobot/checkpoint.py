@@ -81,7 +81,7 @@ class Checkpoint:
         known = POLICY_TYPES.get(self.type, OTHER)
         return PolicySpec(
             observations={key: self.inputs[name][1] for key, name in self.names.items()},
-            actions=contract.action_joints if contract is not None else None,
+            actions=contract.action_names if contract is not None else None,
             action_size=self.action_size,
             chunk_size=min(self.chunk_size, n_action_steps or self.chunk_size),
             rate_hz=contract.rate_hz if contract is not None else None,

@@ -21,7 +21,7 @@ from ibrobot_core.api import (
     Message,
     ObservationPart,
 )
-from ibrobot_core.app import Leaf, Selection
+from ibrobot_core.app import Leaf
 
 _ACTION = "action"
 _DEPTH: Mapping[str, type[np.generic]] = {"16UC1": np.uint16, "32FC1": np.float32}
@@ -42,6 +42,11 @@ class Composer:
 
     def __init__(self, contract: Contract) -> None:
         self._contract = contract
+        if computed := [part for part in contract.action_parts if part.features]:
+            raise ContractError(
+                f"{_ACTION}: cannot make commands from {', '.join(computed[0].features)}: the dataset lacks the "
+                "positions of the joints"
+            )
         if foreign := [part for part in contract.action_parts if part.select]:
             raise ContractError(
                 f"{_ACTION}: cannot make a {foreign[0].type} for {foreign[0].topic}, because the action is foreign"
@@ -126,8 +131,8 @@ class Composer:
 def _leaves(part: ObservationPart) -> tuple[Leaf, ...]:
     if part.type not in MESSAGE_TYPES:
         raise ContractError(f"{part.key}: cannot make a {part.type}, because only the original bags define this type")
-    leaves = Selection(part.type, part.select).leaves
-    if parts := [leaf.label for leaf in leaves if leaf.kind == "foreign"]:
+    leaves = part.selection.leaves
+    if parts := [leaf.label for leaf in leaves if leaf.kind in ("foreign", "feature")]:
         raise ContractError(
             f"{part.key}: cannot make a {part.type} from {', '.join(parts)}: its other fields are unknown"
         )

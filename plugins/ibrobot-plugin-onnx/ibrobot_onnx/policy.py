@@ -209,7 +209,7 @@ def _spec(manifest: Manifest, n_action_steps: int | None) -> PolicySpec:
     contract = manifest.contract
     return PolicySpec(
         observations=manifest.observations,
-        actions=contract.action_joints if contract is not None else None,
+        actions=contract.action_names if contract is not None else None,
         action_size=manifest.action_size,
         chunk_size=min(manifest.chunk_size, n_action_steps or manifest.chunk_size),
         rate_hz=contract.rate_hz if contract is not None else None,

@@ -11,6 +11,7 @@ from ibrobot_core.descriptors import (
     Command,
     ConfigFile,
     DecoderDescriptor,
+    FeatureDescriptor,
     GuideDescriptor,
     HardwareDescriptor,
     PanelDescriptor,
@@ -53,6 +54,7 @@ WITHOUT_NAME: Mapping[str, Callable[[], object]] = {
     "ibrobot_sensors": lambda: SensorDescriptor("x", _nothing, "x", options=3),  # type: ignore[arg-type]
     "ibrobot_readers": lambda: ReaderDescriptor(None, "x", _nothing, _nothing),  # type: ignore[arg-type]
     "ibrobot_decoders": lambda: DecoderDescriptor,
+    "ibrobot_features": lambda: FeatureDescriptor(3, _nothing, _nothing, _nothing),  # type: ignore[arg-type]
     "ibrobot_configs": lambda: ConfigFile("x", "robot.yaml"),  # type: ignore[arg-type]
     "ibrobot_commands": lambda: Command(3, "x", _nothing),  # type: ignore[arg-type]
     "ibrobot_panels": lambda: PanelDescriptor(3, (), _nothing),  # type: ignore[arg-type]

@@ -6,7 +6,8 @@ from typing import override
 
 import attrs
 import numpy as np
-from ibrobot_kinematics import KinematicsError, UnreachableError, robot_model
+from ibrobot_kinematics import KinematicModel, KinematicsError, UnreachableError, robot_model
+from ibrobot_kinematics.tool_features import rotation_6d
 from numpy.typing import NDArray
 
 from ibrobot_core.api import NS_PER_S, Context, Frame, Policy, PolicyError, PolicySpec, Tensors, Vector, seconds
@@ -17,6 +18,7 @@ from ibrobot_mujoco.experts.way import Hand, Way
 
 STATE = "observation.state"
 SCENE = "observation.environment_state"
+TOOL_NAMES = ("ee.x", "ee.y", "ee.z", "ee.r11", "ee.r21", "ee.r31", "ee.r12", "ee.r22", "ee.r32")
 STAMP = "stamp_ns"
 ACTION = "action"
 
@@ -74,10 +76,14 @@ class ScriptedExpert(Policy):
             acceleration=options.speed / ticks * ctx.robot.max_acceleration,
         )
         size = len(ctx.robot.joints)
+        self._arm: KinematicModel | None = None
+        """The arm whose tool's poses are the actions; None for positions of joints."""
+        gripper = ctx.robot.groups.get("gripper", ())
+        names = ctx.robot.joint_names if options.actions == "joints" else (*TOOL_NAMES, *gripper)
         self.spec = PolicySpec(
             observations={STATE: (size,), SCENE: (observed,)},
-            actions=ctx.robot.joint_names,
-            action_size=size,
+            actions=names,
+            action_size=len(names),
             chunk_size=options.chunk_size,
             rate_hz=options.rate_hz,
             stateful=True,
@@ -92,6 +98,7 @@ class ScriptedExpert(Policy):
         except KinematicsError as error:
             raise PolicyError(f"{self._name} cannot be loaded: {error}") from error
         self._task = self._kind(hands, self._options)
+        self._arm = hands[0].arm if self._options.actions == "tool" else None
 
     def _hand(self, side: str) -> Hand:
         robot = self._robot
@@ -148,7 +155,14 @@ class ScriptedExpert(Policy):
 
     @override
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
-        return np.asarray(tensors[ACTION], dtype=np.float64)
+        positions = np.asarray(tensors[ACTION], dtype=np.float64)
+        if self._options.actions == "joints":
+            return positions
+        if self._arm is None:
+            self._arm = self._hand("").arm
+        gripper = self._robot.indices(self._robot.groups["gripper"])
+        tip = self._arm.forward(positions)
+        return np.concatenate([tip.position, rotation_6d(tip.rotation), positions[:, gripper]], axis=1)
 
     def _extended(self, kept: list[Segment], scene: Vector, home: Vector) -> tuple[Trajectory, int]:
         """The trajectory of `kept` followed by a new plan, and the plan's first segment."""

@@ -25,6 +25,12 @@ class ExpertOptions:
     release_height: float = option(0.07, unit="m", gt=0, le=0.3, help="height above the bin's centre at the release")
     gripper_open: float = option(0.6, unit="rad", help="position of the open gripper")
     gripper_closed: float = option(-0.1, unit="rad", help="goal of the closing gripper; the object stops it before")
+    actions: str = option(
+        "joints",
+        choices=("joints", "tool"),
+        help="joints: their positions; tool: `tool.position` and `tool.rotation_6d`, and the position of the gripper, "
+        "for one arm",
+    )
 
 
 @documented
@@ -43,6 +49,8 @@ def check_arm(
     gripper = robot.groups.get(name, ())
     if len(gripper) != 1:
         yield OptionFault((), f"the scripted expert needs one joint in robot.groups.{name}, got {list(gripper)}")
+    if options.actions == "tool" and (name != "gripper" or robot.description.arms):
+        yield OptionFault(("actions",), "the robot has several arms: `tool` is for one arm")
 
 
 def check_arms(options: ExpertOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:

@@ -1,19 +1,31 @@
-"""A JSON Schema (draft 2020-12) of the robot YAML for editors, with the options of every installed plugin."""
+"""`ibrobot config schema`: a JSON Schema (draft 2020-12) of the robot YAML for editors, with the plugins' options."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
 import attrs
+import click
 
-from ibrobot_core.component_config import ComponentConfig, SceneConfig, component_of
-from ibrobot_core.config.schema import SECTIONS
-from ibrobot_core.config.show import plain
-from ibrobot_core.convert import is_literal, is_mapping, is_sequence, is_union
-from ibrobot_core.options import default_of, fields
-from ibrobot_core.plugins import Registry
+from ibrobot_core.api import SceneConfig
+from ibrobot_core.app import (
+    SECTIONS,
+    ComponentConfig,
+    Registry,
+    component_of,
+    default_of,
+    echo,
+    fields,
+    installed_plugins,
+    is_literal,
+    is_mapping,
+    is_sequence,
+    is_union,
+    plain,
+)
 
 Schema = dict[str, Any]
 
@@ -26,6 +38,15 @@ _SCALARS: Mapping[Any, Schema] = {
     type(None): {"type": "null"},
 }
 _BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
+
+
+@click.command("schema")
+def print_schema() -> None:
+    """Print a JSON Schema of robot YAMLs, for editors.
+
+    It has the options of every installed plugin.
+    """
+    echo(json.dumps(json_schema(installed_plugins()), indent=2))
 
 
 def json_schema(registry: Registry) -> Schema:
