@@ -185,8 +185,9 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         missing=missing, absent_models=sections.absent_models, source=source, document=shown, complete=document.root,
         secrets=secrets,
     )  # fmt: skip
-    for each in (*(section for section, _ in registry.sections(config)), *registry.features.values()):
-        for fault in each.check_config(config):
+    checks = [each.check_config for each, _ in registry.sections(config)]
+    for check in (*checks, *(each.check_config for each in registry.features.values())):
+        for fault in check(config):
             document.add(fault.option, fault.message)
     document.raise_problems()
     return config

@@ -300,7 +300,7 @@ def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
 
 
 def _recorded_action(topic: str, max_age: float | None = None, **part: Any) -> ActionPart:
-    lists = {name: tuple(part.pop(name, ())) for name in ("joints", "select", "features")}
+    lists: dict[str, Any] = {name: tuple(part.pop(name, ())) for name in ("joints", "select", "features")}
     max_age = None if max_age is None else _recorded_age(max_age)
     return ActionPart(topic, topic, safety_behavior="hold", max_age=max_age, **lists, **part)
 

@@ -109,7 +109,7 @@ class Around:
 
 
 def test_sections_of_plugins_are_in_it(registry: Registry) -> None:
-    section = SectionDescriptor("around", "what is around the robot", make=lambda *_: None, options=Around)  # type: ignore[arg-type, return-value]
+    section = SectionDescriptor("around", "what is around the robot", make=lambda *_: None, options=Around)  # type: ignore[arg-type]
     registry.entries["section", "around"] = Entry("section", section, "fake", "ibrobot-plugin-fake", "1.0")
     schema = json_schema(registry)["properties"]["around"]
     assert schema["description"] == "what is around the robot"

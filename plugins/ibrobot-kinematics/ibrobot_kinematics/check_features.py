@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import Contract, ContractError, OptionFault
 from ibrobot_kinematics.delta_features import delta_feature
@@ -22,7 +22,9 @@ def _is_feature(path: str) -> bool:
 
 def faults(config: RobotConfig) -> Iterator[OptionFault]:
     """Yield the faults of paths `tool.PART` and `delta.JOINT` in the contract, and in the models' own observations."""
-    lists = [(("contract", "observations"), config.contract.observations)]
+    lists: list[tuple[tuple[str, ...], tuple[Any, ...]]] = [
+        (("contract", "observations"), config.contract.observations)
+    ]
     lists += [(("models", name, "extra_observations"), each.extra_observations) for name, each in config.models.items()]
     found = [
         OptionFault((*place, i, "select", n), message)

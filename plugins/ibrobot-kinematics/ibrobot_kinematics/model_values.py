@@ -79,7 +79,8 @@ def _values(arm: _Arm) -> Mapping[str, Any]:
 
 
 def _rounded(numbers: ArrayLike) -> list[float]:
-    return (np.round(np.asarray(numbers, dtype=float), _DECIMALS) + 0.0).tolist()  # -0.0 becomes 0.0
+    rounded: list[float] = (np.round(np.asarray(numbers, dtype=float), _DECIMALS) + 0.0).tolist()  # no -0.0
+    return rounded
 
 
 def model_of(values: Mapping[str, Any], limits: Mapping[str, tuple[float, float]] | None = None) -> KinematicModel:

@@ -133,7 +133,7 @@ def _gripper(robot: Robot, arm: str) -> str:
     own = [name for name, grips in joints if grips and robot.description.arm_of(name) == arm]
     if len(own) != 1:
         has = ", ".join(own) or "none"
-        raise ContractError(f"{PREFIX}{GRIPPER} is the position of the one joint that grips, and there is: {has}")
+        raise ContractError(f"{PREFIX}{GRIPPER} is the position of the one joint that grips, the robot has: {has}")
     return own[0]
 
 
