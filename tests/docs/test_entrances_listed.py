@@ -109,8 +109,9 @@ COMMANDS = {
     "ui": "page goal",  # it launches runs, and shows their pages
     **dict.fromkeys(
         (
-            "camera", "certs", "config", "config copy", "config import", "config new", "config schema", "contract", "convert",
-            "datasets", "datasets info", "description", "doctor", "episodes", "episodes delete", "episodes list",
+            "camera", "certs", "config", "config copy", "config import", "config new", "config schema", "contract",
+            "convert", "datasets", "datasets info", "description", "doctor", "episodes", "episodes delete",
+            "episodes list",
             "episodes mark", "episodes repair", "episodes trash", "episodes trim", "export", "feetech", "gamepad",
             "lerobot", "plan", "plugins", "serve", "train",
         ),

@@ -25,7 +25,7 @@ from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import LaunchRequest, Session
 from ibrobot_core.plugins import installed_plugins
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 
 POSES = "[tool.position, tool.rotation_6d]"
 TOOL = f"{{key: observation.tool, topic: /joint_states, select: {POSES[:-1]}, position.gripper]}}"
@@ -40,10 +40,10 @@ def kept(site: Any) -> Iterator[list[Any]]:
     """The frames that the policy `mover` gets."""
     site.add("tool-mover", "tool_mover.py")
     installed_plugins()
-    found: list[Any] = sys.modules["tool_mover"].KEPT
-    found.clear()
-    yield found
-    found.clear()
+    frames_kept: list[Any] = sys.modules["tool_mover"].KEPT
+    frames_kept.clear()
+    yield frames_kept
+    frames_kept.clear()
 
 
 def overrides(select: str, *more: str, observations: str = f"[{STATE}, {TOOL}]") -> tuple[str, ...]:

@@ -26,7 +26,7 @@ def faults(config: RobotConfig) -> Iterator[OptionFault]:
         (("contract", "observations"), config.contract.observations)
     ]
     lists += [(("models", name, "extra_observations"), each.extra_observations) for name, each in config.models.items()]
-    found = [
+    option_faults = [
         OptionFault((*place, i, "select", n), message)
         for place, specs in lists
         for i, spec in enumerate(specs)
@@ -37,9 +37,9 @@ def faults(config: RobotConfig) -> Iterator[OptionFault]:
         if any(map(_is_feature, action.select)):
             joints = config.executors[action.executor].joints
             if message := _fault(config, action.select, joints):
-                found.append(OptionFault(("contract", "actions", i, "select"), message))
-    yield from found
-    if not found:
+                option_faults.append(OptionFault(("contract", "actions", i, "select"), message))
+    yield from option_faults
+    if not option_faults:
         yield from _references(config)
 
 

@@ -72,10 +72,10 @@ class FeatureVectors(JointUnits):
 
     @override
     def __call__(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        found = super().__call__({key: value for key, value in values.items() if key != _ACTION})
+        converted = super().__call__({key: value for key, value in values.items() if key != _ACTION})
         if _ACTION in values:
-            found[_ACTION] = self._encoded(values, values[_ACTION])
-        return found
+            converted[_ACTION] = self._encoded(values, values[_ACTION])
+        return converted
 
     @override
     def frame(self, frame: Frame) -> Frame:
@@ -135,16 +135,16 @@ class FeatureVectors(JointUnits):
 
 def measured_places(contract: Contract) -> dict[str, tuple[str, int]]:
     """Joint -> key and index of its measured position in the observations; the first of several."""
-    found: dict[str, tuple[str, int]] = {}
+    places: dict[str, tuple[str, int]] = {}
     for key in contract.observations:
         at = 0
         for part in contract.parts(key):
             leaves = part.selection.leaves if part.type == JointState.ros_type else ()
             for index, leaf in enumerate(leaves):
                 if (leaf.kind, leaf.field) == ("joint", "position"):
-                    found.setdefault(leaf.part, (key, at + index))
+                    places.setdefault(leaf.part, (key, at + index))
             at += part.feature.shape[0]
-    return found
+    return places
 
 
 def missing_reference(joint: str) -> str:

@@ -120,12 +120,12 @@ def tool_model(robot: Robot, paths: Sequence[str]) -> dict[str, Any]:
     """
     arms = tuple(robot.description.arms) or ("",)
     named = [split(path, arms) for path in paths]
-    found: dict[str, Any] = {"arms": list(arms)}
+    model: dict[str, Any] = {"arms": list(arms)}
     for arm in dict.fromkeys(arm for arm, part in named if part != GRIPPER):
-        found.setdefault("chains", {})[arm] = arm_values(robot, arm)
+        model.setdefault("chains", {})[arm] = arm_values(robot, arm)
     for arm in dict.fromkeys(arm for arm, part in named if part == GRIPPER):
-        found.setdefault("grippers", {})[arm] = _gripper(robot, arm)
-    return found
+        model.setdefault("grippers", {})[arm] = _gripper(robot, arm)
+    return model
 
 
 def _gripper(robot: Robot, arm: str) -> str:
@@ -266,8 +266,8 @@ class ToolPoses(ActionFeature):
     def encode(self, positions: Vector, measured: Vector) -> Vector:
         tip = self._chain.forward(measured) if self._relative else None
         rows = positions.reshape(-1, positions.shape[-1])
-        found = np.array([self._numbers(self._chain.forward(row), tip) for row in rows])
-        return found.reshape(*positions.shape[:-1], len(self.names))
+        numbers = np.array([self._numbers(self._chain.forward(row), tip) for row in rows])
+        return numbers.reshape(*positions.shape[:-1], len(self.names))
 
     def _numbers(self, tip: TipPose, measured: TipPose | None) -> Vector:
         if measured is None:
@@ -281,16 +281,16 @@ class ToolPoses(ActionFeature):
     @override
     def decode(self, numbers: Vector, measured: Vector, start: Vector) -> tuple[Vector, int]:
         tip = self._chain.forward(measured) if self._relative else None
-        found, held = np.empty((len(numbers), len(start))), 0
+        positions, held = np.empty((len(numbers), len(start))), 0
         before = np.clip(start, self._chain.lower, self._chain.upper)
         for row, each in enumerate(numbers):
             reached = self._reached(each, tip, before)
             if reached is None:
                 held += 1
-                found[row] = found[row - 1] if row else start
+                positions[row] = positions[row - 1] if row else start
             else:
-                found[row] = before = reached
-        return found, held
+                positions[row] = before = reached
+        return positions, held
 
     def _reached(self, numbers: Vector, measured: TipPose | None, before: Vector) -> Vector | None:
         """The positions of the chain for a pose; None if none within the limits is near enough."""
@@ -300,11 +300,11 @@ class ToolPoses(ActionFeature):
             return None
         if np.abs(target.position).max() > 2 * self._chain.reach:
             return None
-        found = follow(self._chain, target, before)
-        if found is None:
+        nearest = follow(self._chain, target, before)
+        if nearest is None:
             return None
-        off, turned = target.missed(self._chain.forward(found))
-        return found if off <= POSITION_TOLERANCE_M and turned <= ROTATION_TOLERANCE_RAD else None
+        off, turned = target.missed(self._chain.forward(nearest))
+        return nearest if off <= POSITION_TOLERANCE_M and turned <= ROTATION_TOLERANCE_RAD else None
 
     def _target(self, numbers: Vector, measured: TipPose | None) -> Target:
         given = {part: numbers[each] for part, each in self._slices.items()}

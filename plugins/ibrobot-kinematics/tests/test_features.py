@@ -115,12 +115,12 @@ def test_positions_come_back_from_the_numbers_of_each_form(arm: Arm, parts: tupl
     seen = {STATE: path[0].astype(np.float64) + 0.02}
     numbers = np.array([units({**seen, "action": row})["action"] for row in path])
     assert numbers.shape == (len(path), len(names) + 1)
-    found, held = units.commands(numbers, seen, path[0])
+    made, held = units.commands(numbers, seen, path[0])
     assert held == 0
-    again = np.array([units({**seen, "action": row})["action"] for row in found])
+    again = np.array([units({**seen, "action": row})["action"] for row in made])
     np.testing.assert_allclose(again, numbers, atol=1e-6)
     if len(parts) > 1:
-        np.testing.assert_allclose(found, path, atol=1e-4)
+        np.testing.assert_allclose(made, path, atol=1e-4)
 
 
 @pytest.mark.parametrize("parts", FORMS, ids="+".join)
@@ -141,15 +141,15 @@ def test_unreachable_poses_are_held_and_counted(arm: Arm, parts: tuple[str, ...]
     numbers = np.array([units({"action": row})["action"] for row in path])
     numbers[2, :3] = [3.0, 0.0, 0.0]
     numbers[3, :3] += [0.0, 0.0, 0.9]
-    found, held = units.commands(numbers, {}, path[0])
+    made, held = units.commands(numbers, {}, path[0])
     assert held == 2
-    np.testing.assert_array_equal(found[2, :-1], found[1, :-1])
-    np.testing.assert_array_equal(found[3, :-1], found[1, :-1])
-    np.testing.assert_array_equal(found[:, -1], numbers[:, -1])
+    np.testing.assert_array_equal(made[2, :-1], made[1, :-1])
+    np.testing.assert_array_equal(made[3, :-1], made[1, :-1])
+    np.testing.assert_array_equal(made[:, -1], numbers[:, -1])
     numbers[0, :3] = [3.0, 0.0, 0.0]
-    found, held = units.commands(numbers, {}, path[0])
+    made, held = units.commands(numbers, {}, path[0])
     assert held == 3
-    np.testing.assert_array_equal(found[0, :-1], path[0, :-1])
+    np.testing.assert_array_equal(made[0, :-1], path[0, :-1])
 
 
 def test_numbers_that_are_no_rotation_are_held_and_counted(arm: Arm) -> None:
@@ -163,17 +163,17 @@ def test_numbers_that_are_no_rotation_are_held_and_counted(arm: Arm) -> None:
         units = arm.units(arm.contract(tool(("position", turn))))
         numbers = np.array([units({"action": row})["action"] for row in path])
         numbers[1, 3:-1] = bad
-        found, held = units.commands(numbers, {}, path[0])
+        made, held = units.commands(numbers, {}, path[0])
         assert held == 1, (turn, bad)
-        np.testing.assert_array_equal(found[1, :-1], found[0, :-1])
+        np.testing.assert_array_equal(made[1, :-1], made[0, :-1])
 
 
 def test_positions_stay_within_the_limits(arm: Arm) -> None:
     units = arm.units(arm.contract(tool(("position",))))
     numbers = np.array([[0.3, y, 0.1, 0.0] for y in np.linspace(-0.4, 0.4, 40)])
-    found, _ = units.commands(numbers, {}, a_path(arm)[0])
-    assert (found[:, :-1] >= arm.robot.lower[:-1]).all()
-    assert (found[:, :-1] <= arm.robot.upper[:-1]).all()
+    made, _ = units.commands(numbers, {}, a_path(arm)[0])
+    assert (made[:, :-1] >= arm.robot.lower[:-1]).all()
+    assert (made[:, :-1] <= arm.robot.upper[:-1]).all()
 
 
 @settings(max_examples=200, deadline=None)
@@ -183,10 +183,10 @@ def test_rotation_6d_is_orthonormal_near_its_numbers_and_exact_for_rotations(
 ) -> None:
     rotation = exp(np.array(turn))
     np.testing.assert_allclose(from_rotation_6d(rotation_6d(rotation)), rotation, atol=1e-12)
-    found = from_rotation_6d(rotation_6d(rotation) * 3.0 + 0.2 * np.array(noise))
-    np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-12)
-    assert np.linalg.det(found) > 0.999
-    assert np.arccos(np.clip((np.trace(found.T @ rotation) - 1) / 2, -1, 1)) < 0.5
+    made = from_rotation_6d(rotation_6d(rotation) * 3.0 + 0.2 * np.array(noise))
+    np.testing.assert_allclose(made.T @ made, np.eye(3), atol=1e-12)
+    assert np.linalg.det(made) > 0.999
+    assert np.arccos(np.clip((np.trace(made.T @ rotation) - 1) / 2, -1, 1)) < 0.5
 
 
 def test_numbers_are_those_of_each_definition(arm: Arm) -> None:
@@ -204,8 +204,8 @@ def test_numbers_are_those_of_each_definition(arm: Arm) -> None:
     }
     for part, numbers in expected.items():
         parts = ("position",) if part == "position" else ("position", part)
-        found = arm.units(arm.contract(tool(parts)))({"action": q})["action"][:-1]
-        np.testing.assert_allclose(found[-len(numbers) :], numbers, atol=1e-8)
+        made = arm.units(arm.contract(tool(parts)))({"action": q})["action"][:-1]
+        np.testing.assert_allclose(made[-len(numbers) :], numbers, atol=1e-8)
 
 
 class TestDeltas:
@@ -224,12 +224,12 @@ class TestDeltas:
         path = a_path(arm).astype(np.float32)
         for state, action in itertools.pairwise(path):
             row = {STATE: state, "action": action}
-            plain, found = absolute(row), relative(row)
-            np.testing.assert_array_equal(found[STATE], plain[STATE])
+            plain, made = absolute(row), relative(row)
+            np.testing.assert_array_equal(made[STATE], plain[STATE])
             wanted = plain["action"][:-1].astype(float) - plain[STATE][:-1].astype(float)
-            np.testing.assert_allclose(found["action"][:-1], wanted, atol=2e-5)
-            assert found["action"][-1] == plain["action"][-1]
-            commands, held = relative.commands(found["action"][None].astype(float), {STATE: state}, state)
+            np.testing.assert_allclose(made["action"][:-1], wanted, atol=2e-5)
+            assert made["action"][-1] == plain["action"][-1]
+            commands, held = relative.commands(made["action"][None].astype(float), {STATE: state}, state)
             assert held == 0
             np.testing.assert_allclose(
                 commands[0], absolute.radians("action", plain["action"].astype(float)), atol=1e-6
@@ -340,9 +340,9 @@ def test_gripper_may_be_part_of_the_executor_of_the_arm(arm: Arm, order: tuple[s
     numbers = np.array([units({"action": row})["action"] for row in path])
     gripper = order.index("tool.gripper") * 3
     np.testing.assert_array_equal(numbers[:, gripper], path[:, -1])
-    found, held = units.commands(numbers, {}, path[0])
+    made, held = units.commands(numbers, {}, path[0])
     assert held == 0
-    np.testing.assert_allclose([units({"action": row})["action"] for row in found], numbers, atol=1e-6)
+    np.testing.assert_allclose([units({"action": row})["action"] for row in made], numbers, atol=1e-6)
 
 
 def test_search_is_bounded_and_keeps_within_reach_of_its_start(arm: Arm) -> None:
@@ -353,6 +353,6 @@ def test_search_is_bounded_and_keeps_within_reach_of_its_start(arm: Arm) -> None
         start, goal = rng.uniform(-1.4, 1.4, (2, len(arm.joints)))
         near = np.clip(start + 0.05 * goal, model.lower, model.upper)
         tip = model.forward(near)
-        found = follow(model, Target(tip.position, tip.rotation), start)
-        ended += found is not None and float(Target(tip.position).missed(model.forward(found))[0]) < 1e-5
+        made = follow(model, Target(tip.position, tip.rotation), start)
+        ended += made is not None and float(Target(tip.position).missed(model.forward(made))[0]) < 1e-5
     assert ended >= 97
