@@ -16,6 +16,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import figures
 from ibrobot_core.config import load_config
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import LaunchRequest, Session
@@ -64,6 +65,13 @@ def main() -> int:
     report["only_joints"] = pairs.count((True, False))
     report["only_tool"] = pairs.count((False, True))
     print(json.dumps(report))
+    figures.report(
+        joints=report["joints"]["successes"],
+        tool=report["tool"]["successes"],
+        unreachable=report["tool"]["unreachable"],
+        only_joints=report["only_joints"],
+        only_tool=report["only_tool"],
+    )
     return 0 if report["tool"]["successes"] >= 0.95 * arguments.episodes else 1
 
 

@@ -102,6 +102,12 @@ CLAIMS = (
         "scenes.py",
     ),
     Claim(
+        "cartesian_pick",
+        "the scripted pick through poses of the tool succeeds on at least 95 of 100 seeds",
+        "docs/how-to/use-poses-of-the-tool.md",
+        "cartesian_pick.py",
+    ),
+    Claim(
         "train_pick_cube",
         "a small ACT learns the pick from 100 demonstrations in ten minutes on the CPU",
         "docs/tutorials/train-a-policy.md",
