@@ -17,6 +17,7 @@ from time import perf_counter
 from typing import Any
 
 import figures
+
 from ibrobot_core.config import load_config
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import LaunchRequest, Session
