@@ -356,3 +356,13 @@ def test_search_is_bounded_and_keeps_within_reach_of_its_start(arm: Arm) -> None
         made = follow(model, Target(tip.position, tip.rotation), start)
         ended += made is not None and float(Target(tip.position).missed(model.forward(made))[0]) < 1e-5
     assert ended >= 97
+
+
+def test_search_that_has_not_settled_is_no_solution(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = read_mjcf(arm.robot.description.mjcf or Path(), "tool", arm.joints)
+    start = bent(model)
+    tip = model.forward(start + 0.3)
+    target = Target(tip.position, tip.rotation)
+    assert follow(model, target, start) is not None
+    monkeypatch.setattr("ibrobot_kinematics.follow._ITERATIONS", 1)
+    assert follow(model, target, start) is None
