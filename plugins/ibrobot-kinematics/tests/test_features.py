@@ -69,10 +69,19 @@ class Arm:
         }
         observed = state or [f"position.{name}" for name in self.robot.joint_names]
         align = {"strategy": "hold", "stamp": "header", "tol_ms": None}
-        seen = {"topic": "/joint_states", "type": "sensor_msgs/msg/JointState", "select": observed, "encoding": None}
+        seen: dict[str, Any] = {
+            "topic": "/joint_states",
+            "type": "sensor_msgs/msg/JointState",
+            "select": observed,
+            "encoding": None,
+        }
         seen |= {"shape": [-1], "align": align, "model": model}
-        action = {"topic": "/arm", "type": "std_msgs/msg/Float64MultiArray", "joints": list(self.joints)}
-        jaw = {**action, "topic": "/jaw", "joints": [self.robot.joint_names[-1]]}
+        action: dict[str, Any] = {
+            "topic": "/arm",
+            "type": "std_msgs/msg/Float64MultiArray",
+            "joints": list(self.joints),
+        }
+        jaw: dict[str, Any] = {**action, "topic": "/jaw", "joints": [self.robot.joint_names[-1]]}
         action |= {"features": features, "model": model} if features else {}
         jaw |= {"features": list(gripper), "model": model} if gripper else {}
         return Contract.from_canonical(
