@@ -16,6 +16,14 @@ from numpy.typing import NDArray
 from ibrobot_core.api import DatasetError, Feature
 from ibrobot_lerobot.arrow import table_of
 from ibrobot_lerobot.options import LeRobotOptions
+from ibrobot_lerobot.plausible import (
+    check_count,
+    check_episode,
+    check_info,
+    check_tasks,
+    check_template,
+    statistic,
+)
 
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
@@ -252,7 +260,9 @@ class OnDisk:
             try:
                 with pq.ParquetFile(path) as file:
                     for batch in file.iter_batches(batch_size=64):
-                        yield from batch.to_pylist()
+                        for row in batch.to_pylist():
+                            check_episode(path, row)
+                            yield row
             except (OSError, pa.ArrowException) as error:
                 raise DatasetError(f"{path}: cannot be read: {error}") from error
 
@@ -279,14 +289,21 @@ class OlderOnDisk(OnDisk):
 
     @override
     def episodes(self) -> Iterator[dict[str, Any]]:
-        stats = {
-            row["episode_index"]: row["stats"] for row in _lines(self.root / _STATS_LINES, "episode_index", "stats")
-        }
+        stats = {}
+        for row in _lines(self.root / _STATS_LINES, "episode_index", "stats"):
+            check_count(self.root / _STATS_LINES, "episode_index", row["episode_index"])
+            each = row["stats"]
+            if not isinstance(each, dict) or not all(isinstance(values, dict) for values in each.values()):
+                raise DatasetError(
+                    f"{self.root / _STATS_LINES}: stats of episode {row['episode_index']} are no objects"
+                )
+            stats[row["episode_index"]] = each
         begin = 0
-        for row in sorted(
-            _lines(self.root / _EPISODES_LINES, "episode_index", "tasks", "length"),
-            key=lambda row: row["episode_index"],
-        ):
+        path = self.root / _EPISODES_LINES
+        rows = list(_lines(path, "episode_index", "tasks", "length"))
+        for row in rows:
+            check_episode(path, {**row, "dataset_from_index": 0, "dataset_to_index": 0})
+        for row in sorted(rows, key=lambda row: row["episode_index"]):
             length = row["length"]
             times = {"from_timestamp": 0.0, "to_timestamp": length / self.info["fps"]}
             yield {
@@ -318,8 +335,9 @@ class OlderOnDisk(OnDisk):
 
     def _path(self, template: str, number: int, **more: str) -> Path:
         """The file of an episode, below the root, as `info.json` names it."""
-        text = self.info[template]
+        text = self.info.get(template)
         try:
+            check_template(text)
             path = Path(text.format(episode_chunk=number // self.info["chunks_size"], episode_index=number, **more))
         except (KeyError, IndexError, ValueError, AttributeError, TypeError) as error:
             raise DatasetError(
@@ -343,19 +361,25 @@ def open_dataset(root: Path) -> OnDisk | None:
     if not (root / INFO).exists():
         return None
     try:
-        info = json.loads((root / INFO).read_bytes())
+        info = json.loads((root / INFO).read_bytes(), parse_constant=_no_constant)
         stats = json.loads((root / STATS).read_bytes()) if (root / STATS).exists() else {}
         tasks = _read_tasks(root)
         metadata = json.loads((root / OWN).read_bytes()) if (root / OWN).exists() else {}
         pixels = json.loads((root / PIXELS).read_bytes()) if (root / PIXELS).exists() else {}
         version = info["codebase_version"]
-    except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, pa.ArrowException) as error:
         raise DatasetError(f"{root}: is not a LeRobot dataset: {error!r}") from error
-    opened = OnDisk if version == _VERSION else _OLDER.get(version)
+    opened = OnDisk if version == _VERSION else _OLDER.get(str(version))
     if opened is None:
         known = ", ".join((*_OLDER, _VERSION))
         raise DatasetError(f"{root / INFO}: codebase_version: {version!r} cannot be read; versions that can: {known}")
+    check_info(root / INFO, info)
     return opened(root, info, stats, tasks, metadata, pixels)
+
+
+def _no_constant(name: str) -> None:
+    """Refuse what JSON does not have, and what could not be written again."""
+    raise ValueError(f"{name} is no JSON")
 
 
 def existing_dataset(root: Path) -> OnDisk:
@@ -380,6 +404,7 @@ def _read_tasks(root: Path) -> list[str]:
             rows = file.read().to_pylist()
     else:
         rows = list(_lines(root / _TASKS_LINES, "task_index", "task"))
+    check_tasks(root, (row.get("task_index") for row in rows))
     named = {row["task_index"]: _task(row) for row in rows}
     return [named.get(number, "") for number in range(max(named, default=-1) + 1)]
 
@@ -407,13 +432,18 @@ def _lines(path: Path, *keys: str) -> Iterator[dict[str, Any]]:
         yield row
 
 
-def row_stats(row: Mapping[str, Any]) -> dict[str, dict[str, NDArray[Any]]]:
-    """The statistics in an episode's row: feature -> name -> values."""
+def row_stats(root: Path, row: Mapping[str, Any]) -> dict[str, dict[str, NDArray[Any]]]:
+    """The statistics in an episode's row: feature -> name -> values.
+
+    Raises:
+        DatasetError: if some have no numbers.
+    """
     stats: dict[str, dict[str, NDArray[Any]]] = {}
     for column, value in row.items():
         if column.startswith("stats/"):
             key, _, name = column.removeprefix("stats/").rpartition("/")
-            stats.setdefault(key, {})[name] = np.array(value)
+            where = f"{root}: statistics of episode {row['episode_index']}: {key}: {name}"
+            stats.setdefault(key, {})[name] = statistic(where, value)
     return stats
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -201,6 +202,10 @@ class _Merge:
         for row in rows:
             n = row["length"]
             stats = self._count_episode(part, row)
+            if unknown := [task for task in row["tasks"] if task not in part.tasks]:
+                raise DatasetError(
+                    f"{part.root}: episode {row['episode_index']} has task {unknown[0]!r}, unknown to it"
+                )
             task_numbers = tasks[[part.tasks.index(task) for task in row["tasks"]]]
             stats |= counter_stats(n, self._info["fps"], self._frame, self._episode, np.resize(task_numbers, n))
             moved: dict[str, Any] = {
@@ -232,7 +237,7 @@ class _Merge:
 
     def _count_episode(self, part: OnDisk, row: Mapping[str, Any]) -> dict[str, Stats]:
         """The statistics of an episode; those that it lacks are computed from its rows and pictures."""
-        stats = layout.row_stats(row)
+        stats = layout.row_stats(part.root, row)
         cameras = {key: picture_stats(part.features[key]) for key in self._uncounted(part)}
         vectors: dict[str, list[Any]] = {
             key: [] for key, feature in part.features.items()
@@ -284,9 +289,17 @@ class _Merge:
             assert self._schema is not None
             for group in range(file.num_row_groups):
                 table = file.read_row_group(group)
-                for name, offset in (("index", self._frame), ("episode_index", self._episode)):
-                    table = _replaced(table, name, _numbers(table, name) + offset)
-                table = _replaced(table, "task_index", tasks[_numbers(table, "task_index")])
+                try:
+                    for name, offset in (("index", self._frame), ("episode_index", self._episode)):
+                        table = _replaced(table, name, _numbers(table, name) + offset)
+                    numbers = _numbers(table, "task_index")
+                    if not all(0 <= number < len(tasks) for number in (numbers.min(initial=0), numbers.max(initial=0))):
+                        raise ValueError(f"task_index from {numbers.min()} to {numbers.max()}, of {len(tasks)} tasks")
+                    table = _replaced(table, "task_index", tasks[numbers])
+                    for key, width in self._vectors().items():
+                        _check_vectors(table.column(key), key, width)
+                except (LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
+                    raise DatasetError(f"{path}: cannot be read as {layout.INFO} says: {error!r}") from error
                 try:
                     self._table.write_table(table.select(self._schema.names).cast(self._schema))
                 except (KeyError, pa.ArrowException) as error:
@@ -295,6 +308,15 @@ class _Merge:
                     ) from error
         self._data.bytes += size
         return self._data.number
+
+    def _vectors(self) -> dict[str, int]:
+        """The columns of numbers, and how many each row has."""
+        features = layout.features_of(self._info)
+        return dict.fromkeys(layout.COUNTERS, 1) | {
+            key: math.prod(feature.shape)
+            for key, feature in features.items()
+            if layout.is_numeric(feature) and feature.dtype != "image" and len(feature.shape) != 3
+        }
 
     def _append_videos(self, part: OnDisk, key: str, rows: list[dict[str, Any]]) -> dict[Path, tuple[int, float]]:
         """Schedule a part's videos of a camera for joining; returns file number and start time [s] of each."""
@@ -348,6 +370,16 @@ def _next(old: OnDisk | None, folder: str, suffix: str) -> int:
 def _indices(what: str, number: int) -> dict[str, int]:
     chunk, file = divmod(number, layout.FILES_PER_CHUNK)
     return {f"{what}/chunk_index": chunk, f"{what}/file_index": file}
+
+
+def _check_vectors(column: pa.ChunkedArray, key: str, size: int) -> None:
+    """Check that each row of a column has so many numbers.
+
+    Raises:
+        ValueError: if not.
+    """
+    if len(column) and (column.null_count or to_numpy(column).shape[1] != size):
+        raise ValueError(f"column {key} does not have {size} numbers in each row")
 
 
 def _column(path: Path, name: str) -> np.ndarray[Any, Any]:

@@ -28,10 +28,11 @@ def dataset_contents(root: Path) -> Contents:
         DatasetError: if there is no dataset, or it cannot be read.
     """
     dataset = layout.existing_dataset(root)
-    dataset = attrs.evolve(dataset, stats=dataset.stats or _joined_stats(dataset))
     info, own = dataset.info, dataset.metadata
     norm_mode = str((own.get("conversion") or {}).get("norm_mode", ""))
     try:
+        with np.errstate(all="ignore"):  # what makes no sense is shown as it is
+            dataset = attrs.evolve(dataset, stats=dataset.stats or _joined_stats(dataset))
         return Contents(
             path=str(root), robot_type=info.get("robot_type") or "", fps=float(info["fps"]),
             episodes=info["total_episodes"], frames=info["total_frames"],
@@ -44,7 +45,7 @@ def dataset_contents(root: Path) -> Contents:
             ),
             list=_episodes(dataset, own),
         )  # fmt: skip
-    except (KeyError, TypeError, ValueError, ZeroDivisionError, OSError, pa.ArrowException) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, OSError, pa.ArrowException) as error:
         raise DatasetError(f"{root}: is not a LeRobot dataset: {error!r}") from error
 
 
@@ -69,7 +70,7 @@ def _joined_stats(dataset: layout.OnDisk) -> dict[str, dict[str, Any]]:
     """Minimum, maximum, mean and deviation of all episodes, from those of each: v2.1 has no others."""
     episodes: dict[str, list[dict[str, Any]]] = {}
     for row in dataset.episodes():
-        for key, each in layout.row_stats(row).items():
+        for key, each in layout.row_stats(dataset.root, row).items():
             if each.keys() >= {"min", "max", "mean", "std", "count"}:
                 episodes.setdefault(key, []).append(each)
     joined = {}

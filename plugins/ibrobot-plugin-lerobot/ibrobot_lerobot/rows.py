@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from ibrobot_core.api import DatasetError, Feature
-from ibrobot_lerobot.layout import OnDisk
+from ibrobot_lerobot.layout import INFO, OnDisk
 from ibrobot_lerobot.pictures import decode_picture
 
 _ROWS_AT_ONCE = 32
@@ -60,6 +60,8 @@ class EpisodeRows:
         try:
             for values in itertools.islice(self._table(features), first, None):
                 rows += 1
+                if rows > self.length:
+                    continue  # count them for the error
                 yield values | {key: next(each) for key, each in pictures.items()}
         finally:
             for each in pictures.values():
@@ -79,8 +81,10 @@ class EpisodeRows:
                         for row in batch.to_pylist():
                             if row["episode_index"] == self._number:
                                 yield {key: _value(key, row[key], feature) for key, feature in features.items()}
-        except (OSError, pa.ArrowException) as error:
+        except (OSError, pa.ArrowException, DatasetError) as error:
             raise DatasetError(f"{path}: cannot be read: {error}") from error
+        except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
+            raise DatasetError(f"{path}: cannot be read as {self._dataset.root / INFO} says: {error!r}") from error
 
     def _pictures(self, key: str, first: int) -> Generator[NDArray[Any]]:
         """The episode's part of a camera's video, from row `first` on."""
