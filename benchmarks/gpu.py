@@ -257,10 +257,10 @@ def infer(work: Path, device: str, size: Size) -> list[dict[str, Any]]:
             memory_mib = in_use(device) - before
             rows.append(row("here", precision, count, times_ms, sum(times_ms) / 1e3, memory_mib, chunks, expected))
         policy.close()
-    with served(work, device, max(size.at_once)) as (endpoint, memory_mib):
+    with served(work, device, max(size.at_once)) as (endpoint, used_mib):
         for count in size.at_once:
             times_ms, chunks, took_s = fleet(work, endpoint, count, size.rounds)
-            rows.append(row("ibrobot serve", SINGLE, count, times_ms, took_s, memory_mib(), chunks, expected))
+            rows.append(row("ibrobot serve", SINGLE, count, times_ms, took_s, used_mib(), chunks, expected))
     return rows
 
 
@@ -347,7 +347,7 @@ def fleet(work: Path, endpoint: str, count: int, rounds: int) -> tuple[list[floa
     processes = [
         subprocess.Popen(
             [
-                sys.executable, __file__, "--work", work, "--robots", endpoint, str(first),
+                sys.executable, __file__, "--work", str(work), "--robots", endpoint, str(first),
                 str(min(A_PROCESS, count - first)), str(rounds),
             ],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,

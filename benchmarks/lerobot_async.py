@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import pickle
 import socket
 import subprocess
 import sys
@@ -80,7 +79,17 @@ class StubRobot:
         return dict(self._observation)
 
 
-def serve(port: int, payload: str) -> None:
+def features(way: str, shape: tuple[int, int, int]) -> dict[str, Any]:
+    """LeRobot's description of a client's observation."""
+    names = [f"observation.state.{i}" for i in range(len(JOINTS))] if way == "lerobot_server" else [
+        f"{joint}.pos" for joint in JOINTS
+    ]  # fmt: skip
+    picture = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
+    state = {"dtype": "float32", "shape": (len(JOINTS),), "names": names}
+    return {"observation.state": state, "observation.images.top": picture, "observation.images.wrist": picture}
+
+
+def serve(port: int, payload: str, way: str) -> None:
     """The server, until its standard input ends."""
     import grpc
     from lerobot.async_inference.configs import PolicyServerConfig
@@ -94,12 +103,11 @@ def serve(port: int, payload: str) -> None:
 
         def SendPolicyInstructions(self, request: Any, context: Any) -> Any:
             """Nothing is loaded."""
-            self.lerobot_features = pickle.loads(request.data).lerobot_features  # noqa: S301  # from this file
             return services_pb2.Empty()
 
     servicer = Server(PolicyServerConfig(port=port, inference_latency=0.0))
     servicer.device, servicer.policy_type, servicer.actions_per_chunk = "cpu", "act", CHUNK
-    servicer.policy = StubPolicy(shape)
+    servicer.lerobot_features, servicer.policy = features(way, shape), StubPolicy(shape)
     servicer.preprocessor = servicer.postprocessor = lambda value: value
     server = grpc.server(futures.ThreadPoolExecutor(max_workers=4))
     services_pb2_grpc.add_AsyncInferenceServicer_to_server(servicer, server)
@@ -117,11 +125,11 @@ def cpu_s(pid: int | str = "self") -> float:
 
 
 @contextmanager
-def served(payload: str) -> Iterator[tuple[str, int]]:
+def served(payload: str, way: str) -> Iterator[tuple[str, int]]:
     """A server in another process: its address and process."""
     with closing(socket.create_server(("127.0.0.1", 0))) as free:
         port = int(free.getsockname()[1])
-    command = [sys.executable, __file__, "--serve", str(port), "--payload", payload]
+    command = [sys.executable, __file__, "--serve", str(port), "--payload", payload, "--way", way]
     server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None
     try:
@@ -212,7 +220,7 @@ def measure(payload: str, count: int, pause_s: float) -> Iterator[dict[str, Any]
     with ExitStack() as stack:
         clients, servers = {}, {}
         for way, kind in ways.items():
-            address, servers[way] = stack.enter_context(served(payload))
+            address, servers[way] = stack.enter_context(served(payload, way))
             clients[way] = kind(address, payload)
             stack.callback(clients[way].close)
         rows: dict[str, dict[str, Any]] = {way: {"latencies": [], "blocked": [], "cpu": []} for way in ways}
@@ -235,10 +243,11 @@ def main() -> int:
     parser.add_argument("--pause", type=float, default=0.0)
     parser.add_argument("--serve", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--payload", default="", help=argparse.SUPPRESS)
+    parser.add_argument("--way", default="", help=argparse.SUPPRESS)
     given = parser.parse_args()
     logging.disable(logging.CRITICAL)
     if given.serve:
-        serve(given.serve, given.payload)
+        serve(given.serve, given.payload, given.way)
         return 0
     figures: dict[str, float] = {}
     for payload in PAYLOADS:

@@ -261,7 +261,7 @@ def test_network_on_a_gpu_has_all_its_inputs_there(folders: dict[str, Path], nam
     with FakeTensorMode(allow_non_fake_inputs=True), torch.no_grad():
         model._device = torch.device("cuda")
         model.network.to("cuda")
-        model.steps = model.steps.of(lambda array: array.to("cuda"))
+        model.steps = model.steps.of(lambda array: torch.as_tensor(array).to("cuda"))
         actions = model._run(model.inputs(batch), batch)
         assert actions.device.type == "cuda"
         assert actions.shape[::2] == (2, 6)

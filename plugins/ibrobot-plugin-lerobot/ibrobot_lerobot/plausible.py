@@ -35,22 +35,22 @@ def check_info(path: Path, info: Any) -> None:
         DatasetError: if a value is missing or of another kind.
     """
     if not isinstance(info, dict):
-        raise DatasetError(f"{path}: is no object")
+        raise DatasetError(f"{path}: is not an object")
     fps = info.get("fps")
     if not _is_number(fps) or not 0 < fps <= 1e6:
-        raise DatasetError(f"{path}: fps: {_shown(fps)} is no frame rate [Hz]")
+        raise DatasetError(f"{path}: fps: {_shown(fps)} is not a frame rate [Hz]")
     for key in _COUNTS:
         check_count(path, key, info.get(key))
     for key in (*_SIZES, "chunks_size"):
         if key in info and not (_is_number(info[key]) and 1 <= info[key] < _LARGEST):
-            raise DatasetError(f"{path}: {key}: {_shown(info[key])} is no number from 1 on")
+            raise DatasetError(f"{path}: {key}: {_shown(info[key])} is not a number from 1 on")
     if type(info.get("chunks_size", 1)) is not int:
-        raise DatasetError(f"{path}: chunks_size: {_shown(info['chunks_size'])} is no whole number")
+        raise DatasetError(f"{path}: chunks_size: {_shown(info['chunks_size'])} is not a whole number")
     if not isinstance(info.get("robot_type"), str | None):
-        raise DatasetError(f"{path}: robot_type: {_shown(info['robot_type'])} is no text")
+        raise DatasetError(f"{path}: robot_type: {_shown(info['robot_type'])} is not a text")
     features = info.get("features")
     if not isinstance(features, dict):
-        raise DatasetError(f"{path}: features: {_shown(features)} is no object")
+        raise DatasetError(f"{path}: features: {_shown(features)} is not an object")
     for key, entry in features.items():
         _check_feature(path, key, entry)
 
@@ -58,12 +58,12 @@ def check_info(path: Path, info: Any) -> None:
 def _check_feature(path: Path, key: str, entry: Any) -> None:
     where = f"{path}: features: {_shown(key)}"
     if not isinstance(entry, dict) or not isinstance(entry.get("dtype"), str):
-        raise DatasetError(f"{where}: {_shown(entry)} is no object with a dtype")
+        raise DatasetError(f"{where}: {_shown(entry)} is not an object with a dtype")
     dtype, shape, more = entry["dtype"], entry.get("shape"), entry.get("info") or {}
     if not isinstance(shape, list) or not all(type(size) is int and 0 <= size < _LARGEST for size in shape):
-        raise DatasetError(f"{where}: shape: {_shown(shape)} is no list of whole numbers")
+        raise DatasetError(f"{where}: shape: {_shown(shape)} is not a list of whole numbers")
     if not isinstance(more, dict):
-        raise DatasetError(f"{where}: info: {_shown(more)} is no object")
+        raise DatasetError(f"{where}: info: {_shown(more)} is not an object")
     if dtype not in ("image", "video"):
         return
     if len(shape) != 3 or not all(1 <= size < _LONGEST_SIDE for size in shape):
@@ -80,10 +80,10 @@ def check_count(where: object, key: str, value: Any) -> None:
     """Check a count.
 
     Raises:
-        DatasetError: if it is no whole number from 0 on.
+        DatasetError: if it is not a whole number from 0 on.
     """
     if type(value) is not int or not 0 <= value < _LARGEST:
-        raise DatasetError(f"{where}: {key}: {_shown(value)} is no whole number from 0 on")
+        raise DatasetError(f"{where}: {key}: {_shown(value)} is not a whole number from 0 on")
 
 
 def check_template(template: str) -> None:
@@ -111,12 +111,12 @@ def check_episode(where: object, row: Mapping[str, Any]) -> None:
         check_count(where, key, row.get(key))
     tasks = row.get("tasks")
     if not isinstance(tasks, list) or not all(isinstance(task, str) for task in tasks):
-        raise DatasetError(f"{where}: tasks: {_shown(tasks)} is no list of texts")
+        raise DatasetError(f"{where}: tasks: {_shown(tasks)} is not a list of texts")
     for key, value in row.items():
         if key.endswith(("/chunk_index", "/file_index")):
             check_count(where, key, value)
         elif key.endswith(("/from_timestamp", "/to_timestamp")) and not (_is_number(value) and 0 <= value < _LARGEST):
-            raise DatasetError(f"{where}: {key}: {_shown(value)} is no time [s]")
+            raise DatasetError(f"{where}: {key}: {_shown(value)} is not a time [s]")
 
 
 def check_tasks(where: object, numbers: Iterable[Any]) -> None:
@@ -127,7 +127,7 @@ def check_tasks(where: object, numbers: Iterable[Any]) -> None:
     """
     for number in numbers:
         if type(number) is not int or not 0 <= number < _MOST_TASKS:
-            raise DatasetError(f"{where}: task_index: {_shown(number)} is no number of a task")
+            raise DatasetError(f"{where}: task_index: {_shown(number)} is not a number of a task")
 
 
 def statistic(where: object, value: Any) -> NDArray[Any]:
@@ -144,9 +144,9 @@ def statistic(where: object, value: Any) -> NDArray[Any]:
             return array
         array = array.astype(np.float64)  # e.g. with null, or whole numbers beyond 64 bits
     except (TypeError, ValueError, OverflowError):
-        raise DatasetError(f"{where}: {_shown(value)} is no array of numbers") from None
+        raise DatasetError(f"{where}: {_shown(value)} is not an array of numbers") from None
     if not all(each is None or _is_number(each) for each in np.array(value, object).ravel()):
-        raise DatasetError(f"{where}: {_shown(value)} is no array of numbers")
+        raise DatasetError(f"{where}: {_shown(value)} is not an array of numbers")
     return array
 
 

@@ -108,6 +108,14 @@ def attack(good: Path, tmp_path: Path, damage: Callable[[Path], object]) -> str:
     return said
 
 
+def writes(name: Any, content: bytes) -> Callable[[Path], object]:
+    return lambda root: (root / name).write_bytes(content)
+
+
+def stores(name: Any, table: pa.Table) -> Callable[[Path], object]:
+    return lambda root: pq.write_table(table, root / name)
+
+
 def of_json(good: Path, name: str) -> Iterator[tuple[str, Callable[[Path], object]]]:
     """Every value of a JSON file in turn, in place of it every other."""
     text = (good / name).read_text(encoding="utf-8")
@@ -115,7 +123,7 @@ def of_json(good: Path, name: str) -> Iterator[tuple[str, Callable[[Path], objec
     document = json.loads(lines[0])
     for place, value in itertools.product(places(document), (*VALUES, ...)):
         content = "\n".join([json.dumps(changed(document, place, value)), *lines[1:]])
-        yield f"{name} {place}: {value!r}"[:150], lambda root, content=content: (root / name).write_text(content)
+        yield f"{name} {place}: {value!r}"[:150], writes(name, content.encode())
 
 
 def of_tables(good: Path, pattern: str, cuts: int) -> Iterator[tuple[str, Callable[[Path], object]]]:
@@ -133,14 +141,14 @@ def of_tables(good: Path, pattern: str, cuts: int) -> Iterator[tuple[str, Callab
         }  # fmt: skip
         for what, other in others.items():
             changed = table.remove_column(at) if other is None else table.set_column(at, column, other)
-            yield f"{name} {column} {what}", lambda root, t=changed: pq.write_table(t, root / name)
+            yield f"{name} {column} {what}", stores(name, changed)
     content, rng = path.read_bytes(), random.Random(0)
     for _ in range(cuts):
         length = rng.randrange(len(content))
-        yield f"{name} cut at {length}", lambda root, n=length: (root / name).write_bytes(content[:n])
+        yield f"{name} cut at {length}", writes(name, content[:length])
         start = rng.randrange(len(content) - 8)
         noise = content[:start] + rng.randbytes(8) + content[start + 8 :]
-        yield f"{name} noise at {start}", lambda root, c=noise: (root / name).write_bytes(c)
+        yield f"{name} noise at {start}", writes(name, noise)
 
 
 def attacks(good: Path, names: tuple[str, ...]) -> Iterator[tuple[str, Callable[[Path], object]]]:
@@ -218,11 +226,11 @@ def other_tasks(root: Path) -> None:
         ("v2.1", info(data_path="{episode_index:>999999999}"), "data_path: .* is no path of an episode"),
         ("v2.1", info(video_path="{episode_index.__class__}"), "video_path: .* is no path of an episode"),
         ("v2.1", lambda root: (root / "meta/tasks.jsonl").write_text('{"task_index": 4503599627370496, "task": "x"}'),
-         "task_index: 4503599627370496 is no number of a task"),
+         "task_index: 4503599627370496 is not a number of a task"),
         ("v2.1", lambda root: (root / "meta/info.json").write_text('{"codebase_version": ' + "[" * 100_000),
          "is not a LeRobot dataset"),
         ("v2.1", other_tasks, "episode_000000.parquet: .*task_index from -1 to -1, of 2 tasks"),
-        ("v3.0 pictures", info(fps=0), "info.json: fps: 0 is no frame rate"),
+        ("v3.0 pictures", info(fps=0), "info.json: fps: 0 is not a frame rate"),
         ("v3.0", no_unit, "depth_unit: None is none of mm, m"),
     ],
 )  # fmt: skip
