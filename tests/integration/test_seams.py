@@ -18,7 +18,7 @@ import ibrobot_web
 import numpy as np
 import pytest
 from ibrobot_testing import declared_services, make_session
-from ibrobot_web import messages, run_services
+from ibrobot_web import messages
 from ibrobot_web.commands import Commands
 from ibrobot_web.messages import RunCommand, Sent
 
@@ -29,18 +29,18 @@ pytestmark = pytest.mark.integration
 PAGE = Path(inspect.getfile(ibrobot_web)).parent
 MOVES: tuple[RunCommand, ...] = (
     messages.Reset(),
-    messages.SetMode("web"),
-    messages.BeginEpisode("pick"),
-    messages.EndEpisode("failure"),
-    messages.DiscardEpisode(),
-    messages.RedoEpisode(),
-    messages.SetSmoothing(enabled=False),
-    messages.Intervene(take=True),
-    messages.GoTo("home"),
-    messages.Cancel(),
-    messages.Preview(messages.Target(joints={"j0": 0.1})),
+    messages.Call("/set_mode", "web"),
+    messages.Call("/record_episode/start", {"prompt": "pick", "wait": True}),
+    messages.Call("/record_episode/stop", "failure"),
+    messages.Call("/record_episode/discard"),
+    messages.Call("/record_episode/redo"),
+    messages.Call("/action_dispatcher/toggle_smoothing", False),
+    messages.Call("/intervene", True),
+    messages.Call("/planning/go_to", {"goal": "home"}),
+    messages.Call("/planning/cancel"),
+    messages.Preview("home"),
 )
-"""The commands of a page that call services of the run."""
+"""The commands of a page that call services of the run, with requests as its scripts write them."""
 
 
 def changed(kind: type[Any], old: str, new: str) -> type[Any]:
@@ -73,7 +73,7 @@ def check_services(services: Mapping[str, Service[Any, Any]]) -> None:
         answers = {int(reply["reply"]): reply for reply in (replies.get(timeout=60) for _ in MOVES)}
     finally:
         commands.close(10.0)
-    wrong = {type(MOVES[number]).__name__: reply["error"] for number, reply in answers.items() if "error" in reply}
+    wrong = {str(MOVES[number]): reply["error"] for number, reply in answers.items() if "error" in reply}
     assert not wrong
     assert not failures
 
@@ -94,6 +94,16 @@ def test_the_page_calls_services_as_their_owners_declare_them() -> None:
     check_services(declared_services())
 
 
+def test_every_service_that_pages_may_call_is_called() -> None:
+    scripts = "".join(path.read_text(encoding="utf-8") for path in (PAGE / "static").rglob("*.js"))
+    named = set(re.findall(r"[\"\'`](/(?:set_mode|intervene|planning/\w+|action_dispatcher/\w+))[\"\'`]", scripts))
+    record = re.findall(
+        r'button\((?:"[^"]+"|text), "\w", "(\w+)"', (PAGE / "static/record.js").read_text(encoding="utf-8")
+    )
+    named |= {f"/record_episode/{name}" for name in ("start", *record)}
+    assert named == set(messages.SERVICES) == {each.service for each in MOVES if isinstance(each, messages.Call)}
+
+
 @pytest.mark.parametrize(
     ("service", "part", "old"),
     [
@@ -101,8 +111,8 @@ def test_the_page_calls_services_as_their_owners_declare_them() -> None:
         ("/record_episode/start", "request", "prompt"),
         ("/intervene", "request", "take"),
         ("/planning/go_to", "request", "goal"),
-        ("/plan_kinematic_path", "request", "goals"),
-        ("/plan_kinematic_path", "answer", "trajectory"),
+        ("/planning/plan", "request", "goal"),
+        ("/planning/plan", "answer", "trajectory"),
     ],
 )
 def test_another_shape_of_a_service_fails(service: str, part: str, old: str) -> None:
@@ -129,11 +139,6 @@ def called_by_name() -> Iterator[tuple[str, str]]:
             constants = dict(_constants(tree))
             for node in ast.walk(tree):
                 match node:
-                    case ast.Call(
-                        func=ast.Attribute(attr="call" | "serves" | "ask"),
-                        args=[ast.Attribute(value=ast.Name(id="run_services"), attr=constant), *_],
-                    ):
-                        yield getattr(run_services, constant), path.name
                     case ast.Call(func=ast.Attribute(attr="call" | "serves" | "ask"), args=[name, *_]):
                         found = constants.get(name.id) if isinstance(name, ast.Name) else getattr(name, "value", None)
                         if isinstance(found, str) and found.startswith("/"):
@@ -141,7 +146,7 @@ def called_by_name() -> Iterator[tuple[str, str]]:
 
 
 def _constants(tree: ast.Module) -> Iterator[tuple[str, Any]]:
-    """The constants of a module, and those that it imports from `run_services`."""
+    """The constants of a module."""
     for node in tree.body:
         match node:
             case ast.Assign(targets=[ast.Name(id=name)], value=ast.Constant(value=value)):
@@ -151,8 +156,6 @@ def _constants(tree: ast.Module) -> Iterator[tuple[str, Any]]:
                     (ast.unparse(each), getattr(value, "value", None))
                     for each, value in zip(names, values, strict=True)
                 )
-            case ast.ImportFrom(module="ibrobot_web.run_services", names=names):
-                yield from ((each.name, getattr(run_services, each.name)) for each in names)
 
 
 _OF_ROSBRIDGE = "/rosapi/services"
@@ -160,8 +163,8 @@ _OF_ROSBRIDGE = "/rosapi/services"
 
 def test_a_service_that_is_called_by_name_is_declared() -> None:
     found = set(called_by_name())
-    assert {file for _, file in found} >= {"commands.py", "status.py", "objects.py", "performing.py", "moveit2.py"}
-    names = {name for name, _ in found} | {value for name, value in vars(run_services).items() if name.isupper()}
+    assert {file for _, file in found} >= {"commands.py", "status.py", "objects.py", "performing.py", "client.py"}
+    names = {name for name, _ in found} | set(messages.SERVICES)
     assert names - set(declared_services()) == {_OF_ROSBRIDGE}
 
 
@@ -178,7 +181,7 @@ def check_status(status: type[Any], judged: type[Any]) -> None:
         r"(\w+):", *re.findall(r"WORDS = \{(.*?)\}", (PAGE / "static/cues.js").read_text(encoding="utf-8"))
     )
     assert {"", *cues} == set(fields(status)["cue"].metadata["choices"])
-    said = set(re.findall(r'outcome: "(\w+)"', script))
+    said = set(re.findall(r'"stop", "(\w+)"', script))
     assert said
     assert said <= set(fields(judged)["outcome"].metadata["choices"]), "record.js says an unknown outcome"
 

@@ -36,7 +36,12 @@ def robot(run: Callable[..., Runtime]) -> Iterator[SimpleNamespace]:
     """A robot in lockstep, its client, and a list of what to do at each step."""
     at_step: list[Callable[[], object]] = []
     runtime = run()
-    with Client.of_run(runtime, lambda: [act() for act in at_step] and None) as client:
+
+    def stepped() -> None:
+        for act in at_step:
+            act()
+
+    with Client.of_run(runtime, stepped) as client:
         client.wait(0.1)
         yield SimpleNamespace(runtime=runtime, client=client, at_step=at_step)
 
@@ -129,7 +134,7 @@ def test_world(robot: SimpleNamespace, tmp_path: Path):
     mesh = tmp_path / "part.stl"
     mesh.write_text(STL)
     client: Client = robot.client
-    shapes = {
+    shapes: dict[str, dict[str, Any]] = {
         "table": {"shape": "box", "size": [0.6, 0.6, 0.02], "position": [0, 0, -0.05]},
         "ball": {"shape": "sphere", "radius": 0.02, "position": [0.25, 0.1, 0.1]},
         "can": {"shape": "cylinder", "height": 0.1, "radius": 0.03, "position": [0, 0.35, 0.05], "rpy": [np.pi, 0, 0]},
