@@ -17,10 +17,8 @@ UNSAFE = (("weights_only", False), ("allow_pickle", True))
 _SERVERS = "plugins/ibrobot-plugin-policy-servers"
 WRITERS = {f"{_SERVERS}/ibrobot_policy_servers/lerobot_server.py"}
 """Files that may import pickle to write what LeRobot's server reads, and for nothing else."""
-PICKLES_OF_TESTS = {
-    "benchmarks/lerobot_async.py", f"{_SERVERS}/tests/lerobot_server.py", f"{_SERVERS}/tests/test_hostile_pickles.py",
-}  # fmt: skip
-"""Tests and a benchmark that read their own pickles, as LeRobot does, and show that hostile ones would run there."""
+PICKLES_OF_TESTS = {f"{_SERVERS}/tests/lerobot_server.py", f"{_SERVERS}/tests/test_hostile_pickles.py"}
+"""Tests that read their own pickles, as LeRobot does, and show that hostile ones would run there."""
 LOADERS = {"SafeLoader", "CSafeLoader"}
 
 
