@@ -195,7 +195,7 @@ def convert(work: Path) -> dict[str, Any]:
 def train(work: Path, device: str, size: Size) -> dict[str, Any]:
     """Train ACT, at most for a while: its rate of learning is constant, so that it may end at any time."""
     workers = 0 if device == "cpu" else max(1, cores() - 2)
-    command = [
+    command: list[str | Path] = [
         Path(sys.executable).with_name("ibrobot"), "train", work / "dataset", "--policy", "act", "--out",
         work / "train", "--steps", str(size.steps), "--save-every", str(max(size.steps // 12, 2)), "--batch-size",
         str(size.batch), "--device", device, "--events", "--policy.pretrained_backbone_weights=null",
@@ -237,7 +237,8 @@ def evaluate(work: Path, device: str, trials: int, size: Size) -> dict[str, Any]
 def infer(work: Path, device: str, size: Size) -> list[dict[str, Any]]:
     """A row for each precision and number of requests here, and for each number of robots of a server."""
     frames = observed(work, max(size.at_once))
-    np.savez(work / "frames.npz", **{key: np.stack([each.values[key] for each in frames]) for key in frames[0].values})
+    stacked: dict[str, Any] = {key: np.stack([each.values[key] for each in frames]) for key in frames[0].values}
+    np.savez(work / "frames.npz", **stacked)
     reference = made(work, "cpu", SINGLE)
     requests = [reference.preprocess(frame) for frame in frames]
     expected = [reference.postprocess(reference.infer(each)) for each in requests]
@@ -327,7 +328,7 @@ def in_use(device: str, pid: int | str = "self") -> float:
 def served(work: Path, device: str, batch: int) -> Iterator[tuple[str, Callable[[], float]]]:
     """A server with the trained policy: its endpoint, and the memory that it uses [MiB]."""
     endpoint, before = f"tcp/127.0.0.1:{free_port()}", before_use(device)
-    command = [
+    command: list[str | Path] = [
         Path(sys.executable).with_name("ibrobot"), "serve", checkpoint(work), "--type", "lerobot", "--name", "act",
         "--set", f"device={device}", "--set", f"dtype={SINGLE}", "--batch", str(batch), "--listen", endpoint,
     ]  # fmt: skip

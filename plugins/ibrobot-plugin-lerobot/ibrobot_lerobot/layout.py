@@ -335,7 +335,7 @@ class OlderOnDisk(OnDisk):
 
     def _path(self, template: str, number: int, **more: str) -> Path:
         """The file of an episode, below the root, as `info.json` names it."""
-        text = self.info.get(template)
+        text: Any = self.info.get(template)
         try:
             check_template(text)
             path = Path(text.format(episode_chunk=number // self.info["chunks_size"], episode_index=number, **more))

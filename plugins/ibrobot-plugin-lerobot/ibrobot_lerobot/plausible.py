@@ -10,7 +10,7 @@ import math
 import string
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,7 +150,7 @@ def statistic(where: object, value: Any) -> NDArray[Any]:
     return array
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: Any) -> TypeGuard[int | float]:
     return type(value) in (int, float) and (type(value) is int or math.isfinite(value))
 
 
