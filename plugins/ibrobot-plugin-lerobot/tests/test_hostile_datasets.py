@@ -172,7 +172,7 @@ def attacked(sets: dict[str, Path], tmp_path: Path, kind: str, step: int) -> tup
 
 @pytest.mark.parametrize("kind", FILES)
 def test_damaged_datasets_are_refused_by_name(sets: dict[str, Path], kind: str, tmp_path: Path) -> None:
-    """A sample of 13,000."""
+    """A sample of all."""
     count, refused = attacked(sets, tmp_path, kind, 300)
     assert refused > count / 4
 
