@@ -17,6 +17,7 @@ from ibrobot_core.api import DatasetError, Feature
 from ibrobot_lerobot.arrow import table_of
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.plausible import (
+    check_content,
     check_count,
     check_episode,
     check_info,
@@ -360,6 +361,7 @@ def open_dataset(root: Path) -> OnDisk | None:
     """
     if not (root / INFO).exists():
         return None
+    check_content(root)
     try:
         info = json.loads((root / INFO).read_bytes(), parse_constant=_no_constant)
         stats = json.loads((root / STATS).read_bytes()) if (root / STATS).exists() else {}

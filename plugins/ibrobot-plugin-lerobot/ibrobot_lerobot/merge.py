@@ -20,6 +20,7 @@ from ibrobot_lerobot import layout
 from ibrobot_lerobot.arrow import table_of, to_array, to_numpy
 from ibrobot_lerobot.episode import counter_stats, stats_columns, write_meta
 from ibrobot_lerobot.layout import OnDisk
+from ibrobot_lerobot.plausible import is_content
 from ibrobot_lerobot.rows import EpisodeRows
 from ibrobot_lerobot.stats import QUANTILES, PictureStats, Stats, picture_stats, vector_stats
 from ibrobot_lerobot.video import join_videos
@@ -328,7 +329,7 @@ class _Merge:
         placed = {}
         place = self._videos.setdefault(key, _Place(_next(self._old, f"{layout.VIDEOS}/{key}", "mp4")))
         for path, count in sorted(frames.items()):
-            if not path.exists():
+            if not is_content(path):
                 raise DatasetError(f"{path}: is missing; download the videos of the dataset too")
             size = path.stat().st_size
             if place.frames and place.bytes + size > limit:

@@ -25,7 +25,28 @@ _LONGEST_SIDE = 1 << 16
 _DEPTH_UNITS = ("mm", "m")
 _COUNTS = ("total_episodes", "total_frames")
 _SIZES = ("data_files_size_in_mb", "video_files_size_in_mb")
+_POINTER, _POINTER_SIZE = b"version https://git-lfs.github.com/spec/", 1024
+"""How a pointer of Git LFS begins, and more than it is long [bytes]."""
 _PLACES = frozenset({"episode_chunk", "episode_index", "video_key"})
+
+
+def is_content(path: Path) -> bool:
+    """Whether a file is there, rather than nothing or a pointer of Git LFS."""
+    return path.exists() and not (path.stat().st_size < _POINTER_SIZE and path.read_bytes().startswith(_POINTER))
+
+
+def check_content(root: Path) -> None:
+    """Check that the tables of a dataset are there, other than in a clone without Git LFS.
+
+    Raises:
+        DatasetError: names a pointer in place of a table.
+    """
+    files = sorted(path for kind in ("meta", "data") for path in (root / kind).rglob("*") if path.is_file())
+    if pointers := [path for path in files if not is_content(path)]:
+        raise DatasetError(
+            f"{pointers[0]}: is a pointer of Git LFS, not the file, as are {len(pointers) - 1} more of {len(files)}; "
+            f"`git lfs pull` in {root} downloads them"
+        )
 
 
 def check_info(path: Path, info: Any) -> None:

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 from ibrobot_core.api import DatasetError
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.contents import Contents, EpisodeContents, FeatureContents
+from ibrobot_lerobot.plausible import is_content
 
 _UNITS = {"radians": "rad", "degrees": "°", "range_m100_100": "% of the range, -100 to 100"}
 _TEXTS = 5
@@ -114,7 +115,7 @@ def _notes(dataset: layout.OnDisk) -> tuple[str, ...]:
         notes.append(f"the tables have {stored} rows, the episodes {counted['total_frames']}")
     for key in dataset.videos:
         wanted = {dataset.video(row, key) for row in rows}
-        if missing := [path for path in sorted(wanted) if not path.exists()]:
+        if missing := [path for path in sorted(wanted) if not is_content(path)]:
             notes.append(f"{key}: {len(missing)} of {len(wanted)} videos are missing, e.g. {missing[0]}")
     if not dataset.is_current:
         notes.append(

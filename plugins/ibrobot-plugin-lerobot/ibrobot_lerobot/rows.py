@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ibrobot_core.api import DatasetError, Feature
 from ibrobot_lerobot.layout import INFO, OnDisk
 from ibrobot_lerobot.pictures import decode_picture
+from ibrobot_lerobot.plausible import is_content
 
 _ROWS_AT_ONCE = 32
 
@@ -89,7 +90,7 @@ class EpisodeRows:
     def _pictures(self, key: str, first: int) -> Generator[NDArray[Any]]:
         """The episode's part of a camera's video, from row `first` on."""
         path = self._dataset.video(self._row, key)
-        if not path.exists():
+        if not is_content(path):
             raise DatasetError(
                 f"{path}: is missing; download the videos of the dataset too, or use a robot YAML whose contract has "
                 f"no {key}"

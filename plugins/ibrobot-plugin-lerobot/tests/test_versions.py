@@ -213,6 +213,17 @@ def missing_video(root: Path) -> None:
     sorted(root.rglob("*.mp4"))[0].unlink()
 
 
+def pointer(path: Path) -> None:
+    """A pointer of Git LFS in place of a file, as in a clone without it."""
+    oid = "f2d2364193a8380fd07852eeeb25692db021b4479e17536907c4fc6d5fca7ed4"
+    path.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{oid}\nsize 1890\n")
+
+
+def pointers_to_videos(root: Path) -> None:
+    for path in root.rglob("*.mp4"):
+        pointer(path)
+
+
 def language(root: Path) -> None:
     """LeRobot 0.6: what is said, as lists of structures."""
     said = [[{"role": "user", "content": "pick it", "timestamp": 0.1}], []]
@@ -249,6 +260,7 @@ def wrong_counts(root: Path) -> None:
 ODDITIES: dict[str, tuple[Callable[[Path], None], str]] = {
     "no videos": (no_videos, "observation.images.top: "),
     "a missing video": (missing_video, "videos are missing, e.g. "),
+    "pointers to videos": (pointers_to_videos, "videos are missing, e.g. "),
     "language": (language, "language_persistent: [{"),
     "channels first": (channels_first, "64x96x3"),
     "no robot": (no_robot, "3 episodes"),
@@ -285,7 +297,7 @@ def test_oddities_are_kept_when_merged(version: str, oddity: str, tmp_path: Path
     assert [(each.frames, each.task) for each in new.list] == [(each.frames, each.task) for each in old.list]
 
 
-@pytest.mark.parametrize("oddity", ["no videos", "a missing video"])
+@pytest.mark.parametrize("oddity", ["no videos", "a missing video", "pointers to videos"])
 def test_pictures_that_are_missing_are_an_error_where_they_are_needed(
     version: str, oddity: str, tmp_path: Path
 ) -> None:
@@ -298,6 +310,17 @@ def test_pictures_that_are_missing_are_an_error_where_they_are_needed(
     assert done.returncode == 2
     assert "mp4: is missing; download the videos of the dataset too" in done.stderr
     assert not (tmp_path / "new/meta").exists()
+
+
+@pytest.mark.parametrize("pattern", ["meta/tasks.*", "data/*/*", "meta/info.json"])
+def test_pointers_of_git_lfs_in_place_of_tables_name_the_remedy(version: str, pattern: str, tmp_path: Path) -> None:
+    root = VERSIONS[version](tmp_path / "set")
+    first, *_ = sorted(root.glob(pattern))
+    pointer(first)
+    done = run_here("datasets", "info", root)
+    assert done.returncode == 2
+    assert f"{first}: is a pointer of Git LFS, not the file, as are 0 more of " in done.stderr
+    assert f"`git lfs pull` in {root} downloads them" in done.stderr
 
 
 def test_episode_of_several_tasks(version: str, tmp_path: Path) -> None:
