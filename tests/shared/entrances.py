@@ -898,7 +898,7 @@ class PageGoal(Entrance):
     """The goals of the page in a browser."""
 
     service: ClassVar[str] = "/planning/go_to"
-    request: ClassVar[str] = f"shoulder_pan={FAR}"
+    goal: ClassVar[str] = f"shoulder_pan={FAR}"
 
     @override
     def meet(self) -> None:
@@ -921,7 +921,7 @@ class PageGoal(Entrance):
 
     @override
     def ask(self) -> object:
-        return self.send(self.run.session.stops, self.request)
+        return self.send(self.run.session.stops, self.goal)
 
     @override
     def with_number(self, value: float) -> Iterator[Callable[[], object]]:
@@ -931,7 +931,7 @@ class PageGoal(Entrance):
     @override
     def keep(self) -> Callable[[], object]:
         stops = self.run.session.stops
-        return lambda: self.send(stops, self.request)
+        return lambda: self.send(stops, self.goal)
 
     @override
     def close(self) -> None:
@@ -944,7 +944,7 @@ class PageMode(PageGoal):
     """The modes of the page in a browser: that of a policy moves the robot."""
 
     service = "/set_mode"
-    request = "model_inference"
+    goal = "model_inference"
     overrides = Policy.overrides
 
     @override

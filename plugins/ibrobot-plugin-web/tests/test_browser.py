@@ -243,7 +243,8 @@ def test_one_operates_the_other_watches_and_takes_over(chromium: Any, address: s
         other.until(lambda: other.ask("ibrobot.operating"))
         tab.until(lambda: not tab.ask("ibrobot.operating"))
         assert "operates" in tab.text("#operator")
-        late = tab.ask("ibrobot.drive.call('mode', {mode: 'jog'}).then(() => 'done', (error) => error.message)")
+        jog = "ibrobot.drive.call('call', {service: '/set_mode', request: 'jog'})"
+        late = tab.ask(f"{jog}.then(() => 'done', (error) => error.message)")
         assert "take over first" in late
         assert other.ask("ibrobot.status.mode") == "web"
         other.until(lambda: other.page.locator("#thumb").is_visible())

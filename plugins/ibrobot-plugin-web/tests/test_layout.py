@@ -75,7 +75,7 @@ def status(arms: tuple[str, ...] = ("",), **changes: Any) -> dict[str, Any]:
     ]
     robot = {**found["robot"], "modes": modes, "tool": True}
     facts = {"mode": "web", "jogs": ["page"], "cameras": cameras, "objects": [], "episode": EPISODE, "ended": False}
-    facts["services"] = [*found["services"], "redo"]
+    facts["services"] = [*found["services"], "/record_episode/redo"]
     return {**found, "robot": robot, **facts, **changes}
 
 

@@ -68,7 +68,7 @@ class Scene:
         await self.page.evaluate(
             "ibrobot.state.estop || ibrobot.status.faults.length ? ibrobot.drive.command('reset') : 0"
         )
-        await self.page.evaluate("ibrobot.drive.command('mode', {mode: 'web'})")
+        await self.page.evaluate("ibrobot.drive.command('call', {service: '/set_mode', request: 'web'})")
         await self.until("ibrobot.jogs.length > 0")
         await self.page.get_by_role("button", name="home", exact=True).scroll_into_view_if_needed()
 
@@ -217,9 +217,9 @@ async def stops(found: Scene, address: str) -> int:
 
 
 async def mode_switches(found: Scene, address: str) -> int:
-    await found.page.evaluate("ibrobot.drive.command('mode', {mode: 'moveit_planning'})")
+    await found.page.evaluate("ibrobot.drive.command('call', {service: '/set_mode', request: 'moveit_planning'})")
     begun_ns = time.time_ns()
-    await found.page.evaluate("ibrobot.drive.command('mode', {mode: 'web'})")
+    await found.page.evaluate("ibrobot.drive.command('call', {service: '/set_mode', request: 'web'})")
     return begun_ns
 
 
