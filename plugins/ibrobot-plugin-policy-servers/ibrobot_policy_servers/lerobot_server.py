@@ -30,6 +30,8 @@ _PIECE = 2 << 20
 """Size of a piece of an observation [bytes]: the server takes messages of 4 MiB."""
 _MAX_ANSWER = 16 << 20
 """Maximum size of an answer [bytes]; LeRobot's own client takes 4 MiB."""
+_MAX_NUMBERS = _MAX_ANSWER // 2
+"""Of all actions of an answer: more can be in it only if its actions overlap, and these could fill the memory."""
 _BEGIN, _MIDDLE, _END = 1, 2, 3
 _CHANNEL = (
     ("grpc.max_receive_message_length", _MAX_ANSWER),
@@ -150,7 +152,7 @@ def read_actions(content: bytes, stamp: float, number: int) -> NDArray[Any]:
     Raises:
         PolicyError: if it is something else, or the answer to another request.
     """
-    reader, storages = PickleReader(_NAMES), {}
+    reader, storages, numbers = PickleReader(_NAMES), {}, 0
     stream = io.BytesIO(content)
     timed = reader.read(stream)
     if not isinstance(timed, list) or not timed or stream.read(1):
@@ -168,6 +170,9 @@ def read_actions(content: bytes, stamp: float, number: int) -> NDArray[Any]:
         if storage not in storages:
             storages[storage] = _values(reader, storage)
         actions.append(_view(storages[storage], *place))
+        numbers += len(actions[-1])
+        if numbers > _MAX_NUMBERS:
+            raise PolicyError(f"the actions of the answer have more than {_MAX_NUMBERS} numbers")
     if len({each.shape for each in actions}) > 1:
         raise PolicyError("the actions of the answer have different sizes")
     return np.stack(actions)
@@ -213,7 +218,8 @@ def _view(values: NDArray[Any], first: int, size: int, stride: int) -> NDArray[A
         raise PolicyError(
             f"a tensor of the answer has {size} elements from {first} at stride {stride}, outside its {len(values)}"
         )
-    return values[[first + i * stride for i in range(size)]]
+    # Not copied: many actions may have the same values.
+    return values[first : first + size * stride : stride] if stride else np.broadcast_to(values[first], size)
 
 
 def _features(options: LerobotServerOptions) -> dict[str, Any]:

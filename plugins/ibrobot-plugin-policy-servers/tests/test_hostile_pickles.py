@@ -165,6 +165,12 @@ def bombs() -> Iterator[tuple[str, bytes]]:
     yield "a long name", b"\x80\x02c" + b"a" * 8_000_000 + b"\n" + b"b" * 4_000_000 + b"\n."
     yield "a name without an end", b"\x80\x02c" + b"a" * 8_000_000
     yield "a memo at a high place", b"\x80\x02]r\xff\xff\xff\xff."
+    for stride, kind in itertools.product((0, 1), (np.float32, np.float64)):
+        values = np.zeros(100_000, kind)
+        file = storage(values, "FloatStorage" if kind is np.float32 else "DoubleStorage")
+        again = [b"j\xe8\x03\0\0"] * 199
+        whole = tensor(file, 0, (values.size,), (stride,)) + b"r\xe8\x03\0\0"
+        yield f"actions of all values at stride {stride}, {kind}", chunk_of(STAMP, NUMBER, [whole, *again])
 
 
 def more_bombs() -> Iterator[tuple[str, bytes]]:
