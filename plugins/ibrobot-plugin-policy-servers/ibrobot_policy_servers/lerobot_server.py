@@ -134,11 +134,14 @@ class LerobotConnection(Connection):
             raise PolicyError("is not connected")
         try:
             make = channel.stream_unary if streamed else channel.unary_unary
-            return bytes(make(_SERVICE + method)(request, timeout=timeout_s))
+            answer = make(_SERVICE + method)(request, timeout=timeout_s)
         except ValueError:  # of a closed channel
             raise PolicyError("was closed") from None
         except grpc.RpcError as error:
             raise PolicyError(_problem(error, timeout_s if limit_s is None else limit_s)) from None
+        if answer is None:
+            raise PolicyError(f"the server ended {method} without an answer")
+        return bytes(answer)
 
 
 def read_actions(content: bytes, stamp: float, number: int) -> NDArray[Any]:

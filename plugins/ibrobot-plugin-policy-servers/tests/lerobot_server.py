@@ -137,6 +137,8 @@ class LerobotServer:
         """How long the client waits for each loading of the checkpoint [s]."""
         self.refusal = ""
         """Why the server does not load the checkpoint."""
+        self.silent = ""
+        """The method that ends well without an answer, from the next start on."""
         self.port = 0
         self.released = threading.Event()
 
@@ -162,6 +164,8 @@ class LerobotServer:
             "SendObservations": streamed(self._observe),
             "GetActions": unary(self._act),
         }
+        if self.silent:
+            handlers[self.silent] = grpc.stream_stream_rpc_method_handler(lambda requests, context: iter(()))
         service = grpc.method_handlers_generic_handler("transport.AsyncInference", handlers)
         self._server.add_generic_rpc_handlers((service,))
         self.port = self._server.add_insecure_port(self.address)

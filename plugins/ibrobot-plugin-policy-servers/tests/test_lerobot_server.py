@@ -246,6 +246,19 @@ def test_a_checkpoint_that_the_server_does_not_load_is_an_error(
     policy.close()
 
 
+@pytest.mark.parametrize("method", ["Ready", "SendPolicyInstructions", "SendObservations", "GetActions"])
+def test_a_call_that_ends_without_an_answer_is_an_error(
+    server: LerobotServer, options: LerobotServerOptions, method: str
+) -> None:
+    server.stop()
+    server.silent = method
+    server.start()
+    policy = make(options)
+    with pytest.raises(PolicyError, match=f"{server.address}: the server ended {method} without an answer"):
+        policy.load()
+    policy.close()
+
+
 def test_a_late_answer_reaches_no_later_request(options: LerobotServerOptions, server: LerobotServer) -> None:
     policy = make(attrs.evolve(options, timeout=0.2))
     policy.load()
