@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, override
@@ -76,9 +77,9 @@ def from_rotation_6d(numbers: Vector) -> Vector:
 
 
 def _from_quaternion(numbers: Vector) -> Vector:
-    if float(np.linalg.norm(numbers)) < _NO_LENGTH:
+    if not _NO_LENGTH <= (length := math.hypot(*numbers.tolist())) < math.inf:
         raise ValueError(f"a quaternion without a length: {numbers.tolist()}")
-    return from_quaternion(numbers)
+    return from_quaternion(numbers / length)
 
 
 _ROTATIONS: Mapping[str, tuple[Callable[[Vector], Vector], Callable[[Vector], Vector]]] = {

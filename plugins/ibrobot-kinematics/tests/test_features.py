@@ -178,6 +178,22 @@ def test_numbers_that_are_no_rotation_are_held_and_counted(arm: Arm) -> None:
         np.testing.assert_array_equal(made[1, :-1], made[0, :-1])
 
 
+@pytest.mark.parametrize("length", [1e-5, 1e5, 1e200])
+def test_the_length_of_a_quaternion_turns_nothing(arm: Arm, length: float) -> None:
+    """The tool is almost parallel to the base frame: what a quaternion seems to mean whose length overflows."""
+    angles = {"lift": -0.6, "elbow": -0.5, "flex": 1.1 - np.pi / 2}
+    start = np.array([angles.get(name, 0.0) for name in arm.robot.joint_names])
+    units = arm.units(arm.contract(tool(("position", "quaternion"))))
+    numbers = units({"action": start + [0.3 * (name == "roll") for name in arm.robot.joint_names]})["action"][None]
+    expected, _ = units.commands(numbers, {}, start)
+    numbers[:, 3:-1] *= length
+    made, held = units.commands(numbers, {}, start)
+    assert held == 0
+    np.testing.assert_allclose(made, expected, atol=1e-9)
+    numbers[:, 3:-1] = np.inf
+    assert units.commands(numbers, {}, start)[1] == 1
+
+
 def test_positions_stay_within_the_limits(arm: Arm) -> None:
     units = arm.units(arm.contract(tool(("position",))))
     numbers = np.array([[0.3, y, 0.1, 0.0] for y in np.linspace(-0.4, 0.4, 40)])
