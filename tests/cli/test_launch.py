@@ -258,7 +258,7 @@ def test_dry_run_prints_the_plan(launch: Callable[..., Ran]):
         "episodes",
     ]
     assert ran.out.splitlines()[-1] == (
-        "model net fits the contract: observation.state -> 1 joints in chunks of 10; "
+        "model net fits the contract: observation.state -> 1 numbers in chunks of 10; "
         "what it was trained on is not known"
     )
 
@@ -296,7 +296,7 @@ def test_deep_check_compares_the_models_of_all_modes(launch: Callable[..., Ran],
     deep = ("config", "check", "mini.yaml", "--sim", "--mode", "stick", "--deep")
     ran = ibrobot(*deep)
     assert (ran.code, ran.err) == (0, "")
-    assert ran.out.splitlines()[-1].startswith("model net fits the contract: observation.state -> 1 joints")
+    assert ran.out.splitlines()[-1].startswith("model net fits the contract: observation.state -> 1 numbers")
     config = Path("mini.yaml")
     config.write_text(config.read_text().replace("select: [position.pan]", "select: [position.pan, velocity.pan]"))
     assert ibrobot(*deep[:-1]).code == 0, "without --deep nothing of the model is read"

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from ibrobot_provenance.ownership import Ownership, lock_file, owned
 
-from ibrobot_core.errors import DatasetError, InUse, wrong_input
+from ibrobot_core.api import DatasetError
+from ibrobot_core.app import InUse, wrong_input
 
 HOLD = """
 import sys
