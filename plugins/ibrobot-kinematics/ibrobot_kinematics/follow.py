@@ -18,8 +18,8 @@ _LONGEST_STEP = 0.5
 _CONVERGED = 1e-8
 _SETTLED = 1e-3
 """A search has found a pose if its last step changed no joint by more [rad or m]; it ends at `_CONVERGED`."""
-_DAMPING, _LEAST_DAMPING, _FACTOR = 1e-4, 1e-12, 10.0
-"""Of Levenberg and Marquardt: at first, at least, and how it changes."""
+_DAMPING, _LEAST_DAMPING, _FACTOR = 1e-4, 1e-9, 10.0
+"""Of Levenberg and Marquardt: at first, at least (well above the rounding of its matrix), and how it changes."""
 
 
 def follow(model: KinematicModel, target: Target, start: Vector) -> Vector | None:

@@ -22,7 +22,7 @@ from ibrobot_kinematics.tool_features import from_rotation_6d, rotation_6d, tool
 from ibrobot_core.api import Contract, ContractError, Description, Joint, PolicySpec, Robot, Vector
 from ibrobot_core.app import policy_units
 
-from .arms import FIVE, SIX, bent, write_arm
+from .arms import FIVE, SIX, bent, load, write_arm
 
 STATE = "observation.state"
 ROTATIONS = ("rotation_6d", "rotation_vector", "quaternion")
@@ -382,6 +382,22 @@ def test_search_is_bounded_and_keeps_within_reach_of_its_start(arm: Arm) -> None
         made = follow(model, Target(tip.position, tip.rotation), start)
         ended += made is not None and float(Target(tip.position).missed(model.forward(made))[0]) < 1e-5
     assert ended >= 97
+
+
+def test_search_goes_on_where_joints_do_the_same(tmp_path: Path) -> None:
+    """Their normal matrix is singular but for the damping, which a long way makes small."""
+    joints = [f"{kind}{i}" for i in range(2) for kind in ("turn", "rail")]
+    bodies = '<body><joint name="{}" axis="0 0 1" range="-3 3"/><geom size="1"/>'
+    rails = '<body pos="0.2 0.5 0.2"><joint name="{}" type="slide" axis="1 0 0" range="-9 9"/><geom size="1"/>'
+    text = "".join((bodies + rails).format(*joints[i : i + 2]) for i in (0, 2))
+    text += '<site name="tip" pos="0.5 0 0"/>' + "</body>" * 4
+    _, model = load(tmp_path, f'<mujoco><compiler angle="radian"/><worldbody>{text}</worldbody></mujoco>', (*joints,))
+    ended = 0
+    for angle, start, goal in itertools.product((0.0, 0.5, 1.0), (-8.0, -2.0, 0.3), (-3.0, 0.0, 5.0)):
+        tip = model.forward(np.array([angle, goal, 0.0, goal]))
+        for target in (Target(tip.position), Target(tip.position, tip.rotation)):
+            ended += follow(model, target, np.array([0.0, start, 0.0, start])) is not None
+    assert ended > 40
 
 
 def test_search_that_has_not_settled_is_no_solution(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
