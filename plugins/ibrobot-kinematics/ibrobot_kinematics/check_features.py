@@ -8,16 +8,14 @@ from typing import TYPE_CHECKING, Any
 from ibrobot_core.api import Contract, ContractError, OptionFault
 from ibrobot_kinematics.delta_features import delta_feature
 from ibrobot_kinematics.feature_vectors import measured_places, missing_reference
-from ibrobot_kinematics.tool_features import PREFIX, tool_feature, tool_model
+from ibrobot_kinematics.tool_features import tool_feature, tool_model
 
 if TYPE_CHECKING:
     from ibrobot_core.app import RobotConfig
 
-_DELTA = "delta."
-
 
 def _is_feature(path: str) -> bool:
-    return path.startswith((PREFIX, _DELTA))
+    return path.partition(".")[0] in ("tool", "delta")
 
 
 def faults(config: RobotConfig) -> Iterator[OptionFault]:

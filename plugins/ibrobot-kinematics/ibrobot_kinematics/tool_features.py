@@ -104,8 +104,8 @@ def split(path: str, arms: Sequence[str]) -> tuple[str, str]:
     if part not in _NAMES:
         raise ContractError(f"{path!r}: the tool has no {part!r}{did_you_mean(part, list(_NAMES), 'its parts are')}")
     own = {arm.rstrip("_"): arm for arm in arms}
-    if (name := ".".join(rest)) not in own:
-        if not name:
+    if (name := ".".join(rest)) not in own or rest == [""]:
+        if not rest:
             example = f"{PREFIX}{next(iter(own))}.{part}"
             raise ContractError(f"{path!r}: the robot has several tools; name the arm, e.g. {example}")
         known = f": {', '.join(own)}" if any(own) else f"; it has one tool: {PREFIX}{part}"
