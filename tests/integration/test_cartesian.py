@@ -147,7 +147,7 @@ def test_dataset_of_poses_is_not_made_into_commands(kept: list[Any], tmp_path: P
 CHANGES = {
     "no part": ("[tool]", {}, "0.select: 'tool': the tool has no 'tool'"),
     "no joint": ("[delta]", {}, "0.select: expected all joints of the executor in their order"),
-    "empty arm": ("[tool..position]", {}, "0.select: 'tool..position': the robot has no arm ''; it has one tool: tool."),
+    "empty arm": ("[tool..position]", {}, "0.select: 'tool..position': the robot has no arm ''; it has one tool"),
     "unknown part": ("[tool.position, tool.rotation]", {}, "0.select: 'tool.rotation': the tool has no 'rotation'"),
     "two orientations": ("[tool.position, tool.rotation_6d, tool.quaternion]", {}, "at most one orientation"),
     "no position": ("[tool.rotation_6d]", {}, "needs one position"),

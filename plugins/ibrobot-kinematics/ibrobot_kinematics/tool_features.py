@@ -106,7 +106,7 @@ def split(path: str, arms: Sequence[str]) -> tuple[str, str]:
     own = {arm.rstrip("_"): arm for arm in arms}
     if (name := ".".join(rest)) not in own or rest == [""]:
         if not rest:
-            example = f"{PREFIX}{next(iter(own))}.{part}"
+            example = f"{PREFIX}{next(iter(own), 'ARM')}.{part}"
             raise ContractError(f"{path!r}: the robot has several tools; name the arm, e.g. {example}")
         known = f": {', '.join(own)}" if any(own) else f"; it has one tool: {PREFIX}{part}"
         raise ContractError(f"{path!r}: the robot has no arm {name!r}{known}")

@@ -328,7 +328,14 @@ def _longer(model: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    "bad", [{}, {"tool": {}}, {"tool": {"arms": [""]}}, {"tool": {"arms": [""], "chains": {"": {"joints": 3}}}}]
+    "bad",
+    [
+        {},
+        {"tool": {}},
+        {"tool": {"arms": []}},
+        {"tool": {"arms": [""]}},
+        {"tool": {"arms": [""], "chains": {"": {"joints": 3}}}},
+    ],
 )
 def test_damaged_model_in_a_recording_is_an_error(arm: Arm, bad: Any) -> None:
     canonical = arm.contract(["tool.position"]).canonical()
