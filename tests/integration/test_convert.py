@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import run_here
 from ibrobot_data.run import STAGING
-from ibrobot_provenance import Ownership
+from ibrobot_provenance.ownership import Ownership
 from ibrobot_ros2 import encode
 from ibrobot_testing.terminal import Terminal
 from recordings import CONTRACT, JOINTS, SIZE, START_NS, numbered, record

@@ -22,7 +22,7 @@ from ibrobot_data import run as run_module
 from ibrobot_data.episode import make_writer
 from ibrobot_data.run import STAGING
 from ibrobot_lerobot.layout import open_dataset
-from ibrobot_provenance import Ownership
+from ibrobot_provenance.ownership import Ownership
 from killed_process import KILLED, killing
 from recordings import record
 

@@ -18,6 +18,10 @@ def _is_feature(path: str) -> bool:
     return path.partition(".")[0] in ("tool", "delta")
 
 
+def _is_relative(path: str) -> bool:
+    return path.startswith("delta.") or path.rpartition(".")[2].startswith("delta_")
+
+
 def faults(config: RobotConfig) -> Iterator[OptionFault]:
     """Yield the faults of paths `tool.PART` and `delta.JOINT` in the contract, and in the models' own observations."""
     lists: list[tuple[tuple[str, ...], tuple[Any, ...]]] = [
@@ -57,7 +61,7 @@ def _fault(config: RobotConfig, paths: tuple[str, ...], joints: tuple[str, ...])
 
 def _references(config: RobotConfig) -> Iterator[OptionFault]:
     """Check that what actions are relative to is among the observations."""
-    relative = [(i, each) for i, each in enumerate(config.contract.actions) if any("delta" in p for p in each.select)]
+    relative = [(i, each) for i, each in enumerate(config.contract.actions) if any(map(_is_relative, each.select))]
     if not relative:
         return
     places = measured_places(Contract.from_config(config))

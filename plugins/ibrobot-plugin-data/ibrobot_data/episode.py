@@ -16,7 +16,7 @@ from uuid import uuid4
 
 import attrs
 import numpy as np
-from ibrobot_provenance import Ownership
+from ibrobot_provenance.ownership import Ownership
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (

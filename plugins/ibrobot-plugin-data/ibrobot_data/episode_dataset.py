@@ -8,7 +8,7 @@ from tempfile import TemporaryFile
 from typing import Any
 
 import yaml
-from ibrobot_provenance import Ownership, owned
+from ibrobot_provenance.ownership import Ownership, owned
 
 from ibrobot_core.api import Contract, IbrobotError, RecorderError, replace_file
 from ibrobot_core.app import installed_plugins

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from uuid import NAMESPACE_OID, uuid4, uuid5
 
-from ibrobot_provenance import Ownership
+from ibrobot_provenance.ownership import Ownership
 
 import ibrobot_core
 from ibrobot_core.api import MODEL_ANSWERS, Contract, EpisodeStart, ModelAnswer, RecorderError, String

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import override
 
 import attrs
-from ibrobot_provenance import Ownership
+from ibrobot_provenance.ownership import Ownership
 
 from ibrobot_core.api import (
     NS_PER_S,

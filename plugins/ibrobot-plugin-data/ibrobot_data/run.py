@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
-from ibrobot_provenance import Ownership
+from ibrobot_provenance.ownership import Ownership
 
 from ibrobot_core.api import Contract, DatasetError, DatasetSummary, EpisodeAddress, IbrobotError, seconds
 from ibrobot_core.app import DiskFull, Pool, installed_plugins, set_malloc

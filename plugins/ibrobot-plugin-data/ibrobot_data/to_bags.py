@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
-from ibrobot_provenance import Ownership
+from ibrobot_provenance.ownership import Ownership
 
 import ibrobot_core
 from ibrobot_core.api import (

@@ -25,7 +25,7 @@ from ibrobot_data.episode_service import (
     EpisodeService,
     RecordedEpisode,
 )
-from ibrobot_provenance import Ownership
+from ibrobot_provenance.ownership import Ownership
 
 from ibrobot_core.api import Contract, IbrobotError, NotSupported, RecorderError
 from ibrobot_core.app import ESTOP, RESET, ConfigError, DiskFull, InUse, RequestError

@@ -12,7 +12,7 @@ from typing import override
 from uuid import uuid4
 
 import attrs
-from ibrobot_provenance import differing_code, installed_code
+from ibrobot_provenance.code import differing_code, installed_code
 
 from ibrobot_core.api import (
     MODEL_ANSWERS,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
-from ibrobot_provenance import owned
+from ibrobot_provenance.ownership import owned
 
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import ComponentFailed, Done, Job, installed_plugins

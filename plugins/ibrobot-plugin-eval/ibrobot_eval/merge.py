@@ -10,7 +10,7 @@ from typing import Any, override
 
 import attrs
 import click
-from ibrobot_provenance import Ownership
+from ibrobot_provenance.ownership import Ownership
 
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import echo, wrong_input

@@ -13,7 +13,7 @@ import attrs
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from ibrobot_provenance import Ownership, owned
+from ibrobot_provenance.ownership import Ownership, owned
 
 from ibrobot_core.api import DatasetError, sync
 from ibrobot_lerobot import layout

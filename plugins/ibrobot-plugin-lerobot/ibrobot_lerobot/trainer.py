@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from ibrobot_provenance import owned
+from ibrobot_provenance.ownership import owned
 
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import echo

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from ibrobot_provenance import Ownership
+from ibrobot_provenance.ownership import Ownership
 
 from ibrobot_core.api import RecorderError
 from ibrobot_core.app import InUse

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from ibrobot_mcap import trash
 from ibrobot_mcap.commands import episodes
-from ibrobot_provenance import Ownership
+from ibrobot_provenance.ownership import Ownership
 from killed_process import KILLED, killing
 
 from ibrobot_core.api import RecorderError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -147,17 +147,15 @@ class Client:
             goals: one text, or mappings.
             scalings: for mappings, `velocity_scaling` and `acceleration_scaling`: fractions of the limits.
         """
-        if len(goals) == 1 and isinstance(goals[0], str):
-            return Motion(self, self.call("/planning/go_to", {"goal": goals[0], **scalings}))
-        return Motion(self, self.call("/move_action", {"goals": goals, **scalings}))
+        service, request = _asked(goals, "/planning/go_to", "/move_action")
+        return Motion(self, self.call(service, {**request, **scalings}))
 
     def plan(
         self, *goals: str | GoalKeys, start: Mapping[str, float] | None = None, **scalings: float
     ) -> JointTrajectory:
         """Plan without moving; arguments as for `go_to`, and `start` [rad] in place of the present positions."""
-        if len(goals) == 1 and isinstance(goals[0], str):
-            return self._planned("/planning/plan", goal=goals[0], start=start, **scalings)
-        return self._planned("/plan_kinematic_path", goals=goals, start=start, **scalings)
+        service, request = _asked(goals, "/planning/plan", "/plan_kinematic_path")
+        return self._planned(service, **request, start=start, **scalings)
 
     def plan_straight(
         self, *waypoints: GoalKeys, start: Mapping[str, float] | None = None, **more: float
@@ -204,3 +202,10 @@ class Client:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _asked(goals: Sequence[str | GoalKeys], by_text: str, by_keys: str) -> tuple[str, dict[str, Any]]:
+    """The service that takes goals of this form, and its request."""
+    if len(goals) == 1 and isinstance(goals[0], str):
+        return by_text, {"goal": goals[0]}
+    return by_keys, {"goals": goals}

@@ -18,7 +18,7 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # before Ray reads it
 os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")  # `uv run` would make Ray build an environment per job
 
 import ray
-from ibrobot_provenance import differing_code, installed_code
+from ibrobot_provenance.code import differing_code, installed_code
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import ComponentFailed, Done, Job, Pool, installed_plugins

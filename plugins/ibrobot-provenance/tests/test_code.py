@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ibrobot_provenance import code, differing_code, installed_code
+from ibrobot_provenance import code
+from ibrobot_provenance.code import differing_code, installed_code
 
 Install = Callable[..., Path]
 
