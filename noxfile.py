@@ -48,6 +48,8 @@ LOCAL = {
     **{folder.name: folder for folder in FOLDERS.values()},
 }
 """Distribution -> folder."""
+EXAMPLES = {"ibrobot-plugin-jointlog": Path("tests/examples/ibrobot-plugin-jointlog")}
+"""As `LOCAL`, of what tests install and nobody publishes."""
 EXTRAS = {
     "ibrobot-plugin-camera": "[realsense]",
     "ibrobot-plugin-lerobot": "[hub]",
@@ -99,16 +101,17 @@ def packages(*requirements: str, plain: tuple[str, ...] = ()) -> list[str]:
 
     The distributions `plain` come without their extras.
     """
+    folders = LOCAL | EXAMPLES
     local: list[str] = []
     wanted = list(map(Requirement, requirements))
     for each in wanted:  # it grows meanwhile
-        if each.name in LOCAL and each.name not in local:
+        if each.name in folders and each.name not in local:
             local.append(each.name)
-            project = nox.project.load_toml(LOCAL[each.name] / "pyproject.toml")["project"]
+            project = nox.project.load_toml(folders[each.name] / "pyproject.toml")["project"]
             wanted += map(Requirement, project["dependencies"])
-    asked = [str(each) for each in wanted[: len(requirements)] if each.name not in LOCAL]
+    asked = [str(each) for each in wanted[: len(requirements)] if each.name not in folders]
     extras = {name: extra for name, extra in EXTRAS.items() if name not in plain}
-    return [*(argument for name in local for argument in ("-e", f"{LOCAL[name]}{extras.get(name, '')}")), *asked]
+    return [*(argument for name in local for argument in ("-e", f"{folders[name]}{extras.get(name, '')}")), *asked]
 
 
 def install(
@@ -196,7 +199,7 @@ def marked(mark: str) -> list[str]:
 @nox.session
 def integration(session: nox.Session) -> None:
     """What needs every plugin, or starts processes."""
-    install(session, *PLUGINS, groups=("test", "browser"))
+    install(session, *PLUGINS, groups=("test", "browser", "examples"))
     system_libraries(session)
     chromium(session)
     session.run(*PYTEST, *TWO, "-m", f"integration{SHORT}", *marked("integration"), *session.posargs)

@@ -38,23 +38,23 @@ STILL_SERVICES = {
 }  # fmt: skip
 """Services that move nothing."""
 OTHER_SERVICES = {
-    "ibrobot_servo/teleop.py: topic": "teleop twist",
+    "ibrobot_kinematics/twist.py: topic": "teleop twist",
     "ibrobot_web/messages.py: name": "",  # commands of pages, see `page_commands`
     "ibrobot_web/ui/context.py: ''": "",  # requests of the page that starts runs
 }
 """Where services are declared whose names are computed -> the entrance that they are; empty: none."""
 SUBSCRIBERS = {
     "ibrobot_planning/execution/source.py": "/cmd_pose",
-    "ibrobot_servo/teleop.py": "teleop twist",
+    "ibrobot_kinematics/twist.py": "teleop twist",
     "ibrobot_lerobot_devices/cmd_vel.py": "teleop cmd_vel",
     # Observations of policies, records, pictures, and what is shown, counted or passed on.
     **dict.fromkeys(
         (
             "ibrobot_core/contract/frames.py", "ibrobot_data/recording_worker.py", "ibrobot_eval/episodes.py",
-            "ibrobot_description/component.py", "ibrobot_eval/cameras.py", "ibrobot_eval/film.py",
+            "ibrobot_kinematics/description.py", "ibrobot_eval/cameras.py", "ibrobot_eval/film.py",
             "ibrobot_gym/environment.py", "ibrobot_mujoco/camera.py", "ibrobot_mujoco/viewer.py",
             "ibrobot_planning/tasks/performing.py", "ibrobot_ros/topics.py", "ibrobot_ros2/inference.py",
-            "ibrobot_servo/tool_pose.py", "ibrobot_web/objects.py", "ibrobot_web/viewer.py",
+            "ibrobot_kinematics/tool_pose.py", "ibrobot_web/objects.py", "ibrobot_web/viewer.py",
             "ibrobot_webxr/images.py", "ibrobot_webxr/server.py", "ibrobot_zenoh/sharing.py",
             # The world.
             "ibrobot_planning/world/clouds.py", "ibrobot_planning/world/frames.py",

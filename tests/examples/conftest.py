@@ -1,8 +1,8 @@
-"""The example plugin on the import path, as if it were installed."""
+"""The example plugins on the import path, as if they were installed."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent / "ibrobot-plugin-wave"))
+sys.path[:0] = map(str, sorted(Path(__file__).parent.glob("ibrobot-plugin-*")))

@@ -18,7 +18,6 @@ from pathlib import Path
 from ibrobot_core.descriptors import SectionDescriptor
 from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, RECORDS, discover
 
-CORE = "ibrobot-core"
 PLUGINS = Path(__file__).parents[2] / "plugins"
 DISTRIBUTION = PLUGINS / "ibrobot" / "pyproject.toml"
 
@@ -31,8 +30,8 @@ def offers() -> dict[str, dict[str, list[str]]]:
     found: dict[str, dict[str, list[str]]] = {}
     for entry in entry_points(group="ibrobot"):
         package = entry.dist.name if entry.dist is not None else ""
-        if not package.startswith("ibrobot-") or package == CORE:
-            continue
+        if not (PLUGINS / package).is_dir():
+            continue  # core, an example, or a plugin of others
         registry = discover([entry])
         assert not registry.failures, registry.failures
         kinds: dict[str, list[str]] = {}

@@ -59,7 +59,7 @@ NOTES = [
     "mode jog is unavailable: teleop type 'keyboard' needs a plugin that is not installed: "
     "pip install ibrobot-plugin-keyboard",
     "mode servo is unavailable: teleop type 'twist' needs a plugin that is not installed: "
-    "pip install ibrobot-plugin-servo",
+    "pip install ibrobot-kinematics",
     "mode web is unavailable: teleop type 'web' needs a plugin that is not installed: pip install ibrobot-plugin-web",
     "mode moveit_planning is unavailable: executor type 'trajectory', executor type 'gripper', "
     "planner type 'rrt_connect', a mode with planner need plugins that are not installed: "

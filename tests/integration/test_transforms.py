@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from ibrobot_description.frames import transform
+from ibrobot_kinematics.frames import transform
 from ibrobot_kinematics.poses import matrix
 from ibrobot_kinematics.urdf import read_urdf
 

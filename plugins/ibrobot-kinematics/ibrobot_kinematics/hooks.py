@@ -1,11 +1,17 @@
-"""The hooks: features of the contract. Importing it imports no NumPy."""
+"""The hooks: features, teleop `twist`, sections `tool_pose` and `description`. Importing it imports no NumPy."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-from ibrobot_core.api import Late, hookimpl
-from ibrobot_core.app import FeatureDescriptor
+from ibrobot_core.api import Late, OptionFault, TeleopDescriptor, hookimpl
+from ibrobot_core.app import FeatureDescriptor, SectionDescriptor
+from ibrobot_kinematics.options import ToolPoseOptions, TwistOptions
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
+    from ibrobot_core.app import RobotConfig
 
 _OF_TOOLS = "ibrobot_kinematics.tool_features"
 _OF_DELTAS = "ibrobot_kinematics.delta_features"
@@ -27,4 +33,66 @@ def ibrobot_features() -> Iterable[FeatureDescriptor]:
         model=lambda robot, paths: {},
         make=Late(f"{_OF_DELTAS}:delta_feature"),
         vectors=_VECTORS,
+    )
+
+
+def _check_twist(options: TwistOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    if robot.description.mjcf is None:
+        yield OptionFault(("topic",), "twists move a tool, which needs robot.description.mjcf: set it", "mjcf")
+    if len({robot.description.arm_of(name) for name in robot.joint_names}) > 1:
+        message = "the robot has several arms: give the device one in the mode, e.g. teleop: {left: DEVICE}"
+        yield OptionFault((), message)
+    if options.frame == robot.description.tip:
+        yield OptionFault(("frame",), f"{options.frame!r} is robot.description.tip; give the name of the base frame")
+
+
+def _check_pose(options: ToolPoseOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    if robot.description.mjcf is None:
+        yield OptionFault((), "the pose of the tool needs robot.description.mjcf: set it", "mjcf")
+    if robot.description.arms:
+        yield OptionFault((), "publishes the pose of one tool, but the robot has several arms: leave the section out")
+
+
+def _has_model(config: RobotConfig) -> bool:
+    return config.robot.description.mjcf is not None and not config.robot.description.arms
+
+
+@hookimpl
+def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
+    """The teleop `twist`, the counterpart of MoveIt Servo."""
+    yield TeleopDescriptor(
+        type="twist",
+        options=TwistOptions,
+        make=Late("ibrobot_kinematics.twist:TwistTeleop"),
+        check_options=_check_twist,
+        label="follow twists on a topic",
+        summary="moves the tool along a topic of twists, as MoveIt Servo does",
+    )
+
+
+def _has_frames(config: RobotConfig) -> bool:
+    mounted = any(peripheral.transform is not None for peripheral in config.peripherals.values())
+    return mounted or config.robot.description.urdf is not None
+
+
+@hookimpl
+def ibrobot_sections() -> Iterable[SectionDescriptor]:
+    """The sections `tool_pose` and `description`, the counterpart of robot_state_publisher."""
+    yield SectionDescriptor(
+        type="tool_pose",
+        options=ToolPoseOptions,
+        make=lambda options, session: Late("ibrobot_kinematics.tool_pose:ToolPose")(
+            options or ToolPoseOptions(), session
+        ),
+        check_options=_check_pose,
+        without_section=_has_model,
+        publishes=lambda options: [(("topic",), options.topic)],
+        summary="the tool's pose in the base frame, on /robot_status/ee_pose",
+    )
+    yield SectionDescriptor(
+        type="description",
+        make=lambda options, session: Late("ibrobot_kinematics.description:DescriptionPublisher")(session),
+        without_section=_has_frames,
+        check_config=Late("ibrobot_kinematics.check_description:faults"),
+        summary="/tf, /tf_static and /robot_description from the URDF and the mounts of sensors; has no keys",
     )

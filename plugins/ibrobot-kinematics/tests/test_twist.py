@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from ibrobot_kinematics import KinematicModel, ServoStatus, robot_model
 from ibrobot_kinematics.clearance import CLEARANCE, Configuration
-from ibrobot_servo import ibrobot_sections, ibrobot_teleop
-from ibrobot_servo.options import TwistOptions
-from ibrobot_servo.teleop import TwistTeleop
+from ibrobot_kinematics.hooks import ibrobot_sections, ibrobot_teleop
+from ibrobot_kinematics.options import TwistOptions
+from ibrobot_kinematics.twist import TwistTeleop
 from ibrobot_testing import TeleopSuite, host_context, make_robot
 from ibrobot_testing.contexts import START_NS, SetClock
 
@@ -365,7 +365,7 @@ def test_options_are_checked_against_the_robot(model):
     assert faults(make_robot()) == ["twists move a tool, which needs robot.description.mjcf: set it"]
     same = "'tool' is robot.description.tip; give the name of the base frame"
     assert faults(robot_of(model), TwistOptions(frame="tool")) == [same]
-    (section,) = ibrobot_sections()
+    section, _ = ibrobot_sections()
     (fault,) = section.check_options(section.options(), make_robot(), ())
     assert fault.message == "the pose of the tool needs robot.description.mjcf: set it"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ibrobot_description.frames import MountedFrame, transform
+from ibrobot_kinematics.frames import MountedFrame, transform
 from ibrobot_kinematics.poses import orientation
 from ibrobot_kinematics.rotations import from_rpy
 from ibrobot_kinematics.urdf import UrdfJoint, read_urdf

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import override
 
 import numpy as np
-from ibrobot_kinematics import KinematicsError, Servo, ServoStatus, robot_model, world_clearance
 
 from ibrobot_core.api import (
     Context,
@@ -25,7 +24,8 @@ from ibrobot_core.api import (
     ns,
 )
 from ibrobot_core.app import Received, Service, Subscription
-from ibrobot_servo.options import TwistOptions
+from ibrobot_kinematics import KinematicsError, Servo, ServoStatus, robot_model, world_clearance
+from ibrobot_kinematics.options import TwistOptions
 
 _STATUS_S = 0.1
 """The status is published when it changes, and at least that often [s]."""

@@ -9,8 +9,8 @@ import attrs
 import mujoco
 import numpy as np
 import pytest
-from ibrobot_servo import ibrobot_sections
-from ibrobot_servo.options import ToolPoseOptions
+from ibrobot_kinematics.hooks import ibrobot_sections
+from ibrobot_kinematics.options import ToolPoseOptions
 from ibrobot_testing import SectionSuite, make_robot, make_session
 
 from ibrobot_core.api import Description, Header, JointState, PoseStamped, ns
@@ -25,7 +25,7 @@ MJCF = """<mujoco><worldbody>
 <body pos="1 0 0"><joint name="wrist_roll"/><geom size="0.01"/></body>
 <body pos="1 0 0"><joint name="gripper"/><geom size="0.01"/></body>
 </worldbody></mujoco>"""
-(SECTION,) = ibrobot_sections()
+SECTION, _ = ibrobot_sections()
 
 
 @pytest.fixture(scope="session")

@@ -7,12 +7,12 @@ from typing import Any
 
 import attrs
 import numpy as np
-from ibrobot_kinematics.poses import orientation
-from ibrobot_kinematics.rotations import exp, from_quaternion, from_rpy
-from ibrobot_kinematics.urdf import MOVING, UrdfJoint
 
 from ibrobot_core.api import Header, Quaternion, TransformStamped, Vector3
 from ibrobot_core.app import Mount, RobotConfig
+from ibrobot_kinematics.poses import orientation
+from ibrobot_kinematics.rotations import exp, from_quaternion, from_rpy
+from ibrobot_kinematics.urdf import MOVING, UrdfJoint
 
 OPTICAL = Quaternion(-0.5, 0.5, -0.5, 0.5)
 """A camera's optical frame (z ahead, x right, y down) in its body's (x ahead, y left, z up). Source: ROS REP 103."""

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import override
 
-from ibrobot_kinematics.errors import KinematicsError
-from ibrobot_kinematics.urdf import MOVING, read_urdf
-
 from ibrobot_core.api import JointState, String, TFMessage
 from ibrobot_core.app import CONTROL, RunView, SessionWorker
-from ibrobot_description.frames import mounted, transform
+from ibrobot_kinematics.errors import KinematicsError
+from ibrobot_kinematics.frames import mounted, transform
+from ibrobot_kinematics.urdf import MOVING, read_urdf
 
 
 def _text(path: Path) -> str:

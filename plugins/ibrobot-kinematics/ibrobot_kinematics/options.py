@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import attrs
-from ibrobot_kinematics import ServoOptions
 
 from ibrobot_core.api import documented, option
+from ibrobot_kinematics.servo_options import ServoOptions
 
 
 def _check_topic(instance: Any, attribute: attrs.Attribute[Any], topic: str) -> None:

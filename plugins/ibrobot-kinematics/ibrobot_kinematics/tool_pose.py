@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import override
 
-from ibrobot_kinematics import KinematicModel, KinematicsError, robot_model
-from ibrobot_kinematics.poses import orientation
-
 from ibrobot_core.api import NS_PER_S, Header, JointState, Pose, PoseStamped, Vector3
 from ibrobot_core.app import CONTROL, RunView, SessionWorker
-from ibrobot_servo.options import ToolPoseOptions
+from ibrobot_kinematics import KinematicModel, KinematicsError, robot_model
+from ibrobot_kinematics.options import ToolPoseOptions
+from ibrobot_kinematics.poses import orientation
 
 
 class ToolPose(SessionWorker):

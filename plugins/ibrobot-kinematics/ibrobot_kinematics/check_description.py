@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ibrobot_kinematics.errors import KinematicsError
-from ibrobot_kinematics.srdf import read_srdf
-from ibrobot_kinematics.urdf import Urdf, read_urdf
-
 from ibrobot_core.api import OptionFault, did_you_mean
 from ibrobot_core.app import RobotConfig
-from ibrobot_description.frames import MountedFrame, mounted
+from ibrobot_kinematics.errors import KinematicsError
+from ibrobot_kinematics.frames import MountedFrame, mounted
+from ibrobot_kinematics.srdf import read_srdf
+from ibrobot_kinematics.urdf import Urdf, read_urdf
 
 _URDF, _SRDF = ("robot", "description", "urdf"), ("robot", "description", "srdf")
 

@@ -10,8 +10,8 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
-from ibrobot_description import ibrobot_sections
-from ibrobot_description.component import DescriptionPublisher
+from ibrobot_kinematics.description import DescriptionPublisher
+from ibrobot_kinematics.hooks import ibrobot_sections
 from ibrobot_testing import SectionSuite, check_descriptor, make_robot, make_session
 
 from ibrobot_core.api import HardwareDescriptor, Header, JointState, NoOptions, SensorDescriptor, TFMessage
@@ -57,7 +57,7 @@ class TestDescriptionPublisher(SectionSuite):
 
 
 def test_descriptor_is_complete() -> None:
-    (descriptor,) = ibrobot_sections()
+    _, descriptor = ibrobot_sections()
     check_descriptor(descriptor, NoOptions())
 
 
@@ -119,7 +119,7 @@ def test_moving_links_are_not_computed_for_nobody(tmp_path: Path) -> None:
 
 
 def test_robot_without_urdf_and_mounts_needs_no_component(tmp_path: Path) -> None:
-    (descriptor,) = ibrobot_sections()
+    _, descriptor = ibrobot_sections()
     assert not descriptor.without_section(make_session().config)
     assert descriptor.without_section(session_of(tmp_path).config)
 

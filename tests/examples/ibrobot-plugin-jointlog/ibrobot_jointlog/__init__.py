@@ -1,10 +1,10 @@
-"""The plugin's hooks: recorder and reader `joint_log`, dataset writer `npz`."""
+"""The plugin's hooks: recorder and reader `joint_log`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from ibrobot_core.api import DatasetDescriptor, Late, ReaderDescriptor, RecorderDescriptor, hookimpl
+from ibrobot_core.api import Late, ReaderDescriptor, RecorderDescriptor, hookimpl
 
 
 @hookimpl
@@ -25,14 +25,4 @@ def ibrobot_recorders() -> Iterable[RecorderDescriptor]:
         type="joint_log",
         make=lambda options, ctx: Late("ibrobot_jointlog.recorder:JointLogRecorder")(ctx),
         summary="joint positions of an episode as CSV, for replay",
-    )
-
-
-@hookimpl
-def ibrobot_datasets() -> Iterable[DatasetDescriptor]:
-    """The writer of NumPy datasets."""
-    yield DatasetDescriptor(
-        type="npz",
-        make=lambda options, ctx: Late("ibrobot_jointlog.npz:NpzDatasetWriter")(),
-        summary="one NumPy .npz file per episode",
     )
