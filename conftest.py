@@ -1,7 +1,8 @@
-"""Settings of all tests here: an example may take as long as it takes, since the machine may be busy; signals work."""
+"""Settings of all tests here: no deadlines, since the machine may be busy; signals work; remedies name pip."""
 
 from __future__ import annotations
 
+import os
 import signal
 
 from hypothesis import settings
@@ -10,6 +11,8 @@ from hypothesis import settings
 for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, handler)
+
+os.environ["IBROBOT_INSTALLER"] = "pip install"  # in remedies, whatever installed what runs here
 
 settings.register_profile("untimed", deadline=None)
 settings.register_profile("few", deadline=None, max_examples=5)  # where another run looks for rare examples

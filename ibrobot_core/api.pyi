@@ -136,6 +136,7 @@ from ibrobot_core.errors import (
     GoalRejected as GoalRejected,
     HardwareError as HardwareError,
     MissingDependency as MissingDependency,
+    how_to_install as how_to_install,
     NotSupported as NotSupported,
     PlanningError as PlanningError,
     PolicyError as PolicyError,

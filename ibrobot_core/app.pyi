@@ -72,7 +72,6 @@ from ibrobot_core.plugins import (
 from ibrobot_core.launch.session import (
     LaunchRequest as LaunchRequest,
     Session as Session,
-    StateWatch as StateWatch,
 )
 from ibrobot_core.launch.views import RunAccess as RunAccess, RunView as RunView
 from ibrobot_core.launch.runtime import Runtime as Runtime
@@ -132,7 +131,6 @@ from ibrobot_core.launch.runtime import (
     ESTOP as ESTOP,
     CHECK_ESTOP as CHECK_ESTOP,
 )
-from ibrobot_core.launch.sources.policy import TOGGLE_SMOOTHING as TOGGLE_SMOOTHING
 from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
 from ibrobot_core.interfaces.policy import (
     check_finite as check_finite,

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import copyreg
 import errno
+import os
+import shlex
+import shutil
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, override
 
@@ -14,6 +19,24 @@ import attrs
 
 _LISTED = 50
 """Maximum number of problems in a message, to fit on a screen."""
+
+
+def how_to_install(*packages: str) -> str:
+    """The command that installs packages into the environment that runs.
+
+    An environment that uv made has no pip, and the pip of a shell may be another Python's. The environment variable
+    IBROBOT_INSTALLER replaces the command, e.g. `pixi add --pypi`.
+    """
+    names = " ".join(f'"{each}"' if "[" in each else each for each in packages)
+    here = shlex.quote(sys.executable)
+    if installer := os.environ.get("IBROBOT_INSTALLER"):
+        return f"{installer} {names}"
+    if find_spec("pip") is None:
+        places = (Path(each) for each in (os.environ.get("VIRTUAL_ENV"), ".venv") if each)  # where uv looks
+        is_active = any(each.exists() and each.samefile(sys.prefix) for each in places)
+        return f"uv pip install {names}{'' if is_active else f' --python {here}'}"
+    pip = shutil.which("pip")
+    return f"{'pip' if pip and Path(pip).parent == Path(sys.executable).parent else f'{here} -m pip'} install {names}"
 
 
 class IbrobotError(Exception):
@@ -86,7 +109,7 @@ class PluginNotInstalled(PluginError):
         self.package = package
         self.reason = reason
         self.missing = reason or f"{plugin_type(kind, type)} needs a plugin that is not installed"
-        self.remedy = f"pip install {'--force-reinstall ' if reason else ''}{package}"
+        self.remedy = how_to_install(*(["--force-reinstall"] if reason else []), package)
         super().__init__(reason or f"{self.missing}: {self.remedy}")
 
 

@@ -22,6 +22,7 @@ from ibrobot_core.errors import (
     PluginError,
     PluginNotInstalled,
     RecorderError,
+    how_to_install,
     plugin_type,
 )
 from ibrobot_core.options import did_you_mean
@@ -188,7 +189,7 @@ class Registry:
             packages = ", ".join(f"{entry.descriptor.type} ({entry.package})" for entry in defaults)
             raise PluginError(f"name the type of the {kind}: several plugins offer a default: {packages}")
         package = next(name for name, offers in official_plugins().items() if kind in offers.get("default", ()))
-        raise PluginError(f"no {kind} is named, and no installed plugin has a default: pip install {package}")
+        raise PluginError(f"no {kind} is named, and no installed plugin has a default: {how_to_install(package)}")
 
     def missing(self, kind: str, type_: str, options: Any = None) -> MissingDependency | None:
         """The dependency that this machine lacks for `type_`, or None. A check that raises is reported too.
@@ -230,7 +231,7 @@ class Registry:
                 return reader.make(address)
         formats = ", ".join(f"{reader.type} ({reader.summary})" for reader in self.readers)
         packages = " or ".join(name for name, offers in official_plugins().items() if "reader" in offers)
-        hint = "" if formats else f"; pip install {packages}"
+        hint = "" if formats else f"; {how_to_install(packages)}"
         raise RecorderError(f"{path}: not an episode of a known format; installed: {formats or 'none'}{hint}")
 
     def pool(self, where: str, jobs: int | None = None) -> Pool:
@@ -324,8 +325,8 @@ def install_command(packages: Iterable[str]) -> str:
     extras: dict[str, list[str]] = json.loads(EXTRAS.read_bytes())
     covering = [name for name, content in extras.items() if len(wanted) > 1 and set(wanted) <= set(content)]
     if covering:
-        return f'pip install "ibrobot[{min(covering, key=lambda name: len(extras[name]))}]"'
-    return f"pip install {' '.join(wanted)}"
+        return how_to_install(f"ibrobot[{min(covering, key=lambda name: len(extras[name]))}]")
+    return how_to_install(*wanted)
 
 
 def example_type(kind: str) -> str:

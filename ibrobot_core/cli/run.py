@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext, suppress
 
@@ -116,7 +117,7 @@ def _run(runtime: Runtime, hooks: RunHooks, signals: _Signals, *, live: bool, as
             hooks.step()
             display.show()
     outcome = session.outcome
-    if outcome.faults:
+    if session.faults:
         return _FAULTED
     return NOT_ALL_SUCCEEDED if outcome.successes < outcome.episodes or outcome.goals_failed else 0
 
@@ -349,8 +350,10 @@ def _print_summary(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
         return
     loop = summary["loop"]
     echo(f"{summary['robot']}: {summary['mode']} for {summary['duration_s']:.1f} s")
-    if summary["episodes"]:
-        echo(f"episodes   {summary['episodes']}, of which {summary['successes']} succeeded")
+    judged, unjudged = summary["episodes"], summary["unjudged"]
+    if judged or unjudged:
+        more = f", {unjudged} not judged" if unjudged else ""
+        echo(f"episodes   {judged + unjudged}, of which {summary['successes']} succeeded{more}")
     if summary["disturbed"]:
         echo(f"disturbed  {summary['disturbed']} episodes, by a fault or an emergency stop")
     if summary["lockstep"]:
@@ -364,5 +367,6 @@ def _print_summary(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
         echo(f"{heading:10} {text}")
     if runtime.plan.without:
         echo(f"without    {runtime.plan.without}")
-    faults = summary["faults"]
-    echo(f"faults     {'; '.join(faults) + ' (all of the run, those that were reset too)' if faults else 'none'}")
+    left = summary["faults_at_end"]
+    were_reset = (Counter(summary["faults"]) - Counter(left)).elements()
+    echo(f"faults     {'; '.join([*left, *(f'{fault} (reset)' for fault in were_reset)]) or 'none'}")

@@ -7,6 +7,8 @@ import re
 from importlib.util import find_spec
 from pathlib import Path
 
+from ibrobot_core.errors import how_to_install
+
 VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)(?::([^}]*))?\}")
 """A variable in a value of a robot YAML: its name, and its default."""
 
@@ -54,7 +56,7 @@ def resolve_path(text: str, base: Path) -> Path:
     spec = find_spec(package)
     if spec is None or not spec.submodule_search_locations:
         distribution = package.replace("_", "-")
-        raise ValueError(f"the Python package {package!r} is not installed: pip install {distribution}")
+        raise ValueError(f"the Python package {package!r} is not installed: {how_to_install(distribution)}")
     path = Path(next(iter(spec.submodule_search_locations))) / inside
     if not path.exists():
         raise ValueError(f"the Python package {package!r} has no file {inside!r}; check its version and the path")

@@ -10,7 +10,7 @@ import attrs
 from ibrobot_core.config.schema import ContractConfig
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
-from ibrobot_core.errors import PluginNotInstalled, plugin_type
+from ibrobot_core.errors import PluginNotInstalled, how_to_install, plugin_type
 from ibrobot_core.plugins import install_command
 
 _OPTIONAL_SENSORS = ("camera",)
@@ -79,7 +79,7 @@ def absent_models(absent: Mapping[str, PluginNotInstalled]) -> list[str]:
         by_package.setdefault(error.package, []).append(model)
     return [
         f"joint limits are not compared with robot.description.{' and '.join(models)}, whose package is not installed: "
-        f"pip install {package}"
+        f"{how_to_install(package)}"
         for package, models in by_package.items()
     ]
 

@@ -19,7 +19,7 @@ from ibrobot_core.config.secrets import note
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Converter, Faults, Key, error_message, unknown_key
 from ibrobot_core.descriptors import Descriptor, HardwareDescriptor, SensorDescriptor
-from ibrobot_core.errors import PluginError, PluginNotInstalled
+from ibrobot_core.errors import PluginError, PluginNotInstalled, how_to_install
 from ibrobot_core.options import fields
 from ibrobot_core.plugins import Registry, example_type
 
@@ -181,9 +181,8 @@ class SectionParser:
         for model in MODELS if isinstance(described, Mapping) else ():
             path = described.get(model)
             if isinstance(path, str) and (package := missing_package(path)) is not None:
-                reason = (
-                    f"robot.description.{model}: {path} is in a package that is not installed: pip install {package}"
-                )
+                remedy = how_to_install(package)
+                reason = f"robot.description.{model}: {path} is in a package that is not installed: {remedy}"
                 sections.absent_models[model] = PluginNotInstalled("model", model, package, reason)
         if not sections.absent_models:
             return root

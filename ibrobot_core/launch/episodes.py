@@ -52,7 +52,9 @@ class Episodes:
             session.log.warning("episode %d is disturbed by: %s", self.number, "; ".join(self.faults))
         if outcome == "discarded":
             session.log.info("episode %d: discarded", self.number)
-        elif outcome != "unknown":
+        elif outcome == "unknown":
+            session.outcome.unjudged += 1
+        else:
             session.outcome.episodes += 1
             session.outcome.successes += outcome == "success"
             session.log.info("episode %d: %s", self.number, outcome)

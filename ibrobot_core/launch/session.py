@@ -64,6 +64,8 @@ class Outcome:
 
     episodes: int = 0
     successes: int = 0
+    unjudged: int = 0
+    """Number of kept episodes that nobody judged."""
     disturbed: int = 0
     """Number of episodes during which a fault or an emergency stop occurred."""
     faults: list[str] = attrs.field(factory=list)

@@ -12,13 +12,18 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, override
 
 import pytest
 from ibrobot_testing.fakes import FakePolicy
 
-from ibrobot_core.cli.run import _Signals
+from ibrobot_core.cli.run import _Signals, run_robot
+from ibrobot_core.config.load import load_config
 from ibrobot_core.errors import PolicyError
+from ibrobot_core.launch.runtime import Runtime
+from ibrobot_core.launch.session import LaunchRequest
+from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.run_hooks import RunHooks
 
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site
@@ -163,6 +168,43 @@ def test_a_device_that_is_lost_is_a_fault_and_the_run_goes_on(launch: Callable[.
     assert "E fault: the stick is gone; the robot holds" in ran.err
     summary = json.loads(ran.out.splitlines()[-1])
     assert summary.items() >= {"faults": ["the stick is gone"], "duration_s": 2.0}.items()
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+def test_a_fault_that_was_reset_is_a_note(
+    launch: Callable[..., Ran], capsys: pytest.CaptureFixture[str], as_json: bool
+):
+    """As an operator does who tries the emergency stop first."""
+    registry = installed_plugins()
+    config = load_config("mini.yaml", mode="idle", sim=True, registry=registry)
+
+    class Cautious(RunHooks):
+        def __init__(self, runtime: Runtime) -> None:
+            self.runtime, self.ticks = runtime, 0
+
+        @override
+        def step(self) -> None:
+            self.ticks += 1
+            if self.ticks in (5, 20):
+                self.runtime.session.emergency_stop()
+            elif self.ticks == 10 or (self.ticks == 25 and resets_all):
+                self.runtime.reset(self.runtime.session.stops)
+
+    for resets_all in (True, False):
+        request = LaunchRequest(lockstep=True, duration_s=1.0)
+        with pytest.raises(SystemExit) as ended:
+            run_robot(config, request, headless=True, as_json=as_json, make_hooks=Cautious)
+        out = capsys.readouterr().out
+        assert ended.value.code == (0 if resets_all else 1)
+        if as_json:
+            summary = json.loads(out.splitlines()[-1])
+            left = [] if resets_all else ["emergency stop"]
+            assert (summary["faults"], summary["faults_at_end"]) == (["emergency stop"] * 2, left)
+        else:
+            last = "emergency stop (reset)" if resets_all else "emergency stop"
+            assert sorted(out.splitlines()[-1].removeprefix("faults     ").split("; ")) == sorted(
+                [last, "emergency stop (reset)"]
+            )
 
 
 def test_what_died_is_reported_after_the_summary(launch: Callable[..., Ran]):
@@ -429,7 +471,7 @@ def test_ctrl_c_at_any_moment_of_the_start_is_one_line(site: Site, tmp_path: Pat
         code, out, err = run(at)
         codes.append(code)
         if code == 130:
-            logged = [line for line in err.splitlines() if not line.startswith(("I ", "W goals of trajectories"))]
+            logged = [line for line in err.splitlines() if not line.startswith(("I ", "W goals of "))]
             assert (out, logged) == ("", ["error: stopped"]), f"step {at} of {steps}"
         else:  # it ran already, and stopped in order
             assert code == 0, err

@@ -171,7 +171,7 @@ def test_a_service_that_is_called_by_name_is_declared() -> None:
 def check_status(status: type[Any], judged: type[Any]) -> None:
     """Look for what the page's scripts read of a recording's state, or say of an episode, that its owner lacks."""
     script = (PAGE / "static/record.js").read_text(encoding="utf-8")
-    taken = ",".join(re.findall(r"(?:(?:words|controls)\(|const )\{(.*?)\}(?:, redo\)|\)| = episode)", script)).split(
+    taken = ",".join(re.findall(r"(?:(?:words|controls)\(|const )\{(.*?)\}(?:, \{ redo|\)| = episode)", script)).split(
         ","
     )
     read = {*re.findall(r"\bepisode\.(\w+)", script), *(each.partition(":")[0].strip() for each in taken)}

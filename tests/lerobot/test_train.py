@@ -85,7 +85,7 @@ def test_small_act_with_cameras_is_refused_before_it_would_download_weights(
 def test_policy_whose_extra_is_missing_is_refused_before_it_starts(small_dataset: Path, tmp_path: Path) -> None:
     message = refused(small_dataset, tmp_path / "out", "--policy", "groot")
     assert message.startswith("policy groot needs ")
-    assert message.endswith("not installed; pip install 'lerobot[groot]'")
+    assert message.endswith('not installed; pip install "lerobot[groot]"')
 
 
 def ended(output: list[str]) -> list[dict[str, object]]:

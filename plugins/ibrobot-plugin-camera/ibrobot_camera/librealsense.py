@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from ibrobot_core.api import MissingDependency
+from ibrobot_core.api import MissingDependency, how_to_install
 
 _PACKAGES = {"libusb-1.0.so.0": "libusb-1.0-0", "libudev.so.1": "libudev1"}
 """System library -> the Debian package that contains it."""
@@ -23,7 +23,7 @@ def load_library() -> Any:
         if sys.platform == "darwin":
             remedy = "pyrealsense2 has no wheels for macOS, use Linux"
         else:
-            remedy = "pip install 'ibrobot-plugin-camera[realsense]'"
+            remedy = how_to_install("ibrobot-plugin-camera[realsense]")
         raise MissingDependency("the Python package pyrealsense2 is not installed", remedy=remedy) from None
     except ImportError as error:
         library = str(error).partition(":")[0]

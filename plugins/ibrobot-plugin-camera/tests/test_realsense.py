@@ -39,7 +39,7 @@ SMALL = RealSenseOptions(width=WIDTH, height=HEIGHT)
     [
         (
             "ModuleNotFoundError(\"No module named 'pyrealsense2'\")",
-            "the Python package pyrealsense2 is not installed; pip install 'ibrobot-plugin-camera[realsense]'",
+            'the Python package pyrealsense2 is not installed; pip install "ibrobot-plugin-camera[realsense]"',
         ),
         (
             "ImportError('libusb-1.0.so.0: cannot open shared object file')",

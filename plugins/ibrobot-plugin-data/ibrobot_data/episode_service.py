@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from ibrobot_data.recording_worker import RecordingWorker
     from ibrobot_data.written import WrittenEpisode
 
+_COUNTED = ("episodes", "successes", "unjudged")
+"""Numbers of episodes in the outcome of a run."""
+
 
 @documented
 @attrs.frozen
@@ -168,6 +171,8 @@ class EpisodeService(Episodes):
         self.on_cue: list[Callable[[Cue], None]] = []
         self._again = False
         """Whether the present episode replaces the last one."""
+        self._last_counted: dict[str, int] = {}
+        """What the last kept episode added to each of `_COUNTED`."""
         self.by_mode = session.simulates_episodes or not session.request.by_operator
         self._lock = threading.Lock()
         config = session.config.recording
@@ -194,9 +199,17 @@ class EpisodeService(Episodes):
 
     @override
     def end(self, outcome: str) -> None:
-        if self.running:
-            self._recording.end(self.judged(outcome), self.faults)
+        if not self.running:
+            return
+        self._recording.end(self.judged(outcome), self.faults)
+        counts, kept = self._session.outcome, outcome != "discarded"
+        if kept and self._again:  # what is recorded again counts once
+            for name, number in self._last_counted.items():
+                setattr(counts, name, getattr(counts, name) - number)
+        before = {name: getattr(counts, name) for name in _COUNTED}
         super().end(outcome)
+        if kept:
+            self._last_counted = {name: getattr(counts, name) - number for name, number in before.items()}
 
     @property
     def saved(self) -> int:

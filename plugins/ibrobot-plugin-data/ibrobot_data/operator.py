@@ -16,6 +16,8 @@ from ibrobot_data.recording_session import Session as SessionEvent
 from ibrobot_data.written import lost_text, rows
 
 _MIB = 1 << 20
+_REDO_S = 8.0
+"""How long a person can record the last episode again before the run ends [s]."""
 _START, _FAILURE, _DISCARD, _REDO = "tab", "f11", "f12", "backspace"
 """The keys; `_START` also ends an episode as a success, and between episodes `_FAILURE` asks for another prompt. None
 of them jogs the robot."""
@@ -67,6 +69,8 @@ class Operator(RunHooks):
         self._continuous = continuous
         self._longest_s = inf if continuous else run.config.contract.max_duration_s
         self._not_before_s = 0.0
+        self._complete_s: float | None = None
+        """Since when all episodes are saved [s]; None while some are not."""
         self._typed: str | None = None
         """The typed part of a prompt; None while none is asked for."""
         self._asked = False
@@ -88,6 +92,8 @@ class Operator(RunHooks):
         if self._service.by_mode:
             return
         service = self._service
+        if service.running or service.waiting:
+            self._complete_s = None
         left_s = self._longest_s - service.elapsed_s()
         if service.running and left_s <= ENDING_S < self._longest_s and service.number != self._warned_of:
             self._warned_of = service.number
@@ -106,6 +112,8 @@ class Operator(RunHooks):
         elif service.waiting:
             self._try(service.follow)
         elif self._count is not None and service.saved - self._spoilt >= self._count:
+            if self._complete_s is None:
+                self._complete_s = self._clock_s()
             if self._is_over():
                 self._run.finish()
         elif self._auto and self._clock_s() >= self._not_before_s:
@@ -114,7 +122,13 @@ class Operator(RunHooks):
     def _is_over(self) -> bool:
         """Whether the last episode is written, its cue has ended, and so has the pause in which it can be redone."""
         heard = not (self._service.writing or self._cues.playing)
-        return heard and (self._auto or self._clock_s() >= self._not_before_s)
+        return heard and (self._auto or (self._clock_s() >= self._not_before_s and self._redo_left_s() <= 0))
+
+    def _redo_left_s(self) -> float:
+        """Time in which a person can record the last of all episodes again [s]; 0 without a person."""
+        if self._complete_s is None or self._auto or not (self._keys or self._run.config.viewer is not None):
+            return 0.0
+        return self._complete_s + _REDO_S - self._clock_s()
 
     @property
     def _spoilt(self) -> int:
@@ -132,6 +146,8 @@ class Operator(RunHooks):
             self._end(lambda: self._service.stop("success"))
         elif key in (_START, _DISCARD) and self._service.waiting:
             self._service.discard()
+        elif key == _START and self._complete_s is not None:
+            self._run.finish()
         elif key == _START and (self._prompt is not None or self._asked):
             self._begin(self._prompt)
         elif key == _START or (key == _FAILURE and self._prompt is None and not self._service.running):
@@ -197,6 +213,8 @@ class Operator(RunHooks):
             return "   ".join(["Tab success", "F11 failure", "F12 discard", *again])
         if service.waiting:
             return "Tab goes back"
+        if self._complete_s is not None:
+            return "   ".join(["Tab end of the session", *again])
         other = ["F11 another task"] if self._prompt is None and self._asked else []
         return "   ".join(["Tab start", *other, *again])
 
@@ -218,6 +236,8 @@ class Operator(RunHooks):
             return f"recording{prompt}, {service.elapsed_s():.0f} s{left}"
         if service.waiting:
             return "ready: recording begins when the robot follows you"
+        if self._complete_s is not None:
+            return f"all episodes are saved; the session ends in {max(0.0, self._redo_left_s()):.0f} s"
         pause_s = self._not_before_s - self._clock_s()
         if self._service.writing and self._service.status().waiting_bytes >= _MIB:
             return f"writing the last episode, {self._service.status().waiting_bytes / _MIB:.0f} MiB are left"

@@ -217,8 +217,30 @@ def test_redo_replaces_the_last_episode_once_the_new_one_is_saved(record: Record
     assert run.service.running, "the last one, in the pause after it"
     run.keys("f11")
     run.step(10)
+    assert not run.finished
+    assert run.operator.help() == "Tab end of the session   Backspace again"
+    assert ("record", "all episodes are saved; the session ends in 8 s") in run.operator.rows()
+    run.step(410)
     assert run.finished
     assert (kept(), run.service.saved) == (["episode_000003", "episode_000005"], 2)
+    summary = run.runtime.summary()
+    assert (summary["episodes"], summary["successes"], summary["unjudged"]) == (2, 1, 0), (
+        "those that were replaced are not"
+    )
+
+
+def test_the_session_ends_at_once_if_the_person_says_so_or_is_not_there(record: Record):
+    run = record(prompt="pick", count=1)
+    run.keys("tab", "tab")
+    run.step(5)
+    assert not run.finished
+    run.keys("tab")
+    assert run.finished
+    alone = record("pad", prompt="pick", count=1, keys=False)
+    for button in ("start", "success"):
+        alone.press(button)
+        alone.step(5)
+    assert alone.finished
 
 
 def test_cues_of_an_episode(record: Record, monkeypatch: pytest.MonkeyPatch):

@@ -9,10 +9,11 @@ from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import Any
 
+from ibrobot_core.api import how_to_install
 from ibrobot_core.app import Child, ComponentFailed
 from ibrobot_lerobot_devices.device import ANSWER, CONNECT, DONE, READY, STAND, TRAFFIC
 
-INSTALL = "pip install lerobot"
+INSTALL = how_to_install("lerobot")
 """The command that installs LeRobot; its devices need extras, e.g. `lerobot[feetech]`."""
 _MODULE = "ibrobot_lerobot_devices.device"
 _END_S = 1.5

@@ -16,7 +16,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from ibrobot_core.api import PolicyError
+from ibrobot_core.api import PolicyError, how_to_install
 from ibrobot_lerobot.checkpoint import (
     ACTION,
     POSTPROCESSOR,
@@ -83,7 +83,7 @@ def export_onnx(path: Path, out: Path) -> Exported:
     except ImportError as error:
         raise PolicyError(
             f"an export needs LeRobot, onnxscript and ONNX Runtime ({error}); install them with: "
-            'pip install "ibrobot-plugin-lerobot[export]" lerobot'
+            f"{how_to_install('ibrobot-plugin-lerobot[export]', 'lerobot')}"
         ) from error
     options = LeRobotPolicyOptions(path, device="cpu", dtype="float32")
     with held_back(_LOG):

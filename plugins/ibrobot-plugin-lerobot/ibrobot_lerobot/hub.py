@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.api import DatasetError, MissingDependency
+from ibrobot_core.api import DatasetError, MissingDependency, how_to_install
 from ibrobot_lerobot.read_contents import dataset_contents
 
 _KINDS = ("meta", "data", "videos", "images")
@@ -140,6 +140,6 @@ def _hub() -> Any:
         import huggingface_hub
     except ImportError:
         raise MissingDependency(
-            "the Hub needs huggingface_hub 1", remedy='pip install "ibrobot-plugin-lerobot[hub]"'
+            "the Hub needs huggingface_hub 1", remedy=how_to_install("ibrobot-plugin-lerobot[hub]")
         ) from None
     return huggingface_hub

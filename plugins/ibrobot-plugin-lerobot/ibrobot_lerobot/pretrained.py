@@ -15,7 +15,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from ibrobot_core.api import MissingDependency, did_you_mean
+from ibrobot_core.api import MissingDependency, did_you_mean, how_to_install
 
 _EXTRAS = {"pi0": "pi", "pi05": "pi", "pi0_fast": "pi", "wall_x": "wallx"}
 """Policy type -> its extra, if their names differ."""
@@ -53,7 +53,7 @@ def check_policy(policy: str, options: Sequence[str], *, download: bool, on_page
     if missing := missing_packages(policy):
         raise MissingDependency(
             f"policy {policy} needs {', '.join(missing)}, not installed",
-            remedy=f"pip install 'lerobot[{_extra(policy)}]'",
+            remedy=how_to_install(f"lerobot[{_extra(policy)}]"),
         )
     if download:
         return

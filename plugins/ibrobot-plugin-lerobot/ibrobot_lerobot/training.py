@@ -10,7 +10,7 @@ from typing import Any, override
 
 import attrs
 
-from ibrobot_core.api import MissingDependency, option
+from ibrobot_core.api import MissingDependency, how_to_install, option
 from ibrobot_core.app import Event, Shown, on_option
 
 LEROBOT = "lerobot[dataset,training]"
@@ -35,7 +35,7 @@ def find_trainer() -> str:
     beside = Path(sys.executable).with_name("lerobot-train")
     program = str(beside) if beside.exists() else shutil.which("lerobot-train")
     if program is None:
-        raise MissingDependency("LeRobot is not installed", remedy=f"pip install '{LEROBOT}'")
+        raise MissingDependency("LeRobot is not installed", remedy=how_to_install(LEROBOT))
     return program
 
 

@@ -11,9 +11,9 @@ from importlib.util import find_spec
 
 from packaging.version import InvalidVersion, Version
 
-from ibrobot_core.api import Check
+from ibrobot_core.api import Check, how_to_install
 
-INSTALL = "pip install lerobot"
+INSTALL = how_to_install("lerobot")
 TESTED: Mapping[str, str] = {
     "0.4.4": "devices need `torch: true`, recording NumPy before 2.3; `ibrobot datasets push` and `pull` need a newer "
     "huggingface_hub than it allows",

@@ -267,7 +267,7 @@ def test_a_training_without_lerobot_names_the_command_that_installs_it(tmp_path:
     root = write(tmp_path / "set", FEATURES, (3,), codec="h264")
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(MissingDependency, match=r"pip install 'lerobot\[dataset,training\]"):
+    with pytest.raises(MissingDependency, match=r"pip install \"lerobot\[dataset,training\]"):
         run(train, root, "--out", tmp_path / "out")
 
 

@@ -387,7 +387,7 @@ def test_plot_takes_the_actions_and_their_joints_from_the_contract(tmp_path):
 def test_plot_without_matplotlib_says_how_to_install_it(tmp_path, monkeypatch):
     path = made(tmp_path)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(RecorderError, match=r"pip install 'ibrobot-plugin-mcap\[plot\]'"):
+    with pytest.raises(RecorderError, match=r"pip install \"ibrobot-plugin-mcap\[plot\]\""):
         run("plot", path)
 
 

@@ -12,7 +12,7 @@ from urllib.parse import unquote
 import attrs
 import mujoco
 
-from ibrobot_core.api import HardwareError
+from ibrobot_core.api import HardwareError, how_to_install
 from ibrobot_mujoco.ros_packages import Packages
 from ibrobot_mujoco.urdf_file import Shape, several
 
@@ -20,7 +20,7 @@ _READS = (".stl", ".obj", ".msh")
 """Meshes that MuJoCo reads."""
 _FLAT = ("coplanar", "at least 4 vertices")
 """MuJoCo's error for a mesh without a volume."""
-_INSTALL = "pip install 'ibrobot-plugin-mujoco[urdf]'"
+_INSTALL = how_to_install("ibrobot-plugin-mujoco[urdf]")
 
 
 @attrs.define

@@ -12,13 +12,13 @@ from typing import Any
 from xml.dom.minidom import Element
 from xml.parsers import expat
 
-from ibrobot_core.api import HardwareError, did_you_mean
+from ibrobot_core.api import HardwareError, did_you_mean, how_to_install
 from ibrobot_mujoco.ros_packages import Packages
 
 PLACE = "ibrobot-place"
 """Attribute with FILE:LINE that each element of an expanded file has."""
 _ARGUMENT = re.compile(r"\$\(arg\s+([^)\s]+)\s*\)|xacro\.arg\(\s*'([^']+)'|<xacro:arg[^>]*\sname\s*=\s*[\"']([^\"']+)")
-_INSTALL = "pip install 'ibrobot-plugin-mujoco[urdf]'"
+_INSTALL = how_to_install("ibrobot-plugin-mujoco[urdf]")
 
 
 def expand_xacro(path: Path, packages: Packages, arguments: Mapping[str, str]) -> str:

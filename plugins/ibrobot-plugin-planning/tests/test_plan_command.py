@@ -151,7 +151,7 @@ def test_plot_needs_matplotlib(yaml: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("ibrobot_planning.commands.plan.find_spec", lambda name: None)
     result = run(yaml, "--from", "up", "--goal", "left", "--plot", "a.png")
     assert isinstance(result.exception, MissingDependency)
-    assert "pip install 'ibrobot-plugin-planning[plot]'" in str(result.exception)
+    assert 'pip install "ibrobot-plugin-planning[plot]"' in str(result.exception)
 
 
 def test_gripper_alone_needs_no_plan(yaml: Path):

@@ -12,7 +12,7 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import MissingDependency, PolicyError
+from ibrobot_core.api import MissingDependency, PolicyError, how_to_install
 from ibrobot_policy_servers.connection import Connection, one_line
 from ibrobot_policy_servers.options import LerobotServerOptions
 from ibrobot_policy_servers.pickles import Made, Named, PickleReader, Reference
@@ -22,7 +22,7 @@ try:
 except ModuleNotFoundError:
     raise MissingDependency(
         "policy lerobot_server needs the Python package grpcio",
-        remedy="pip install 'ibrobot-plugin-policy-servers[grpc]'",
+        remedy=how_to_install("ibrobot-plugin-policy-servers[grpc]"),
     ) from None
 
 _SERVICE = "/transport.AsyncInference/"

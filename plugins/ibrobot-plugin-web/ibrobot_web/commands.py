@@ -31,11 +31,13 @@ _LATE_MS = 200
 """Age from which on messages of the deadman are refused [ms]."""
 _AHEAD_MS = 5
 """How far a page's estimate of the time may be ahead [ms]."""
-_ALWAYS = messages.Finish | messages.Reset | messages.Preview
+_ALWAYS = messages.Finish | messages.Reset | messages.Preview | messages.Abandoned
 """Commands that may be older than an emergency stop: a reset says which stops it clears, the others move nothing."""
 _STOPPED = "an emergency stop came after this command was sent, so it is not carried out; reset, then send it again"
 _PLAN = "/planning/plan"
 _PREVIEW_ROWS = 40
+_RECORD = "/record_episode"
+_BEGINS = (f"{_RECORD}/start", f"{_RECORD}/redo")
 _BLOCKED_S = 6.0
 """Time without a sign of life of a thread that stops go through after which the run ends [s]; control may take 5 s to
 answer."""
@@ -65,6 +67,8 @@ class Commands:
         self._finish = finish
         self._reply = reply
         self._on_failure = on_failure
+        self._begun = 0
+        """Number of the last episode that a page began; 0 before the first."""
         self._stops: queue.SimpleQueue[int | None] = queue.SimpleQueue()
         self._others: queue.SimpleQueue[Sent[RunCommand] | None] = queue.SimpleQueue()
         self._threads = [
@@ -155,9 +159,30 @@ class Commands:
             return {"error": error_text(error)}
 
     def _execute(self, sent: Sent[RunCommand]) -> Any:
-        if isinstance(sent.command, messages.Finish):
-            return self._finish()
+        match sent.command:
+            case messages.Finish():
+                return self._finish()
+            case messages.Abandoned():
+                return self._abandon()
+            case messages.Call(service, request):
+                answer = self._session.bus.call(service, request)
+                if service in _BEGINS and self._session.bus.serves(f"{_RECORD}/status"):
+                    status = self._session.bus.call(f"{_RECORD}/status")
+                    self._begun = status.episode + status.waiting
+                return answer
         return _HANDLERS[type(sent.command)](self._session, sent)
+
+    def _abandon(self) -> None:
+        """End the episode that a page began, if it goes on: nobody could do it, and an idle arm would be recorded."""
+        if not self._begun:
+            return
+        bus = self._session.bus
+        status = bus.call(f"{_RECORD}/status")
+        if status.episode + status.waiting != self._begun or not (status.recording or status.waiting):
+            return
+        ends = ("discard", None) if status.waiting else ("stop", "unknown")
+        bus.call(f"{_RECORD}/{ends[0]}", ends[1])
+        _log.warning("the page that operated is gone: the episode that it began has ended, not judged")
 
 
 def _waiting[T](waiting: queue.SimpleQueue[T]) -> list[T]:
@@ -219,6 +244,5 @@ _HANDLERS: Mapping[type[RunCommand], Handler] = {
     messages.Jog: _jog,
     messages.Release: _release,
     messages.Reset: _reset,
-    messages.Call: lambda session, sent: session.bus.call(sent.command.service, sent.command.request),
     messages.Preview: _preview,
 }

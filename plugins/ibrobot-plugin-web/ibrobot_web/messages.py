@@ -145,6 +145,11 @@ class Finish:
 
 
 @attrs.frozen
+class Abandoned:
+    """Nobody operates any more. The server says so; no page can."""
+
+
+@attrs.frozen
 class Operate:
     """Makes the page the operator."""
 
@@ -161,15 +166,15 @@ class AskTime:
     """Asks for the time of `clock_ms`, which every answer has."""
 
 
-RunCommand = Jog | Release | Reset | Call | Preview | Finish
+RunCommand = Jog | Release | Reset | Call | Preview | Finish | Abandoned
 """Commands that the run carries out."""
-PageCommand = RunCommand | Operate | Resign | AskTime
+PageCommand = Jog | Release | Reset | Call | Preview | Finish | Operate | Resign | AskTime
 """Commands that pages may send."""
 _COMMANDS: Mapping[str, Service[Any, None]] = {
     name: Service(name, kind, type(None), limits=_LIMITS)
     for name, kind in {
         "jog": Jog, "release": Release, "reset": Reset, "call": Call, "preview": Preview, "finish": Finish,
-        "operate": Operate, "resign": Resign, "time": AskTime,
+        "abandoned": Abandoned, "operate": Operate, "resign": Resign, "time": AskTime,
     }.items()
 }  # fmt: skip
 _NAMES = {service.request: name for name, service in _COMMANDS.items()}
@@ -224,7 +229,10 @@ def from_page(text: str) -> Sent[PageCommand]:
         if not isinstance(name := message.get("do"), str):
             raise ValueError("expected an object with a text `do`")
         facts = {key: value for key, value in message.items() if key not in ("id", "stops", "do")}
-        return Sent(number, stops, _read(name, facts))
+        command = _read(name, facts)
+        if not isinstance(command, PageCommand):
+            raise ValueError(f"{name} is not for pages")
+        return Sent(number, stops, command)
     except (ValueError, IbrobotError) as error:
         raise MalformedMessage(str(error), number) from None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -268,3 +269,44 @@ def test_a_press_in_the_future_is_refused(rig: Callable[..., Rig], ahead: int, p
     assert refused["error"] == "the page's time is wrong; press again"
     assert [each.get("error") for each in taken] == [None, None]
     assert len(asked) == 2
+
+
+@pytest.mark.parametrize(
+    ("now", "ends"),
+    [
+        ({"episode": 3, "recording": True}, [("stop", "unknown")]),
+        ({"episode": 3, "recording": False}, []),
+        ({"episode": 4, "recording": True}, []),  # one that another program began
+        ({"episode": 2, "waiting": True}, [("discard", None)]),
+    ],
+    ids=["recording", "ended", "another", "waiting"],
+)
+@pytest.mark.parametrize("begins", ["start", "redo"])
+def test_the_episode_of_a_page_that_is_gone_ends(
+    rig: Callable[..., Rig], begins: str, now: Mapping[str, Any], ends: list[tuple[str, Any]]
+) -> None:
+    status = SimpleNamespace(episode=2, recording=False, waiting=False)
+    called: list[tuple[str, Any]] = []
+
+    def begin(_: object) -> None:
+        status.episode, status.recording = 3, True
+
+    found = rig(
+        {
+            f"/record_episode/{begins}": begin,
+            "/record_episode/status": lambda _: status,
+            **{
+                f"/record_episode/{name}": lambda given, name=name: called.append((name, given))
+                for name in ("stop", "discard")
+            },
+        }
+    )
+    found.send(messages.Abandoned())
+    found.answers(1)
+    assert called == [], "no page has begun one"
+    found.send(messages.Call(f"/record_episode/{begins}"))
+    found.answers(1)
+    vars(status).update({"recording": False, **now})
+    found.send(messages.Abandoned(), messages.Abandoned(), stops=None)
+    found.answers(2)
+    assert called[:1] == ends

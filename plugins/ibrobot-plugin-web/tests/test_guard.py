@@ -13,7 +13,7 @@ import aiohttp
 import pytest
 from ibrobot_http.server import HttpServer, ServerThread
 from ibrobot_testing.http import HttpSuite, Served
-from ibrobot_web.messages import LARGEST_MESSAGE, Call, Jog, Release, RunCommand, Sent, clock_ms
+from ibrobot_web.messages import LARGEST_MESSAGE, Abandoned, Call, Jog, Release, RunCommand, Sent, clock_ms
 from ibrobot_web.options import WebOptions
 from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
@@ -197,6 +197,34 @@ def test_only_the_operator_commands_and_taking_over_is_explicit() -> None:
             assert server.released == released + 1
             assert server.drive.operator is None
             assert "ok" in await call(one, do="operate")
+
+    run(test)
+
+
+@pytest.mark.parametrize("loads_again", [True, False])
+def test_the_run_is_told_that_the_operators_page_is_gone(loads_again: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[Callable[[], None]] = []
+
+    async def test(server: Server) -> None:
+        loop = asyncio.get_running_loop()
+        later = loop.call_later
+        # The wait ends when the test says so.
+        monkeypatch.setattr(
+            loop,
+            "call_later",
+            lambda s, act, *a, **k: waits.append(act) if s == 5.0 and not a else later(s, act, *a, **k),
+        )
+        async with server.browser() as browser:
+            await server.signed_in(browser)
+            socket = await browser.ws_connect("/drive")
+            assert "ok" in await call(socket, **MODE)
+            await socket.close()
+            while not waits:
+                await asyncio.sleep(0.01)
+            if loads_again:
+                await call(await browser.ws_connect("/drive"), **MODE)
+            waits[0]()
+            assert (Abandoned() in server.executed) == (not loads_again)
 
     run(test)
 

@@ -128,6 +128,7 @@ def test_a_stop_is_a_number_and_nothing_else(text: str) -> None:
 COMMANDS = (
     messages.Jog(7, 5, joints={"a": 0.5}, linear=(0.0, 1.0, 0.0)), Release(), Release(3), messages.Reset(),
     messages.Call("/set_mode", "web"), messages.Call("/planning/cancel"), messages.Preview("home"), messages.Finish(),
+    messages.Abandoned(),
 )  # fmt: skip
 """Every command of the run."""
 
@@ -152,6 +153,11 @@ def test_the_run_takes_only_messages_of_the_server(message: dict[str, Any]) -> N
 def test_a_message_of_the_server_with_a_further_key_is_refused(message: Any) -> None:
     with pytest.raises((ValueError, IbrobotError)):
         from_server({**to_run(message), "event": "log"})
+
+
+def test_only_the_server_says_that_nobody_operates() -> None:
+    with pytest.raises(messages.MalformedMessage, match="abandoned is not for pages"):
+        messages.from_page(json.dumps({"id": 1, "do": "abandoned"}))
 
 
 @pytest.mark.parametrize("name", ["operate", "resign", "time", "estop", "log"])

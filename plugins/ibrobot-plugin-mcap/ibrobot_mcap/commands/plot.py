@@ -10,7 +10,7 @@ from typing import Any
 import click
 import numpy as np
 
-from ibrobot_core.api import NS_PER_S, Contract, Float64MultiArray, Image, JointState, RecorderError
+from ibrobot_core.api import NS_PER_S, Contract, Float64MultiArray, Image, JointState, RecorderError, how_to_install
 from ibrobot_core.app import EpisodePath, echo, wrong_input
 
 _THUMBNAILS = 8
@@ -28,7 +28,7 @@ def plot(episode: Path, output: Path | None) -> None:
     try:
         import matplotlib as mpl
     except ImportError:
-        raise RecorderError("plot needs matplotlib: pip install 'ibrobot-plugin-mcap[plot]'") from None
+        raise RecorderError(f"plot needs matplotlib: {how_to_install('ibrobot-plugin-mcap[plot]')}") from None
     mpl.use("Agg")
     output = output or Path(f"{episode.name}.png")
     _draw(PlotData(episode), output)

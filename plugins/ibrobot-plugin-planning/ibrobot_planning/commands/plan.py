@@ -15,7 +15,15 @@ import attrs
 import click
 import numpy as np
 
-from ibrobot_core.api import JointTrajectory, MissingDependency, NotSupported, PlanningError, Robot, Vector
+from ibrobot_core.api import (
+    JointTrajectory,
+    MissingDependency,
+    NotSupported,
+    PlanningError,
+    Robot,
+    Vector,
+    how_to_install,
+)
 from ibrobot_core.app import (
     ControlMode,
     LaunchRequest,
@@ -283,7 +291,7 @@ def _check_plot(path: Path) -> None:
         NotSupported: for an unknown format, or a folder that does not exist.
     """
     if find_spec("matplotlib") is None:
-        raise MissingDependency("--plot needs matplotlib", remedy="pip install 'ibrobot-plugin-planning[plot]'")
+        raise MissingDependency("--plot needs matplotlib", remedy=how_to_install("ibrobot-plugin-planning[plot]"))
     if path.suffix not in (".png", ".svg", ".pdf"):
         raise NotSupported(f"--plot {path}: the format is .png, .svg or .pdf, got {path.suffix or 'no suffix'}")
     if not path.absolute().parent.is_dir():

@@ -6,7 +6,7 @@ import ctypes
 import sys
 from importlib.util import find_spec
 
-from ibrobot_core.api import MissingDependency
+from ibrobot_core.api import MissingDependency, how_to_install
 
 
 def find_engines() -> None:
@@ -19,7 +19,7 @@ def find_engines() -> None:
     if missing:
         raise MissingDependency(
             f"planning around obstacles needs the Python package {missing[0]}, which is not installed",
-            remedy="pip install 'ibrobot-plugin-planning[obstacles]'",
+            remedy=how_to_install("ibrobot-plugin-planning[obstacles]"),
         )
     if sys.platform == "linux":
         try:

@@ -17,6 +17,7 @@ import attrs
 from aiohttp import WSMsgType, web
 
 from ibrobot_web.messages import (
+    Abandoned,
     AskTime,
     Jog,
     MalformedMessage,
@@ -38,6 +39,8 @@ _PER_SECOND = 100
 _BURST = 200
 _OPEN_COMMANDS = 32
 """Commands of a page that may wait for their replies."""
+_ABANDONED_S = 5.0
+"""Time without an operator whose page was closed, e.g. while it loads again, after which the run is told [s]."""
 _STOP_S = 5.0
 """Longest wait for the confirmation of a stop that was sent as a request [s]."""
 
@@ -122,10 +125,15 @@ class Drive:
             if self.operator is driver:
                 self.operator = None
                 self._release()
+                asyncio.get_running_loop().call_later(_ABANDONED_S, self._give_up)
             self.announce()
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
             await socket.close(code=1008 if driver.malformed >= _MALFORMED else 1000)
+
+    def _give_up(self) -> None:
+        if self.operator is None:
+            self._execute(Sent(None, None, Abandoned()), lambda reply: None)
 
     async def serve_stop(self, socket: web.WebSocketResponse, role: str) -> None:
         """Pass on the emergency stops of a page until it is gone; each message is one, a number for its reply."""

@@ -236,7 +236,7 @@ page.stream.addEventListener("connection", ({ detail }) => {
 });
 page.drive.addEventListener("operator", update);
 page.drive.addEventListener("connection", showConnection);
-page.drive.addEventListener("refused", ({ detail }) => toast(detail, "error", false));
+page.drive.addEventListener("refused", ({ detail }) => toast(detail, "error"));
 
 function update() {
   showHeader();

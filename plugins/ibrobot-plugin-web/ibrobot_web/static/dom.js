@@ -81,15 +81,19 @@ export function switchTheme() {
   localStorage.setItem("theme", theme);
 }
 
+const SHOWN_MS = { info: 5000, error: 15000 };
 let announced;
 // Removes all messages, e.g. when another view is shown.
 export function clearToasts() { announced?.replaceChildren(); }
 
-// A message for a few seconds; one that `stays`, as errors do, until the next one or a click.
-export function toast(text, kind = "info", stays = kind === "error") {
-  announced ??= document.body.appendChild(h("div", { class: "toasts", role: "status", "aria-live": "polite" }));
+// A message for a few seconds, or for as long as it is pointed at. The same text once more replaces the first.
+export function toast(text, kind = "info") {
+  // On the page of a run they are above the pictures, where no control is.
+  announced ??= (document.getElementById("stage") ?? document.body).appendChild(h("div", { class: "toasts", role: "status", "aria-live": "polite" }));
   const item = h("div", { class: `toast ${kind}` }, h("p", {}, text),
     h("button", { "aria-label": "Close", onclick: () => item.remove() }, "×"));
-  announced.replaceChildren(...[...announced.children].slice(-2), item);
-  if (!stays) setTimeout(() => item.remove(), 5000);
+  const others = [...announced.children].filter((each) => each.firstChild.textContent !== text);
+  announced.replaceChildren(...others.slice(-2), item);
+  const leave = () => { if (item.matches(":hover, :focus-within")) setTimeout(leave, 1000); else item.remove(); };
+  setTimeout(leave, SHOWN_MS[kind]);
 }

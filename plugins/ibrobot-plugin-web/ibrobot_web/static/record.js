@@ -35,26 +35,32 @@ export class Record {
     this.time.value = Math.min(1, episode.elapsed_s / episode.max_duration_s);
     const redo = services.includes("/record_episode/redo") && episode.can_redo;
     const { recording, waiting, by_mode: byMode } = episode;
-    refresh(this.line, [recording, waiting, byMode, redo, page.operating, ended], () => [this.facts, ...(ended ? [] : this.controls(episode, redo))]);
+    const stopped = page.state?.estop || page.status.faults.length > 0;
+    const complete = episode.wanted !== null && episode.saved >= episode.wanted;
+    refresh(this.line, [recording, waiting, byMode, redo, page.operating, ended, stopped, complete], () => [this.facts, ...(ended ? [] : this.controls(episode, { redo, stopped, complete }))]);
   }
 
-  controls({ recording, waiting, by_mode: byMode, prompt: before }, redo) {
+  controls({ recording, waiting, by_mode: byMode, prompt: before }, { redo, stopped, complete }) {
     const { page } = this;
     if (byMode) return [h("span", { class: "note" }, "The mode begins and ends its episodes itself.")];
-    const button = (text, key, service, request, kind = "") => h("button", {
-      class: kind, disabled: !page.operating, "data-key": key, onclick: () => page.call(`/record_episode/${service}`, request),
+    const button = (text, key, service, request, kind = "", disabled = false) => h("button", {
+      class: kind, disabled: !page.operating || disabled, "data-key": key, onclick: () => page.call(`/record_episode/${service}`, request),
     }, text, h("kbd", { "aria-hidden": "true" }, key.toUpperCase()));
-    const again = (text) => redo ? [button(text, "r", "redo", null)] : [];
+    const again = (text) => redo ? [button(text, "r", "redo", null, "", stopped)] : [];
     if (waiting) return [button("Cancel", "d", "discard", null)];
     if (recording) {
       return [button("Success", "s", "stop", "success", "primary"),
         button("Failure", "f", "stop", "failure"),
         button("Discard", "d", "discard", null, "danger"), ...again("Again")];
     }
+    if (complete) {
+      return [...again("Redo the last"), h("button", { class: "primary", disabled: !page.operating, "data-key": "e", onclick: () => page.command("finish") },
+        "End the session", h("kbd", { "aria-hidden": "true" }, "E"))];
+    }
     const prompt = h("input", { type: "text", "aria-label": "Task", placeholder: "task, e.g. pick the cube" });
     prompt.value = this.prompt ?? before;
     prompt.addEventListener("input", () => { this.prompt = prompt.value; });
-    const form = h("form", {}, prompt, h("button", { class: "primary", disabled: !page.operating, "data-key": "b" }, "Begin",
+    const form = h("form", {}, prompt, h("button", { class: "primary", disabled: !page.operating || stopped, title: stopped ? "Reset the robot first" : null, "data-key": "b" }, "Begin",
       h("kbd", { "aria-hidden": "true" }, "B")));
     form.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -79,5 +85,5 @@ function words({ recording, waiting, saved, wanted, elapsed_s: elapsed, max_dura
   if (waiting) return `Ready: ${saved + 1}${wanted ? ` of ${wanted}` : ""} begins when the robot follows you`;
   const minutes = flow ? Math.floor(free / flow / 60) : Infinity;
   const left = minutes < 120 ? ` · disk for ${minutes} min` : free < 5 * GIB ? ` · ${(free / GIB).toFixed(1)} GiB left` : "";
-  return `${saved}${wanted ? ` of ${wanted}` : ""} saved${left}`;
+  return `${saved}${wanted ? ` of ${wanted}` : ""} saved${wanted && saved >= wanted ? " · the session ends" : ""}${left}`;
 }
