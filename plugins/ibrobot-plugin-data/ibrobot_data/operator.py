@@ -91,27 +91,36 @@ class Operator(RunHooks):
             self._press(self._run.operator_events.get())
         if self._service.by_mode:
             return
-        service = self._service
-        if service.running or service.waiting:
+        if self._service.running or self._service.waiting:
             self._complete_s = None
+        if self._service.running:
+            self._record()
+        else:
+            self._pause()
+
+    def _record(self) -> None:
+        """End the present episode when it is due."""
+        service = self._service
         left_s = self._longest_s - service.elapsed_s()
-        if service.running and left_s <= ENDING_S < self._longest_s and service.number != self._warned_of:
+        if left_s <= ENDING_S < self._longest_s and service.number != self._warned_of:
             self._warned_of = service.number
             service.play("ending")
-        if service.running:
-            if service.failure is not None:
-                self._end(lambda: service.stop("unknown"))
-                self._refuse(f"recording ended: {service.failure}")
-                if self._auto:  # no operator can correct it
-                    self._run.finish()
-            elif self._auto and service.faults:
-                self._end(lambda: service.stop("failure"))
-            elif left_s <= 0.0:
-                self._run.log.info("the episode is %g s long (contract.max_duration_s): ended", self._longest_s)
-                self._end(lambda: service.stop("unknown"))
-        elif service.waiting:
-            self._try(service.follow)
-        elif self._count is not None and service.saved - self._spoilt >= self._count:
+        if service.failure is not None:
+            self._end(lambda: service.stop("unknown"))
+            self._refuse(f"recording ended: {service.failure}")
+            if self._auto:  # no operator can correct it
+                self._run.finish()
+        elif self._auto and service.faults:
+            self._end(lambda: service.stop("failure"))
+        elif left_s <= 0.0:
+            self._run.log.info("the episode is %g s long (contract.max_duration_s): ended", self._longest_s)
+            self._end(lambda: service.stop("unknown"))
+
+    def _pause(self) -> None:
+        """Begin the next episode, or end the run, when it is due."""
+        if self._service.waiting:
+            self._try(self._service.follow)
+        elif self._count is not None and self._service.saved - self._spoilt >= self._count:
             if self._complete_s is None:
                 self._complete_s = self._clock_s()
             if self._is_over():
@@ -236,12 +245,14 @@ class Operator(RunHooks):
             return f"recording{prompt}, {service.elapsed_s():.0f} s{left}"
         if service.waiting:
             return "ready: recording begins when the robot follows you"
-        if self._complete_s is not None:
-            return f"all episodes are saved; the session ends in {max(0.0, self._redo_left_s()):.0f} s"
-        pause_s = self._not_before_s - self._clock_s()
         if self._service.writing and self._service.status().waiting_bytes >= _MIB:
             return f"writing the last episode, {self._service.status().waiting_bytes / _MIB:.0f} MiB are left"
-        if pause_s > 0:
+        return self._state_of_pause()
+
+    def _state_of_pause(self) -> str:
+        if self._complete_s is not None:
+            return f"all episodes are saved; the session ends in {max(0.0, self._redo_left_s()):.0f} s"
+        if (pause_s := self._not_before_s - self._clock_s()) > 0:
             return f"reset the scene, {pause_s:.0f} s"
         return "waiting: Tab starts" if self._keys and not (self._auto or self._service.by_mode) else "waiting"
 

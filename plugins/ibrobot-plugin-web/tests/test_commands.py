@@ -291,16 +291,13 @@ def test_the_episode_of_a_page_that_is_gone_ends(
     def begin(_: object) -> None:
         status.episode, status.recording = 3, True
 
-    found = rig(
-        {
-            f"/record_episode/{begins}": begin,
-            "/record_episode/status": lambda _: status,
-            **{
-                f"/record_episode/{name}": lambda given, name=name: called.append((name, given))
-                for name in ("stop", "discard")
-            },
-        }
-    )
+    services: dict[str, Callable[[Any], Any]] = {
+        begins: begin,
+        "status": lambda _: status,
+        "stop": lambda given: called.append(("stop", given)),
+        "discard": lambda given: called.append(("discard", given)),
+    }
+    found = rig({f"/record_episode/{name}": handler for name, handler in services.items()})
     found.send(messages.Abandoned())
     found.answers(1)
     assert called == [], "no page has begun one"

@@ -24,7 +24,7 @@ export class JobCard {
     this.problems = h("div", {});
     this.made = h("div", { class: "row" });
     this.output = h("pre", { class: "output", tabindex: "0", "aria-label": "Output" });
-    this.details = h("details", {}, h("summary", {}, "Output"), this.output);
+    this.details = h("details", { ontoggle: () => { this.output.scrollTop = this.output.scrollHeight; } }, h("summary", {}, "Output"), this.output);
     this.element = h("div", { class: "card job" }, h("div", { class: "row" }, this.title, this.state), this.progress,
       this.facts, this.question.element, this.error, this.plot, this.problems, this.made, this.controls, this.details);
   }
