@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import queue
+import re
 import signal
 import subprocess
 import threading
@@ -27,11 +28,12 @@ PATIENT = ("hardware.lost_replies=1000", "hardware.retries=200", "control.state_
 def test_cube_lies_in_the_bin_and_only_the_emulator_says_so(ibrobot: tuple[str, ...], tmp_path: Path) -> None:
     link = tmp_path / "follower"
     environment = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path / "config"), "IBROBOT_FOLLOWER_PORT": str(link)}
-    emulate = (*ibrobot, "feetech", "emulate", "--physics", ROBOT, "--throttle")
     launch = [*ibrobot, "launch", ROBOT, "--headless", "--json", "--duration", "100"]
     launch += [word for each in PATIENT for word in ("--set", each)]
+    refused = subprocess.run(launch, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    (remedy,) = re.findall("`ibrobot (.*?)`", refused.stderr.splitlines()[-1])  # it works as it is printed
     with subprocess.Popen(
-        (*emulate, "--link", str(link), "--calibration", "emulated"),
+        (*ibrobot, *remedy.replace("CONFIG", ROBOT).split(), "--throttle"),
         env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

@@ -35,7 +35,7 @@ from ibrobot_feetech.bus import RETURN_DELAY_S, FeetechBus
 from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, ServoFault, TorqueStaysOn
 from ibrobot_feetech.health import Health, Measured, SteadyLoad
 from ibrobot_feetech.options import TOOL, FollowerOptions, check_follower
-from ibrobot_feetech.port import no_such_port
+from ibrobot_feetech.port import emulate
 from ibrobot_feetech.protocol import OVER_CURRENT, OVERLOAD, faults
 from ibrobot_feetech.supply import supply
 from ibrobot_feetech.sync import Replies, SyncReader, SyncWriter
@@ -80,10 +80,11 @@ class FeetechFollower(Hardware):
         try:
             calibration = load_calibration(options.calibration, ctx.joints, tool=TOOL)
         except IbrobotError as error:
-            is_there = calibration_path(options.calibration).exists() or Path(options.port).exists()
-            if is_there or options.port.startswith("/dev/"):
+            if options.port.startswith("/dev/") or calibration_path(options.calibration).exists():
                 raise
-            raise HardwareError(f"{options.port}: {no_such_port(options.port)}, which makes the calibration") from error
+            known = "its emulator has no calibration" if Path(options.port).exists() else "there is no such port"
+            command = emulate(options.port, options.calibration)
+            raise HardwareError(f"{options.port}: {known}; for an emulated arm run {command}") from error
         closed = {joint: float(lower[joint]) for joint in options.anchored if joint in lower}
         self._arm = Arm(ctx.joints, calibration, closed)
         self._bus = FeetechBus(

@@ -28,9 +28,14 @@ _MOST_AWAITED = 255
 def no_such_port(path: str) -> str:
     """What to say of a port that does not exist; one outside /dev is that of an emulator."""
     known = "there is no such port"
-    if path.startswith("/dev/"):
-        return known
-    return f"{known}; for an emulated arm run `ibrobot feetech emulate --link {path}` in another terminal"
+    return known if path.startswith("/dev/") else f"{known}; for an emulated arm run {emulate(path)}"
+
+
+def emulate(path: str, calibration: str | None = None) -> str:
+    """The command that emulates an arm at a port, for messages."""
+    command = f"`ibrobot feetech emulate --physics CONFIG --link {path} --calibration {calibration or 'NAME'}`"
+    of_robot = "" if calibration else ", its calibration as NAME"
+    return f"{command} in another terminal, with the robot YAML as CONFIG{of_robot}"
 
 
 class SerialPort:

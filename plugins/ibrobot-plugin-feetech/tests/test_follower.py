@@ -188,9 +188,13 @@ class TestSetUp:
 
     def test_without_an_emulator_the_error_names_its_command(self, tmp_path: Path) -> None:
         options = FollowerOptions(port=str(tmp_path / "arm"), calibration=str(tmp_path / "none.json"))
-        command = f"run `ibrobot feetech emulate --link {options.port}` in another terminal"
-        with pytest.raises(HardwareError, match=re.escape(command)):
-            FeetechFollower(options, control_context())
+        ends = f"--link {options.port} --calibration {options.calibration}` in another terminal"
+        command = f"run `ibrobot feetech emulate --physics CONFIG {ends}"
+        for known in ("there is no such port", "its emulator has no calibration"):
+            with pytest.raises(HardwareError, match=re.escape(command)) as error:
+                FeetechFollower(options, control_context())
+            assert known in str(error.value)
+            Path(options.port).touch()
 
     def test_no_port_says_what_to_do(self, calibration_file: Path) -> None:
         options = FollowerOptions(port="/dev/ttyNONE", calibration=str(calibration_file))
