@@ -51,12 +51,12 @@ class Seen:
 
 
 def start(page: Any, folder: str = "blind") -> None:
-    page.get_by_role("link", name="Eval", exact=True).click()
+    page.get_by_role("link", name="Evaluate", exact=True).click()
     page.get_by_label("arm.yaml").check()
     page.get_by_label("Modes").fill(", ".join(NAMES))
     page.get_by_label("Episodes", exact=True).fill("2")
     page.get_by_label("Folder").fill(folder)
-    page.get_by_role("button", name="Eval", exact=True).click()
+    page.get_by_role("button", name="Evaluate", exact=True).click()
 
 
 def question(page: Any, text: str) -> None:
@@ -119,13 +119,13 @@ def first_day(page: Any, seen: Seen, folder: Path) -> None:
 
 def second_day(page: Any, seen: Seen) -> None:
     """The other trials, until the last one runs."""
-    page.get_by_role("button", name="Eval", exact=True).click()  # the form is still filled in
+    page.get_by_role("button", name="Evaluate", exact=True).click()  # the form is still filled in
     judge(page, 3, "f")
     question(page, "trial 4 (start 2 of 2)")
     page.get_by_role("link", name="Episodes").click()
     page.get_by_text("No episodes in the opened folders").wait_for(timeout=WAIT_MS)
     seen.look()
-    page.get_by_role("link", name="Eval", exact=True).click()
+    page.get_by_role("link", name="Evaluate", exact=True).click()
     page.get_by_role("button", name="Begin the trial").click()
     question(page, "outcome")
     page.keyboard.press("Escape")  # the emergency stop
@@ -162,7 +162,7 @@ def test_operator_judges_blind_on_the_page_and_goes_on_after_a_crash(site: Site,
         check_report(out)
         file = sorted((out / "trials").glob("*.json"))[-1]
         file.write_text(json.dumps(json.loads(file.read_text()) | {"seal": "0"}))
-        page.get_by_role("button", name="Eval", exact=True).click()
+        page.get_by_role("button", name="Evaluate", exact=True).click()
         page.get_by_text("so they are not blind").wait_for(timeout=WAIT_MS)
         browser.close()
     assert not seen.errors

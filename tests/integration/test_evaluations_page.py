@@ -66,7 +66,7 @@ def test_an_evaluation_is_looked_at_on_the_page(tmp_path: Path) -> None:
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda line: errors.extend([line.text] * (line.type == "error")))
         page.goto(address)
-        page.get_by_role("link", name="Evaluations").click()
+        page.get_by_role("link", name="Results").click()
         page.get_by_text("broken/report.json: is not a report of an evaluation").wait_for(timeout=WAIT_MS)
         page.get_by_role("link", name="night").click()
         page.get_by_role("heading", name="Failures (2)").wait_for(timeout=WAIT_MS)
@@ -78,7 +78,7 @@ def test_an_evaluation_is_looked_at_on_the_page(tmp_path: Path) -> None:
         assert command.inner_text().startswith("ibrobot record arm.yaml --sim --lockstep --headless")
         page.get_by_role("button", name="Play the recording of hasty, seed 0").click()
         plays(page)
-        assert page.title() == "ibrobot: Evaluations"
+        assert page.title() == "ibrobot: Results"
         browser.close()
     assert not errors
 

@@ -33,7 +33,7 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
     """Evaluations."""
     yield ReportDescriptor(
         KIND,
-        "Evaluations",
+        "Results",
         _is_evaluation,
         Late("ibrobot_eval.contents:lines_of"),
         Late("ibrobot_eval.contents:read_contents"),

@@ -12,6 +12,7 @@ from typing import Any
 
 import aiohttp
 import pytest
+from ibrobot_web.ui.server import views
 from ui_server import UiServer, run_ui
 
 PYTHON = (sys.executable, "-c")
@@ -31,6 +32,15 @@ def test_every_view_has_its_module_for_browsers(tmp_path: Path) -> None:
             assert "export class View" in await server.text(f"/static/ui/{view['module']}.js")
 
     run(tmp_path, test)
+
+
+def test_views_stand_in_groups_in_the_order_of_the_work() -> None:
+    groups: dict[str, list[str]] = {}
+    for view in views():
+        groups.setdefault(view["group"], []).append(view["name"])
+    assert list(groups) == ["Set up", "Record", "Learn", "Evaluate", ""]
+    assert groups["Learn"] == ["job-convert", "datasets", "job-train", "policies"]
+    assert groups["Evaluate"][0] == "job-eval"
 
 
 def test_nothing_is_served_without_a_session_and_watching_changes_nothing(tmp_path: Path) -> None:

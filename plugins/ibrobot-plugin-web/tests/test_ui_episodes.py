@@ -57,6 +57,23 @@ def test_the_motion_and_plots_are_thinned(opened: Playback) -> None:
         opened.series("/imu")
 
 
+def test_an_overview_counts_what_the_folders_contain(episode: Path, tmp_path: Path) -> None:
+    (tmp_path / "my_arm.yaml").write_text("# An arm.\nrobot:\n  name: mine\n")
+
+    async def test(server: UiServer) -> None:
+        found = await server.get("robots/overview")
+        assert found["robots"] == [{"robot": "my_arm.yaml", "summary": "An arm"}]
+        assert (found["episodes"], found["unjudged"], found["datasets"], found["policies"]) == (1, 0, [], [])
+        assert found["newest"][0] | {"began_s": None} == {
+            "path": "pick/episodes/episode_000001",
+            "task": "pick",
+            "outcome": "success",
+            "began_s": None,
+        }
+
+    run_ui([tmp_path], test)
+
+
 def brightness(picture: Any) -> int:
     import simplejpeg
 

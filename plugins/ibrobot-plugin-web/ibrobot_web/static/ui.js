@@ -120,8 +120,11 @@ function address() {
 
 async function showView() {
   const [name, rest] = address();
-  for (const link of $("nav").children) {
-    if (link.dataset.name === name) link.setAttribute("aria-current", "page");
+  for (const link of $("nav").querySelectorAll("a")) {
+    if (link.dataset.name === name) {
+      link.setAttribute("aria-current", "page");
+      $("nav").scrollTo({ left: link.offsetLeft - 60 }); // on a phone it is one row that scrolls
+    }
     else link.removeAttribute("aria-current");
   }
   document.title = `ibrobot: ${ui.session.views.find((view) => view.name === name).title}`;
@@ -163,6 +166,9 @@ window.addEventListener("focus", () => shown?.show?.(true, address()[1]));
 ui.session = await ui.get("session");
 say($("folder"), ui.session.folders.join(" · "));
 say($("role"), ui.drives ? "" : "watching only");
-$("nav").append(...ui.session.views.map(({ name, title }) => h("a", { href: `#${name}`, "data-name": name }, title)));
+const groups = Map.groupBy(ui.session.views, ({ group }) => group);
+$("nav").append(...[...groups].map(([group, members]) => h("div", group ? { role: "group", "aria-label": group } : {},
+  group ? h("span", { class: "heading", "aria-hidden": "true" }, group) : null,
+  ...members.map(({ name, title }) => h("a", { href: `#${name}`, "data-name": name }, title)))));
 ui.follow();
 showView();

@@ -31,6 +31,8 @@ from ibrobot_web.ui.robots import robot_names, robot_of
 _FLAG = re.compile(r"(?<![\w.])(?P<flag>--[a-z][a-z-]*)(?![\w.-])(?: (?P<value>[\w-]+))?")
 _COMMAND = re.compile(r"`ibrobot ([a-z]+(?: [a-z]+)?)[^`]*`")
 _COMMAND_S = 600.0
+_TITLES = {"eval": "Evaluate"}
+"""Command -> what the page calls it, where that is not its last word."""
 WITH_ROBOT = frozenset({"record"})
 """Commands that run a robot, with a view of their own in which it is chosen."""
 
@@ -43,7 +45,7 @@ def job_commands() -> list[str]:
 
 def title_of(name: str) -> str:
     """What the page calls a command, e.g. `Trim` for `episodes trim`."""
-    return name.rpartition(" ")[2].capitalize()
+    return _TITLES.get(name) or name.rpartition(" ")[2].capitalize()
 
 
 def label_of(name: str, field: attrs.Attribute[Any]) -> str:

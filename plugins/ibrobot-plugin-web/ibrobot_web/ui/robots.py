@@ -24,6 +24,7 @@ from ibrobot_core.app import (
 from ibrobot_web.modes import modes_json
 from ibrobot_web.ui.context import Routes, Ui
 from ibrobot_web.ui.copying import variables_of, write_copy
+from ibrobot_web.ui.recordings import Episodes, find_policies, find_recordings
 
 _ROBOT = re.compile(r"^robot:", re.MULTILINE)
 _SUMMARY = re.compile(r"\A(?:#[^\n]*\n)+")
@@ -132,6 +133,22 @@ def _mode_for_page(modes: Iterable[Mapping[str, Any]], default: str) -> str:
     return next(iter(own), default if default in names or not names else names[0])
 
 
+def overview(ui: Ui) -> dict[str, Any]:
+    """What the opened folders contain, for a first look: counts, and the newest episodes."""
+    recordings = find_recordings(ui.folders)
+    rows = [ui.keep(Episodes).row(ui, path) for path in recordings.episodes]
+    newest = sorted(rows, key=lambda row: row["began_s"] or 0.0, reverse=True)
+    return {
+        "robots": [{"robot": ui.folders.name(path), "summary": _summary(_head(path))} for path in _yamls(ui)],
+        "episodes": len(rows),
+        "unjudged": sum(row["outcome"] == "unknown" for row in rows),
+        "newest": [{name: row[name] for name in ("path", "task", "outcome", "began_s")} for row in newest[:3]],
+        "datasets": list(map(ui.folders.name, recordings.datasets)),
+        "policies": [ui.folders.name(path) for path, _ in find_policies(ui)],
+        "reports": sum(map(len, recordings.reports.values())),
+    }
+
+
 def launch(ui: Ui, robot: str, sim: bool = False, mode: str = "") -> dict[str, int]:
     """Launch a robot with its page."""
     title = f"{Path(robot).stem}{' in simulation' if sim else ''}"
@@ -196,6 +213,7 @@ def read_address(line: str) -> Mapping[str, Any] | None:
 
 ROUTES: Routes = {
     "GET /list": listing,
+    "GET /overview": overview,
     "GET /check": check,
     "GET /copying": copying,
     "POST /copy": copy,

@@ -23,13 +23,16 @@ from ibrobot_web.server.app import STATIC
 from ibrobot_web.ui.context import File, Handler, Routes, Ui, read_facts, read_query
 from ibrobot_web.ui.forms import job_commands, takes, title_of
 
-VIEWS = ("robots", "devices", "record", "episodes", "datasets", "policies", "jobs")
-"""The views. The module `ibrobot_web.ui.NAME` has the `ROUTES` of one, and `static/ui/NAME.js` shows it. Each command
-that runs as a job has a view, too, all by `static/ui/command.js`; each kind of report has one, all by
-`static/ui/reports.js`."""
-SHOWN = {"episodes": "episodes", "dataset": "datasets", "policy": "policies"}
-"""Kind of a command's input -> the view that shows it."""
-ROUTED = (*VIEWS, "reports")
+GROUPS = {
+    "Set up": ("robots", "devices"), "Record": ("record", "episodes"), "Learn": ("datasets", "policies"),
+    "Evaluate": (), "": ("jobs",),
+}  # fmt: skip
+"""Group of views, in the order of the work -> views. The module `ibrobot_web.ui.NAME` has the `ROUTES` of one, and
+`static/ui/NAME.js` shows it. Each command that runs as a job has a view, too, all by `static/ui/command.js`; each kind
+of report has one, all by `static/ui/reports.js`."""
+SHOWN = {"episodes": "datasets", "dataset": "policies"}
+"""Kind of a command's input -> the view before which its own stands; others are in the last group."""
+ROUTED = (*(name for names in GROUPS.values() for name in names), "reports")
 """The modules with `ROUTES`."""
 LARGEST_REQUEST = 1 << 20
 """Largest body of a request [bytes]."""
@@ -53,21 +56,7 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
 
     async def session(request: web.Request) -> web.StreamResponse:
         folders = [str(path) for path in ui.folders.paths]
-        views: list[dict[str, Any]] = [{"name": name, "title": name.capitalize(), "module": name} for name in VIEWS]
-        jobs = [
-            {"name": f"job-{name}", "title": title_of(name), "module": "command", "command": name, "takes": takes(name)}
-            for name in job_commands()
-        ]
-        reports = [
-            {"name": f"report-{each.name}", "title": each.title, "module": "reports", "report": each.name}
-            for each in installed_plugins().reports
-        ]
-        for job in jobs:  # after its input's view, in the order of the work
-            names = [view["name"] for view in views]
-            taken = next((SHOWN[kind] for kind in job["takes"] if kind in SHOWN), names[-2])
-            views.insert(names.index(taken) + 1, job)
-        views[-1:-1] = reports  # before the last one, which shows all jobs
-        return web.json_response({"role": guard.role(request), "folders": folders, "views": views})
+        return web.json_response({"role": guard.role(request), "folders": folders, "views": views()})
 
     async def follow(request: web.Request) -> web.StreamResponse:
         socket = web.WebSocketResponse(heartbeat=_HEARTBEAT_S, max_msg_size=LARGEST_REQUEST, compress=False)
@@ -82,6 +71,29 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
             method, path = route.split()
             app.router.add_route(method, f"/api/{name}{path}", functools.partial(_answer, handler, guard))
     return app
+
+
+def views() -> list[dict[str, Any]]:
+    """The views for browsers, in the order of the work."""
+    made: list[dict[str, Any]] = [
+        {"name": name, "title": name.capitalize(), "module": name, "group": group}
+        for group, names in GROUPS.items()
+        for name in names
+    ]
+    last = list(GROUPS)[-2]
+    for command in job_commands():
+        job = {
+            "name": f"job-{command}", "title": title_of(command), "module": "command", "command": command,
+            "takes": takes(command),
+        }  # fmt: skip
+        before = next((SHOWN[kind] for kind in job["takes"] if kind in SHOWN), "")
+        at = next((i for i, view in enumerate(made) if view["name"] == before), len(made) - 1)
+        made.insert(at, {**job, "group": made[at]["group"] or last})
+    made[-1:-1] = [
+        {"name": f"report-{each.name}", "title": each.title, "module": "reports", "report": each.name, "group": last}
+        for each in installed_plugins().reports
+    ]
+    return made
 
 
 def routes_of(view: str) -> Routes:

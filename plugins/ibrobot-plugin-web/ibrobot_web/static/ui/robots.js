@@ -4,6 +4,7 @@ import { h } from "../dom.js";
 import { Chooser } from "./chooser.js";
 import { Copy } from "./copy.js";
 import { JobList, RUNS } from "./job.js";
+import { Overview } from "./overview.js";
 
 export class View {
   constructor(ui) {
@@ -11,12 +12,13 @@ export class View {
     this.runs = new JobList(ui, "No run yet. A run opens a page of its own, which shows and drives the robot.", ...RUNS);
     this.chooser = new Chooser(ui, () => this.enable());
     this.copy = new Copy(ui, this.chooser);
+    this.overview = new Overview(ui);
   }
 
   mount(element) {
     this.launch = h("button", { class: "primary", disabled: true, onclick: () => this.start() }, "Launch");
     this.hint = h("p", { class: "note" });
-    element.append(h("h2", {}, "Robots"),
+    element.append(this.overview.element, h("h2", {}, "Robots"),
       h("div", { class: "columns" },
         h("section", { class: "card", "aria-label": "Choice" }, this.chooser.fields,
           h("div", { class: "row" }, this.launch, h("a", { class: "button", href: "#record" }, "Record episodes")), this.hint, this.copy.element),
@@ -28,6 +30,7 @@ export class View {
     if (!shown) return;
     this.chooser.load();
     this.runs.show();
+    this.overview.load();
   }
 
   enable() {
@@ -44,5 +47,8 @@ export class View {
     this.enable();
   }
 
-  job(job) { this.runs.update(job); }
+  job(job) {
+    this.runs.update(job);
+    if (job.state !== "running") this.overview.load();
+  }
 }
