@@ -32,11 +32,9 @@ extensions = [
     "sphinx.ext.doctest",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
-    "sphinxcontrib.mermaid",
 ]
 copybutton_prompt_text = "$ "
 copybutton_line_continuation_character = "\\"
-myst_fence_as_directive = ["mermaid"]  # hosts of repositories draw ```mermaid, too
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
 html_theme = "furo"

@@ -23,7 +23,7 @@ def plugin_page() -> Iterator[str]:
     yield "# Plugins\n"
     yield "This page lists what core and the plugins of the repository offer. Each type links to its"
     yield "options. `ibrobot plugins` prints the list for your own installation.\n"
-    yield from _drawing(sorted({package for package, _ in shown if package != CORE}))
+    yield from _needs(sorted({package for package, _ in shown if package != CORE}))
     for package, name in shown:
         yield f"## {package}\n"
         yield f"{metadata(package)['Summary']}.\n"
@@ -34,27 +34,16 @@ def plugin_page() -> Iterator[str]:
         yield ""
 
 
-def _drawing(plugins: list[str]) -> Iterator[str]:
-    """A drawing of the packages, from their metadata: plugins with the libraries that they share, on top of core."""
-    yield "All packages need `ibrobot-core`; the arrows show what else of the project they need.\n"
-    yield "```mermaid"
-    yield "flowchart LR"
-    alone = []
+def _needs(plugins: list[str]) -> Iterator[str]:
+    """A table of what the packages need of the project, from their metadata."""
+    yield "All packages need `ibrobot-core`; these need more of the project:\n"
+    yield "| package | needs |"
+    yield "|---|---|"
     for plugin in plugins:
-        needed = {re.split(r"[^\w-]", each)[0] for each in requires(plugin) or () if "extra ==" not in each} - {
-            CORE,
-            plugin,
-        }
-        libraries = sorted(name for name in needed if name.startswith("ibrobot-"))
-        name = plugin.removeprefix("ibrobot-plugin-")
-        if not libraries:
-            alone.append(f"    {name}")
-        for library in libraries:
-            yield f"  {name} --> {library}[[{library}]]"
-    yield '  subgraph alone ["core alone"]'
-    yield from alone
-    yield "  end"
-    yield "```\n"
+        needed = {re.split(r"[^\w-]", each)[0] for each in requires(plugin) or () if "extra ==" not in each}
+        if libraries := sorted(name for name in needed - {CORE, plugin} if name.startswith("ibrobot-")):
+            yield f"| `{plugin}` | {', '.join(f'`{name}`' for name in libraries)} |"
+    yield ""
 
 
 def _offers(manager: pluggy.PluginManager) -> Iterator[tuple[str, str, str]]:

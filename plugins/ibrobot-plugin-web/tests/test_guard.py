@@ -202,7 +202,7 @@ def test_only_the_operator_commands_and_taking_over_is_explicit() -> None:
 
 
 @pytest.mark.parametrize("loads_again", [True, False])
-def test_the_run_is_told_that_the_operators_page_is_gone(loads_again: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_run_learns_that_the_operators_page_is_gone(loads_again: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     waits: list[Callable[[], None]] = []
 
     async def test(server: Server) -> None:

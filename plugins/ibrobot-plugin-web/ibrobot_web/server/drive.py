@@ -40,7 +40,7 @@ _BURST = 200
 _OPEN_COMMANDS = 32
 """Commands of a page that may wait for their replies."""
 _ABANDONED_S = 5.0
-"""Time without an operator whose page was closed, e.g. while it loads again, after which the run is told [s]."""
+"""Time without an operator whose page was closed, e.g. while it loads again, until the run gets `Abandoned` [s]."""
 _STOP_S = 5.0
 """Longest wait for the confirmation of a stop that was sent as a request [s]."""
 
