@@ -19,8 +19,9 @@ from typing import Any
 import figures
 
 from ibrobot_core.config import load_config
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101_blind.yaml"

@@ -31,8 +31,9 @@ from ibrobot_core.clock import RealClock
 from ibrobot_core.config import load_config
 from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import Punctuality
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.units import ns
 

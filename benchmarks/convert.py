@@ -86,10 +86,10 @@ def record(folder: Path, frames: int, episode: int) -> None:
     from ibrobot_testing.contexts import host_context
 
     from ibrobot_core.clock import SteppedClock
-    from ibrobot_core.config.schema import Align, ImageSpec
     from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
     from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
     from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
+    from ibrobot_core.schema import Align, ImageSpec
 
     recorder_clock = SteppedClock(start_ns := 1_700_000_000_000_000_000 + episode * 60_000_000_000)
     state = "sensor_msgs/msg/JointState"

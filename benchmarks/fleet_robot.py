@@ -12,15 +12,6 @@ from ibrobot_testing import host_context, make_robot
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import RealClock
-from ibrobot_core.config.schema import (
-    ActionSpec,
-    ContractConfig,
-    ControlMode,
-    DispatchConfig,
-    ExecutorConfig,
-    ObservationSpec,
-    RobotConfig,
-)
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.inference.client import Chunk, EngineClient
@@ -29,6 +20,15 @@ from ibrobot_core.messages import Header, JointState
 from ibrobot_core.options import NoOptions
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.robot import Vector
+from ibrobot_core.schema import (
+    ActionSpec,
+    ContractConfig,
+    ControlMode,
+    DispatchConfig,
+    ExecutorConfig,
+    ObservationSpec,
+    RobotConfig,
+)
 
 RATE_HZ = 30.0
 

@@ -29,8 +29,9 @@ from figures import report
 
 from ibrobot_core.config import load_config
 from ibrobot_core.interfaces import Context, Sensor
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import Header, Image
 from ibrobot_core.plugins import Registry, discover
 

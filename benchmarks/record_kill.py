@@ -28,11 +28,11 @@ from ibrobot_testing.contexts import host_context
 from mcap.reader import make_reader
 
 from ibrobot_core.clock import RealClock
-from ibrobot_core.config.schema import Align, ImageSpec
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeStart, Feature
 from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState
 from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.schema import Align, ImageSpec
 
 JOINTS, CAMERA, COMMANDS = "/joint_states", "/camera/top/image_raw", "/commands"
 SIZE = 320 * 240 * 3

@@ -28,8 +28,9 @@ from ibrobot_testing.ports import free_port
 from made_up import plugin
 
 from ibrobot_core.config import load_config
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import Float64MultiArray
 from ibrobot_core.plugins import discover
 from ibrobot_core.units import seconds

@@ -26,17 +26,17 @@ from flow_policy import FlowPolicy
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, load_config
-from ibrobot_core.config.schema import DispatchConfig
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.control.host import InlineControl
-from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient, run_policy
 from ibrobot_core.inference.engine import LocalEngine
 from ibrobot_core.interfaces import Policy
+from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 from ibrobot_core.messages import Header, JointState
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.robot import Vector
+from ibrobot_core.schema import DispatchConfig
 from ibrobot_core.units import NS_PER_S, ns
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101_blind.yaml"

@@ -29,7 +29,13 @@ from ibrobot_testing import make_robot
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.config.schema import (
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.dispatch.dispatcher import Dispatcher
+from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
+from ibrobot_core.interfaces import PolicySpec
+from ibrobot_core.messages import Header, JointState
+from ibrobot_core.options import NoOptions
+from ibrobot_core.schema import (
     ActionSpec,
     ContractConfig,
     ControlMode,
@@ -38,12 +44,6 @@ from ibrobot_core.config.schema import (
     ObservationSpec,
     RobotConfig,
 )
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.dispatch.dispatcher import Dispatcher
-from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
-from ibrobot_core.interfaces import PolicySpec
-from ibrobot_core.messages import Header, JointState
-from ibrobot_core.options import NoOptions
 from ibrobot_core.units import ns
 
 RATE_HZ, CHUNK = 30.0, 50

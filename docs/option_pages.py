@@ -12,10 +12,10 @@ from ibrobot_testing import declared_services
 
 from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config.describe import described, type_name
-from ibrobot_core.config.schema import SECTIONS
 from ibrobot_core.convert import is_mapping, is_sequence
 from ibrobot_core.options import fields
 from ibrobot_core.plugins import KINDS, installed_plugins
+from ibrobot_core.schema import SECTIONS
 
 
 def config_page() -> Iterator[str]:
@@ -143,7 +143,7 @@ def _class_lines(path: str, kind: type[Any], shown: set[type]) -> Iterator[str]:
 
 def _types(kind: type[ComponentConfig]) -> Iterator[str]:
     registry = installed_plugins()
-    found = [each for each in registry.of_kind(kind.plugin_kind) if kind.takes(each)]
+    found = [each for each in registry.of_kind(kind.plugin_kind) if each.fits(kind)]
     links = [f"[`{each.type}`](#{_options_anchor(kind.plugin_kind, each.type)})" for each in found]
     yield f"`{kind.type_key()}` is one of {', '.join(links)}, each with options of its own.\n"
 

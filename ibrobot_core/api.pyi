@@ -30,8 +30,7 @@ from ibrobot_core.options import (
     OptionFault as OptionFault,
     did_you_mean as did_you_mean,
 )
-from ibrobot_core.descriptors import StreamOptions as StreamOptions
-from ibrobot_core.component_config import SceneConfig as SceneConfig
+from ibrobot_core.descriptors import StreamOptions as StreamOptions, SceneConfig as SceneConfig
 
 # The robot
 from ibrobot_core.robot import Robot as Robot, Joint as Joint, Description as Description, Vector as Vector

@@ -21,7 +21,7 @@ from ibrobot_core.config import (
     from_document as from_document,
 )
 from ibrobot_core.config.expand import VARIABLE as VARIABLE
-from ibrobot_core.config.schema import (
+from ibrobot_core.schema import (
     ControlMode as ControlMode,
     ExecutorConfig as ExecutorConfig,
     RecordingConfig as RecordingConfig,
@@ -69,29 +69,29 @@ from ibrobot_core.plugins import (
 )
 
 # A run
-from ibrobot_core.launch.session import (
+from ibrobot_core.launch.session import Session as Session
+from ibrobot_core.interfaces.run import (
     LaunchRequest as LaunchRequest,
-    Session as Session,
+    RunView as RunView,
+    StreamingRun as StreamingRun,
+    GoalRun as GoalRun,
+    GuardedRun as GuardedRun,
+    RecordedRun as RecordedRun,
+    Plugins as Plugins,
 )
-from ibrobot_core.launch.views import RunAccess as RunAccess, RunView as RunView
 from ibrobot_core.launch.runtime import Runtime as Runtime
-from ibrobot_core.component import (
-    Component as Component,
-    SessionWorker as SessionWorker,
-    CONTROL as CONTROL,
-    error_line as error_line,
-    error_text as error_text,
-)
-from ibrobot_core.control.link import ControlState as ControlState
+from ibrobot_core.component import Component as Component, SessionWorker as SessionWorker, CONTROL as CONTROL
+from ibrobot_core.bug_reports import error_line as error_line, error_text as error_text
+from ibrobot_core.interfaces.run_state import ControlState as ControlState
 from ibrobot_core.run_hooks import RunHooks as RunHooks, RUN_KEYS as RUN_KEYS
 from ibrobot_core.launch.episodes import Episodes as Episodes
-from ibrobot_core.launch.transport import TransportLink as TransportLink
+from ibrobot_core.component import TransportLink as TransportLink
 from ibrobot_core.launch.models import check_models as check_models
 from ibrobot_core.inference.build import build_policy as build_policy
 from ibrobot_core.launch.absence import absent_sensors as absent_sensors, describe_absent as describe_absent
 
 # Sources
-from ibrobot_core.launch.sources.source_worker import SourceWorker as SourceWorker
+from ibrobot_core.component import SourceWorker as SourceWorker
 from ibrobot_core.launch.sources.policy import PolicySource as PolicySource
 from ibrobot_core.launch.sources.operator_devices import OperatorDevices as OperatorDevices
 from ibrobot_core.interfaces import operate as operate, begin_operation as begin_operation
@@ -206,8 +206,9 @@ from ibrobot_core.reports import (
 from ibrobot_core.child import Child as Child, Channel as Channel, Failure as Failure, open_parent as open_parent
 from ibrobot_core.memory import create_memory as create_memory, set_malloc as set_malloc
 from ibrobot_core.control.realtime import go_real_time as go_real_time
-from ibrobot_core.component import as_failure as as_failure, raise_thread_priority as raise_thread_priority
-from ibrobot_core.launch.pulses import PULSE_S as PULSE_S, Pulse as Pulse
+from ibrobot_core.bug_reports import as_failure as as_failure
+from ibrobot_core.component import raise_thread_priority as raise_thread_priority
+from ibrobot_core.pulses import PULSE_S as PULSE_S, Pulse as Pulse
 
 # Errors
 from ibrobot_core.errors import (

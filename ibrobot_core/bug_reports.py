@@ -7,6 +7,7 @@ import sys
 import tempfile
 import traceback
 
+from ibrobot_core.errors import ComponentFailed, IbrobotError
 from ibrobot_core.safe_output import printable
 
 DEBUG = "IBROBOT_DEBUG"
@@ -42,3 +43,23 @@ def _place(error: BaseException) -> str:
         return ""
     file = "/".join(frames[-1].filename.split(os.sep)[-2:])
     return f"a bug at {file}:{frames[-1].lineno}; "
+
+
+def as_failure(error: BaseException) -> Exception:
+    """The failure of a thread that `error` ended; `sys.exit` in a thread would otherwise end it in silence."""
+    return error if isinstance(error, Exception) else ComponentFailed(f"its thread was ended by {error!r}")
+
+
+def error_text(error: BaseException) -> str:
+    """The message of an error, possibly in several lines."""
+    return str(error).strip() if isinstance(error, IbrobotError) else describe_bug(error)
+
+
+def error_line(error: BaseException) -> str:
+    """The message of an error on one line."""
+    return error_text(error).replace("\n", "; ")
+
+
+def exit_code(error: BaseException) -> int:
+    """The exit status of a run ended by `error`."""
+    return error.exit_code if isinstance(error, IbrobotError) else 1

@@ -7,16 +7,19 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING, override
+from typing import override
 
-from ibrobot_core.bug_reports import describe_bug
-from ibrobot_core.errors import ComponentFailed, IbrobotError
-
-if TYPE_CHECKING:
-    from ibrobot_core.launch.views import RunView
+from ibrobot_core.bug_reports import as_failure
+from ibrobot_core.component_config import ComponentConfig
+from ibrobot_core.errors import ComponentFailed
+from ibrobot_core.interfaces import Transport
+from ibrobot_core.interfaces.run import CommandSource, RunView
+from ibrobot_core.schema import ControlMode
 
 CONTROL = "control"
 """Name of the component that owns the hardware; components that need joint states list it in `needs`."""
+TRANSPORT = "transport"
+"""Name of the component that opens the transport."""
 _POLL_S = 0.1
 """Longest wait of a unit of work, so that a worker notices a stop [s]."""
 _STOP_TIMEOUT_S = 5.0
@@ -75,7 +78,7 @@ class SessionWorker(Component):
     urgent = False
     ready_timeout_s = 60.0
     session: RunView
-    """A subclass that does more to the run says so: `session: RunAccess`."""
+    """A subclass that does more to the run says so: `session: StreamingRun`."""
 
     def __init__(self, session: RunView, name: str, summary: str, needs: tuple[str, ...] = ()) -> None:
         super().__init__(name, summary, needs)
@@ -167,24 +170,82 @@ class SessionWorker(Component):
                 self.session.fail(self.name, self._failure)
 
 
-def as_failure(error: BaseException) -> Exception:
-    """The failure of a thread that `error` ended; `sys.exit` in a thread would otherwise end it in silence."""
-    return error if isinstance(error, Exception) else ComponentFailed(f"its thread was ended by {error!r}")
+class SourceWorker(SessionWorker, CommandSource):
+    """A command source for one mode, with its own thread or, in lockstep, its own step.
+
+    `setup` runs once, then `work` repeatedly, and `teardown` at the end. `begin_mode` and `end_mode` run between two
+    units of work. A source sends setpoints with `session.send_plan`. `session.finish` ends the run, and so does an
+    exception.
+
+    Args:
+        session: the run.
+        mode: the mode whose executors it commands.
+        summary: one line for `--dry-run`.
+        needs: names of the components that must be ready before it starts.
+
+    Attributes:
+        mode: the mode.
+        active: whether the mode is entered; `work` must not send commands otherwise.
+        lock: held during `begin_mode` and `end_mode`. Hold it while `work` checks `active` and sends commands.
+    """
+
+    def __init__(self, session: RunView, mode: ControlMode, summary: str, needs: tuple[str, ...] = (CONTROL,)) -> None:
+        super().__init__(session, f"mode:{mode.name}", summary, needs)
+        self.mode = mode
+        self.active = False
+        self.lock = threading.RLock()
+
+    @override
+    def begin(self, seed: int) -> None:
+        with self.lock:
+            self.end()
+            self.begin_mode(seed)
+            self.active = True
+
+    @override
+    def end(self) -> None:
+        with self.lock:
+            if self.active:
+                self.active = False
+                self.end_mode()
+
+    @abstractmethod
+    def begin_mode(self, seed: int) -> None:
+        """Start from the measured state; called with the lock held."""
+
+    def end_mode(self) -> None:
+        """Stop; called with the lock held."""
 
 
-def error_text(error: BaseException) -> str:
-    """The message of an error, possibly in several lines."""
-    return str(error).strip() if isinstance(error, IbrobotError) else describe_bug(error)
+class TransportLink(Component):
+    """Opens the transport named in the YAML, for components that communicate with other machines."""
 
+    def __init__(self, session: RunView, section: ComponentConfig) -> None:
+        super().__init__(TRANSPORT, f"transport {section.type}")
+        self._session = session
+        self._section = section
+        self._transport: Transport | None = None
 
-def error_line(error: BaseException) -> str:
-    """The message of an error on one line."""
-    return error_text(error).replace("\n", "; ")
+    @property
+    def transport(self) -> Transport:
+        """The transport.
 
+        Raises:
+            ComponentFailed: before it is open.
+        """
+        if self._transport is None:
+            raise ComponentFailed("the transport is not open yet")
+        return self._transport
 
-def exit_code(error: BaseException) -> int:
-    """The exit status of a run ended by `error`."""
-    return error.exit_code if isinstance(error, IbrobotError) else 1
+    @override
+    def start(self) -> None:
+        self._transport = self._session.make("transport", self._section, TRANSPORT)
+
+    @override
+    def stop(self) -> None:
+        if self._transport is not None:
+            self._transport.close()
+            self._transport = None
 
 
 def raise_thread_priority() -> None:

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, get_args
+from typing import Any, ClassVar, get_args
 
 import attrs
 
-from ibrobot_core import descriptors
-from ibrobot_core.descriptors import Descriptor
 from ibrobot_core.options import documented, not_a_key, option
-
-if TYPE_CHECKING:
-    from ibrobot_core import interfaces
-    from ibrobot_core.robot import Robot
 
 
 @documented
@@ -25,6 +18,8 @@ class ComponentConfig:
     """The kind of plugins for its types."""
     may_be_alone: ClassVar[bool] = False
     """Whether the section may be a single component instead of named components."""
+    simulates: ClassVar[bool] = False
+    """Whether hardware in this section is simulated."""
 
     type: str = option(help="type of plugin; `ibrobot plugins` lists them")
     options: Any = not_a_key()
@@ -39,16 +34,6 @@ class ComponentConfig:
         """The key that names the plugin."""
         return str(attrs.fields(cls).type.alias)
 
-    @classmethod
-    def takes(cls, descriptor: Descriptor[Any]) -> bool:
-        """Whether a plugin of the kind may be used in this section."""
-        return True
-
-    @classmethod
-    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """Fields that are not keys, derived from the options by the plugin's descriptor."""
-        return {}
-
 
 @attrs.frozen
 class NamedComponentConfig(ComponentConfig):
@@ -61,21 +46,3 @@ def component_of(kind: Any) -> type[ComponentConfig] | None:
     """The component class in a type annotation: that of a section, or of each of its items."""
     members = (kind, *get_args(kind))
     return next((each for each in members if isinstance(each, type) and issubclass(each, ComponentConfig)), None)
-
-
-@attrs.frozen
-class SceneConfig(ComponentConfig):
-    """The scene in the options of a simulation."""
-
-    plugin_kind = "scene"
-
-    descriptor: descriptors.SceneDescriptor = not_a_key()
-
-    @classmethod
-    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """Its descriptor, with which the simulation makes it."""
-        return {"descriptor": descriptor}
-
-    def make(self, robot: Robot) -> interfaces.Scene[Any, Any]:
-        """The scene, around a robot."""
-        return self.descriptor.make(self.options, robot)

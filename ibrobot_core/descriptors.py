@@ -10,22 +10,20 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
-from ibrobot_core.options import NoOptions, OptionFault, OptionName, documented, option
+from ibrobot_core.component_config import ComponentConfig
+from ibrobot_core.options import NoOptions, OptionFault, OptionName, documented, not_a_key, option
 
 if TYPE_CHECKING:
     import click
 
     from ibrobot_core import interfaces
-    from ibrobot_core.component import Component
-    from ibrobot_core.config.schema import RobotConfig
-    from ibrobot_core.contract.joint_units import JointUnits
+    from ibrobot_core.component import Component, SourceWorker, TransportLink
     from ibrobot_core.events import Event
-    from ibrobot_core.launch.sources.source_worker import SourceWorker
-    from ibrobot_core.launch.transport import TransportLink
-    from ibrobot_core.launch.views import RunAccess, RunView
+    from ibrobot_core.interfaces.run import RunAccess, RunView
     from ibrobot_core.messages import CompressedImage, Image
     from ibrobot_core.reports import ReportSection
     from ibrobot_core.robot import Robot
+    from ibrobot_core.schema import RobotConfig
     from ibrobot_core.selection import JointFeature
 
 
@@ -89,6 +87,14 @@ class Descriptor[T]:
     default: bool = attrs.field(default=False, kw_only=True)
     """Whether commands use this type by default; at most one type of each kind."""
 
+    def fits(self, section: builtins.type[ComponentConfig]) -> bool:
+        """Whether it may be used in a section of its kind."""
+        return True
+
+    def kept(self, options: Any) -> Mapping[str, Any]:
+        """Fields of its section that are no keys, by name; a section without such a field leaves it out."""
+        return {}
+
 
 @attrs.frozen
 class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
@@ -107,6 +113,14 @@ class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
     film: Mapping[str, Any] = attrs.field(factory=dict, kw_only=True)
     """For simulated hardware: the keys of a peripheral of kind `camera` that films the robot and all of its scene."""
 
+    def fits(self, section: builtins.type[ComponentConfig]) -> bool:
+        """Whether the section is for simulated hardware, as it is or is not."""
+        return self.simulated == section.simulates
+
+    def kept(self, options: Any) -> Mapping[str, Any]:
+        """Its calibration and its anchored joints."""
+        return {"calibration": self.calibration(options), "anchored": self.anchored(options)}
+
 
 @attrs.frozen
 class SceneDescriptor(Descriptor["interfaces.Scene[Any, Any]"]):
@@ -114,6 +128,23 @@ class SceneDescriptor(Descriptor["interfaces.Scene[Any, Any]"]):
 
     make: Callable[[Any, Robot], interfaces.Scene[Any, Any]] = attrs.field(kw_only=True)  # type: ignore[assignment]
     """Options and robot -> the scene."""
+
+    def kept(self, options: Any) -> Mapping[str, Any]:
+        """Itself, with which the simulation makes the scene."""
+        return {"descriptor": self}
+
+
+@attrs.frozen
+class SceneConfig(ComponentConfig):
+    """The scene in the options of a simulation."""
+
+    plugin_kind = "scene"
+
+    descriptor: SceneDescriptor = not_a_key()
+
+    def make(self, robot: Robot) -> interfaces.Scene[Any, Any]:
+        """The scene, around a robot."""
+        return self.descriptor.make(self.options, robot)
 
 
 @attrs.frozen
@@ -130,6 +161,10 @@ class SensorDescriptor(Descriptor["interfaces.Sensor"]):
         MissingDependency: if it is not there. A run continues without a sensor that it does not need.
     """
 
+    def kept(self, options: Any) -> Mapping[str, Any]:
+        """The size of its images."""
+        return {"picture": self.picture(options)}
+
 
 @attrs.frozen
 class TeleopDescriptor(Descriptor["interfaces.Teleop"]):
@@ -144,6 +179,10 @@ class TeleopDescriptor(Descriptor["interfaces.Teleop"]):
     and the robot that it moves. Devices of one mode share a key only if it does the same for all of them."""
     needs_terminal: Callable[[Any], bool] = attrs.field(default=lambda options: False, kw_only=True)
     """Whether the device works only in runs with a terminal, by its options."""
+
+    def kept(self, options: Any) -> Mapping[str, Any]:
+        """Its calibration."""
+        return {"calibration": self.calibration(options)}
 
 
 @attrs.frozen
@@ -165,6 +204,10 @@ class EngineDescriptor(Descriptor["interfaces.Engine"]):
     """Whether it reaches the model over the transport of the YAML, which must then connect to other machines."""
     weights_here: bool = True
     """Whether this machine has the model's weights, so that `ibrobot config check --deep` checks them."""
+
+    def kept(self, options: Any) -> Mapping[str, Any]:
+        """Its needs."""
+        return {"uses_transport": self.uses_transport, "weights_here": self.weights_here}
 
 
 @documented
@@ -190,6 +233,10 @@ class ExecutorDescriptor(Descriptor["interfaces.Executor"]):
     """The goals of an executor that does not stream: `trajectory`, made by `trajectory_goal`, or `position`,
     `{"position": q}`, with the position of its first joint [rad]. The result of an aborted trajectory has the key
     `exceeded` if a tolerance was: `path` or `goal`."""
+
+    def kept(self, options: Any) -> Mapping[str, Any]:
+        """The kind of goals that it takes."""
+        return {"goals": "" if self.streams else self.goals}
 
 
 @attrs.frozen
@@ -325,8 +372,8 @@ class FeatureDescriptor:
     fingerprint, and recordings have it. Raises ContractError."""
     make: Callable[[Mapping[str, Any], Sequence[str], Sequence[str]], JointFeature]
     """Model, paths, and for an action the joints that it moves -> the numbers. Raises ContractError."""
-    vectors: Callable[..., JointUnits]
-    """The class of the conversion of vectors for contracts whose actions have such paths; arguments as `JointUnits`."""
+    vectors: Callable[..., Any]
+    """The subclass of `JointUnits` that converts vectors of contracts whose actions have such paths."""
     check_config: Callable[[RobotConfig], Iterable[OptionFault]] = attrs.field(default=lambda config: (), kw_only=True)
     """As `SectionDescriptor.check_config`."""
 

@@ -28,9 +28,9 @@ from ibrobot_core.errors import (
 from ibrobot_core.options import did_you_mean
 
 if TYPE_CHECKING:
-    from ibrobot_core.config.schema import RobotConfig
     from ibrobot_core.interfaces import EpisodeReader, Pool
     from ibrobot_core.messages import CompressedImage, Image
+    from ibrobot_core.schema import RobotConfig
 
 ENTRY_POINT_GROUP = "ibrobot"
 CORE = "ibrobot-core"

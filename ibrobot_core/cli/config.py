@@ -14,10 +14,10 @@ from ibrobot_core.calibration import load_calibration
 from ibrobot_core.cli.options import run_options
 from ibrobot_core.config import RobotConfig, find_config, load_config
 from ibrobot_core.config.missing import absent_models, describe, unavailable_modes
-from ibrobot_core.config.schema import HardwareConfig, TeleopConfig
 from ibrobot_core.errors import CalibrationError, ConfigError, PluginError, Problem
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.safe_output import echo
+from ibrobot_core.schema import HardwareConfig, TeleopConfig
 
 _CONFIG = "config "
 config_options = run_options("config", "sim", "overrides", "mode")

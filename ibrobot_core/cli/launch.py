@@ -9,7 +9,7 @@ import click
 from ibrobot_core.cli.options import check_end, run_options, run_overrides
 from ibrobot_core.cli.run import run_robot
 from ibrobot_core.config import find_config, load_config
-from ibrobot_core.launch.session import LaunchRequest
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.plugins import installed_plugins
 
 

@@ -20,13 +20,14 @@ import click
 from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.errors import IbrobotError, TeleopError
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.keys import RELEASE, REPEAT
 from ibrobot_core.launch.models import check_models
-from ibrobot_core.launch.pulses import PULSE_S, Pulse
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.output_thread import discard, output_aside
 from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.pulses import PULSE_S, Pulse
 from ibrobot_core.run_hooks import RunHooks
 from ibrobot_core.safe_output import LogFormatter, echo
 from ibrobot_core.signals import end_signals
@@ -196,7 +197,7 @@ class _Signals:
         session = self._session
         if session.has_control and not session.request.lockstep:
             with suppress(IbrobotError):
-                session.control.call("fault", fault="the host was suspended by Ctrl-Z")
+                session.raise_fault("the host was suspended by Ctrl-Z")
             time.sleep(session.config.control.peer_timeout)  # until the robot has stopped
         with self._keys.suspended() if self._keys is not None else nullcontext():
             os.kill(os.getpid(), signal.SIGSTOP)

@@ -12,14 +12,6 @@ import attrs
 
 from ibrobot_core.config.missing import Missing
 from ibrobot_core.config.models import READERS, DescriptionModel, Limits, ModelError
-from ibrobot_core.config.schema import (
-    ControlConfig,
-    ControlMode,
-    ExecutorConfig,
-    HardwareConfig,
-    InferenceConfig,
-    devices_of,
-)
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
@@ -29,6 +21,14 @@ from ibrobot_core.options import OptionFault, did_you_mean
 from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Joint, Robot
 from ibrobot_core.run_hooks import RUN_KEYS
+from ibrobot_core.schema import (
+    ControlConfig,
+    ControlMode,
+    ExecutorConfig,
+    HardwareConfig,
+    InferenceConfig,
+    devices_of,
+)
 from ibrobot_core.terminal import check_key
 
 _SLACK = 0.01

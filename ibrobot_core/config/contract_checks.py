@@ -9,7 +9,6 @@ import attrs
 
 from ibrobot_core import messages
 from ibrobot_core.config.checks import streams
-from ibrobot_core.config.schema import TASK_KEY, ActionSpec, ContractConfig, ExecutorConfig, ObservationSpec, SignalSpec
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
@@ -17,6 +16,7 @@ from ibrobot_core.descriptors import StreamOptions
 from ibrobot_core.errors import ContractError
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.schema import TASK_KEY, ActionSpec, ContractConfig, ExecutorConfig, ObservationSpec, SignalSpec
 from ibrobot_core.selection import Selection
 
 PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {

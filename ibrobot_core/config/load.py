@@ -16,7 +16,6 @@ from ibrobot_core.config.contract_checks import ContractChecks
 from ibrobot_core.config.missing import split
 from ibrobot_core.config.name_checks import check_names
 from ibrobot_core.config.overrides import apply_overrides, put
-from ibrobot_core.config.schema import ContractConfig, PeripheralConfig, RobotConfig
 from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_secrets
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections, SectionParser
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse_yaml
@@ -25,6 +24,7 @@ from ibrobot_core.errors import ConfigError, Problem
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import Registry, installed_plugins
 from ibrobot_core.robot import Robot
+from ibrobot_core.schema import ContractConfig, PeripheralConfig, RobotConfig
 
 DEFAULT_CONFIG = "so101"
 

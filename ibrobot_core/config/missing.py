@@ -7,11 +7,11 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.config.schema import ContractConfig
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
 from ibrobot_core.errors import PluginNotInstalled, how_to_install, plugin_type
 from ibrobot_core.plugins import install_command
+from ibrobot_core.schema import ContractConfig
 
 _OPTIONAL_SENSORS = ("camera",)
 """Kinds of sensors without which a run may continue, if nothing in it needs them."""

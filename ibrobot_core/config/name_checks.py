@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from ibrobot_core.config.contract_checks import PERIPHERAL_TOPICS
-from ibrobot_core.config.schema import ContractConfig
 from ibrobot_core.config.structure import ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.messages import RUN_TOPICS
+from ibrobot_core.schema import ContractConfig
 
 
 def check_names(document: Document, sections: ParsedSections) -> None:

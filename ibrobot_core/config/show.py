@@ -9,8 +9,8 @@ from typing import Any
 import attrs
 import yaml
 
+from ibrobot_core import schema
 from ibrobot_core.component_config import ComponentConfig
-from ibrobot_core.config import schema
 from ibrobot_core.config.yaml_nodes import is_text
 from ibrobot_core.options import HIDDEN, fields
 from ibrobot_core.safe_output import without_credentials

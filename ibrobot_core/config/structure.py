@@ -10,8 +10,8 @@ from typing import Any
 
 import attrs
 
+from ibrobot_core import schema
 from ibrobot_core.component_config import ComponentConfig, NamedComponentConfig, component_of
-from ibrobot_core.config import schema
 from ibrobot_core.config.expand import missing_package, resolve_path
 from ibrobot_core.config.missing import Missing
 from ibrobot_core.config.repair import structure_rest
@@ -254,9 +254,9 @@ class SectionParser:
         if options is None or descriptor is None:
             return None
         named = {} if name is None else {"name": name}
-        described = kind.described(descriptor, options)
+        kept = {name: value for name, value in descriptor.kept(options).items() if name in attrs.fields_dict(kind)}
         try:
-            return ParsedComponent(key, kind(**arguments, **named, **described, options=options), descriptor)
+            return ParsedComponent(key, kind(**arguments, **named, **kept, options=options), descriptor)
         except TypeError:
             if not faults.found:
                 raise
@@ -325,7 +325,7 @@ class SectionParser:
         part = self._component(("simulation",), schema.SimulationConfig, needed=sections.simulated or self._elsewhere)
         if part is None:
             return
-        if not schema.SimulationConfig.takes(part.descriptor):
+        if not part.descriptor.fits(schema.SimulationConfig):
             message = f"{part.descriptor.type!r} is not a simulation; it belongs in the hardware section"
             self.document.add(("simulation", "type"), message)
         elif sections.simulated or self._elsewhere:
@@ -347,7 +347,7 @@ class SectionParser:
             part = self._component(key, schema.HardwareConfig, name=name, needed=not sections.simulated)
             if part is None:
                 continue
-            if not schema.HardwareConfig.takes(part.descriptor):
+            if not part.descriptor.fits(schema.HardwareConfig):
                 message = f"{part.descriptor.type!r} is a simulation; it belongs in the simulation section"
                 self.document.add((*key, "type"), message)
             sections.hardware[name] = part

@@ -6,7 +6,7 @@ from collections import deque
 
 import attrs
 
-from ibrobot_core.config.schema import Align
+from ibrobot_core.schema import Align
 from ibrobot_core.units import NS_PER_S
 
 

@@ -9,10 +9,10 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.config.schema import ImageSpec
 from ibrobot_core.errors import ContractError
 from ibrobot_core.messages import CompressedImage, Image
 from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.schema import ImageSpec
 
 ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
     "rgb8": (np.uint8, 3),

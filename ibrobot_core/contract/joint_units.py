@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.calibration import JointCalibration, load_calibration
-from ibrobot_core.config.schema import RobotConfig
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import CalibrationError
 from ibrobot_core.interfaces import Frame, PolicySpec
 from ibrobot_core.messages import JointState
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.robot import Vector
+from ibrobot_core.schema import RobotConfig
 
 ACTION = "action"
 """Key of the action vector."""

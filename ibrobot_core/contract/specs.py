@@ -12,12 +12,12 @@ from typing import Any
 import attrs
 
 from ibrobot_core.config.contract_checks import completed
-from ibrobot_core.config.schema import MAX_AGE, ActionSpec, Align, ImageSpec, ObservationSpec, RobotConfig
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.dataset import Feature
 from ibrobot_core.messages import MESSAGE_TYPES, CompressedImage, Image, JointState
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.robot import Robot
+from ibrobot_core.schema import MAX_AGE, ActionSpec, Align, ImageSpec, ObservationSpec, RobotConfig
 from ibrobot_core.selection import JointFeature, Selection
 from ibrobot_core.units import NS_PER_S
 

@@ -9,9 +9,9 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.control.link import PlanRecord
 from ibrobot_core.errors import GoalRejected
 from ibrobot_core.interfaces import Executor, JointReading, Plan
+from ibrobot_core.interfaces.run_state import PlanRecord
 from ibrobot_core.robot import Robot, Vector
 
 

@@ -10,6 +10,7 @@ from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.errors import ConfigError, Problem
+from ibrobot_core.interfaces import Context
 from ibrobot_core.plugins import Registry
 
 
@@ -24,7 +25,7 @@ def build_core(config: RobotConfig, registry: Registry, clock: Clock, seed: int)
 
     def make(kind: str, component: ComponentConfig, name: str, joints: tuple[str, ...]) -> Any:
         options = simulation.options if simulation is not None else None
-        context = config.context(name, clock, seed, joints=joints, simulation=options)
+        context = Context.of(config, name, clock, seed, joints=joints, simulation=options)
         return registry.find(kind, component.type).make(component.options, context)
 
     executors = {name: make("executor", each, name, each.joints) for name, each in config.executors.items()}

@@ -17,7 +17,6 @@ from ibrobot_core.control.commands import Act, permitted
 from ibrobot_core.control.following import FollowingError
 from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.control.health import Health
-from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.control.phase import TRANSITIONS, Cause, Phase
 from ibrobot_core.control.pose_motion import TIMEOUT_S, PoseMotion
 from ibrobot_core.control.readings import Readings
@@ -25,6 +24,7 @@ from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.control.timing import Pace
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
 from ibrobot_core.interfaces import EpisodeSetup, Executor, JointReading, Signal, Torque
+from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S, ns
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.config.schema import Following
 from ibrobot_core.robot import LAG_S, Robot, Vector
+from ibrobot_core.schema import Following
 from ibrobot_core.units import ns
 
 _EXCHANGED_RAD = 0.1

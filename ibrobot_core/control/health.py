@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Sequence
 
-from ibrobot_core.config.schema import Shedding
 from ibrobot_core.interfaces.hardware import Condition, Severity
+from ibrobot_core.schema import Shedding
 from ibrobot_core.units import ns
 
 _Key = tuple[str, str]

@@ -18,9 +18,10 @@ from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.component import raise_thread_priority
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control.build import build_core
-from ibrobot_core.control.link import ControlState, LinkLayout, PlanRecord, SharedMemory, raise_error
+from ibrobot_core.control.link import LinkLayout, SharedMemory, raise_error
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError
+from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 from ibrobot_core.memory import create_memory
 from ibrobot_core.plugins import Registry
 

@@ -18,10 +18,9 @@ from zlib import crc32
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from ibrobot_core.errors import HardwareError
-from ibrobot_core.robot import Vector
+from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 
 STATE_SLOTS = 256
 """Number of states kept for the host: 2.5 s at 100 Hz."""
@@ -31,44 +30,6 @@ _SEQUENCE_BYTES = 8
 _BEAT_BYTES = 8
 _PLAN_HEAD_BYTES = 48
 """The integers of a plan, before its mask; the checksum covers everything after the first two, `seq` and `crc`."""
-
-
-@attrs.frozen(eq=False)
-class ControlState:
-    """The state of the control loop after a tick; arrays in robot order."""
-
-    tick: int
-    stamp_ns: int
-    late_ns: int
-    """Delay of the tick's start [ns]."""
-    generation: int
-    """Counts mode switches and resets; plans from an earlier generation are not followed."""
-    estop: bool
-    stale: bool
-    """Whether the reading repeats an earlier one."""
-    success: bool | None
-    position: Vector
-    velocity: Vector
-    effort: Vector
-    command: Vector
-    """Command written to the hardware [rad], shape (J,)."""
-    signals: Vector
-    """All hardware signals, concatenated, shape (S,)."""
-    stops: int = 0
-    """Number of emergency stops since the run began, also of those pressed while one was latched."""
-
-
-@attrs.frozen(eq=False)
-class PlanRecord:
-    """Timed setpoints for the joints in `mask`; executors without joints in it brake."""
-
-    generation: int
-    start_ns: int
-    step_ns: int
-    mask: NDArray[np.bool_]
-    """Shape (J,)."""
-    positions: Vector
-    """Setpoints [rad], shape (N, J); columns outside the mask are ignored."""
 
 
 @attrs.frozen

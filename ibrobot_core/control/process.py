@@ -16,9 +16,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from ibrobot_core.bug_reports import error_text, exit_code
 from ibrobot_core.child import FAREWELL_S, Channel, Failure, is_stopped, open_parent
 from ibrobot_core.clock import RealClock
-from ibrobot_core.component import error_text, exit_code
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.core import ControlCore

@@ -9,7 +9,6 @@ import attrs
 import numpy as np
 
 from ibrobot_core.bus import Bus
-from ibrobot_core.config.schema import DispatchConfig
 from ibrobot_core.contract.frames import FrameSampler
 from ibrobot_core.contract.joint_units import JointUnits
 from ibrobot_core.contract.specs import Contract
@@ -19,7 +18,9 @@ from ibrobot_core.dispatch.smoother import TemporalSmoother
 from ibrobot_core.errors import ContractError
 from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
 from ibrobot_core.interfaces import Frame, PolicySpec
+from ibrobot_core.interfaces.run_state import DispatchStats
 from ibrobot_core.robot import Robot, Vector
+from ibrobot_core.schema import DispatchConfig
 from ibrobot_core.units import ns, seconds
 
 _FIRST_PAUSE_NS = 100_000_000
@@ -33,43 +34,6 @@ _SILENCE_NS = 2_000_000_000
 
 SendPlan = Callable[[int, int, Vector], None]
 Report = Callable[[Chunk, int, str], None]
-
-
-@attrs.define
-class DispatchStats:
-    """Counters and timings for diagnostics."""
-
-    strategy: str = "ensemble"
-    smoothing: bool = True
-    """Whether chunks blend."""
-    plan_length: int = 0
-    """Actions left in the plan."""
-    watermark: int = 0
-    """Plan length at which the next chunk is requested."""
-    latency_ms: float = 0.0
-    """Time from the observation to the arrival of its chunk, for the last chunk."""
-    latency_p50_ms: float = 0.0
-    """Median of the recent latencies."""
-    latency_p99_ms: float = 0.0
-    queue_ms: float = 0.0
-    """The part of the last latency that the request spent queued behind other robots."""
-    pace_ms: float = 0.0
-    """Minimum time between requests, set by the model's server; 0 for no minimum."""
-    requests: int = 0
-    retries: int = 0
-    """Requests sent because the previous one was overdue."""
-    chunks: int = 0
-    late_chunks: int = 0
-    """Chunks that were entirely in the past on arrival."""
-    dropped_answers: int = 0
-    """Answers to requests that had timed out, been overtaken by a newer answer, or preceded a reset."""
-    failures: int = 0
-    """Requests without a chunk, including timeouts; all requests in flight during one outage count as one."""
-    timeouts: int = 0
-    unreachable: int = 0
-    """Actions that no position of the joints gives; the one before is held instead."""
-    holds: int = 0
-    """Times the plan ran dry."""
 
 
 def check_strategy(options: DispatchConfig, spec: PolicySpec) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from ibrobot_core.clock import RealClock
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.interfaces import Policy
-from ibrobot_core.plugins import Registry
+from ibrobot_core.interfaces import Context, Policy
+from ibrobot_core.interfaces.run import Plugins
 
 
-def build_policy(config: RobotConfig, registry: Registry, name: str, seed: int = 0) -> Policy:
+def build_policy(config: RobotConfig, registry: Plugins, name: str, seed: int = 0) -> Policy:
     """Construct the model `name` of `config` without loading it.
 
     Raises:
@@ -16,5 +16,7 @@ def build_policy(config: RobotConfig, registry: Registry, name: str, seed: int =
         PolicyError: e.g. for a checkpoint without its statistics.
     """
     model = config.models[name]
-    policy: Policy = registry.find("policy", model.type).make(model.options, config.context(name, RealClock(), seed))
+    policy: Policy = registry.find("policy", model.type).make(
+        model.options, Context.of(config, name, RealClock(), seed)
+    )
     return policy

@@ -5,19 +5,18 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import attrs
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock
+from ibrobot_core.interfaces.policy import Policy
+from ibrobot_core.interfaces.run import RunView
+from ibrobot_core.interfaces.transport import Transport
 from ibrobot_core.robot import Robot
-
-if TYPE_CHECKING:
-    from ibrobot_core.config import RobotConfig
-    from ibrobot_core.interfaces.policy import Policy
-    from ibrobot_core.interfaces.transport import Transport
-    from ibrobot_core.launch.views import RunView
+from ibrobot_core.schema import RobotConfig
+from ibrobot_core.units import ns
 
 
 @attrs.frozen(eq=False)
@@ -60,3 +59,20 @@ class Context:
     """For engines: the model, whose name is that of the context."""
     session: RunView | None = None
     """For viewers: the run that they show."""
+
+    @classmethod
+    def of(cls, config: RobotConfig, name: str, clock: Clock, seed: int = 0, **more: Any) -> Self:
+        """The context for the `make` of a component's plugin.
+
+        Args:
+            config: the robot YAML.
+            name: name of the component.
+            clock: the clock of the run.
+            seed: the seed of the run.
+            more: other fields; `joints` defaults to all joints of the robot.
+        """
+        simulation = config.simulation.options if config.simulation is not None else None
+        robot: Robot = more.get("robot", config.robot)
+        given = {"robot": robot, "joints": robot.joint_names, "simulation": simulation, **more}
+        log, period_ns = logging.getLogger(f"ibrobot.{name}"), ns(1.0 / config.control.rate_hz)
+        return cls(name=name, clock=clock, log=log, period_ns=period_ns, seed=seed, **given)

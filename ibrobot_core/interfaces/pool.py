@@ -10,7 +10,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.component import error_text
+from ibrobot_core.bug_reports import error_text
 from ibrobot_core.errors import ComponentFailed, IbrobotError
 from ibrobot_core.options import option
 

@@ -4,24 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import attrs
-
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.contract_checks import PERIPHERAL_TOPICS
 from ibrobot_core.errors import MissingDependency, PluginNotInstalled
+from ibrobot_core.interfaces.run_state import AbsentSensor
 from ibrobot_core.plugins import Registry
-
-
-@attrs.frozen
-class AbsentSensor:
-    """A peripheral that cannot run on this machine."""
-
-    name: str
-    label: str
-    """Kind and name, e.g. `camera top`."""
-    topic: str
-    """The topic of its messages."""
-    missing: MissingDependency
 
 
 def absent_sensors(config: RobotConfig, registry: Registry) -> tuple[AbsentSensor, ...]:

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.component import CONTROL, Component
-from ibrobot_core.config.schema import ControlMode, RobotConfig
 from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
-from ibrobot_core.control.link import ControlState
 from ibrobot_core.deadman import LONGEST_BRAKING_S
 from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import ComponentFailed, HardwareError
-from ibrobot_core.launch.pulses import PULSE_S
+from ibrobot_core.interfaces.run_state import ControlState
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import JOINT_STATES, Float64MultiArray, Header, JointState
+from ibrobot_core.pulses import PULSE_S
+from ibrobot_core.schema import ControlMode, RobotConfig
 
 _PATIENCE_S = 1.0
 """Time after the end of a run was asked for in which the main thread begins to stop it [s]."""

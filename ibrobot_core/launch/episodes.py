@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-if TYPE_CHECKING:
-    from ibrobot_core.launch.views import RunAccess
+from ibrobot_core.interfaces.run import RecordedRun
 
 
 class Episodes:
     """Begins, ends and counts episodes. Not thread-safe."""
 
-    def __init__(self, session: RunAccess) -> None:
+    def __init__(self, session: RecordedRun) -> None:
         self._session = session
         self.number = 0
         """Number of the present episode, from 1; 0 before the first."""

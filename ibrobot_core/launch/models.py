@@ -8,7 +8,6 @@ from contextlib import closing
 
 from ibrobot_core.calibration import load_calibration
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.schema import ModelConfig
 from ibrobot_core.contract.check import check_policy
 from ibrobot_core.contract.joint_units import JointUnits, calibrations, policy_units, with_closed_ends
 from ibrobot_core.contract.specs import Contract
@@ -16,7 +15,8 @@ from ibrobot_core.dispatch.dispatcher import check_strategy
 from ibrobot_core.errors import ConfigError, ContractError, IbrobotError, Problem
 from ibrobot_core.inference.build import build_policy
 from ibrobot_core.interfaces import PolicySpec
-from ibrobot_core.plugins import Registry
+from ibrobot_core.interfaces.run import Plugins
+from ibrobot_core.schema import ModelConfig
 
 
 def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: logging.Logger) -> JointUnits:
@@ -60,7 +60,7 @@ def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: 
     return units
 
 
-def check_models(config: RobotConfig, registry: Registry, modes: Iterable[str]) -> list[str]:
+def check_models(config: RobotConfig, registry: Plugins, modes: Iterable[str]) -> list[str]:
     """Compare the models of some modes with the robot, without loading any.
 
     Returns:

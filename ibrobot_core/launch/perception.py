@@ -6,9 +6,10 @@ from collections import deque
 from typing import override
 
 from ibrobot_core.component import SessionWorker
-from ibrobot_core.config.schema import PeripheralConfig
 from ibrobot_core.interfaces import Sensor
-from ibrobot_core.launch.session import SensorFigures, Session
+from ibrobot_core.interfaces.run_state import SensorFigures
+from ibrobot_core.launch.session import Session
+from ibrobot_core.schema import PeripheralConfig
 from ibrobot_core.units import seconds
 
 _RATE_WINDOW = 31

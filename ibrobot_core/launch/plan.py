@@ -7,24 +7,23 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.component import CONTROL, Component
+from ibrobot_core.component import CONTROL, Component, SourceWorker, TransportLink
 from ibrobot_core.config.missing import unavailable_modes
-from ibrobot_core.config.schema import ActionSpec, ObservationSpec, PeripheralConfig
 from ibrobot_core.descriptors import SourceDescriptor, TransportDescriptor
 from ibrobot_core.errors import ComponentFailed, NotSupported
+from ibrobot_core.interfaces.run import CommandSource
 from ibrobot_core.launch.absence import describe_absent
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.episodes import EpisodeRecorder
 from ibrobot_core.launch.outputs.status import Status
 from ibrobot_core.launch.outputs.viewer import ViewerWorker
 from ibrobot_core.launch.perception import SensorWorker
-from ibrobot_core.launch.session import CommandSource, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.launch.simulation import SimulatedEpisodes
 from ibrobot_core.launch.sources.policy import LoadedModel, PolicySource
-from ibrobot_core.launch.sources.source_worker import SourceWorker
 from ibrobot_core.launch.sources.teleop import TeleopSource
-from ibrobot_core.launch.transport import TransportLink
 from ibrobot_core.messages import MESSAGE_TYPES
+from ibrobot_core.schema import ActionSpec, ObservationSpec, PeripheralConfig
 
 
 @attrs.frozen

@@ -10,8 +10,9 @@ from typing import Any
 
 import attrs
 
+from ibrobot_core.bug_reports import as_failure, error_line, error_text, exit_code
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.component import Component, as_failure, error_line, error_text, exit_code
+from ibrobot_core.component import Component
 from ibrobot_core.config.missing import absent_models, unavailable_modes
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, NotSupported, PluginError
@@ -232,7 +233,7 @@ class Runtime:
             try:
                 session.begin_source()
             except IbrobotError as error:
-                session.control.call("fault", fault=f"mode {session.mode} does not start over: {error}")
+                session.raise_fault(f"mode {session.mode} does not start over: {error}")
                 raise
             then = f"holding: {session.to_go_on()}" if session.held else f"mode {session.mode} starts over"
             session.log.info("reset; %s", then)

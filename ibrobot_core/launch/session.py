@@ -5,160 +5,28 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import attrs
 import numpy as np
 
+from ibrobot_core.bug_reports import as_failure, error_line
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock, RealClock, SteppedClock
-from ibrobot_core.component import as_failure, error_line
 from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.schema import ControlMode
-from ibrobot_core.control.link import ControlState, PlanRecord
+from ibrobot_core.control.host import ControlHost
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, MissingDependency
-from ibrobot_core.interfaces import Context, EngineStats, JointReading, OperatorEvent, Teleop, trajectory_goal
-from ibrobot_core.launch.absence import AbsentSensor, absent_sensors, by_cause
+from ibrobot_core.interfaces import Context, JointReading, OperatorEvent, run_state, trajectory_goal
+from ibrobot_core.interfaces.run import CommandSource, LaunchRequest
+from ibrobot_core.launch.absence import absent_sensors, by_cause
 from ibrobot_core.launch.episodes import Episodes
-from ibrobot_core.launch.pulses import Pulse
 from ibrobot_core.plugins import Registry
+from ibrobot_core.pulses import Pulse
 from ibrobot_core.robot import Vector
-
-if TYPE_CHECKING:
-    from ibrobot_core.control.host import ControlHost
-    from ibrobot_core.dispatch.dispatcher import DispatchStats
-    from ibrobot_core.launch.sources.source_worker import SourceWorker
-
-
-@attrs.frozen
-class LaunchRequest:
-    """The user's request for a run: the options of `ibrobot launch`."""
-
-    lockstep: bool = False
-    """Whether time is simulated, and advances once all work of a tick is done."""
-    seed: int = 0
-    """Seed of the first episode; each later episode adds 1."""
-    duration_s: float | None = None
-    """Duration of the run [s]; None for a run without a time limit."""
-    episodes: int | None = None
-    """Number of episodes after which the run ends."""
-    goals: tuple[str, ...] = ()
-    """Goals for a mode with a planner, in the syntax of `--goal`."""
-    keys: Callable[[], Any] | None = None
-    """Subscribes to the keys of the terminal, e.g. `KeyReader.subscribe`."""
-    prompt: str = ""
-    """Prompt of recorded episodes."""
-    by_operator: bool = False
-    """Whether an operator begins and ends episodes, instead of the mode."""
-    source: Callable[[Session, ControlMode], SourceWorker] | None = None
-    """Makes the command source of the first mode, in place of the one in the YAML."""
-
-
-@attrs.define
-class Outcome:
-    """The outcome of a run."""
-
-    episodes: int = 0
-    successes: int = 0
-    unjudged: int = 0
-    """Number of kept episodes that nobody judged."""
-    disturbed: int = 0
-    """Number of episodes during which a fault or an emergency stop occurred."""
-    faults: list[str] = attrs.field(factory=list)
-    goals_failed: int = 0
-    holding: list[str] = attrs.field(factory=list)
-    """One line for each part that holds torque after the run, with the command that switches it off."""
-
-
-@attrs.frozen
-class ActingPolicy:
-    """The policy that moves the robot in a mode with inference."""
-
-    dispatch: DispatchStats
-    engine: EngineStats
-    described: Callable[[], Mapping[str, str]]
-    """Name and weights of the policy."""
-
-
-@attrs.define
-class SensorFigures:
-    """Measurements of a sensor's messages."""
-
-    received: int
-    """Number of messages so far."""
-    rate_hz: float
-    age_s: float | None
-    """Age of the newest message at publication, by its stamp [s]; None for messages without a stamp."""
-
-
-class SharedDevices:
-    """The open teleoperation devices of a run, with the number of their users. Thread-safe."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._open: dict[Hashable, tuple[Teleop, int]] = {}
-
-    def take(self, key: Hashable, opened: Callable[[], Teleop]) -> Teleop:
-        """The device with this key, made by `opened` unless it is open already."""
-        with self._lock:
-            device, users = self._open.get(key) or (opened(), 0)
-            self._open[key] = device, users + 1
-            return device
-
-    def give_back(self, key: Hashable) -> bool:
-        """End a use of a device; return whether it was the last one."""
-        with self._lock:
-            device, users = self._open.pop(key)
-            if users > 1:
-                self._open[key] = device, users - 1
-            return users == 1
-
-
-class CommandSource:
-    """Commands the active executors of a mode, from `begin` to `end`. The base class sends nothing.
-
-    Attributes:
-        autonomous: whether it moves the robot without an operator. Such a source does not start again after a reset
-            until the operator enters the mode.
-    """
-
-    autonomous = False
-
-    def begin(self, seed: int) -> None:
-        """Start; called when the mode is entered and after a reset."""
-
-    def end(self) -> None:
-        """Stop; called when the mode is left."""
-
-    def recover(self) -> None:
-        """Recover from a failure; called before a reset.
-
-        Raises:
-            IbrobotError: if it cannot recover; the fault stays.
-        """
-
-    def take_goal(self, event: Mapping[str, Any]) -> None:
-        """Handle a change of state of an executor's goal."""
-
-    def described(self) -> Mapping[str, str] | None:
-        """Name and weights of the policy that it runs; None without one."""
-        return None
-
-    def help(self) -> str:
-        """Instructions for the operator in this mode."""
-        return ""
-
-    def summary_rows(self) -> list[tuple[str, str]]:
-        """Rows for the summary of the run: heading and text."""
-        return []
-
-    def facts(self) -> dict[str, Any]:
-        """Facts for the summary as JSON."""
-        return {}
 
 
 class Session:
@@ -209,25 +77,25 @@ class Session:
         # Lockstep starts at a fixed time, so that equal seeds give equal stamps.
         self.clock: Clock = SteppedClock(0) if request.lockstep else RealClock()
         self.bus = Bus(self.clock)
-        self.outcome = Outcome()
+        self.outcome = run_state.Outcome()
         self.mode = config.default_control_mode
         self.generation = 0
         self.factors: Mapping[str, float] = {}
         self.command_source = CommandSource()
         self.episodes = Episodes(self)
-        self.devices = SharedDevices()
+        self.devices = run_state.SharedDevices()
         self.changing = threading.RLock()
         self.commander = ""
         self.followed_ns = 0
         self.held = False
         self.start_failed = False
-        self.state: ControlState | None = None
-        self.on_state: list[Callable[[ControlState], None]] = []
+        self.state: run_state.ControlState | None = None
+        self.on_state: list[Callable[[run_state.ControlState], None]] = []
         self.on_goal: list[Callable[[Mapping[str, Any]], None]] = []
         self.goal_door: Callable[..., None] | None = None
-        self.plan: PlanRecord | None = None
-        self.acting: ActingPolicy | None = None
-        self.sensors: dict[str, SensorFigures] = {}
+        self.plan: run_state.PlanRecord | None = None
+        self.acting: run_state.ActingPolicy | None = None
+        self.sensors: dict[str, run_state.SensorFigures] = {}
         self.failure: tuple[str, Exception] | None = None
         self.finished = threading.Event()
         self.stopping = threading.Event()
@@ -242,7 +110,7 @@ class Session:
         self._new_state = threading.Condition()
 
     @cached_property
-    def absent(self) -> tuple[AbsentSensor, ...]:
+    def absent(self) -> tuple[run_state.AbsentSensor, ...]:
         """The sensors that this machine cannot run; determined once.
 
         Raises:
@@ -289,15 +157,23 @@ class Session:
         """Whether control was created."""
         return self._control is not None
 
-    def context(self, name: str, **more: Any) -> Context:
-        """The context for a plugin's `make` in the host, with the further fields `more`."""
-        return self.config.context(name, self.clock, self.request.seed, bus=self.bus, keys=self.request.keys, **more)
+    @property
+    def signals(self) -> Sequence[tuple[str, int]]:
+        """Topic and size of each signal of the hardware, in the order of `ControlState.signals`."""
+        return self.control.signals
+
+    @property
+    def conditions(self) -> Sequence[Mapping[str, Any]]:
+        """The conditions of joints in control's last report."""
+        return list(self.control.report["counters"].get("conditions", ()))
 
     def make(self, kind: str, component: ComponentConfig, name: str, **more: Any) -> Any:
         """Make a component of the YAML by its plugin; `name` and `more` go into the context."""
-        return self.registry.find(kind, component.type).make(component.options, self.context(name, **more))
+        given = {"bus": self.bus, "keys": self.request.keys, **more}
+        context = Context.of(self.config, name, self.clock, self.request.seed, **given)
+        return self.registry.find(kind, component.type).make(component.options, context)
 
-    def take_state(self, state: ControlState) -> None:
+    def take_state(self, state: run_state.ControlState) -> None:
         """Set the newest state, and wake those who wait for it."""
         with self._new_state:
             self.state = state
@@ -305,12 +181,12 @@ class Session:
         for call in tuple(self.on_state):
             call(state)
 
-    def watch_states(self) -> StateWatch:
+    def watch_states(self) -> run_state.StateWatch:
         """Wait for the states from now on: one at each tick of control, even while the joints do not answer.
 
         `/joint_states`, in contrast, has a message only for each state that was measured.
         """
-        return StateWatch(self, self._new_state)
+        return run_state.StateWatch(lambda: self.state, self._new_state)
 
     def measured(self) -> JointReading:
         """The newest joint state.
@@ -331,7 +207,7 @@ class Session:
         mask[columns] = True
         full = np.zeros((len(positions), len(robot.joints)))
         full[:, columns] = positions
-        self.plan = PlanRecord(self.generation, start_ns, step_ns, mask, full)
+        self.plan = run_state.PlanRecord(self.generation, start_ns, step_ns, mask, full)
         self.control.write_plan(self.plan)
 
     def send_goal(self, executor: str, goal_id: str, goal: Mapping[str, Any], stops: int | None = None) -> None:
@@ -357,6 +233,26 @@ class Session:
             self.control.call("goal", executor=executor, goal_id=goal_id, goal={**checked, **plain}, **requested)
 
         send(goal) if self.goal_door is None else self.goal_door(executor, goal_id, goal, send)
+
+    def cancel_goals(self, executor: str = "") -> None:
+        """Cancel the goal of an executor, or all goals if it is empty; the executors then hold.
+
+        Raises:
+            ComponentFailed: if control has died.
+        """
+        self.control.call("cancel", executor=executor)
+
+    def raise_fault(self, fault: str) -> None:
+        """Have control brake all joints and hold until a reset.
+
+        Raises:
+            ComponentFailed: if control has died.
+        """
+        self.control.call("fault", fault=fault)
+
+    def reset_episode(self, seed: int) -> bool:
+        """Set up the simulated scene again; False if an emergency stop is latched, so that nothing has changed."""
+        return bool(self.command("reset_episode", seed=seed)["begun"])
 
     @property
     def stops(self) -> int:
@@ -480,19 +376,3 @@ class Session:
         if self.failure is None and not self.finished.is_set():
             self.failure = (component, error)
         self.finished.set()
-
-
-class StateWatch:
-    """Waits for states of control; made by `Session.watch_states`."""
-
-    def __init__(self, session: Session, new_state: threading.Condition) -> None:
-        self._session, self._new_state = session, new_state
-        self._seen = session.state
-
-    def get(self, timeout_s: float = 0.0) -> ControlState | None:
-        """The newest state, if it has not been returned yet; None if none comes within `timeout_s` [s]."""
-        with self._new_state:
-            if not self._new_state.wait_for(lambda: self._session.state is not self._seen, timeout_s):
-                return None
-            self._seen = self._session.state
-            return self._seen

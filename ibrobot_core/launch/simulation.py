@@ -54,7 +54,7 @@ class SimulatedEpisodes(SessionWorker):
     def _begin_episode(self) -> None:
         session = self.session
         seed = session.request.seed + session.episodes.number
-        if not session.command("reset_episode", seed=seed)["begun"]:
+        if not session.reset_episode(seed):
             return  # an emergency stop is latched
         self._begun_ns = session.clock.now_ns()
         session.episodes.begin()

@@ -20,8 +20,8 @@ from ibrobot_testing.fakes import FakePolicy
 from ibrobot_core.cli.run import _Signals, run_robot
 from ibrobot_core.config.load import load_config
 from ibrobot_core.errors import PolicyError
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.run_hooks import RunHooks
 

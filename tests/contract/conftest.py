@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from ibrobot_testing.contexts import ARM, GRIPPER, make_robot
 
-from ibrobot_core.config.schema import (
+from ibrobot_core.options import NoOptions
+from ibrobot_core.schema import (
     ActionSpec,
     Align,
     ContractConfig,
@@ -19,7 +20,6 @@ from ibrobot_core.config.schema import (
     PeripheralConfig,
     RobotConfig,
 )
-from ibrobot_core.options import NoOptions
 
 STATE = ObservationSpec("observation.state", topic="/joint_states")
 TOP = ObservationSpec(

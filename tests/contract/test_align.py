@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ibrobot_core.config.schema import Align
 from ibrobot_core.contract.align import Stream
+from ibrobot_core.schema import Align
 
 MS = 1_000_000
 S = 1000 * MS

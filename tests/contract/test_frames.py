@@ -16,7 +16,6 @@ from ibrobot_testing.images import encode_image
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.config.schema import Align, ImageSpec, ObservationSpec
 from ibrobot_core.contract import frames as frames_module
 from ibrobot_core.contract import image as image_module
 from ibrobot_core.contract.frames import FrameAssembler, FrameSampler
@@ -27,6 +26,7 @@ from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.policy import Frame
 from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Image, Imu, JointState, Message, Vector3
 from ibrobot_core.plugins import Registry
+from ibrobot_core.schema import Align, ImageSpec, ObservationSpec
 
 Make = Callable[..., Any]
 MS = 1_000_000

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_testing.images import encode_image
 
-from ibrobot_core.config.schema import ImageSpec
 from ibrobot_core.contract.image import ENCODINGS, decode_image, pixels, resize
 from ibrobot_core.errors import ContractError
 from ibrobot_core.messages import Header, Image
+from ibrobot_core.schema import ImageSpec
 
 HEADER = Header(5, "camera")
 

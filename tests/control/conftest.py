@@ -17,11 +17,11 @@ from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, from_document
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.core import ControlCore
-from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.descriptors import ExecutorDescriptor, HardwareDescriptor
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces import Context, JointReading, Torque
 from ibrobot_core.interfaces.hardware import Condition, Holding
+from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 from ibrobot_core.plugins import Entry, Registry, discover
 from ibrobot_core.robot import Vector
 

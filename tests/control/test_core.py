@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ibrobot_core.control import core
-from ibrobot_core.control.link import PlanRecord
 from ibrobot_core.errors import ConfigError, HardwareError, NotSupported
+from ibrobot_core.interfaces.run_state import PlanRecord
 
 POINTS = {"joint_names": ["pan", "lift"], "points": [{"time_from_start_ns": 400_000_000, "positions": [0.3, 0.2]}]}
 GOAL = {"executor": "arm_trajectory", "goal_id": "one", "goal": {"trajectory": POINTS}}

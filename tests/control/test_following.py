@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_testing.contexts import make_robot
 
-from ibrobot_core.config.schema import Following
 from ibrobot_core.control.following import FollowingError
 from ibrobot_core.control.safety import SafetyLayer
+from ibrobot_core.schema import Following
 
 ROBOT = make_robot()
 PERIOD_NS = 10_000_000

@@ -23,8 +23,8 @@ from logged_run import wait_for
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.config import from_document
 from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
-from ibrobot_core.control.link import ControlState, PlanRecord
 from ibrobot_core.errors import ComponentFailed, HardwareError
+from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 from ibrobot_core.plugins import installed_plugins
 
 if TYPE_CHECKING:

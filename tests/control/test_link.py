@@ -14,16 +14,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ibrobot_core.control import link
-from ibrobot_core.control.link import (
-    PLAN_ROWS,
-    STATE_SLOTS,
-    ControlState,
-    LinkLayout,
-    PlanRecord,
-    SharedMemory,
-    raise_error,
-)
+from ibrobot_core.control.link import PLAN_ROWS, STATE_SLOTS, LinkLayout, SharedMemory, raise_error
 from ibrobot_core.errors import HardwareError
+from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 from ibrobot_core.memory import create_memory
 
 LAYOUT = LinkLayout(joints=3, signals=2)

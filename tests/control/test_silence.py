@@ -6,7 +6,7 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.config.schema import InferenceConfig
+from ibrobot_core.schema import InferenceConfig
 
 PEER_TIMEOUT_S = 0.3
 ACCELERATION = 40.0

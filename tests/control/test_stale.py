@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ibrobot_core.control.link import PlanRecord
+from ibrobot_core.interfaces.run_state import PlanRecord
 from ibrobot_core.units import ns, seconds
 from tests.control.conftest import PERIOD_S, Rig
 

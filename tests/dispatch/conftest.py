@@ -11,7 +11,13 @@ from ibrobot_testing.contexts import START_NS
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.config.schema import (
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.dispatch.dispatcher import Dispatcher
+from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
+from ibrobot_core.interfaces import PolicySpec
+from ibrobot_core.messages import Header, JointState
+from ibrobot_core.options import NoOptions
+from ibrobot_core.schema import (
     ActionSpec,
     Align,
     ContractConfig,
@@ -22,12 +28,6 @@ from ibrobot_core.config.schema import (
     RobotConfig,
     Smoothing,
 )
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.dispatch.dispatcher import Dispatcher
-from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
-from ibrobot_core.interfaces import PolicySpec
-from ibrobot_core.messages import Header, JointState
-from ibrobot_core.options import NoOptions
 
 STEP = 100_000_000
 """The contract's tick at 10 Hz [ns]."""

@@ -19,14 +19,17 @@ ALLOWED = {
     ): "every encoding that contracts know",
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.config"): DRIVE,
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.control.build"): DRIVE,
-    ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.control.link"): DRIVE,
+    ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.interfaces.run_state"): DRIVE,
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.plugins"): DRIVE,
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.control.safety"): LOOP,
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.dispatch.smoother"): LOOP,
     ("ibrobot-plugin-mujoco/tests/test_model_limits.py", "ibrobot_core.config.models"): (
         "limits as core reads them, against those of MuJoCo"
     ),
-    ("ibrobot-plugin-data/tests/test_interleavings.py", "ibrobot_core.control.link"): "plans beside other requests",
+    (
+        "ibrobot-plugin-data/tests/test_interleavings.py",
+        "ibrobot_core.interfaces.run_state",
+    ): "plans beside other requests",
     ("ibrobot-plugin-data/tests/test_conversion_events.py", "ibrobot_core.events"): "a line as a command prints it",
     ("ibrobot-plugin-web/tests/test_ui_jobs.py", "ibrobot_core.events"): "a line as a command prints it",
 }

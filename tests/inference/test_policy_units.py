@@ -15,11 +15,11 @@ from lerobot_units import angle, normalised
 from numpy.typing import NDArray
 
 from ibrobot_core.calibration import ZERO_AT, Calibration, JointCalibration
-from ibrobot_core.config.schema import Align
 from ibrobot_core.contract.joint_units import JointUnits, radians_to_lerobot
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import CalibrationError
 from ibrobot_core.interfaces import Feature, Frame, Policy, PolicySpec, Tensors
+from ibrobot_core.schema import Align
 
 JOINTS = host_context().robot.joint_names
 CALIBRATION: dict[str, dict[str, Any]] = {

@@ -48,11 +48,11 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
-from ibrobot_core.config.schema import Align
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
 from ibrobot_core.messages import Float64MultiArray, Header, JointState
+from ibrobot_core.schema import Align
 
 JOINTS = ("pan", "tilt")
 CONTRACT = Contract(

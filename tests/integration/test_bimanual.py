@@ -27,8 +27,9 @@ from ibrobot_core.contract.joint_units import calibrations
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.control import host
 from ibrobot_core.errors import IbrobotError
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import RESET, Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("prompt_threads")]

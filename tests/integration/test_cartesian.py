@@ -21,8 +21,9 @@ from ibrobot_core.contract.frames import FrameAssembler
 from ibrobot_core.contract.joint_units import policy_units
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ComponentFailed, ConfigError
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]

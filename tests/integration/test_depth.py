@@ -19,10 +19,10 @@ from PIL import Image as Pillow
 from recordings import JOINTS, START_NS
 
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.config.schema import Align, ImageSpec
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
 from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Image, JointState
+from ibrobot_core.schema import Align, ImageSpec
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 

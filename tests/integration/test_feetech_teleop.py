@@ -26,8 +26,9 @@ from ibrobot_core.config import load_config
 from ibrobot_core.contract.joint_units import calibrations
 from ibrobot_core.control import host
 from ibrobot_core.errors import IbrobotError
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import Float64MultiArray
 from ibrobot_core.plugins import installed_plugins
 

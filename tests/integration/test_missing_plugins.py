@@ -13,8 +13,9 @@ from ibrobot_core import plugins
 from ibrobot_core.cli.main import main
 from ibrobot_core.config import find_config, load_config
 from ibrobot_core.errors import PluginError
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
 
 pytestmark = pytest.mark.integration

@@ -25,14 +25,15 @@ from stream_server import StreamServer, number_of
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.config import find_config, load_config
-from ibrobot_core.config.schema import Align, ImageSpec
 from ibrobot_core.contract.frames import FrameAssembler, FrameSampler
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature, Frame
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import CompressedImage, Float64MultiArray, Header, Imu, JointState, Message, Vector3
 from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.schema import Align, ImageSpec
 
 pytestmark = pytest.mark.integration
 

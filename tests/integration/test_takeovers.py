@@ -11,8 +11,9 @@ import takeovers
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.config import load_config
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
 
 pytestmark = pytest.mark.integration

@@ -11,8 +11,7 @@ import pytest
 from ibrobot_core import component as module
 from ibrobot_core.component import SessionWorker
 from ibrobot_core.errors import ComponentFailed, SensorError
-from ibrobot_core.launch.session import LaunchRequest
-from ibrobot_core.launch.views import RunView
+from ibrobot_core.interfaces.run import LaunchRequest, RunView
 
 PATIENCE_S = 30.0
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import attrs
 import pytest
 
-from ibrobot_core.config.schema import ObservationSpec
 from ibrobot_core.errors import ComponentFailed, NotSupported, TeleopError
 from ibrobot_core.interfaces.hardware import Condition, Severity
 from ibrobot_core.launch.runtime import ESTOP, RESET, Runtime
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import DiagnosticArray, DiagnosticStatus, KeyValue
+from ibrobot_core.schema import ObservationSpec
 
 if TYPE_CHECKING:
     from fake_runs import Runs

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, override
 
 import numpy as np
 
-from ibrobot_core.launch.sources.source_worker import SourceWorker
+from ibrobot_core.component import SourceWorker
 from ibrobot_core.launch.sources.teleop import TeleopSource
 
 if TYPE_CHECKING:
     from fake_runs import Runs
 
-    from ibrobot_core.config.schema import ControlMode
     from ibrobot_core.launch.session import Session
+    from ibrobot_core.schema import ControlMode
 
 
 class Raise(SourceWorker):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from ibrobot_testing.fakes import FakeHardware
 
-from ibrobot_core.control.link import ControlState
 from ibrobot_core.interfaces import JointReading, TeleopCommand
+from ibrobot_core.interfaces.run_state import ControlState
 
 if TYPE_CHECKING:
     from fake_runs import Runs

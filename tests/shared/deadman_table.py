@@ -33,8 +33,9 @@ from ibrobot_core.api import Context, Header, Twist, TwistStamped, Vector3
 from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.config import load_config
 from ibrobot_core.errors import IbrobotError
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.terminal import decode as keys_of
 

@@ -42,8 +42,9 @@ from ibrobot_core.api import Header, Pose, PoseStamped, Twist, TwistStamped, Vec
 from ibrobot_core.child import Channel
 from ibrobot_core.config import RobotConfig, from_document, load_config
 from ibrobot_core.errors import IbrobotError
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
 
 CONFIG = Path(__file__).parents[2] / "configs" / "so101_blind.yaml"

@@ -14,8 +14,9 @@ import pytest
 from ibrobot_testing.site import Site, made_up_site
 
 from ibrobot_core.config import load_config
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import discover
 
 PLUGINS = Path(__file__).parent / "plugins"

@@ -41,9 +41,9 @@ from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, from_document
 from ibrobot_core.control.build import build_core
-from ibrobot_core.control.link import PlanRecord
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Context, JointReading, Teleop
+from ibrobot_core.interfaces.run_state import PlanRecord
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.units import NS_PER_S
 

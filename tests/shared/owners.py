@@ -58,11 +58,11 @@ from trainer import install as install_trainer
 
 from ibrobot_core.cli.main import main as ibrobot
 from ibrobot_core.clock import RealClock, SteppedClock
-from ibrobot_core.config.schema import Align
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
 from ibrobot_core.messages import Float64MultiArray, Header, JointState
+from ibrobot_core.schema import Align
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

@@ -18,8 +18,9 @@ from ibrobot_ros2 import decode, encode
 from ibrobot_core.config.load import load_config
 from ibrobot_core.convert import is_array, is_literal, is_mapping, is_sequence, is_union
 from ibrobot_core.errors import IbrobotError
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import (
     MESSAGE_TYPES,
     CameraInfo,

@@ -14,10 +14,10 @@ from ibrobot_testing.contexts import host_context
 from numpy.typing import NDArray
 
 from ibrobot_core.clock import SteppedClock
-from ibrobot_core.config.schema import Align, ImageSpec
 from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
 from ibrobot_core.interfaces import EpisodeEnd, EpisodeStart, Feature
 from ibrobot_core.messages import Float64MultiArray, Header, Image, JointState, String
+from ibrobot_core.schema import Align, ImageSpec
 
 START_NS = 1_700_000_000_000_000_000
 JOINTS = ("pan", "lift", "gripper")

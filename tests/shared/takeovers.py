@@ -44,8 +44,9 @@ from ibrobot_core.config import load_config
 from ibrobot_core.contract.frames import FrameAssembler, FrameSampler
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.interfaces import Frame
+from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import LaunchRequest, Session
+from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
 
 CONFIG = ROOT / "configs" / "so101_blind.yaml"

@@ -7,7 +7,7 @@ from typing import Any, override
 
 from ibrobot_core.component import SessionWorker
 from ibrobot_core.interfaces.hardware import Severity
-from ibrobot_core.launch.views import RunView
+from ibrobot_core.interfaces.run import RunView
 from ibrobot_core.messages import (
     DIAGNOSTICS,
     ROBOT_STATUS,
@@ -73,7 +73,7 @@ class Status(SessionWorker):
             DiagnosticStatus(level if name == "loop" else DiagnosticStatus.OK, name, "", robot, _values(values))
             for name, values in groups.items()
         ]
-        statuses += [_of_joint(each, robot) for each in session.control.report["counters"].get("conditions", ())]
+        statuses += [_of_joint(each, robot) for each in session.conditions]
         return DiagnosticArray(Header(now_ns), tuple(statuses))
 
 

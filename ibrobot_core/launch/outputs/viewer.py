@@ -8,7 +8,7 @@ from typing import override
 from ibrobot_core.component import SessionWorker
 from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.interfaces import Viewer
-from ibrobot_core.launch.views import RunView
+from ibrobot_core.interfaces.run import RunView
 
 _RATE_HZ = 30.0
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ibrobot_core.control.plausible import Plausibility
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import JointReading, Teleop, TeleopCommand, begin_operation, operate
-from ibrobot_core.launch.pulses import Pulse
-from ibrobot_core.launch.views import RunAccess
+from ibrobot_core.interfaces.run import StreamingRun
+from ibrobot_core.pulses import Pulse
 from ibrobot_core.robot import Robot, Vector
 from ibrobot_core.units import ns
 
@@ -75,7 +75,7 @@ class OperatorDevices:
             unit of work, and pause for what may take long.
     """
 
-    def __init__(self, session: RunAccess, devices: Mapping[str, str]) -> None:
+    def __init__(self, session: StreamingRun, devices: Mapping[str, str]) -> None:
         self._session = session
         self._devices = devices
         self._connected: list[_Connected] = []

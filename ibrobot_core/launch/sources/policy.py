@@ -9,21 +9,20 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.component import Component
-from ibrobot_core.config.schema import ControlMode, InferenceConfig
+from ibrobot_core.component import Component, SourceWorker, TransportLink
 from ibrobot_core.contract.joint_units import ACTION, JointUnits
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.dispatch.dispatcher import Dispatcher, DispatchStats
+from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.errors import wrong_input
 from ibrobot_core.inference.client import Chunk, EngineClient, InferenceClient, LockstepClient
 from ibrobot_core.interfaces import Engine, ModelContext, Policy
+from ibrobot_core.interfaces.run_state import ActingPolicy, DispatchStats
 from ibrobot_core.launch.models import check_model
-from ibrobot_core.launch.session import ActingPolicy, Session
-from ibrobot_core.launch.sources.source_worker import SourceWorker
-from ibrobot_core.launch.transport import TransportLink
+from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import MODEL_ANSWERS, Header, ModelAnswer
 from ibrobot_core.options import documented, option
 from ibrobot_core.robot import Vector
+from ibrobot_core.schema import ControlMode, InferenceConfig
 from ibrobot_core.services import Service
 from ibrobot_core.units import NS_PER_S
 

@@ -6,11 +6,11 @@ from typing import override
 
 import numpy as np
 
-from ibrobot_core.config.schema import ControlMode
+from ibrobot_core.component import SourceWorker
 from ibrobot_core.errors import TeleopError
+from ibrobot_core.interfaces.run import StreamingRun
 from ibrobot_core.launch.sources.operator_devices import OperatorDevices
-from ibrobot_core.launch.sources.source_worker import SourceWorker
-from ibrobot_core.launch.views import RunAccess
+from ibrobot_core.schema import ControlMode
 
 
 class TeleopSource(SourceWorker):
@@ -20,10 +20,11 @@ class TeleopSource(SourceWorker):
     device again.
     """
 
+    session: StreamingRun
     sends_stops = True
     urgent = True
 
-    def __init__(self, session: RunAccess, mode: ControlMode) -> None:
+    def __init__(self, session: StreamingRun, mode: ControlMode) -> None:
         self._devices = OperatorDevices(session, mode.devices)
         self._commands = False
         """Whether the last plan has joints; one without any lets them brake."""
@@ -62,7 +63,7 @@ class TeleopSource(SourceWorker):
         except TeleopError as error:
             self.end()
             if not session.finished.is_set():
-                session.control.call("fault", fault=str(error))
+                session.raise_fault(str(error))
             return
         if session.finished.is_set():
             return  # from here on, only emergency stops count

@@ -16,10 +16,10 @@ from ibrobot_core.app import (
     ControlMode,
     FrameSampler,
     LaunchRequest,
-    RunAccess,
     Runtime,
     Session,
     SourceWorker,
+    StreamingRun,
     Subscription,
     installed_plugins,
 )
@@ -38,9 +38,10 @@ type Observation = dict[str, Any]
 class EnvironmentSource(SourceWorker):
     """Takes the place of a policy: `frame` is the newest observation, `act` commands from its tick on."""
 
+    session: StreamingRun
     autonomous = True
 
-    def __init__(self, session: RunAccess, mode: ControlMode) -> None:
+    def __init__(self, session: StreamingRun, mode: ControlMode) -> None:
         super().__init__(session, mode, "actions of an environment")
         self._contract = Contract.from_config(session.config)
         self._sampler: FrameSampler | None = None
@@ -154,7 +155,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return spaces.Dict(by_key)
 
     def _start(self) -> None:
-        def source(session: RunAccess, mode: Any) -> EnvironmentSource:
+        def source(session: StreamingRun, mode: Any) -> EnvironmentSource:
             self._source = EnvironmentSource(session, mode)
             return self._source
 
@@ -173,7 +174,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._source.end()
         session.clock.advance(-session.clock.now_ns() % _ALIGNED_NS)
         self._tick()
-        if not session.command("reset_episode", seed=seed)["begun"]:
+        if not session.reset_episode(seed):
             raise HardwareError("the episode cannot begin: an emergency stop is latched")
         self._begun_ns = session.clock.now_ns()
         self._source.begin(seed)

@@ -25,10 +25,10 @@ from ibrobot_core.app import (
     FrameSampler,
     LaunchRequest,
     RobotConfig,
-    RunAccess,
     Runtime,
     Session,
     SourceWorker,
+    StreamingRun,
     error_text,
     find_config,
     installed_plugins,
@@ -67,11 +67,12 @@ class ProgramSource(SourceWorker):
     A command counts until the executors' `stale_timeout`; then the arm holds where it is.
     """
 
+    session: StreamingRun
     urgent = True
     autonomous = True
 
     def __init__(
-        self, session: RunAccess, mode: ControlMode, channel: Channel, pictures: int, features: RobotFeatures
+        self, session: StreamingRun, mode: ControlMode, channel: Channel, pictures: int, features: RobotFeatures
     ) -> None:
         super().__init__(session, mode, "a program of LeRobot's", (CONTROL,))
         self._channel = channel

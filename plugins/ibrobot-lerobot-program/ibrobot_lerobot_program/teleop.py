@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ibrobot_core.api import JointReading, RealClock, Robot, Teleop, TeleopError, Vector, did_you_mean
+from ibrobot_core.api import Context, JointReading, RealClock, Robot, Teleop, TeleopError, Vector, did_you_mean
 from ibrobot_core.app import (
     KeyReader,
     RobotConfig,
@@ -78,7 +78,7 @@ class ProgramTeleop:
             TeleopError: if it cannot be opened.
         """
         keys = KeyReader() if sys.stdin.isatty() else None
-        context = self._config.context(self._name, self._clock, keys=keys.subscribe if keys is not None else None)
+        context = Context.of(self._config, self._name, self._clock, keys=keys.subscribe if keys is not None else None)
         section = self._config.teleoperation[self._name]
         descriptor = installed_plugins().find("teleop", section.type)
         device: Teleop = descriptor.make(section.options, context)

@@ -13,7 +13,7 @@ from ibrobot_data.recording_session import RecordOptions
 from ibrobot_data.recording_session import Session as SessionEvent
 
 if TYPE_CHECKING:
-    from ibrobot_core.app import Component, RobotConfig, RunAccess
+    from ibrobot_core.app import Component, RecordedRun, RobotConfig
 
 
 CONVERT = Command(
@@ -51,7 +51,7 @@ def ibrobot_sources() -> Iterable[SourceDescriptor]:
     )
 
 
-def _recording(options: EpisodesOptions | None, session: RunAccess) -> Component:
+def _recording(options: EpisodesOptions | None, session: RecordedRun) -> Component:
     from ibrobot_data.partial_recording import PartialRecording
     from ibrobot_data.recording_worker import NoRecording, RecordingWorker
 

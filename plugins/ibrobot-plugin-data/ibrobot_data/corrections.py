@@ -24,9 +24,9 @@ from ibrobot_core.app import (
     ControlState,
     OperatorDevices,
     PolicySource,
-    RunAccess,
     Service,
     SourceWorker,
+    StreamingRun,
 )
 from ibrobot_data.handover import Handover
 from ibrobot_data.options import COMMANDER, HANDOVER, OPERATOR, POLICY, EpisodesOptions, has_button, options_of
@@ -65,11 +65,12 @@ class Corrections(SourceWorker):
         policy: runs the policy.
     """
 
+    session: StreamingRun
     autonomous = True
     sends_stops = True
     urgent = True
 
-    def __init__(self, session: RunAccess, mode: ControlMode, policy: PolicySource) -> None:
+    def __init__(self, session: StreamingRun, mode: ControlMode, policy: PolicySource) -> None:
         assert mode.inference is not None
         config = session.config
         self._devices = OperatorDevices(session, mode.inference.devices)
@@ -209,7 +210,7 @@ class Corrections(SourceWorker):
             self._command(command)
         except TeleopError as error:
             self.end()
-            session.control.call("fault", fault=str(error))
+            session.raise_fault(str(error))
 
     def _press(self, command: TeleopCommand, presses: int) -> None:
         """Act on keys and buttons."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, get_args, override
 import attrs
 
 from ibrobot_core.api import NS_PER_S, Contract, NotSupported, RecorderError, documented, option, seconds
-from ibrobot_core.app import DiskFull, Episodes, NoRequest, RunAccess, Service, wrong_input
+from ibrobot_core.app import DiskFull, Episodes, NoRequest, RecordedRun, Service, wrong_input
 from ibrobot_data.conversion import OUTCOMES
 from ibrobot_data.cues import Cue
 from ibrobot_data.episode_dataset import EpisodeDataset, count_complete
@@ -158,7 +158,7 @@ class EpisodeService(Episodes):
             topic of the contract in a run where an operator records.
     """
 
-    def __init__(self, session: RunAccess, recording: RecordingWorker) -> None:
+    def __init__(self, session: RecordedRun, recording: RecordingWorker) -> None:
         super().__init__(session)
         self._recording = recording
         self.wanted: int | None = None

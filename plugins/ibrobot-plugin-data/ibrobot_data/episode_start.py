@@ -12,7 +12,7 @@ from ibrobot_provenance.ownership import Ownership
 
 import ibrobot_core
 from ibrobot_core.api import MODEL_ANSWERS, Contract, EpisodeStart, ModelAnswer, RecorderError, String
-from ibrobot_core.app import InUse, RecordingConfig, RobotConfig, RunAccess, calibrations
+from ibrobot_core.app import InUse, RecordedRun, RecordingConfig, RobotConfig, calibrations
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.options import COMMANDER
 
@@ -47,7 +47,7 @@ def take_next_folder(recording: RecordingConfig) -> Ownership:
 
 
 def episode_start(
-    session: RunAccess, recording: RecordingConfig, directory: Path, *, number: int, stamp_ns: int, prompt: str
+    session: RecordedRun, recording: RecordingConfig, directory: Path, *, number: int, stamp_ns: int, prompt: str
 ) -> EpisodeStart:
     """The start of an episode.
 

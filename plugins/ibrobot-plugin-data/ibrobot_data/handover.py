@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ibrobot_core.api import Vector, ns, seconds
-from ibrobot_core.app import ControlState, RunAccess
+from ibrobot_core.app import ControlState, StreamingRun
 
 _BRAKE_SHARE, _FADE_SHARE = 0.75, 0.5
 """Fraction of the limits used for braking, and for moving to the positions of a device."""
@@ -25,7 +25,7 @@ class Handover:
         joints: the joints of the mode's executors, in robot order.
     """
 
-    def __init__(self, session: RunAccess, joints: tuple[str, ...]) -> None:
+    def __init__(self, session: StreamingRun, joints: tuple[str, ...]) -> None:
         robot = session.config.robot
         self._session = session
         self._joints = joints

@@ -7,7 +7,7 @@ from math import inf
 from typing import override
 
 from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, ViewerDescriptor, seconds
-from ibrobot_core.app import DiskFull, Event, RunAccess, RunHooks
+from ibrobot_core.app import DiskFull, Event, RecordedRun, RunHooks
 from ibrobot_data.cues import ENDING_S, Cues
 from ibrobot_data.episode_service import RECORD, START, EpisodeService
 from ibrobot_data.options import has_button
@@ -44,7 +44,7 @@ class Operator(RunHooks):
     """
 
     def __init__(
-        self, run: RunAccess, service: EpisodeService, count: int | None, reset_time_s: float, prompt: str | None, *,
+        self, run: RecordedRun, service: EpisodeService, count: int | None, reset_time_s: float, prompt: str | None, *,
         auto: bool, keys: bool, continuous: bool = False, report: Callable[[Event], None] | None = None,
         cues: Cues | None = None,
     ) -> None:  # fmt: skip
@@ -322,7 +322,7 @@ class Operator(RunHooks):
         self._not_before_s = self._clock_s() + self._reset_time_s
 
 
-def _can_begin(run: RunAccess) -> bool:
+def _can_begin(run: RecordedRun) -> bool:
     """Whether the viewer, a teleoperation device of the mode, or another program can begin episodes."""
     if (viewer := run.config.viewer) is not None:
         shown_by = run.registry.find("viewer", viewer.type)

@@ -11,7 +11,7 @@ from ibrobot_core.api import OptionFault, TeleopDescriptor, documented, option
 from ibrobot_core.app import RUN_KEYS, check_key, installed_plugins
 
 if TYPE_CHECKING:
-    from ibrobot_core.app import RobotConfig, RunAccess
+    from ibrobot_core.app import RobotConfig, RunView
 
 COMMANDER = "/commander"
 """Topic (std_msgs/msg/String) with who commands the robot at each state of control, in modes with `intervene`."""
@@ -59,7 +59,7 @@ def options_of(config: RobotConfig) -> EpisodesOptions:
     return section.options
 
 
-def has_button(run: RunAccess, devices: Iterable[str], event: str) -> bool:
+def has_button(run: RunView, devices: Iterable[str], event: str) -> bool:
     """Whether one of these teleoperation devices of a run has a button for an event."""
     for name in devices:
         device = run.config.teleoperation[name]

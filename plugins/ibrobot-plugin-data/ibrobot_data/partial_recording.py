@@ -9,7 +9,7 @@ from types import NoneType
 from typing import override
 
 from ibrobot_core.api import EpisodeEnd, RecorderError, String, ns
-from ibrobot_core.app import NoRequest, Received, RecordingConfig, RunAccess, Service
+from ibrobot_core.app import NoRequest, Received, RecordedRun, RecordingConfig, Service
 from ibrobot_data.options import COMMANDER, POLICY, EpisodesOptions
 from ibrobot_data.recording_worker import RecordingWorker
 
@@ -30,7 +30,7 @@ class PartialRecording(RecordingWorker):
 
     keeps_whole = False
 
-    def __init__(self, session: RunAccess, config: RecordingConfig, options: EpisodesOptions) -> None:
+    def __init__(self, session: RecordedRun, config: RecordingConfig, options: EpisodesOptions) -> None:
         super().__init__(session, config)
         self._options = options
         self._recent: deque[Received] = deque()

@@ -27,7 +27,15 @@ from ibrobot_core.api import (
     RecorderError,
     seconds,
 )
-from ibrobot_core.app import Component, ComponentFailed, Received, RecordingConfig, RunAccess, SessionWorker, error_line
+from ibrobot_core.app import (
+    Component,
+    ComponentFailed,
+    Received,
+    RecordedRun,
+    RecordingConfig,
+    SessionWorker,
+    error_line,
+)
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.episode_start import episode_start, is_kept, model_topics, take_next_folder
 from ibrobot_data.written import WrittenEpisode, lost_text, read_back
@@ -71,13 +79,13 @@ class RecordingWorker(SessionWorker):
     At the end of the run, it waits for a slow disk as long as that takes data, until an operator gives up.
     """
 
-    session: RunAccess
+    session: RecordedRun
     urgent = True
     may_wait = True
     keeps_whole = True
     """Whether an episode of the run is one recording, so that it can be recorded again."""
 
-    def __init__(self, session: RunAccess, config: RecordingConfig) -> None:
+    def __init__(self, session: RecordedRun, config: RecordingConfig) -> None:
         super().__init__(session, "recording", f"{config.type} into {config.root}")
         self._config = config
         self._contract = Contract.from_config(session.config)

@@ -7,7 +7,7 @@ from typing import Any, override
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S, HardwareError, Vector, ns, seconds
-from ibrobot_core.app import ControlMode, ControlState, RunAccess, SourceWorker
+from ibrobot_core.app import ControlMode, ControlState, SourceWorker, StreamingRun
 from ibrobot_data.playback import Playback, Track
 
 _APPROACH_SPEED = 0.5
@@ -33,10 +33,13 @@ class ReplaySource(SourceWorker):
         speed: seconds of the recording that are played per second.
     """
 
+    session: StreamingRun
     autonomous = True
     urgent = True
 
-    def __init__(self, session: RunAccess, mode: ControlMode, episode: str, playback: Playback, speed: float) -> None:
+    def __init__(
+        self, session: StreamingRun, mode: ControlMode, episode: str, playback: Playback, speed: float
+    ) -> None:
         super().__init__(session, mode, f"{episode}, {playback.duration / speed:.1f} s")
         self._episode, self._playback, self._speed = episode, playback, speed
         self._period_ns = ns(1.0 / session.config.control.rate_hz)
@@ -61,7 +64,7 @@ class ReplaySource(SourceWorker):
         recorded = self._playback.seed
         if not self.session.config.simulated or recorded is None:
             return
-        if not self.session.command("reset_episode", seed=recorded)["begun"]:
+        if not self.session.reset_episode(recorded):
             raise HardwareError("the replay cannot begin: reset the emergency stop first")
 
     @override

@@ -10,7 +10,7 @@ from pathlib import Path
 import attrs
 
 from ibrobot_core.api import EpisodeSummary, IbrobotError, seconds
-from ibrobot_core.app import RunAccess, error_line
+from ibrobot_core.app import RunView, error_line
 from ibrobot_data.plural import plural
 
 
@@ -49,7 +49,7 @@ class WrittenEpisode:
         return f"{self.path.name}: {', '.join(parts)}"
 
 
-def read_back(run: RunAccess, path: Path, stated: str, told: str, lost: Mapping[str, int]) -> WrittenEpisode:
+def read_back(run: RunView, path: Path, stated: str, told: str, lost: Mapping[str, int]) -> WrittenEpisode:
     """What is on the disk of an episode that the recorder has ended without an error.
 
     Args:

@@ -20,7 +20,7 @@ from ibrobot_testing.fakes import FakeTeleop
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, JointReading, TeleopCommand, TeleopDescriptor, ns
 from ibrobot_core.app import HOLD_S, ComponentFailed, ControlState, Registry
-from ibrobot_core.control.link import PlanRecord
+from ibrobot_core.interfaces.run_state import PlanRecord
 
 if TYPE_CHECKING:
     from fake_runs import Runs

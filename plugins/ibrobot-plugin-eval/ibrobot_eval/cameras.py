@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ibrobot_ros2.jpeg import fits_jpeg, is_jpeg, to_jpeg
 
-from ibrobot_core.api import CompressedImage, IbrobotError, Image, Message, RealClock, Sensor
+from ibrobot_core.api import CompressedImage, Context, IbrobotError, Image, Message, RealClock, Sensor
 from ibrobot_core.app import Bus, RobotConfig, Sight, Subscription, installed_plugins
 from ibrobot_eval.episodes import write
 
@@ -96,7 +96,7 @@ def live_pictures(config: RobotConfig, folder: Path) -> Iterator[str]:
             file, ready = folder / f"{name}.jpg", threading.Event()
             file.parent.mkdir(parents=True, exist_ok=True)
             peripheral = config.peripherals[name]
-            made = registry.find("sensor", peripheral.type).make(peripheral.options, config.context(name, clock, 0))
+            made = registry.find("sensor", peripheral.type).make(peripheral.options, Context.of(config, name, clock))
             thread = threading.Thread(
                 target=_follow, args=(made, name, file, ready, ended, problems), name=f"live {name}", daemon=True
             )

@@ -16,7 +16,7 @@ def servo_rows(session: RunView) -> list[tuple[str, ...]]:
         return []
     values: dict[str, list[float]] = {}
     begin = 0
-    for topic, size in session.control.signals:
+    for topic, size in session.signals:
         values[topic] = state.signals[begin : begin + size].tolist()
         begin += size
     rows = []

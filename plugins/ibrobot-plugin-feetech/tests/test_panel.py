@@ -22,7 +22,7 @@ def run(*, simulated: bool = False) -> Any:
     }
     config = SimpleNamespace(simulated=simulated, hardware=parts)
     state = SimpleNamespace(signals=np.array(values))
-    return cast("Any", SimpleNamespace(config=config, state=state, control=SimpleNamespace(signals=signals)))
+    return cast("Any", SimpleNamespace(config=config, state=state, signals=signals))
 
 
 def test_each_servo_has_a_row() -> None:

@@ -118,7 +118,7 @@ class _Schemas:
         return {"anyOf": [{"type": "string", "enum": schema["properties"][kind.type_key()]["enum"]}, schema]}
 
     def _of_typed(self, kind: type[ComponentConfig]) -> Schema:
-        offered = [descriptor for descriptor in self.registry.of_kind(kind.plugin_kind) if kind.takes(descriptor)]
+        offered = [descriptor for descriptor in self.registry.of_kind(kind.plugin_kind) if descriptor.fits(kind)]
         own, key = self.of_fields(fields(kind)), kind.type_key()
         own["properties"][key]["enum"] = [descriptor.type for descriptor in offered]
         default = own["properties"][key].get("default")

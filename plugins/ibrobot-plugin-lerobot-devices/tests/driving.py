@@ -34,7 +34,7 @@ from ibrobot_core.api import (
 from ibrobot_core.app import ComponentFailed, begin_operation, operate
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
-from ibrobot_core.control.link import PlanRecord
+from ibrobot_core.interfaces.run_state import PlanRecord
 from ibrobot_core.plugins import Entry, discover
 
 AXES = ("x", "y", "theta")

@@ -11,7 +11,7 @@ from typing import Any, override
 from ibrobot_ros2.goals import Actions, with_goals
 
 from ibrobot_core.api import DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
-from ibrobot_core.app import CONTROL, Component, ComponentFailed, Pulse, RunAccess, error_line
+from ibrobot_core.app import CONTROL, Component, ComponentFailed, GoalRun, Pulse, error_line
 from ibrobot_ros.options import RosOptions
 from ibrobot_ros.process import NodeProcess
 from ibrobot_ros.services import Services
@@ -42,7 +42,7 @@ class RosNode(Component):
 
     sends_stops = True
 
-    def __init__(self, options: RosOptions, session: RunAccess) -> None:
+    def __init__(self, options: RosOptions, session: GoalRun) -> None:
         super().__init__("ros", f"node /{options.name} in a process of its own", (CONTROL,))
         if session.request.lockstep and options.subscribe:
             raise NotSupported("ros.subscribe: a lockstep run cannot receive topics of ROS")

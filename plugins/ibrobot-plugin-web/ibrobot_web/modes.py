@@ -6,13 +6,13 @@ from collections import Counter
 from typing import Any
 
 from ibrobot_core.api import IbrobotError, TeleopDescriptor
-from ibrobot_core.app import ControlMode, Registry, RobotConfig
+from ibrobot_core.app import ControlMode, Plugins, RobotConfig
 
 _PAGE = "web"
 """The type of the teleoperation device that is the robot's page."""
 
 
-def modes_json(config: RobotConfig, registry: Registry, *, terminal: bool) -> list[dict[str, Any]]:
+def modes_json(config: RobotConfig, registry: Plugins, *, terminal: bool) -> list[dict[str, Any]]:
     """The modes, in the order of the YAML.
 
     Each has its `name`, a `label` that says what it does in the words of the plugins that do it, whether a `policy` or
@@ -56,7 +56,7 @@ def _jogs(config: RobotConfig, mode: ControlMode) -> dict[str, list[str]]:
     }
 
 
-def _label(config: RobotConfig, registry: Registry, mode: ControlMode) -> str:
+def _label(config: RobotConfig, registry: Plugins, mode: ControlMode) -> str:
     if mode.inference is not None:
         return f"run the policy {mode.inference.model}"
     if mode.planner is not None:
@@ -68,21 +68,22 @@ def _label(config: RobotConfig, registry: Registry, mode: ControlMode) -> str:
     return " and ".join(f"{group}: {text}" if group else text for group, text in words.items()) or mode.name
 
 
-def _words(registry: Registry, kind: str, type_: str) -> str:
+def _words(registry: Plugins, kind: str, type_: str) -> str:
     """What a plugin says that its type does; its name if it is not installed."""
     try:
         descriptor = registry.find(kind, type_)
     except IbrobotError:
         return type_
-    return descriptor.label or descriptor.summary
+    words: str = descriptor.label or descriptor.summary
+    return words
 
 
-def _lacks_terminal(config: RobotConfig, registry: Registry, mode: ControlMode) -> str:
+def _lacks_terminal(config: RobotConfig, registry: Plugins, mode: ControlMode) -> str:
     names = [name for name in mode.devices.values() if _needs_terminal(registry, config.teleoperation[name])]
     return f"{' and '.join(names)} needs a terminal: start the robot in one, with ibrobot launch" if names else ""
 
 
-def _needs_terminal(registry: Registry, device: Any) -> bool:
+def _needs_terminal(registry: Plugins, device: Any) -> bool:
     try:
         descriptor = registry.find("teleop", device.type)
     except IbrobotError:

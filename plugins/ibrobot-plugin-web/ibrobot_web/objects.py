@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ibrobot_core.api import Float64MultiArray, HardwareDescriptor, IbrobotError, SceneObject, Vector
-from ibrobot_core.app import Registry, RobotConfig, RunView, Subscription
+from ibrobot_core.app import Plugins, RobotConfig, RunView, Subscription
 
 SHAPES = "/world/shapes"
 _POSE_SIZE = 7
@@ -80,7 +80,7 @@ def _half(kind: str, size: Sequence[float]) -> list[float]:
             return [round(float(size[0]), 4), round(float(size[1]) / 2, 4), 0.0]
 
 
-def simulated_objects(config: RobotConfig, registry: Registry) -> list[SceneObject]:
+def simulated_objects(config: RobotConfig, registry: Plugins) -> list[SceneObject]:
     """The objects of a robot's simulation, without the ground; none if it has no simulation.
 
     Raises:

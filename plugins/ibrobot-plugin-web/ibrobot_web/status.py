@@ -84,7 +84,7 @@ def robot_json(session: RunView) -> dict[str, Any]:
 def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
     """Everything about a run that changes, except joint states."""
     counts = session.counts()
-    conditions = session.control.report["counters"].get("conditions", ())
+    conditions = session.conditions
     held = session.held and not session.faults
     return {
         "robot": robot_json(session),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ibrobot_core.api import NS_PER_S, HardwareError
-from ibrobot_core.app import ControlState, RunAccess
+from ibrobot_core.app import ControlState, RunView
 
 
 class Arrivals:
@@ -15,7 +15,7 @@ class Arrivals:
         session: the run.
     """
 
-    def __init__(self, session: RunAccess) -> None:
+    def __init__(self, session: RunView) -> None:
         self._session = session
         self._stops = 0
         """Number of emergency stops that the times know of."""

@@ -16,7 +16,7 @@ from ibrobot_ros2.offers import TRIGGER, Offer, Offers, refused, time_of
 from ibrobot_ros2.workers import StopWay
 
 from ibrobot_core.api import NS_PER_S, HardwareError, IbrobotError, NotSupported, did_you_mean
-from ibrobot_core.app import CHECK_ESTOP, CONTROL, ESTOP, RunAccess, SessionWorker, TransportLink
+from ibrobot_core.app import CHECK_ESTOP, CONTROL, ESTOP, GoalRun, SessionWorker, TransportLink
 from ibrobot_zenoh.arrivals import Arrivals
 from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.ros2 import absolute
@@ -77,9 +77,9 @@ class RosSharing(SessionWorker):
         NotSupported: for an executor that takes no goals.
     """
 
-    session: RunAccess
+    session: GoalRun
 
-    def __init__(self, session: RunAccess, link: TransportLink, share: Share, arrivals: Arrivals) -> None:
+    def __init__(self, session: GoalRun, link: TransportLink, share: Share, arrivals: Arrivals) -> None:
         super().__init__(session, "share:ros", "services and actions for ROS 2 nodes", (link.name, CONTROL))
         self._link = link
         self._arrivals = arrivals

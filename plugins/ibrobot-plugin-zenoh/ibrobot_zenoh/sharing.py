@@ -36,7 +36,7 @@ from ibrobot_core.app import (
     CHECK_ESTOP,
     ESTOP,
     Component,
-    RunAccess,
+    GoalRun,
     RunView,
     SessionWorker,
     Subscription,
@@ -158,7 +158,7 @@ class TopicTransport(Transport):
         """
 
 
-def components(share: Share, session: RunAccess, link: TransportLink) -> list[Component]:
+def components(share: Share, session: GoalRun, link: TransportLink) -> list[Component]:
     """The components that share the topics and services in a YAML.
 
     Raises:

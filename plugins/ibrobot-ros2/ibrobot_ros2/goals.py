@@ -27,7 +27,7 @@ from ibrobot_core.api import (
     PlanningError,
     seconds,
 )
-from ibrobot_core.app import ControlState, ExecutorConfig, PlanCode, RunAccess
+from ibrobot_core.app import ControlState, ExecutorConfig, GoalRun, PlanCode
 from ibrobot_ros2.calls import Calls, Wire
 from ibrobot_ros2.inference import serve_chunks
 from ibrobot_ros2.offers import time_of, with_ns
@@ -79,7 +79,7 @@ def action_of(executor: ExecutorConfig, gripper_action: str) -> tuple[str, str]:
     return f"/{executor.name}/gripper_cmd", f"control_msgs/action/{gripper_action}"
 
 
-def with_goals(session: RunAccess) -> dict[str, ExecutorConfig]:
+def with_goals(session: GoalRun) -> dict[str, ExecutorConfig]:
     """The executors of a run that take goals, by name."""
     return {name: executor for name, executor in session.config.executors.items() if executor.goals}
 
@@ -103,7 +103,7 @@ class Actions:
     """
 
     def __init__(
-        self, session: RunAccess, executors: Collection[str], is_offered: Callable[[str], bool],
+        self, session: GoalRun, executors: Collection[str], is_offered: Callable[[str], bool],
         named: Callable[[str], str], who: str, gripper_action: str,
     ) -> None:  # fmt: skip
         self._session = session
@@ -213,7 +213,7 @@ class Actions:
     def _stop(self, executor: str) -> bool:
         """Cancel the goal of an executor; returns whether that succeeded."""
         try:
-            self._session.control.call("cancel", executor=executor)
+            self._session.cancel_goals(executor)
         except IbrobotError as error:
             self._session.log.warning("%s: %s: cancel failed: %s", self._who, executor, error)
             return False

@@ -22,7 +22,7 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_core.app import ControlState, PlanCode, RunAccess, RunView, SessionWorker
+from ibrobot_core.app import ControlState, GuardedRun, PlanCode, RunView, SessionWorker
 from ibrobot_planning.planners.completion import Start, check_size, completed
 from ibrobot_planning.planners.options import GoalCheckOptions, RrtConnectOptions
 from ibrobot_planning.planners.timing import Motion, motion_of
@@ -68,9 +68,9 @@ class GoalDoor(SessionWorker):
     where the joints will be then. Goals of positions, as of grippers, are checked by their executors.
     """
 
-    session: RunAccess
+    session: GuardedRun
 
-    def __init__(self, options: GoalCheckOptions, session: RunAccess) -> None:
+    def __init__(self, options: GoalCheckOptions, session: GuardedRun) -> None:
         super().__init__(session, "goals", "checks goals before control gets them")
         self._options = options
         self._robot = session.config.robot
@@ -287,13 +287,12 @@ class GoalDoor(SessionWorker):
             touched = f"the motion cannot be checked: {error}"
         if not touched or self._tracks.get(name) is not track:
             return
-        control = self.session.control
         self.session.log.warning("%s stops before an obstacle: %s", name, touched)
         track.trajectory = None
         try:
-            control.call("goal", executor=name, goal_id=f"{track.goal_id} before {touched}", goal={"stop": True})
+            self.session.send_goal(name, f"{track.goal_id} before {touched}", {"stop": True})
         except HardwareError:  # an executor of another plugin may not know how to slow down
-            control.call("cancel", executor=name)
+            self.session.cancel_goals(name)
 
     def _take_event(self, event: Mapping[str, Any]) -> None:
         with self._begun:

@@ -20,7 +20,7 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_core.app import Planner, RunAccess, RunView
+from ibrobot_core.app import GoalRun, Planner, RunView
 from ibrobot_planning.execution.door import GoalDoor
 from ibrobot_planning.planners.blend import Limits, braking, cut, joined
 from ibrobot_planning.planners.timing import Motion, motion_of, trajectory_of
@@ -74,7 +74,7 @@ class Execution:
         door: through which its goals pass.
     """
 
-    def __init__(self, session: RunAccess, planner: Planner, door: GoalDoor) -> None:
+    def __init__(self, session: GoalRun, planner: Planner, door: GoalDoor) -> None:
         self._session = session
         self._planner = planner
         self._door = door
@@ -115,7 +115,7 @@ class Execution:
                 for name, goal in goals.items():
                     self._send(name, f"{number}:{name}", goal)
             except (HardwareError, PlanningError):
-                self._session.control.call("cancel")
+                self._session.cancel_goals()
                 self._tracks = {}
                 raise
 
@@ -130,7 +130,7 @@ class Execution:
                     session.send_goal(name, goal_id, {"stop": True})
                 except HardwareError as error:
                     session.log.warning("%s does not slow down, and is cancelled: %s", name, error)
-                    session.control.call("cancel")
+                    session.cancel_goals()
                     return
                 self._tracks[name] = _Track(goal_id, None)
 

@@ -21,7 +21,7 @@ from ibrobot_core.app import (
     PlannerDescriptor,
     PlanRequest,
     PlanResult,
-    Registry,
+    Plugins,
     RobotConfig,
     RunView,
 )
@@ -217,7 +217,7 @@ class GoalPlans:
                 raise PlanningError(f"the planner failed: {type(error).__name__}: {error}", PlanCode.FAILURE) from error
 
 
-def tool_planners(registry: Registry) -> list[str]:
+def tool_planners(registry: Plugins) -> list[str]:
     """The types of planners that take goals of the tool."""
     planners = registry.of_kind("planner")
     return [each.type for each in planners if isinstance(each, PlannerDescriptor) and each.tool_goals]

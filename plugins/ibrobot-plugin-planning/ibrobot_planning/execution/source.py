@@ -18,6 +18,7 @@ from ibrobot_core.app import (
     ControlMode,
     ControlState,
     Goal,
+    GoalRun,
     JointGoal,
     NoRequest,
     OrientationPolicy,
@@ -25,7 +26,6 @@ from ibrobot_core.app import (
     PlanResult,
     PoseGoal,
     RequestLimits,
-    RunAccess,
     Service,
     SourceWorker,
 )
@@ -128,7 +128,9 @@ class PlannerSource(SourceWorker):
         PlanningError: for an invalid goal of the request.
     """
 
-    def __init__(self, session: RunAccess, mode: ControlMode) -> None:
+    session: GoalRun
+
+    def __init__(self, session: GoalRun, mode: ControlMode) -> None:
         assert mode.planner is not None
         super().__init__(session, mode, f"planner {mode.planner.type}")
         self._plans = GoalPlans(session, mode)
@@ -149,7 +151,7 @@ class PlannerSource(SourceWorker):
         self._last_state: ControlState | None = None
         self._era = 0, 0
         """Numbers of the emergency stops and of the generation that `/cmd_pose` was last read in."""
-        for goal in () if session.has_control else session.request.goals:
+        for goal in session.request.goals if session.state is None else ():
             try:
                 self._queue.append(self._new(goal, asked=True))
             except PlanningError as error:

@@ -15,9 +15,9 @@ from ibrobot_core.app import (
     ControlMode,
     Goal,
     LinearGoal,
+    Plugins,
     PoseGoal,
     PositionGoal,
-    Registry,
     RobotConfig,
     check_models,
 )
@@ -47,7 +47,7 @@ class Situation:
     """The robot and the situation for which a task is checked."""
 
     config: RobotConfig
-    registry: Registry
+    registry: Plugins
     world: World | None
     """The objects; None for a robot without a section `world`."""
     movable: Collection[str] = ()

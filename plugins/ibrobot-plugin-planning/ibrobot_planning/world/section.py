@@ -25,7 +25,7 @@ from ibrobot_core.api import (
     did_you_mean,
     resolve_path,
 )
-from ibrobot_core.app import Component, NoRequest, PlanCode, Registry, RobotConfig, RunView, Service, Subscription
+from ibrobot_core.app import Component, NoRequest, PlanCode, Plugins, RobotConfig, RunView, Service, Subscription
 from ibrobot_planning.world.ages import Age, Limit, Unusable
 from ibrobot_planning.world.objects import (
     FLOOR,
@@ -83,7 +83,7 @@ _STILL = 1e-4
 """Smaller changes of an object's position [m] and axes do not count as motion."""
 
 
-def scene_objects(config: RobotConfig, registry: Registry) -> tuple[SceneObject, ...]:
+def scene_objects(config: RobotConfig, registry: Plugins) -> tuple[SceneObject, ...]:
     """The objects of the simulated scene that the world of a robot has: none without `scene: true`, or on hardware."""
     section = config.plugin_sections.get(SECTION)
     if section is None or not section.options.scene or not config.simulated or config.simulation is None:

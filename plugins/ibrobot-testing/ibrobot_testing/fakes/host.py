@@ -39,8 +39,8 @@ from ibrobot_core.app import (
     Planner,
     PlanRequest,
     PlanResult,
-    RunAccess,
     SourceWorker,
+    StreamingRun,
     Subscription,
 )
 
@@ -187,7 +187,7 @@ class FakeEngine(Engine):
 class FakeSource(SourceWorker):
     """Commands nothing: the executors hold."""
 
-    def __init__(self, session: RunAccess, mode: ControlMode) -> None:
+    def __init__(self, session: StreamingRun, mode: ControlMode) -> None:
         super().__init__(session, mode, "holds")
 
     @override

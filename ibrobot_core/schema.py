@@ -5,7 +5,6 @@ Loading, `config show`, the JSON Schema and the reference pages derive from thes
 
 from __future__ import annotations
 
-import logging
 import math
 import types
 from collections.abc import Mapping
@@ -14,21 +13,12 @@ from typing import Any, Literal, get_args, get_origin
 
 import attrs
 
-from ibrobot_core.clock import Clock
 from ibrobot_core.component_config import ComponentConfig, NamedComponentConfig, component_of
 from ibrobot_core.deadman import HOLD_S
-from ibrobot_core.descriptors import (
-    Descriptor,
-    EngineDescriptor,
-    ExecutorDescriptor,
-    HardwareDescriptor,
-    SensorDescriptor,
-)
 from ibrobot_core.errors import PluginNotInstalled
-from ibrobot_core.interfaces import Context
 from ibrobot_core.options import documented, fields, not_a_key, option
 from ibrobot_core.robot import Robot
-from ibrobot_core.units import NORM_MODES, ns
+from ibrobot_core.units import NORM_MODES
 
 _UNIT = 1e-3
 """Tolerance for the length of a quaternion, which may be rounded."""
@@ -47,30 +37,15 @@ class HardwareConfig(NamedComponentConfig):
     anchored: tuple[str, ...] = not_a_key(())
     """Joints whose calibrated closed end is their lower limit."""
 
-    @classmethod
-    def takes(cls, descriptor: Descriptor[Any]) -> bool:
-        """Whether it is real hardware."""
-        return not SimulationConfig.takes(descriptor)
-
-    @classmethod
-    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """Its calibration and its anchored joints."""
-        assert isinstance(descriptor, HardwareDescriptor)
-        return {"calibration": descriptor.calibration(options), "anchored": descriptor.anchored(options)}
-
 
 @attrs.frozen
 class SimulationConfig(ComponentConfig):
     """The simulation, used with `--sim` or without a hardware section."""
 
     plugin_kind = "hardware"
+    simulates = True
 
     default_control_mode: str | None = option(None, help="with --sim, in place of the file's default_control_mode")
-
-    @classmethod
-    def takes(cls, descriptor: Descriptor[Any]) -> bool:
-        """Whether it is simulated hardware."""
-        return isinstance(descriptor, HardwareDescriptor) and descriptor.simulated
 
 
 @documented
@@ -108,12 +83,6 @@ class PeripheralConfig(ComponentConfig):
     picture: tuple[int, int] | None = not_a_key(None)
     """Height and width of its images [px], if the options determine them."""
 
-    @classmethod
-    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """The size of its images."""
-        assert isinstance(descriptor, SensorDescriptor)
-        return {"picture": descriptor.picture(options)}
-
 
 @attrs.frozen
 class ExecutorConfig(NamedComponentConfig):
@@ -127,12 +96,6 @@ class ExecutorConfig(NamedComponentConfig):
     goals: str = not_a_key("trajectory")
     """Kind of goals that it takes; empty if it streams."""
 
-    @classmethod
-    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """The kind of goals that it takes."""
-        assert isinstance(descriptor, ExecutorDescriptor)
-        return {"goals": "" if descriptor.streams else descriptor.goals}
-
 
 @attrs.frozen
 class TeleopConfig(NamedComponentConfig):
@@ -142,11 +105,6 @@ class TeleopConfig(NamedComponentConfig):
 
     calibration: str | None = not_a_key(None)
     """Name or path of the calibration."""
-
-    @classmethod
-    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """Its calibration."""
-        return {"calibration": descriptor.calibration(options)}
 
 
 @attrs.frozen
@@ -360,12 +318,6 @@ class InferenceConfig(ComponentConfig):
     weights_here: bool = not_a_key(True)
     """Whether the weights are on this machine."""
 
-    @classmethod
-    def described(cls, descriptor: Descriptor[Any], options: Any) -> Mapping[str, Any]:
-        """The engine's needs."""
-        assert isinstance(descriptor, EngineDescriptor)
-        return {"uses_transport": descriptor.uses_transport, "weights_here": descriptor.weights_here}
-
     @property
     def devices(self) -> Mapping[str, str]:
         """The devices of `intervene`, as `devices_of`."""
@@ -509,21 +461,6 @@ class RobotConfig:
     """`document` with its secrets, only for other processes of the run; never write or show it."""
     secrets: Mapping[str, str] = not_a_key(factory=dict, repr=False, eq=False)
     """Secret -> text shown in its place."""
-
-    def context(self, name: str, clock: Clock, seed: int = 0, **more: Any) -> Context:
-        """The context for the `make` of a component's plugin.
-
-        Args:
-            name: name of the component.
-            clock: the clock of the run.
-            seed: the seed of the run.
-            more: other fields of the context; `joints` defaults to all joints of the robot.
-        """
-        simulation = self.simulation.options if self.simulation is not None else None
-        robot: Robot = more.get("robot", self.robot)
-        given = {"robot": robot, "joints": robot.joint_names, "simulation": simulation, **more}
-        log, period_ns = logging.getLogger(f"ibrobot.{name}"), ns(1.0 / self.control.rate_hz)
-        return Context(name=name, clock=clock, log=log, period_ns=period_ns, seed=seed, **given)
 
 
 def _as_written(field: attrs.Attribute[Any]) -> attrs.Attribute[Any]:
