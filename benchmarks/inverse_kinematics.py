@@ -110,8 +110,8 @@ def packaged_arm(name: str) -> KinematicModel:
     with tempfile.TemporaryDirectory() as folder:
         mjcf = Path(folder) / "arm.xml"
         mjcf.write_text(spec.to_xml())
-        return read_mjcf(
-            mjcf, "tool", joints, lower=None if limit is None else -limit, upper=None if limit is None else limit
+        return read_mjcf(mjcf).chain(
+            "tool", joints, lower=None if limit is None else -limit, upper=None if limit is None else limit
         )
 
 

@@ -186,7 +186,7 @@ class Maker:
     def __init__(self) -> None:
         made = arm()
         self.arm = attrs.evolve(made, unchecked=unchecked_pairs(made))
-        self._model = read_mjcf(MJCF, "gripperframe", ARM_JOINTS)
+        self._model = read_mjcf(MJCF).chain("gripperframe", ARM_JOINTS)
 
     def checks(self, world: World, padding: float = PADDING_M) -> Collisions:
         """The planner's own checks."""

@@ -52,12 +52,6 @@ from ibrobot_core.config.overrides import (
 from ibrobot_core.config.missing import unavailable_modes as unavailable_modes
 from ibrobot_core.config.yaml_nodes import Document as Document, parse_yaml as parse_yaml
 from ibrobot_core.config.show import dump_yaml as dump_yaml, plain as plain
-from ibrobot_core.config.models import (
-    ModelError as ModelError,
-    XmlElement as XmlElement,
-    read_xml as read_xml,
-    read_mjcf as read_mjcf,
-)
 
 # Installed plugins
 from ibrobot_core.plugins import (

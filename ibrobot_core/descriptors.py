@@ -311,8 +311,8 @@ class SectionDescriptor(Descriptor["Component"]):
     records_episodes: bool = attrs.field(default=False, kw_only=True)
     """Whether its component is the `EpisodeRecorder` of runs with a section `recording`."""
     check_config: Callable[[RobotConfig], Iterable[OptionFault]] = attrs.field(default=lambda config: (), kw_only=True)
-    """Yields faults of a robot config in any section; opens no device. The `option` of a fault is a path from the top
-    of the file: `("peripherals", 0, "transform")`."""
+    """Yields faults of a robot config in any section, also if the component does not run; opens no device. The `option`
+    of a fault is a path from the top of the file: `("peripherals", 0, "transform")`."""
 
 
 @attrs.frozen

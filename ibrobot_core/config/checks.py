@@ -11,15 +11,14 @@ from typing import Any
 import attrs
 
 from ibrobot_core.config.missing import Missing
-from ibrobot_core.config.models import READERS, DescriptionModel, Limits, ModelError
-from ibrobot_core.config.structure import ParsedComponent, ParsedSections
+from ibrobot_core.config.structure import MODELS, ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
 from ibrobot_core.deadman import HOLD_S, LONGEST_BRAKING_S
 from ibrobot_core.descriptors import ExecutorDescriptor, TeleopDescriptor, TransportDescriptor
-from ibrobot_core.options import OptionFault, did_you_mean
+from ibrobot_core.options import OptionFault
 from ibrobot_core.plugins import example_type
-from ibrobot_core.robot import Joint, Robot
+from ibrobot_core.robot import Robot
 from ibrobot_core.run_hooks import RUN_KEYS
 from ibrobot_core.schema import (
     ControlConfig,
@@ -30,9 +29,6 @@ from ibrobot_core.schema import (
     devices_of,
 )
 from ibrobot_core.terminal import check_key
-
-_SLACK = 0.01
-"""Tolerance for limits wider than a model's [rad], since both may be rounded."""
 
 
 @attrs.frozen
@@ -99,46 +95,12 @@ class Checks:
         self._models(robot)
 
     def _models(self, robot: Robot) -> None:
-        """Check that the models can be read and contain the tip, and that joint limits are within those of a model."""
-        known: list[DescriptionModel] = []
-        described = robot.description
-        for model, path in (("mjcf", described.mjcf), ("urdf", described.urdf), ("srdf", described.srdf)):
-            key: Key = ("robot", "description", model)
+        """Check that the files of the models exist; the plugin that reads them checks what they say."""
+        for model in MODELS:
+            path = getattr(robot.description, model)
             if path is not None and not path.is_file():
-                self.document.add(key, f"no such file: {path}; a relative path starts at the folder of the YAML file")
-            elif path is not None and model in READERS:
-                try:
-                    known.append(READERS[model](path))
-                except ModelError as error:
-                    self.document.add(key, str(error))
-        for i, joint in enumerate(robot.joints):
-            name = joint.name.removeprefix(robot.description.arm_of(joint.name))
-            for each in () if self.sections.simulated else known:  # the simulation has its own error
-                if each.joints and name not in each.joints:
-                    remark = did_you_mean(name, each.joints, "it has")
-                    self.document.add(("robot", "description", "mjcf"), f"the model has no joint {name!r}{remark}")
-            limits = [each.limits[name] for each in known if name in each.limits]
-            if limits and not joint.beyond_model:
-                self._within(("robot", "joints", i), joint, limits)
-        at: Key = ("robot", "description", "tip")
-        models = {("robot", "description", model) for model in READERS}
-        if known and self.document.get(*at) is not None and not models & self.document.unread:
-            frames = [name for each in known for name in each.frames]
-            self.document.refer(at, robot.description.tip, frames, " or ".join(each.frame for each in known))
-
-    def _within(self, key: Key, joint: Joint, limits: list[Limits]) -> None:
-        lowest, highest = min(limits, key=lambda each: each.lower), max(limits, key=lambda each: each.upper)
-        for end, value, widest, excess in (
-            ("lower", joint.lower, lowest, lowest.lower - joint.lower),
-            ("upper", joint.upper, highest, joint.upper - highest.upper),
-        ):
-            if excess <= _SLACK:
-                continue
-            remedy = f"narrow it, or set beyond_model: true where {joint.name} can go there"
-            if abs(value) > 2 * math.pi:
-                remedy = f"were degrees meant? {value:g} degrees are {math.radians(value):.5g} rad"
-            model = f"{widest.lower:g} to {widest.upper:g} rad ({widest.place})"
-            self.document.add((*key, end), f"{value:g} rad is beyond the model's limits, {model}; {remedy}")
+                message = f"no such file: {path}; a relative path starts at the folder of the YAML file"
+                self.document.add(("robot", "description", model), message)
 
     def _pose(self, key: Key, robot: Robot, positions: tuple[float, ...]) -> None:
         if len(positions) != len(robot.joints):

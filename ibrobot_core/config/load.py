@@ -17,10 +17,11 @@ from ibrobot_core.config.missing import split
 from ibrobot_core.config.name_checks import check_names
 from ibrobot_core.config.overrides import apply_overrides, put
 from ibrobot_core.config.secrets import check_known, expanded_again, public, warn_of_secrets
-from ibrobot_core.config.structure import ParsedComponent, ParsedSections, SectionParser
+from ibrobot_core.config.structure import MODELS, ParsedComponent, ParsedSections, SectionParser
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse_yaml
 from ibrobot_core.convert import shown
-from ibrobot_core.errors import ConfigError, Problem
+from ibrobot_core.descriptors import SectionDescriptor
+from ibrobot_core.errors import ConfigError, PluginNotInstalled, Problem
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import Registry, installed_plugins
 from ibrobot_core.robot import Robot
@@ -179,18 +180,27 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         "viewer": _component(sections.viewer),
         "plugin_sections": _components(sections.plugin_sections),
     }
+    absent = {**_unread(robot, registry), **sections.absent_models}
     missing = (*(each.error for each in sections.missing), *sections.absent_models.values())
     config = RobotConfig(
         **arguments, simulated=sections.simulated, closed_ends=_closed_ends(robot, sections), unavailable=unavailable,
-        missing=missing, absent_models=sections.absent_models, source=source, document=shown, complete=document.root,
+        missing=missing, absent_models=absent, source=source, document=shown, complete=document.root,
         secrets=secrets,
     )  # fmt: skip
-    checks = [each.check_config for each, _ in registry.sections(config)]
+    checks = [each.check_config for each in registry.of_kind("section") if isinstance(each, SectionDescriptor)]
     for check in (*checks, *(each.check_config for each in registry.features.values())):
         for fault in check(config):
             document.add(fault.option, fault.message)
     document.raise_problems()
     return config
+
+
+def _unread(robot: Robot, registry: Registry) -> dict[str, PluginNotInstalled]:
+    """The models that no installed plugin reads, with the plugin that would."""
+    error = registry.not_found("section", "description")
+    if ("section", "description") in registry.entries or not isinstance(error, PluginNotInstalled):
+        return {}
+    return {model: error for model in MODELS if getattr(robot.description, model) is not None}
 
 
 def _closed_ends(robot: Robot, sections: ParsedSections) -> dict[str, float | None]:

@@ -73,13 +73,13 @@ def unavailable_modes(unavailable: Mapping[str, str]) -> list[str]:
 
 
 def absent_models(absent: Mapping[str, PluginNotInstalled]) -> list[str]:
-    """One line per package that is not installed and contains models of `robot.description`."""
+    """One line per package that is not installed and contains or reads models of `robot.description`."""
     by_package: dict[str, list[str]] = {}
     for model, error in absent.items():
         by_package.setdefault(error.package, []).append(model)
     return [
-        f"joint limits are not compared with robot.description.{' and '.join(models)}, whose package is not installed: "
-        f"{how_to_install(package)}"
+        f"joint limits are not compared with robot.description.{' and '.join(models)}, since {package} is not "
+        f"installed: {how_to_install(package)}"
         for package, models in by_package.items()
     ]
 

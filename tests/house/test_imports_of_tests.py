@@ -23,9 +23,6 @@ ALLOWED = {
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.plugins"): DRIVE,
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.control.safety"): LOOP,
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.dispatch.smoother"): LOOP,
-    ("ibrobot-plugin-mujoco/tests/test_model_limits.py", "ibrobot_core.config.models"): (
-        "limits as core reads them, against those of MuJoCo"
-    ),
     (
         "ibrobot-plugin-data/tests/test_interleavings.py",
         "ibrobot_core.interfaces.run_state",

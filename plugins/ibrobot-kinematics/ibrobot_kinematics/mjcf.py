@@ -1,11 +1,15 @@
-"""Kinematic models from MJCF files.
+"""MJCF files: what MuJoCo's compiler makes of one, and the tree of its joints.
 
-MuJoCo reads the file, since its compiler resolves defaults, includes, frames and orientations.
+MuJoCo reads the file, since its compiler resolves defaults, includes, frames and orientations. Kinematics, collision
+checks, the page's shapes and the simulation derive what they know of the robot's geometry from it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +18,235 @@ import numpy as np
 
 from ibrobot_core.api import Robot, Vector
 from ibrobot_kinematics.errors import KinematicsError
+from ibrobot_kinematics.mjcf_names import read_names
 from ibrobot_kinematics.model import ChainJoint, KinematicModel, TipPose
+from ibrobot_kinematics.poses import homogeneous
+from ibrobot_kinematics.read_once import read_once
 from ibrobot_kinematics.rotations import from_quaternion
 
 _SLIDE, _HINGE = 2, 3
 """Values of mujoco.mjtJoint."""
+_LINE = re.compile(r"\bline (?:number=)?([1-9]\d*)", re.IGNORECASE)
+
+
+@attrs.frozen(eq=False)
+class TreeJoint:
+    """A moving joint of an MJCF."""
+
+    name: str
+    parent: int
+    """Index in `JointTree.joints` of the next moving joint towards the base; -1: none."""
+    placement: Vector
+    """Frame of the joint, whose origin is on its axis, in that of the parent at the reference, shape (4, 4)."""
+    axis: Vector
+    """Unit vector along the axis in the joint's own frame, shape (3,)."""
+    reference: float
+    """Position at which the joint causes no displacement [rad or m]."""
+    slides: bool
+    """Whether it is prismatic; revolute otherwise."""
+
+
+@attrs.frozen(eq=False)
+class JointTree:
+    """The joints that may move, and where the bodies are in their frames."""
+
+    joints: tuple[TreeJoint, ...]
+    """From the base outwards: parents first."""
+    bodies: tuple[tuple[int, Vector], ...]
+    """For each of MuJoCo's bodies the joint that carries it (-1: none), and its frame in that joint's, shape (4, 4)."""
+
+
+@attrs.frozen(eq=False, slots=False)
+class Mjcf:
+    """An MJCF. Its models are compiled when they are first needed, and are not to be changed."""
+
+    path: Path
+    spec: Any = attrs.field(repr=False)
+    """mujoco.MjSpec; copy it before changing it."""
+
+    @cached_property
+    def skeleton(self) -> Any:
+        """mujoco.MjModel without shapes, which take most of the time to compile."""
+        spec = self.spec.copy()
+        for element in (*spec.sensors, *spec.pairs, *spec.geoms, *spec.meshes, *spec.materials, *spec.textures):
+            spec.delete(element)
+        # Only the compiler needs a mass of each body, which may have come from its shapes.
+        spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
+        for joint in spec.joints:
+            joint.armature = 1.0
+        return self._compiled(spec)
+
+    @cached_property
+    def solid(self) -> Any:
+        """mujoco.MjModel with shapes; bodies without collision geometry have the hulls of their visible meshes."""
+        spec = self.spec.copy()
+        for body in spec.bodies:
+            if not any(geom.contype or geom.conaffinity for geom in body.geoms):
+                for geom in body.geoms:
+                    geom.contype = 1  # makes the compiler compute its hull
+        return self._compiled(spec)
+
+    def tree(self, model: Any, joints: Iterable[str]) -> JointTree:
+        """The tree of some joints in `skeleton` or `solid`. Others stay at their reference position.
+
+        Raises:
+            KinematicsError: if the file lacks a joint, or one is neither a hinge nor a slide.
+        """
+        known = {model.joint(i).name: i for i in range(model.njnt)}
+        for name in joints:
+            if name not in known:
+                raise KinematicsError(f"{self.path} has no joint {name!r}; it has: {', '.join(known)}")
+            if model.jnt_type[known[name]] not in (_SLIDE, _HINGE):
+                raise KinematicsError(f"{self.path}: joint {name!r} is neither a hinge nor a slide")
+        moving = {known[name] for name in joints}
+        placed_joints: list[TreeJoint] = []
+        bodies = [(-1, np.eye(4))]
+        for body in range(1, model.nbody):
+            carrier, placed = bodies[model.body_parentid[body]]
+            placed = placed @ placement(model.body_pos[body], model.body_quat[body])
+            first = int(model.body_jntadr[body])
+            for joint in range(first, first + int(model.body_jntnum[body])):
+                if joint not in moving:
+                    continue
+                anchor = homogeneous(np.eye(3), model.jnt_pos[joint])
+                placed_joints.append(
+                    TreeJoint(
+                        model.joint(joint).name, carrier, placed @ anchor, model.jnt_axis[joint].copy(),
+                        float(model.qpos0[model.jnt_qposadr[joint]]), bool(model.jnt_type[joint] == _SLIDE),
+                    )
+                )  # fmt: skip
+                carrier, placed = len(placed_joints) - 1, np.linalg.inv(anchor)
+            bodies.append((carrier, placed))
+        return JointTree(tuple(placed_joints), tuple(bodies))
+
+    def chain(
+        self, tip: str, joints: Sequence[str], *, lower: Vector | None = None, upper: Vector | None = None
+    ) -> KinematicModel:
+        """The kinematic model of a site.
+
+        Args:
+            tip: name of the site.
+            joints: names of the joints that may move, in the order of vectors.
+            lower: lower position limits [rad or m], shape (J,); None: those of the MJCF.
+            upper: upper position limits [rad or m], shape (J,); None: those of the MJCF.
+
+        Raises:
+            KinematicsError: if the file lacks the site or a joint, if a joint is neither a hinge nor a slide or has no
+                limits, or if the tip moves with a free or ball joint.
+        """
+        model = self.skeleton
+        sites = {model.site(i).name: i for i in range(model.nsite)}
+        if tip not in sites:
+            raise KinematicsError(f"{self.path} has no site {tip!r}; it has: {', '.join(sites)}")
+        tree = self.tree(model, joints)
+        ids = [model.joint(name).id for name in joints]
+        for joint in ids if lower is None or upper is None else ():
+            if not model.jnt_limited[joint]:
+                raise KinematicsError(f"{self.path}: joint {model.joint(joint).name!r} has no limits")
+        body = int(model.site_bodyid[sites[tip]])
+        carrier, placed = tree.bodies[body]
+        tip_pose = placed @ placement(model.site_pos[sites[tip]], model.site_quat[sites[tip]])
+        chain: list[ChainJoint] = []
+        while carrier >= 0:
+            each = tree.joints[carrier]
+            place = each.placement
+            index = joints.index(each.name)
+            chain.insert(
+                0, ChainJoint(index, place[:3, 3], place[:3, :3], each.axis, each.reference, each.slides)
+            )  # fmt: skip
+            carrier = each.parent
+        self._check_carried(body)
+        return KinematicModel(
+            tuple(joints),
+            model.jnt_range[ids, 0].copy() if lower is None else lower,
+            model.jnt_range[ids, 1].copy() if upper is None else upper,
+            tuple(chain),
+            tip,
+            TipPose(tip_pose[:3, 3], tip_pose[:3, :3]),
+        )
+
+    def _check_carried(self, body: int) -> None:
+        model = self.skeleton
+        while body:
+            for joint in range(int(model.body_jntadr[body]), int(model.body_jntadr[body] + model.body_jntnum[body])):
+                if model.jnt_type[joint] not in (_SLIDE, _HINGE):
+                    name = model.joint(joint).name
+                    raise KinematicsError(f"{self.path}: the tip moves with {name!r}, a free or ball joint")
+            body = int(model.body_parentid[body])
+
+    def _compiled(self, spec: Any) -> Any:
+        try:
+            return spec.compile()
+        except ValueError as error:
+            raise unusable(self.path, error) from error
+
+
+def files_of(mjcf: Mjcf) -> list[Path]:
+    """The files that an MJCF consists of: itself, includes and meshes."""
+    folder = Path(mjcf.spec.modelfiledir) / mjcf.spec.meshdir
+    try:
+        names = read_names(mjcf.path).files
+    except KinematicsError:
+        names = (mjcf.path,)  # e.g. a URDF
+    return [*names, *(folder / mesh.file for mesh in mjcf.spec.meshes if mesh.file)]
+
+
+@read_once(files_of)
+def read_mjcf(path: Path) -> Mjcf:
+    """Read an MJCF, or a URDF as MuJoCo understands it.
+
+    Raises:
+        KinematicsError: if MuJoCo cannot read it; names file and line where MuJoCo does.
+    """
+    import mujoco
+
+    try:
+        return Mjcf(path, mujoco.MjSpec.from_file(str(path)))
+    except ValueError as error:
+        raise unusable(path, error) from error
+
+
+def unusable(path: Path, error: Exception) -> KinematicsError:
+    """What is wrong with a file that MuJoCo refuses, with the line if it is known."""
+    if path.suffix != ".urdf":
+        try:
+            read_names(path)  # names the line, and the file among those that are included
+        except KinematicsError as fault:
+            return fault
+    text = " ".join(str(error).split())
+    line = _LINE.search(text)
+    return KinematicsError(f"{path}{f':{line[1]}' if line else ''}: MuJoCo cannot load it: {text}")
+
+
+def several_arms(path: Path, arms: Mapping[str, Sequence[float]]) -> Any:
+    """mujoco.MjSpec with a copy of an MJCF for each arm.
+
+    Args:
+        path: the MJCF of one arm.
+        arms: prefix of the arm's names -> x, y, z [m] and yaw [rad] of its base.
+
+    Raises:
+        KinematicsError: as `read_mjcf`.
+    """
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    for prefix, (x, y, z, yaw) in arms.items():
+        arm = read_mjcf(path).spec.copy()
+        folder = Path(arm.modelfiledir) / arm.meshdir
+        for mesh in arm.meshes:
+            mesh.name, mesh.file = mesh_name(mesh), str(folder / mesh.file)
+        arm.meshdir = ""
+        for option in ("integrator", "iterations", "ls_iterations", "timestep", "cone", "impratio"):
+            setattr(spec.option, option, getattr(arm.option, option))
+        base = spec.worldbody.add_frame(pos=[x, y, z], quat=[math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)])
+        spec.attach(arm, prefix=prefix, frame=base)
+    return spec
+
+
+def mesh_name(mesh: Any) -> str:
+    """The name by which geoms of a mujoco.MjSpec refer to a mesh."""
+    return mesh.name or Path(mesh.file).stem
 
 
 def robot_model(robot: Robot, joints: Sequence[str] | None = None) -> KinematicModel:
@@ -46,103 +274,12 @@ def robot_model(robot: Robot, joints: Sequence[str] | None = None) -> KinematicM
         raise KinematicsError(f"robot {robot.name!r} has several arms ({known}), each with a tool: choose one of them")
     own = [name.removeprefix(arm) for arm in arms for name in names]
     try:
-        model = read_mjcf(description.mjcf, description.tip, own, lower=lower, upper=upper)
+        model = read_mjcf(description.mjcf).chain(description.tip, own, lower=lower, upper=upper)
     except KinematicsError as error:
         raise KinematicsError(f"robot.description: {error}") from error
     return attrs.evolve(model, joint_names=names)
 
 
-def read_mjcf(
-    path: Path, tip: str, joints: Sequence[str], *, lower: Vector | None = None, upper: Vector | None = None
-) -> KinematicModel:
-    """The kinematic model of a site in an MJCF.
-
-    Args:
-        path: the MJCF.
-        tip: name of the site.
-        joints: names of the joints that may move, in the order of vectors. Others stay at their reference position.
-        lower: lower position limits [rad or m], shape (J,); None: those of the MJCF.
-        upper: upper position limits [rad or m], shape (J,); None: those of the MJCF.
-
-    Raises:
-        KinematicsError: if the file cannot be read or lacks the site or a joint, if a joint is neither a hinge nor a
-            slide or has no limits, or if the tip moves with a free or ball joint.
-    """
-    model = _compiled(path)
-    sites = {model.site(i).name: i for i in range(model.nsite)}
-    known = {model.joint(i).name: i for i in range(model.njnt)}
-    if tip not in sites:
-        raise KinematicsError(f"{path} has no site {tip!r}; it has: {', '.join(sites)}")
-    for name in joints:
-        if name not in known:
-            raise KinematicsError(f"{path} has no joint {name!r}; it has: {', '.join(known)}")
-        if model.jnt_type[known[name]] not in (_SLIDE, _HINGE):
-            raise KinematicsError(f"{path}: joint {name!r} is neither a hinge nor a slide")
-        if (lower is None or upper is None) and not model.jnt_limited[known[name]]:
-            raise KinematicsError(f"{path}: joint {name!r} has no limits")
-    ids = [known[name] for name in joints]
-    chain, tip_pose = _chain(model, sites[tip], {joint: index for index, joint in enumerate(ids)}, path)
-    return KinematicModel(
-        tuple(joints),
-        model.jnt_range[ids, 0].copy() if lower is None else lower,
-        model.jnt_range[ids, 1].copy() if upper is None else upper,
-        chain,
-        tip,
-        tip_pose,
-    )
-
-
-def _compiled(path: Path) -> Any:
-    """The MJCF without its shapes, which take a second to load and do not matter here."""
-    import mujoco
-
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        for element in (*spec.sensors, *spec.pairs, *spec.geoms, *spec.meshes, *spec.materials, *spec.textures):
-            spec.delete(element)
-        # Only the compiler needs a mass of each body, which may have come from its shapes.
-        spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
-        for joint in spec.joints:
-            joint.armature = 1.0
-        return spec.compile()
-    except ValueError as error:
-        raise KinematicsError(f"{path} cannot be loaded: {error}") from error
-
-
-def _chain(model: Any, site: int, order: dict[int, int], path: Path) -> tuple[tuple[ChainJoint, ...], TipPose]:
-    """The joints of `order` (joint id -> index) from the base to a site, and the site in the last one's frame."""
-    bodies = [int(model.site_bodyid[site])]
-    while bodies[-1] != 0:
-        bodies.append(int(model.body_parentid[bodies[-1]]))
-    chain = []
-    # The frame so far, in that of the last joint.
-    position, rotation = np.zeros(3), np.eye(3)
-    for body in reversed(bodies):
-        position = position + rotation @ model.body_pos[body]
-        rotation = rotation @ _rotation(model.body_quat[body])
-        first = int(model.body_jntadr[body])
-        for joint in range(first, first + int(model.body_jntnum[body])):
-            if model.jnt_type[joint] not in (_SLIDE, _HINGE):
-                raise KinematicsError(f"{path}: the tip moves with {model.joint(joint).name!r}, a free or ball joint")
-            if joint not in order:
-                continue
-            anchor = model.jnt_pos[joint].copy()
-            chain.append(
-                ChainJoint(
-                    index=order[joint],
-                    position=position + rotation @ anchor,
-                    rotation=rotation,
-                    axis=model.jnt_axis[joint].copy(),
-                    reference=float(model.qpos0[model.jnt_qposadr[joint]]),
-                    slides=bool(model.jnt_type[joint] == _SLIDE),
-                )
-            )
-            position, rotation = -anchor, np.eye(3)
-    return tuple(chain), TipPose(
-        position + rotation @ model.site_pos[site], rotation @ _rotation(model.site_quat[site])
-    )
-
-
-def _rotation(quaternion: Vector) -> Vector:
-    """The matrix of MuJoCo's quaternion (w, x, y, z)."""
-    return from_quaternion(np.roll(quaternion, -1))
+def placement(position: Sequence[float] | Vector, quaternion: Sequence[float] | Vector) -> Vector:
+    """The matrix, shape (4, 4), of MuJoCo's position and quaternion (w, x, y, z)."""
+    return homogeneous(from_quaternion(np.roll(quaternion, -1)), np.asarray(position, dtype=float))

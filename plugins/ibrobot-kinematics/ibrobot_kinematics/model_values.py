@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,38 +28,14 @@ def arm_values(robot: Robot, arm: str) -> Mapping[str, Any]:
         ContractError: if the robot has no usable model.
     """
     names = tuple(name for name in robot.joint_names if robot.description.arm_of(name) == arm)
-    path = robot.description.mjcf
     try:
-        changed_ns = path.stat().st_mtime_ns if path is not None else 0
-    except OSError:
-        changed_ns = 0  # reading it raises the error
-    return _values(_Arm(robot, names, path, changed_ns))
-
-
-class _Arm:
-    """An arm as the key of a cache."""
-
-    def __init__(self, robot: Robot, names: tuple[str, ...], path: Path | None, changed_ns: int) -> None:
-        self.robot, self.names = robot, names
-        self._key = (path, changed_ns, robot.description.tip, names, tuple(robot.description.arms))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Arm) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-
-@lru_cache(maxsize=16)
-def _values(arm: _Arm) -> Mapping[str, Any]:
-    try:
-        model = robot_model(arm.robot, arm.names)
+        model = robot_model(robot, names)
     except KinematicsError as error:
         raise ContractError(f"the pose of the tool is unknown: {error}") from None
     return {
         "joints": [
             {
-                "name": arm.names[joint.index],
+                "name": names[joint.index],
                 "position": _rounded(joint.position),
                 "rotation": _rounded(joint.rotation.ravel()),
                 "axis": _rounded(joint.axis),

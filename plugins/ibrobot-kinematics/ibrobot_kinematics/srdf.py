@@ -9,9 +9,8 @@ from pathlib import Path
 import attrs
 
 from ibrobot_core.api import did_you_mean
-from ibrobot_core.app import ModelError, XmlElement, read_xml
-from ibrobot_kinematics.errors import KinematicsError
-from ibrobot_kinematics.urdf import MOVING, Urdf, required
+from ibrobot_kinematics.urdf import MOVING, Urdf
+from ibrobot_kinematics.xml_file import XmlElement, read_xml
 
 _ELEMENTS = (
     "group", "group_state", "disable_collisions", "enable_collisions", "disable_default_collisions", "end_effector",
@@ -56,25 +55,18 @@ def read_srdf(path: Path, urdf: Urdf) -> Srdf:
     Raises:
         KinematicsError: if it cannot be read, is not an SRDF, or has a name that the URDF lacks; gives file and line.
     """
-    try:
-        root = read_xml(path, "robot")
-        for element in root.children:
-            _check_tag(element, _ELEMENTS)
-        groups = _Groups(urdf, {})
-        for element in _tagged(root, "group"):
-            name = required(element, "name")
-            if (other := groups.elements.get(name)) is not None:
-                raise element.error(f"a second group named {name!r}, first in line {other.line}")
-            groups.elements[name] = element
-        joints = {name: groups.joints(name) for name in groups.elements}
-        states = tuple(_states(root, urdf, joints))
-        return Srdf(path, root.attributes.get("name", ""), joints, states, _may_touch(root, urdf))
-    except ModelError as error:
-        raise KinematicsError(str(error)) from None
-
-
-def _tagged(element: XmlElement, tag: str) -> Iterator[XmlElement]:
-    return (child for child in element.children if child.tag == tag)
+    root = read_xml(path, "robot")
+    for element in root.children:
+        _check_tag(element, _ELEMENTS)
+    groups = _Groups(urdf, {})
+    for element in root.tagged("group"):
+        name = element.required("name")
+        if (other := groups.elements.get(name)) is not None:
+            raise element.error(f"a second group named {name!r}, first in line {other.line}")
+        groups.elements[name] = element
+    joints = {name: groups.joints(name) for name in groups.elements}
+    states = tuple(_states(root, urdf, joints))
+    return Srdf(path, root.attributes.get("name", ""), joints, states, _may_touch(root, urdf))
 
 
 def _check_tag(element: XmlElement, known: Sequence[str]) -> None:
@@ -87,7 +79,7 @@ def _check_tag(element: XmlElement, known: Sequence[str]) -> None:
 
 def _known(element: XmlElement, attribute: str, known: Sequence[str], what: str) -> str:
     """An attribute that must be one of some names."""
-    name = required(element, attribute)
+    name = element.required(attribute)
     if name not in known:
         raise element.error(f"unknown {what} {name!r}{did_you_mean(name, known, 'known')}")
     return name
@@ -137,14 +129,14 @@ class _Groups:
 def _states(root: XmlElement, urdf: Urdf, groups: Mapping[str, tuple[str, ...]]) -> Iterator[GroupState]:
     without_position = {joint.name for joint in urdf.joints if joint.type not in MOVING}
     lines: dict[tuple[str, str], int] = {}
-    for element in _tagged(root, "group_state"):
-        name, group = required(element, "name"), _known(element, "group", list(groups), "group")
+    for element in root.tagged("group_state"):
+        name, group = element.required("name"), _known(element, "group", list(groups), "group")
         if (group, name) in lines:
             raise element.error(f"a second pose named {name!r} of group {group!r}, first in line {lines[group, name]}")
         lines[group, name] = element.line
         positions: dict[str, float] = {}
-        for joint in _tagged(element, "joint"):
-            of = required(joint, "name")
+        for joint in element.tagged("joint"):
+            of = joint.required("name")
             if of in without_position:  # e.g. the planar joint of a mobile base
                 continue
             if of not in groups[group]:
@@ -161,11 +153,11 @@ def _states(root: XmlElement, urdf: Urdf, groups: Mapping[str, tuple[str, ...]])
 def _may_touch(root: XmlElement, urdf: Urdf) -> frozenset[tuple[str, str]]:
     """The disabled pairs: enabling a pair overrides a default, disabling it overrides both."""
     pairs: set[tuple[str, str]] = set()
-    for element in _tagged(root, "disable_default_collisions"):
+    for element in root.tagged("disable_default_collisions"):
         link = _known(element, "link", urdf.links, "link")
         pairs |= {_pair(link, other) for other in urdf.links if other != link}
     for tag, change in (("enable_collisions", pairs.discard), ("disable_collisions", pairs.add)):
-        for element in _tagged(root, tag):
+        for element in root.tagged(tag):
             first, second = (_known(element, end, urdf.links, "link") for end in ("link1", "link2"))
             if first == second:
                 raise element.error(f"link1 and link2 are both {first!r}; name a pair")

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 
 import attrs
 
 from ibrobot_core.api import did_you_mean
-from ibrobot_core.app import ModelError, XmlElement, read_xml
-from ibrobot_kinematics.errors import KinematicsError
+from ibrobot_kinematics.read_once import read_once
+from ibrobot_kinematics.xml_file import XmlElement, read_xml
 
 MOVING = ("revolute", "continuous", "prismatic")
 """Types of joints with one degree of freedom."""
 _TYPES = (*MOVING, "fixed", "floating", "planar")
+_NO_LENGTH = 1e-6
+"""Axes that are shorter determine no direction."""
 
 Triple = tuple[float, float, float]
+
+
+@attrs.frozen
+class Mimic:
+    """A joint follows another one: multiplier * joint + offset."""
+
+    joint: str
+    multiplier: float
+    offset: float
 
 
 @attrs.frozen
@@ -34,8 +46,14 @@ class UrdfJoint:
     """Roll, pitch and yaw of the child about the fixed axes of the parent, at position 0 [rad]."""
     axis: Triple
     """Axis of the joint in the child's frame, of length 1."""
-    line: int
-    """Its line in the file."""
+    limits: tuple[float, float] | None
+    """Lower and upper limit [rad or m]; None without `<limit>`, and for joints that have none by their type."""
+    effort: float
+    """[N m or N]; 0 without `<limit>`."""
+    velocity: float
+    """[rad/s or m/s]; 0 without `<limit>`."""
+    mimic: Mimic | None
+    element: XmlElement = attrs.field(repr=False, eq=False)
 
 
 @attrs.frozen(slots=False)
@@ -44,17 +62,36 @@ class Urdf:
 
     path: Path
     name: str
-    links: tuple[str, ...]
-    """In file order."""
+    elements: Mapping[str, XmlElement] = attrs.field(repr=False, eq=False)
+    """Link -> its element, in file order."""
     joints: tuple[UrdfJoint, ...]
     """In file order."""
     root: str
     """The link without a parent joint."""
 
     @cached_property
+    def links(self) -> tuple[str, ...]:
+        """The names of the links, in file order."""
+        return tuple(self.elements)
+
+    @cached_property
     def carriers(self) -> Mapping[str, UrdfJoint]:
         """Link -> the joint whose child it is; without the root."""
         return {joint.child: joint for joint in self.joints}
+
+    @cached_property
+    def outwards(self) -> tuple[UrdfJoint, ...]:
+        """The joints from the root outwards: parents come first."""
+        below: dict[str, list[UrdfJoint]] = {}
+        for joint in self.joints:
+            below.setdefault(joint.parent, []).append(joint)
+        ordered: list[UrdfJoint] = []
+        waiting = [self.root]
+        while waiting:
+            joints = below.get(waiting.pop(), [])
+            ordered += joints
+            waiting += [joint.child for joint in reversed(joints)]
+        return tuple(ordered)
 
     def chain(self, base: str, tip: str) -> tuple[UrdfJoint, ...] | None:
         """The joints from one link outwards to another, fixed ones included; None if there is no such way."""
@@ -67,48 +104,28 @@ class Urdf:
         return tuple(reversed(joints))
 
 
+@read_once(lambda urdf: (urdf.path,))
 def read_urdf(path: Path) -> Urdf:
     """Read a URDF.
 
     Raises:
         KinematicsError: if it cannot be read, is not a URDF, or its links form no single tree; gives file and line.
     """
-    try:
-        root = read_xml(path, "robot")
-        _refuse_xacro(root)
-        elements: dict[str, XmlElement] = {}
-        for element in root.children:
-            if element.tag == "link":
-                name = required(element, "name")
-                if name in elements:
-                    raise element.error(f"a second link named {name!r}, first in line {elements[name].line}")
-                elements[name] = element
-        if not elements:
-            raise root.error("has no link")
-        joints: dict[str, UrdfJoint] = {}
-        for element in root.children:
-            if element.tag == "joint":
-                joint = _joint(element, list(elements))
-                if joint.name in joints:
-                    raise element.error(f"a second joint named {joint.name!r}, first in line {joints[joint.name].line}")
-                joints[joint.name] = joint
-        links = {name: element.line for name, element in elements.items()}
-        base = _tree(path, links, tuple(joints.values()))
-        return Urdf(path, root.attributes.get("name", ""), tuple(elements), tuple(joints.values()), base)
-    except ModelError as error:
-        raise KinematicsError(str(error)) from None
+    return urdf_of(read_xml(path, "robot"), path)
 
 
-def required(element: XmlElement, attribute: str) -> str:
-    """An attribute that an element must have.
+def urdf_of(root: XmlElement, path: Path) -> Urdf:
+    """The URDF with this root element, e.g. of an expanded xacro file.
 
     Raises:
-        ModelError: if it is missing or empty.
+        KinematicsError: as `read_urdf`.
     """
-    value = element.attributes.get(attribute, "").strip()
-    if not value:
-        raise element.error(f"<{element.tag}> has no {attribute}")
-    return value
+    _refuse_xacro(root)
+    elements = _named(root, "link")
+    if not elements:
+        raise root.error("has no <link>; a xacro file that only defines macros is included by another one: give that")
+    joints = tuple(_joint(element, elements) for element in _named(root, "joint").values())
+    return Urdf(path, root.attributes.get("name", ""), elements, joints, _root_link(elements, joints))
 
 
 def _refuse_xacro(root: XmlElement) -> None:
@@ -117,54 +134,81 @@ def _refuse_xacro(root: XmlElement) -> None:
             raise element.error(f"<{element.tag}> is xacro; expand the file first: xacro {root.file.name} > FILE")
 
 
-def _joint(element: XmlElement, links: list[str]) -> UrdfJoint:
-    name, kind = required(element, "name"), required(element, "type")
+def _named(root: XmlElement, tag: str) -> dict[str, XmlElement]:
+    by_name: dict[str, XmlElement] = {}
+    for element in root.tagged(tag):
+        name = element.required("name")
+        if name in by_name:
+            raise element.error(f"a second {tag} named {name!r}, first in line {by_name[name].line}")
+        by_name[name] = element
+    return by_name
+
+
+def _joint(element: XmlElement, links: Mapping[str, XmlElement]) -> UrdfJoint:
+    name, kind = element.required("name"), element.required("type")
     if kind not in _TYPES:
         raise element.error(f"joint {name!r}: unknown type {kind!r}{did_you_mean(kind, _TYPES, 'known')}")
-    parts = {child.tag: child for child in element.children}
     ends = []
-    for end in ("parent", "child"):
-        if end not in parts:
-            raise element.error(f"joint {name!r} has no {end}")
-        link = required(parts[end], "link")
+    for side in ("parent", "child"):
+        end = element.child(side)
+        if end is None:
+            raise element.error(f"joint {name!r} has no <{side} link=…/>")
+        link = end.required("link")
         if link not in links:
-            raise parts[end].error(f"joint {name!r}: unknown link {link!r}{did_you_mean(link, links, 'known')}")
+            raise end.error(f"joint {name!r}: unknown link {link!r}{did_you_mean(link, list(links), 'known')}")
         ends.append(link)
-    nothing = XmlElement("", {}, element.file, element.line)
-    origin, axis = parts.get("origin", nothing), parts.get("axis", nothing)
-    x, y, z = axis.numbers("xyz", "1 0 0", 3)
-    length = (x * x + y * y + z * z) ** 0.5
-    if length == 0:
+    axis = element.child("axis")
+    x, y, z = axis.numbers("xyz", "1 0 0", 3) if axis is not None else (1.0, 0.0, 0.0)
+    length = math.hypot(x, y, z)
+    if length < _NO_LENGTH:
         if kind in MOVING:
-            raise axis.error(f"joint {name!r}: its axis has length 0")
-        x, length = 1.0, 1.0
+            raise (axis or element).error(f"joint {name!r}: its axis is zero, must have a direction, e.g. 0 0 1")
+        x, y, z, length = 1.0, 0.0, 0.0, 1.0
+    limit = element.child("limit") if kind in MOVING else None
+    lower, upper, effort, velocity = _numbers(limit, ("lower", "upper", "effort", "velocity"))
+    limits = (lower, upper) if limit is not None and kind != "continuous" else None
+    xyz, rpy = origin_of(element)
     return UrdfJoint(
-        name, kind, ends[0], ends[1], _triple(origin, "xyz"), _triple(origin, "rpy"),
-        (x / length, y / length, z / length), element.line,
+        name, kind, ends[0], ends[1], xyz, rpy, (x / length, y / length, z / length), limits, effort, velocity,
+        _mimic(name, element.child("mimic")), element,
     )  # fmt: skip
 
 
-def _triple(element: XmlElement, attribute: str) -> Triple:
-    x, y, z = element.numbers(attribute, "0 0 0", 3)
-    return x, y, z
+def origin_of(element: XmlElement) -> tuple[Triple, Triple]:
+    """Position [m], and roll, pitch and yaw [rad], of the origin in an element; zeros without one."""
+    origin = element.child("origin")
+    if origin is None:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    (x, y, z), (roll, pitch, yaw) = (origin.numbers(each, "0 0 0", 3) for each in ("xyz", "rpy"))
+    return (x, y, z), (roll, pitch, yaw)
 
 
-def _tree(path: Path, links: Mapping[str, int], joints: tuple[UrdfJoint, ...]) -> str:
+def _numbers(element: XmlElement | None, names: tuple[str, ...]) -> Iterator[float]:
+    return (0.0 if element is None else element.numbers(name, "0", 1)[0] for name in names)
+
+
+def _mimic(name: str, element: XmlElement | None) -> Mimic | None:
+    if element is None:
+        return None
+    joint = element.attributes.get("joint", "")
+    if not joint:
+        raise element.error(f"joint {name!r}: <mimic> names no joint")
+    return Mimic(joint, element.numbers("multiplier", "1", 1)[0], element.numbers("offset", "0", 1)[0])
+
+
+def _root_link(links: Mapping[str, XmlElement], joints: tuple[UrdfJoint, ...]) -> str:
     """The root of the tree of links.
 
-    Args:
-        path: the file.
-        links: link -> line.
-        joints: the joints of the file.
-
     Raises:
-        ModelError: if they do not form one tree.
+        KinematicsError: if they do not form one tree.
     """
     carriers: dict[str, UrdfJoint] = {}
     for joint in joints:
         if (other := carriers.setdefault(joint.child, joint)) is not joint:
-            reason = f"joints {other.name!r} (line {other.line}) and {joint.name!r} both carry link {joint.child!r}"
-            raise ModelError(f"{path}:{joint.line}: {reason}; links must form a tree")
+            raise joint.element.error(
+                f"joints {other.name!r} (line {other.element.line}) and {joint.name!r} both carry link "
+                f"{joint.child!r}; links must form a tree"
+            )
     roots = [link for link in links if link not in carriers]
     for link, joint in carriers.items():
         seen = [link]
@@ -172,12 +216,10 @@ def _tree(path: Path, links: Mapping[str, int], joints: tuple[UrdfJoint, ...]) -
             seen.append(parent)
             if parent == link:
                 loop = " -> ".join(reversed(seen))
-                raise ModelError(
-                    f"{path}:{joint.line}: link {link!r} is its own ancestor: {loop}; links must form a tree"
-                )
+                raise joint.element.error(f"link {link!r} is its own ancestor: {loop}; links must form a tree")
             if len(seen) > len(links):
                 break  # a loop of its ancestors, reported for these
     if len(roots) > 1:
-        place = f"{path}:{links[roots[1]]}"
-        raise ModelError(f"{place}: link {roots[1]!r} is not connected: no joint leads to it from {roots[0]!r}")
+        reason = f"link {roots[1]!r} is not connected: no joint leads to it from {roots[0]!r}"
+        raise links[roots[1]].error(f"{reason}; links must form a tree: join them by a fixed joint")
     return roots[0]

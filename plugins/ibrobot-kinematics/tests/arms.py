@@ -91,4 +91,4 @@ def load(directory: Path, text: str, joints: tuple[str, ...]) -> tuple[Path, Kin
     """The MJCF on disk, and its model."""
     path = directory / "chain.xml"
     path.write_text(text)
-    return path, read_mjcf(path, "tip", joints)
+    return path, read_mjcf(path).chain("tip", joints)

@@ -47,7 +47,7 @@ def build(
         path.write_text(
             f'<mujoco><compiler angle="radian"/><worldbody><body euler="{euler}">{bodies}</body></worldbody></mujoco>'
         )
-        return read_mjcf(path, "tool", JOINTS)
+        return read_mjcf(path).chain("tool", JOINTS)
 
 
 ARM = build(1.7)
@@ -152,6 +152,6 @@ def test_an_unreachable_target_comes_with_the_nearest_point(axis: Vector | None)
 
 
 def test_joints_off_the_chain_stay(tmp_path: Path):
-    five = read_mjcf(write_arm(tmp_path, *FIVE), "tool", FIVE)
+    five = read_mjcf(write_arm(tmp_path, *FIVE)).chain("tool", FIVE)
     start = np.full(6, 0.4)
     assert all(q[-1] == start[-1] for q in solve_all(five, Target(five.forward(start).position), start))

@@ -167,8 +167,15 @@ Faults = Callable[..., str]
 def load(tmp_path: Path, registry: Registry) -> Callable[..., RobotConfig]:
     """Loads the robot above, with keys for its cameras and other models."""
 
-    def run(top: str = "", wrist: str = "", urdf: str = URDF, srdf: str | None = None) -> RobotConfig:
-        text = ROBOT
+    def run(
+        top: str = "", wrist: str = "", urdf: str = URDF, srdf: str | None = None, mjcf: str | None = None,
+        joint: str = "", tip: str = "",
+    ) -> RobotConfig:  # fmt: skip
+        text = ROBOT.replace("lower: -1,", f"{joint or 'lower: -1'},")
+        if mjcf is not None:
+            (tmp_path / "arm.xml").write_text(mjcf)
+            text = text.replace("{urdf:", "{mjcf: arm.xml, urdf:")
+        text = text.replace("{urdf:", f"{{tip: {tip}, urdf:").replace("{mjcf:", f"{{tip: {tip}, mjcf:") if tip else text
         for name, more in (("top", top), ("wrist", wrist)):
             text = text.replace(f"name: {name}, kind: camera", f"name: {name}, kind: camera{more and ', '}{more}")
         (tmp_path / "robot.urdf").write_text(urdf)
@@ -294,3 +301,68 @@ def test_mounts_without_a_urdf_need_one_root(
 def test_empty_srdf_is_named(faults: Faults) -> None:
     error = faults(top="transform: {parent: tool}", srdf="")
     assert "robot.srdf:1: not valid XML" in error
+
+
+MJCF = """<mujoco>
+  <compiler angle="radian"/>
+  <worldbody><body><site name="nail"/>
+    <joint name="shoulder_pan" range="-3.5 3.5"/>
+  </body></worldbody>
+</mujoco>
+"""
+PAN = "robot.yaml:4: robot.joints.shoulder_pan.lower"
+
+
+def test_limits_beyond_the_models_need_a_word(load: Callable[..., RobotConfig], faults: Faults) -> None:
+    wide = "-3.2 rad is beyond the model's limits, -3 to 3 rad (robot.urdf:5)"
+    allow = "or set beyond_model: true where shoulder_pan can go there"
+    assert faults(joint="lower: -3.2") == f"{PAN}: {wide}; narrow it, {allow}"
+    assert faults(joint="lower: -171.9") == (
+        f"{PAN}: -171.9 rad is beyond the model's limits, -3 to 3 rad (robot.urdf:5); were degrees meant? "
+        "-171.9 degrees are -3.0002 rad"
+    )
+    assert load(joint="beyond_model: true, lower: -3.2").robot.joints[0].lower == -3.2
+    assert load(joint="lower: -3.005").robot.joints[0].lower == -3.005
+
+
+def test_of_two_models_the_wider_one_counts(load: Callable[..., RobotConfig], faults: Faults) -> None:
+    assert load(joint="lower: -3.2", mjcf=MJCF).robot.joints[0].lower == -3.2
+    assert "-3.5 to 3.5 rad (arm.xml:4)" in faults(joint="lower: -3.7", mjcf=MJCF)
+
+
+def test_limits_are_checked_by_an_mjcf_alone(
+    load: Callable[..., RobotConfig], tmp_path: Path, registry: Registry
+) -> None:
+    load(mjcf=MJCF)
+    path = tmp_path / "robot.yaml"
+    path.write_text(path.read_text().replace(", urdf: robot.urdf", "").replace("lower: -1,", "lower: -4,"))
+    with pytest.raises(ConfigError, match=r"robot\.joints\.shoulder_pan\.lower: -4 rad is beyond the model's limits"):
+        load_config(path, registry=registry)
+
+
+def test_a_joint_that_the_mjcf_lacks_is_named(faults: Faults) -> None:
+    assert faults(mjcf=MJCF.replace("shoulder_pan", "shoulder_pen")) == (
+        "robot.yaml:6: robot.description.mjcf: the model has no joint 'shoulder_pan', did you mean 'shoulder_pen'?"
+    )
+
+
+def test_a_tip_that_no_model_has_is_refused(load: Callable[..., RobotConfig], faults: Faults) -> None:
+    at = "robot.yaml:6: robot.description.tip"
+    assert faults(tip="tol") == f"{at}: unknown link 'tol', did you mean 'tool'?"
+    assert faults(tip="nial", mjcf=MJCF) == f"{at}: unknown site or link 'nial', did you mean 'nail'?"
+    assert load(tip="nail", mjcf=MJCF).robot.description.tip == "nail"
+
+
+def test_faults_of_both_models_and_of_limits_are_reported_together(faults: Faults) -> None:
+    error = faults(mjcf="<mujoco>", joint="lower: -3.2")
+    assert "robot.description.mjcf: arm.xml:1: not valid XML: no element found" in error
+    assert f"{PAN}: -3.2 rad is beyond the model's limits" in error
+
+
+def test_without_this_package_a_config_says_what_is_not_compared(
+    load: Callable[..., RobotConfig], tmp_path: Path, registry: Registry
+) -> None:
+    load()
+    entries = {key: each for key, each in registry.entries.items() if key != ("section", "description")}
+    config = load_config(tmp_path / "robot.yaml", registry=attrs.evolve(registry, entries=entries))
+    assert [(model, error.package) for model, error in config.absent_models.items()] == [("urdf", "ibrobot-kinematics")]

@@ -111,7 +111,7 @@ def arm(request, tmp_path_factory) -> Arm:
 
 def a_path(arm: Arm, rows: int = 12) -> Vector:
     """A smooth motion of all joints."""
-    model = read_mjcf(arm.robot.description.mjcf or Path(), "tool", arm.robot.joint_names)
+    model = read_mjcf(arm.robot.description.mjcf or Path()).chain("tool", arm.robot.joint_names)
     times = np.linspace(0, 1, rows)[:, None]
     return bent(model) + 0.4 * np.sin(times * np.arange(1, len(model.joint_names) + 1))
 
@@ -216,7 +216,7 @@ def test_rotation_6d_is_orthonormal_near_its_numbers_and_exact_for_rotations(
 
 
 def test_numbers_are_those_of_each_definition(arm: Arm) -> None:
-    model = read_mjcf(arm.robot.description.mjcf or Path(), "tool", arm.robot.joint_names)
+    model = read_mjcf(arm.robot.description.mjcf or Path()).chain("tool", arm.robot.joint_names)
     q = bent(model)
     tip = model.forward(q)
     wxyz, turn = np.zeros(4), np.zeros(3)
@@ -379,7 +379,7 @@ def test_gripper_may_be_part_of_the_executor_of_the_arm(arm: Arm, order: tuple[s
 
 
 def test_search_is_bounded_and_keeps_within_reach_of_its_start(arm: Arm) -> None:
-    model = read_mjcf(arm.robot.description.mjcf or Path(), "tool", arm.joints)
+    model = read_mjcf(arm.robot.description.mjcf or Path()).chain("tool", arm.joints)
     rng = np.random.default_rng(0)
     ended = 0
     for _ in range(100):
@@ -408,7 +408,7 @@ def test_search_goes_on_where_joints_do_the_same(tmp_path: Path) -> None:
 
 
 def test_search_that_has_not_settled_is_no_solution(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = read_mjcf(arm.robot.description.mjcf or Path(), "tool", arm.joints)
+    model = read_mjcf(arm.robot.description.mjcf or Path()).chain("tool", arm.joints)
     start = bent(model)
     tip = model.forward(start + 0.3)
     target = Target(tip.position, tip.rotation)

@@ -19,7 +19,7 @@ KINDS = ("position", "axis", "rotation")
 
 @pytest.fixture(scope="module", params=[FIVE, SIX], ids=["five joints", "six joints"])
 def model(request, tmp_path_factory) -> KinematicModel:
-    return read_mjcf(write_arm(tmp_path_factory.mktemp("arm"), *request.param), "tool", request.param)
+    return read_mjcf(write_arm(tmp_path_factory.mktemp("arm"), *request.param)).chain("tool", request.param)
 
 
 def target_at(model: KinematicModel, q: Vector, kind: str) -> Target:
@@ -68,7 +68,7 @@ def test_start_outside_the_limits_is_allowed(model: KinematicModel, kind: str):
 
 def test_tip_that_points_away_from_the_axis_is_turned_around(tmp_path: Path):
     """Where the axes are opposite there is no shortest turn."""
-    model = read_mjcf(write_arm(tmp_path, *SIX), "tool", SIX)
+    model = read_mjcf(write_arm(tmp_path, *SIX)).chain("tool", SIX)
     model = attrs.evolve(model, lower=np.full(7, -4.0), upper=np.full(7, 4.0))
     target = Target([0.0, 0.2, 0.2], axis=-model.forward(np.zeros(7)).rotation[:, 2])
     assert_reached(model, target, solve(model, target, np.zeros(7)), 0.02)
@@ -93,7 +93,7 @@ def test_out_of_reach_tells_the_nearest(model: KinematicModel):
 
 
 def test_five_joints_reach_a_pose_only_with_tolerance(tmp_path: Path):
-    model = read_mjcf(write_arm(tmp_path, *FIVE), "tool", FIVE)
+    model = read_mjcf(write_arm(tmp_path, *FIVE)).chain("tool", FIVE)
     sideways = Target([0.3, 0.1, 0.1], rotation=np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]))
     with pytest.raises(
         UnreachableError, match=r"the nearest is \(0.300, 0.100, 0.100\) m, 0.0 mm and 89.5 degrees off"

@@ -53,7 +53,7 @@ def test_jacobian_agrees_with_finite_differences(
 
 
 def test_joint_off_the_chain_does_not_move_the_tip(tmp_path: Path):
-    model = read_mjcf(write_arm(tmp_path, *FIVE), "tool", FIVE)
+    model = read_mjcf(write_arm(tmp_path, *FIVE)).chain("tool", FIVE)
     q = np.zeros(6)
     assert not model.jacobian(q)[:, -1].any()
     np.testing.assert_array_equal(model.forward(q).position, model.forward(np.array([0, 0, 0, 0, 0, 1.0])).position)
@@ -61,7 +61,7 @@ def test_joint_off_the_chain_does_not_move_the_tip(tmp_path: Path):
 
 def test_joints_that_are_not_listed_stay_at_zero(tmp_path: Path):
     path = write_arm(tmp_path, *SIX)
-    whole, part = (read_mjcf(path, "tool", joints) for joints in (SIX, ("lift", "pan")))
+    whole, part = (read_mjcf(path).chain("tool", joints) for joints in (SIX, ("lift", "pan")))
     np.testing.assert_allclose(
         part.forward(np.array([0.4, 0.3])).position,
         whole.forward(np.array([0.3, 0.4, 0, 0, 0, 0, 0])).position,
@@ -89,22 +89,62 @@ def test_limits_are_the_robots(tmp_path: Path):
 def test_request_that_does_not_fit_the_file_is_refused(tmp_path: Path, tip: str, joints: tuple[str, ...], message: str):
     path = write_arm(tmp_path, *FIVE)
     with pytest.raises(KinematicsError, match=f"{path}.*{message}"):
-        read_mjcf(path, tip, joints)
+        read_mjcf(path).chain(tip, joints)
 
 
 def test_joint_without_limits_is_refused(tmp_path: Path):
     path = write_arm(tmp_path, *FIVE)
     path.write_text(path.read_text().replace('range="-1.6 1.6" limited="true"', "", 1))
     with pytest.raises(KinematicsError, match="joint 'pan' has no limits"):
-        read_mjcf(path, "tool", FIVE)
+        read_mjcf(path).chain("tool", FIVE)
 
 
-@pytest.mark.parametrize("text", ["<mujoco", "<mujoco><worldbody><body><geom/></body></worldbody></mujoco>"])
-def test_file_that_cannot_be_loaded_is_named(tmp_path: Path, text: str):
+FAULTS = {
+    "no XML": ("<mujoco", r"arm\.xml:1: not valid XML"),
+    "no site": ("<mujoco><worldbody><body><geom/></body></worldbody></mujoco>", r"arm\.xml has no site 'tool'"),
+    "unknown attribute": (
+        "<mujoco>\n<worldbody>\n<geom color='1'/></worldbody></mujoco>",
+        r"arm\.xml:3: MuJoCo cannot load it: .*unrecognized attribute: 'color'",
+    ),
+    "no XML in an included file": ("<mujoco>\n<include file='base.xml'/></mujoco>", r"base\.xml:2: not valid XML"),
+    "no included file": ("<mujoco>\n<include file='gone.xml'/></mujoco>", r"gone\.xml: cannot be read: No such file"),
+    "unknown class": (
+        "<mujoco>\n<worldbody><body>\n<joint name='a' class='b'/></body></worldbody></mujoco>",
+        r"arm\.xml:3: joint 'a': no default class 'b'",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), FAULTS.values(), ids=FAULTS)
+def test_file_that_cannot_be_loaded_is_named_with_its_line(tmp_path: Path, text: str, message: str):
     path = tmp_path / "arm.xml"
     path.write_text(text)
-    with pytest.raises(KinematicsError, match=r"arm\.xml (cannot be loaded: .+|has no site 'tool')"):
-        read_mjcf(path, "tool", ())
+    (tmp_path / "base.xml").write_text("<mujocoinclude>\n<worldbody></mujocoinclude>")
+    with pytest.raises(KinematicsError, match=message):
+        read_mjcf(path).chain("tool", ())
+
+
+def test_an_unusable_mesh_is_named(tmp_path: Path):
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        "<mujoco><asset><mesh name='m' file='gone.stl'/></asset>"
+        "<worldbody><body><geom type='mesh' mesh='m'/></body></worldbody></mujoco>"
+    )
+    with pytest.raises(KinematicsError, match=r"arm\.xml: MuJoCo cannot load it: .*gone\.stl"):
+        assert read_mjcf(path).solid
+
+
+def test_a_file_is_read_once_until_it_or_an_included_one_changes(tmp_path: Path):
+    path, arm = tmp_path / "whole.xml", write_arm(tmp_path, *FIVE)
+    path.write_text(f'<mujoco><include file="{arm.name}"/></mujoco>')
+    first = read_mjcf(path)
+    assert read_mjcf(path) is first
+    write_arm(tmp_path, *SIX)
+    second = read_mjcf(path)
+    assert second is not first
+    assert second.chain("tool", SIX).joint_names == SIX
+    path.write_text("<mujoco/>")
+    assert read_mjcf(path).spec.worldbody.first_body() is None
 
 
 def test_robot_without_an_mjcf_is_refused():
@@ -123,7 +163,7 @@ def two_arms(path: Path) -> Robot:
 
 def test_each_of_several_arms_has_the_model_in_the_frame_of_its_base(tmp_path: Path):
     robot = two_arms(write_arm(tmp_path, *FIVE))
-    alone = read_mjcf(robot.description.mjcf or Path(), "tool", FIVE)
+    alone = read_mjcf(robot.description.mjcf or Path()).chain("tool", FIVE)
     q = np.array([0.3, -0.6, 1.1, 0.2, 0.2, 0.4])[: len(FIVE)]
     for arm in ("left", "right"):
         model = robot_model(robot.part(arm))

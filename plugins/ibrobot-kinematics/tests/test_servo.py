@@ -25,7 +25,7 @@ STILL = np.zeros(3)
 
 def load(joints: tuple[str, ...]) -> KinematicModel:
     with tempfile.TemporaryDirectory() as directory:
-        return read_mjcf(write_arm(Path(directory), *joints), "tool", joints)
+        return read_mjcf(write_arm(Path(directory), *joints)).chain("tool", joints)
 
 
 ARMS = {len(joints): load(joints) for joints in (FIVE, SIX)}

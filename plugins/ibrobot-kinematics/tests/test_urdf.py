@@ -52,7 +52,7 @@ def test_links_and_joints_are_in_file_order(read: Read) -> None:
     urdf = read(ARM)
     assert (urdf.name, urdf.links, urdf.root) == ("mini", ("tool", "base", "arm"), "base")
     pan, flange = urdf.joints
-    assert (pan.name, pan.type, pan.parent, pan.child, pan.line) == ("pan", "revolute", "base", "arm", 5)
+    assert (pan.name, pan.type, pan.parent, pan.child, pan.element.line) == ("pan", "revolute", "base", "arm", 5)
     assert (pan.xyz, pan.rpy, pan.axis) == ((0.0, 0.0, 0.1), (0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
     assert (flange.type, flange.xyz, flange.axis) == ("fixed", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 
@@ -78,7 +78,8 @@ def robot(*joints: tuple[str, str, str], links: str = "abcd") -> str:
         ("<robot><joint", "robot.urdf:1: not valid XML: unclosed token"),
         ("<!DOCTYPE r [<!ENTITY a 'b'>]><robot/>", "robot.urdf:1: has a document type (<!DOCTYPE …>): remove it"),
         ("<mujoco/>", "robot.urdf:1: begins with <mujoco>, must be <robot>"),
-        ("<robot/>", "robot.urdf:1: has no link"),
+        ("<robot/>", "robot.urdf:1: has no <link>; a xacro file that only defines macros is included by another "
+         "one: give that"),
         ("<robot>\n<link/></robot>", "robot.urdf:2: <link> has no name"),
         (robot(links="aba"), "robot.urdf:4: a second link named 'a', first in line 2"),
         ("<robot xmlns:xacro='x'>\n<xacro:include filename='a'/></robot>",
@@ -86,17 +87,19 @@ def robot(*joints: tuple[str, str, str], links: str = "abcd") -> str:
         (ARM.replace('type="revolute"', 'type="revolut"'),
          "robot.urdf:5: joint 'pan': unknown type 'revolut', did you mean 'revolute'?"),
         (ARM.replace(' type="fixed"', ""), "robot.urdf:8: <joint> has no type"),
-        (ARM.replace('<parent link="base"/>', ""), "robot.urdf:5: joint 'pan' has no parent"),
+        (ARM.replace('<parent link="base"/>', ""), "robot.urdf:5: joint 'pan' has no <parent link=…/>"),
         (ARM.replace('<parent link="base"/>', '<parent link="bas"/>'),
          "robot.urdf:6: joint 'pan': unknown link 'bas', did you mean 'base'?"),
         (ARM.replace('"flange"', '"pan"'), "robot.urdf:8: a second joint named 'pan', first in line 5"),
         (ARM.replace('xyz="0 0 0.1"', 'xyz="0 0"'), "robot.urdf:6: xyz is '0 0', must be 3 finite numbers"),
         (ARM.replace('rpy="0 0 1"', 'rpy="0 0 nan"'), "robot.urdf:6: rpy is '0 0 nan', must be 3 finite numbers"),
-        (ARM.replace('"0 0 2"', '"0 0 0"'), "robot.urdf:6: joint 'pan': its axis has length 0"),
+        (ARM.replace('"0 0 2"', '"0 0 0"'),
+         "robot.urdf:6: joint 'pan': its axis is zero, must have a direction, e.g. 0 0 1"),
         (robot(("1", "a", "b"), ("2", "c", "b"), ("3", "a", "d")),
          "robot.urdf:7: joints '1' (line 6) and '2' both carry link 'b'; links must form a tree"),
         (robot(("1", "a", "b"), ("2", "b", "d")),
-         "robot.urdf:4: link 'c' is not connected: no joint leads to it from 'a'"),
+         "robot.urdf:4: link 'c' is not connected: no joint leads to it from 'a'; links must form a "
+         "tree: join them by a fixed joint"),
         (robot(("1", "b", "c"), ("2", "c", "d"), ("3", "d", "b")),
          "robot.urdf:6: link 'c' is its own ancestor: c -> d -> b -> c; links must form a tree"),
         (robot(("1", "a", "a"), links="a"),

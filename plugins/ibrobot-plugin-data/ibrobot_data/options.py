@@ -72,6 +72,8 @@ def has_button(run: RunView, devices: Iterable[str], event: str) -> bool:
 
 def check_keys(config: RobotConfig) -> Iterator[OptionFault]:
     """Check that the keys of a robot YAML's takeovers and highlights do nothing else in modes with `intervene`."""
+    if config.recording is None and "episodes" not in config.plugin_sections:
+        return  # the component does not run
     options = options_of(config)
     modes = [mode for mode in config.control_modes.values() if mode.inference is not None and mode.inference.devices]
     keys = {"takeover_key": (options.takeover_key, "takes the robot from the policy")} if modes else {}

@@ -8,6 +8,8 @@ import shutil
 from pathlib import Path
 
 import mujoco
+from ibrobot_kinematics.errors import KinematicsError
+from ibrobot_kinematics.mjcf import read_mjcf, unusable
 
 from ibrobot_core.api import HardwareError
 from ibrobot_mujoco.chains import chains_of, parents_of
@@ -45,10 +47,12 @@ def complete_model(mjcf: Path, folder: Path, tip: str | None = None) -> RobotMod
     """
     notes: list[str] = []
     try:
-        spec = mujoco.MjSpec.from_file(str(mjcf))
+        spec = read_mjcf(mjcf).spec.copy()
         model = spec.compile()
+    except KinematicsError as error:
+        raise HardwareError(str(error)) from error
     except (ValueError, mujoco.FatalError) as error:
-        raise HardwareError(f"MuJoCo cannot load {mjcf}: {' '.join(str(error).split())}") from error
+        raise HardwareError(str(unusable(mjcf, error))) from error
     folder.mkdir(parents=True)
     try:
         _copy_files(spec, mjcf, folder)

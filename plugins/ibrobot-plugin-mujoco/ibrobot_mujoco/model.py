@@ -5,12 +5,12 @@ The physics model has no visual meshes, the visual model has low-poly ones; both
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from ibrobot_kinematics.errors import KinematicsError
+from ibrobot_kinematics.mjcf import mesh_name, read_mjcf, several_arms
 from ibrobot_kinematics.rotations import quaternion
 from numpy.typing import NDArray
 
@@ -70,7 +70,10 @@ def build_spec(options: MujocoOptions, robot: Robot) -> tuple[mujoco.MjSpec, Any
     if path is None:
         raise HardwareError(f"robot {robot.name!r} has no MJCF to simulate: set robot.description.mjcf")
     arms = robot.description.arms
-    spec = _several(path, arms) if arms else _load(path)
+    try:
+        spec = several_arms(path, arms) if arms else read_mjcf(path).spec.copy()
+    except KinematicsError as error:
+        raise HardwareError(str(error)) from error
     spec.option.timestep = ns(options.timestep) / NS_PER_S
     # Grasping needs both: with a pyramidal cone, or an impedance ratio of 1, the cube slips out.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -88,29 +91,6 @@ def build_spec(options: MujocoOptions, robot: Robot) -> tuple[mujoco.MjSpec, Any
     for camera in options.cameras:
         _add_camera(spec, camera)
     return spec, scene
-
-
-def _load(path: Path) -> mujoco.MjSpec:
-    try:
-        return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise HardwareError(f"{path} cannot be loaded: {error}") from error
-
-
-def _several(path: Path, arms: Mapping[str, tuple[float, float, float, float]]) -> mujoco.MjSpec:
-    """Attach an MJCF once for each arm: prefix of its names -> x, y, z [m] and yaw [rad] of its base."""
-    spec = mujoco.MjSpec()
-    for prefix, (x, y, z, yaw) in arms.items():
-        arm = _load(path)
-        folder = Path(arm.modelfiledir) / arm.meshdir
-        for mesh in arm.meshes:
-            mesh.name, mesh.file = _mesh_name(mesh), str(folder / mesh.file)
-        arm.meshdir = ""
-        for option in ("integrator", "iterations", "ls_iterations", "timestep", "cone", "impratio"):
-            setattr(spec.option, option, getattr(arm.option, option))
-        base = spec.worldbody.add_frame(pos=[x, y, z], quat=[math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)])
-        spec.attach(arm, prefix=prefix, frame=base)
-    return spec
 
 
 def _tune_servos(spec: mujoco.MjSpec, options: MujocoOptions, robot: Robot) -> None:
@@ -223,7 +203,7 @@ def _simplify(spec: mujoco.MjSpec) -> None:
     colliding = {g.meshname for g in spec.geoms if g.type == _Mesh and (g.contype or g.conaffinity)}
     directory = Path(spec.modelfiledir) / spec.meshdir
     for mesh in spec.meshes:
-        name = _mesh_name(mesh)
+        name = mesh_name(mesh)
         if name in colliding or Path(mesh.file).suffix.lower() != ".stl":
             continue
         scale = float(np.max(np.abs(mesh.scale)))
@@ -234,12 +214,8 @@ def _simplify(spec: mujoco.MjSpec) -> None:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 
 
-def _mesh_name(mesh: mujoco.MjsMesh) -> str:
-    return mesh.name or Path(mesh.file).stem
-
-
 def _delete_unused_meshes(spec: mujoco.MjSpec) -> None:
     used = {geom.meshname for geom in spec.geoms if geom.type == _Mesh}
     for mesh in list(spec.meshes):
-        if _mesh_name(mesh) not in used:
+        if mesh_name(mesh) not in used:
             spec.delete(mesh)

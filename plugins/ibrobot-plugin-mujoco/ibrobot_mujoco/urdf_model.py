@@ -12,6 +12,7 @@ from pathlib import Path
 import attrs
 import mujoco
 import numpy as np
+from ibrobot_kinematics.urdf import UrdfJoint
 from numpy.typing import NDArray
 
 from ibrobot_core.api import HardwareError, did_you_mean
@@ -19,7 +20,7 @@ from ibrobot_mujoco.chains import Chain, chains_of, parents_of
 from ibrobot_mujoco.meshes import Meshes
 from ibrobot_mujoco.plausibility import Drive, check_plausible, loads, summary
 from ibrobot_mujoco.ros_packages import Packages
-from ibrobot_mujoco.urdf_file import Inertial, Link, Shape, Urdf, UrdfJoint, read_urdf, several
+from ibrobot_mujoco.urdf_file import STILL, Inertial, Link, Robot, Shape, read_robot, several
 
 type Pose = NDArray[np.float64]
 
@@ -108,7 +109,7 @@ def make_model(
         HardwareError: if the file cannot be read or lacks a mesh, or describes no arm, or an absurd one.
     """
     places = Packages(urdf, packages)
-    robot = read_urdf(urdf, places, arguments or {})
+    robot = read_robot(urdf, places, arguments or {})
     notes = list(robot.notes)
     name = re.sub(r"\W+", "_", robot.name or urdf.stem)
     folder.mkdir(parents=True)
@@ -146,7 +147,7 @@ def _compiled(spec: mujoco.MjSpec, urdf: Path) -> mujoco.MjModel:
         raise HardwareError(f"{urdf}: MuJoCo cannot load it: {text}") from error
 
 
-def _bodies(robot: Urdf, meshes: Meshes, notes: list[str]) -> mujoco.MjSpec:
+def _bodies(robot: Robot, meshes: Meshes, notes: list[str]) -> mujoco.MjSpec:
     """The links as bodies, with their joints, shapes and masses."""
     spec = mujoco.MjSpec()
     spec.modelname = robot.name
@@ -158,12 +159,12 @@ def _bodies(robot: Urdf, meshes: Meshes, notes: list[str]) -> mujoco.MjSpec:
     for child, joint in robot.joints.items():
         body = bodies[joint.parent].add_body(name=child, pos=joint.xyz, quat=_quaternion(joint.rpy), gravcomp=1)
         bodies[child] = body
-        if joint.type != "fixed" and joint.type not in ("floating", "planar"):
+        if joint.type not in STILL:
             slides = joint.type == "prismatic"
             body.add_joint(
                 name=joint.name,
                 type=mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE,
-                axis=np.divide(joint.axis, math.hypot(*joint.axis)),
+                axis=joint.axis,
                 limited=True,
                 range=joint.limits or (-TURN_RAD, TURN_RAD),
             )
@@ -206,13 +207,13 @@ def _sizes(shape: Shape) -> list[float]:
             return [shape.size[0], shape.size[1] / 2, 0]
 
 
-def _masses(robot: Urdf, bodies: Mapping[str, mujoco.MjsBody], solid: Mapping[str, bool], notes: list[str]) -> None:
+def _masses(robot: Robot, bodies: Mapping[str, mujoco.MjsBody], solid: Mapping[str, bool], notes: list[str]) -> None:
     """Set masses and inertias, and guess those that the URDF lacks."""
     invented: list[str] = []
     impossible: list[str] = []
     empty: list[str] = []
     heavy = {name for name, link in robot.links.items() if _weighs(link) or solid[name]}
-    moving = {child for child, joint in robot.joints.items() if joint.type not in ("fixed", "floating", "planar")}
+    moving = {child for child, joint in robot.joints.items() if joint.type not in STILL}
     for name, link in robot.links.items():
         body = bodies[name]
         if name == "world":
@@ -241,7 +242,7 @@ def _weighs(link: Link) -> bool:
     return link.inertial is not None and link.inertial.mass > _LEAST_KG
 
 
-def _moves(name: str, robot: Urdf, moving: set[str]) -> bool:
+def _moves(name: str, robot: Robot, moving: set[str]) -> bool:
     """Whether some joint moves a link."""
     while name in robot.joints:
         if name in moving:
@@ -250,7 +251,7 @@ def _moves(name: str, robot: Urdf, moving: set[str]) -> bool:
     return False
 
 
-def _rigid(name: str, robot: Urdf, moving: set[str]) -> set[str]:
+def _rigid(name: str, robot: Robot, moving: set[str]) -> set[str]:
     """The links that are one solid with a link and those below it."""
     rigid = {name}
     for child, joint in robot.joints.items():  # parents come first
@@ -310,7 +311,7 @@ def mark_grippers(joints: Sequence[DrivenJoint], model: mujoco.MjModel) -> list[
     return [attrs.evolve(each, gripper=False) for each in marked] if all(each.gripper for each in marked) else marked
 
 
-def _drive(spec: mujoco.MjSpec, robot: Urdf, notes: list[str]) -> tuple[tuple[DrivenJoint, ...], list[str]]:
+def _drive(spec: mujoco.MjSpec, robot: Robot, notes: list[str]) -> tuple[tuple[DrivenJoint, ...], list[str]]:
     """Give each joint a drive, and those that mimic another one a coupling; returns the joints, and doubts."""
     notes.append("The drives hold the weight of the arm by themselves (gravcomp), as controllers of such arms do.")
     elements = {each.name: each for each in robot.joints.values()}
@@ -403,7 +404,7 @@ def add_servos(
 
 
 def _set_tip(
-    spec: mujoco.MjSpec, robot: Urdf, joints: tuple[DrivenJoint, ...], chain: Chain, tip: str | None, notes: list[str]
+    spec: mujoco.MjSpec, robot: Robot, joints: tuple[DrivenJoint, ...], chain: Chain, tip: str | None, notes: list[str]
 ) -> None:
     """Add the site `tip`."""
     if tip is None:

@@ -95,7 +95,7 @@ def test_what_a_urdf_does_not_say_is_a_stated_guess(small: Path, tmp_path: Path)
     ("text", "arguments", "message"),
     [
         ("<robot", (), "small.urdf:1: not valid XML"),
-        ("<mujoco/>", (), "its first element is <mujoco>, must be <robot>"),
+        ("<mujoco/>", (), "begins with <mujoco>, must be <robot>"),
         (SMALL.replace("SHAPE", '<mesh filename="none.stl"/>'), (), "none.stl, which does not exist"),
         (SMALL.replace("SHAPE", '<mesh filename="package://far/a.stl"/>'), (), "give --package far=FOLDER"),
         (SMALL.replace("SHAPE", BOX), ("--tip", "elbow"), "no link 'elbow'; it has: base, upper, hand"),

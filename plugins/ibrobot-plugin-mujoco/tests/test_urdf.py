@@ -328,7 +328,7 @@ WRONG = {
     "unknown shape": (("<box", "<cone"), "link 'a': unknown shape <cone>; the shapes are: box, cylinder"),
     "no geometry": (("geometry", "geom"), "link 'a': <collision> has no <geometry>"),
     "axis": (('xyz="0 1 0"', 'xyz="0 0 0"'), "joint 'j': its axis is zero, must have a direction, e.g. 0 0 1"),
-    "type": (('type="revolute"', 'type="ball"'), "joint 'j': its type is 'ball', must be one of revolute, continuous"),
+    "type": (('type="revolute"', 'type="ball"'), "joint 'j': unknown type 'ball'; known: revolute, continuous"),
     "sliding without limits": (
         ('type="revolute"', 'type="prismatic"', make.LIMIT, ""),
         "joint 'j' slides, and has no limits: add <limit lower=",
@@ -340,19 +340,28 @@ WRONG = {
     "unknown parent": (('parent link="a"', 'parent link="aa"'), "joint 'k': unknown link 'aa', did you mean 'a'?"),
     "no child": (('<child link="a"/>', ""), "joint 'j' has no <child link="),
     "link without a name": (('link name="a"', "link"), "<link> has no name"),
-    "two links of a name": (('link name="b"', 'link name="a"'), "a second link named 'a'; the first is in line 4"),
-    "two joints of a name": (('name="k"', 'name="j"'), "a second joint named 'j'; the first is in line"),
+    "two links of a name": (('link name="b"', 'link name="a"'), "a second link named 'a', first in line 4"),
+    "two joints of a name": (('name="k"', 'name="j"'), "a second joint named 'j', first in line"),
     "two parents": (
         ('<parent link="a"/><child link="b"/>', '<parent link="base"/><child link="a"/>'),
-        "link 'a' has two parents, by the joints 'j' and 'k'",
+        "joints 'j' (line 5) and 'k' both carry link 'a'; links must form a tree",
     ),
-    "a circle": (('parent link="base"', 'parent link="b"'), "joints form a circle"),
-    "two roots": (('name="base"/>', 'name="base"/><link name="c"/>'), "the links base, c have no parent"),
-    "itself": (('parent link="base"', 'parent link="a"'), "parent and child are the same link, 'a'"),
+    "a circle": (
+        ('parent link="base"', 'parent link="b"'),
+        "link 'a' is its own ancestor: a -> b -> a; links must form a tree",
+    ),
+    "two roots": (
+        ('name="base"/>', 'name="base"/><link name="c"/>'),
+        "link 'c' is not connected: no joint leads to it from 'base'",
+    ),
+    "itself": (
+        ('parent link="base"', 'parent link="a"'),
+        "link 'a' is its own ancestor: a -> a; links must form a tree",
+    ),
     "mimics none": (("</joint>", '<mimic joint="z"/></joint>'), "mimics 'z', unknown; it has: j, k"),
     "mimics itself": (("</joint>", '<mimic joint="j"/></joint>'), "joint 'j' mimics itself"),
     "mimics nothing": (("</joint>", "<mimic/></joint>"), "joint 'j': <mimic> names no joint"),
-    "a variable": (('link name="base"', 'link name="${HOME}"'), "which begins a variable in a robot YAML"),
+    "a variable": (('"base"', '"${HOME}"'), "which begins a variable in a robot YAML"),
     "no links": ((GOOD, "", '<link name="base"/>', ""), "has no <link>; a xacro file that only defines macros"),
     "world in the arm": (('"a"', '"world"'), "the link 'world' must be the one without a parent joint"),
     "document type": (("<robot", "<!DOCTYPE robot><robot"), "has a document type"),
@@ -369,7 +378,7 @@ def test_a_faulty_urdf_is_an_error_at_its_line(
     text = make.robot(GOOD)
     for old, other in zip(changes[::2], changes[1::2], strict=True):
         assert old in text
-        text = text.replace(old, other, 1 if old not in ("geometry", '"a"') else -1)
+        text = text.replace(old, other, 1 if old not in ("geometry", '"a"', '"base"') else -1)
     refused(new(text), tmp_path, "made.urdf:", message)
 
 

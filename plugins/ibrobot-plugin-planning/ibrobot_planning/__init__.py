@@ -86,18 +86,20 @@ def _world(options: WorldOptions, session: RunView) -> Component:
 
 def _unknown_names(options: WorldOptions, robot: Robot) -> Iterable[OptionFault]:
     """Faults of names that are neither a link of the robot's model nor an object."""
-    from ibrobot_core.app import ModelError, read_mjcf
+    from ibrobot_kinematics.errors import KinematicsError
+    from ibrobot_kinematics.mjcf_names import read_names
+
     from ibrobot_planning.world.objects import FLOOR
 
     mjcf = robot.description.mjcf
     if mjcf is None:
         return
     try:
-        model = read_mjcf(mjcf)
-    except ModelError:
-        return  # core reports it
+        model = read_names(mjcf)
+    except KinematicsError:
+        return  # its own check reports it
     prefixes = tuple(robot.description.arms) or ("",)
-    links = [prefix + name for prefix in prefixes for name in ("world", *model.links, *model.frames)]
+    links = [prefix + name for prefix in prefixes for name in ("world", *model.bodies, *model.sites)]
     known = [*links, *options.objects, *options.clouds, FLOOR]
     for name, thing in options.objects.items():
         if name in links:

@@ -225,8 +225,8 @@ def test_models_that_cannot_be_used_are_refused(tmp_path):
         'diaginertia="1 1 1"/></body></worldbody></mujoco>'
     )
     for path, joints, message in (
-        (tmp_path / "none.xml", ("a",), "none.xml cannot be loaded"),
-        (broken, ("a",), "broken.xml cannot be loaded"),
+        (tmp_path / "none.xml", ("a",), "none.xml: cannot be read: No such file"),
+        (broken, ("a",), "broken.xml:1: not valid XML: mismatched tag"),
         (bare, ("b",), "no joint 'b'; it has: a"),
         (bare, ("a",), "no geometry that could collide"),
     ):

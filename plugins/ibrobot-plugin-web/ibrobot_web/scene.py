@@ -1,7 +1,6 @@
 """The robot's shapes for the page: bodies, joints, primitives and low-poly meshes, from its MJCF or URDF.
 
-MuJoCo reads the file, in the server's process. The page computes where the bodies are, so that states need only contain
-the positions of joints.
+The page computes where the bodies are, so that states need only contain the positions of joints.
 """
 
 from __future__ import annotations
@@ -14,12 +13,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.meshes import cluster
+from ibrobot_kinematics.mjcf import read_mjcf, several_arms
 from ibrobot_kinematics.rotations import from_quaternion, from_rpy, quaternion
 from ibrobot_kinematics.urdf import read_urdf
 from numpy.typing import NDArray
-
-from ibrobot_core.app import ModelError
 
 _GRID_M = 0.0035
 """Grid on which the vertices of meshes are merged, for robots of up to 1 m; larger ones have a larger one."""
@@ -52,7 +51,7 @@ def make_scene(description: Mapping[str, Any]) -> dict[str, Any]:
     model, problem = None, "the robot has no model: set robot.description.mjcf or robot.description.urdf"
     try:
         model = _compiled(description)
-    except ValueError as error:
+    except (KinematicsError, ValueError) as error:
         problem = " ".join(str(error).split())
     if model is None:
         return {"bodies": [], "meshes": [], "tips": {}, "problem": problem}
@@ -103,7 +102,7 @@ def _root_link(urdf: str | None) -> str | None:
     """The first link of a URDF that no joint carries: the base frame."""
     try:
         return read_urdf(Path(urdf)).root if urdf is not None else None
-    except ModelError:
+    except KinematicsError:
         return None
 
 
@@ -114,13 +113,7 @@ def _compiled(description: Mapping[str, Any]) -> Any:
     if not path:
         return None
     arms = description.get("arms") or {}
-    if not arms:
-        return mujoco.MjSpec.from_file(path).compile()
-    spec = mujoco.MjSpec()
-    for prefix, (x, y, z, yaw) in arms.items():
-        frame = spec.worldbody.add_frame(pos=[x, y, z], quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
-        spec.attach(mujoco.MjSpec.from_file(path), prefix=prefix, frame=frame)
-    return spec.compile()
+    return several_arms(Path(path), arms).compile() if arms else read_mjcf(Path(path)).solid
 
 
 def _body(model: Any, body: int, geoms: list[int], meshes: list[int]) -> dict[str, Any]:

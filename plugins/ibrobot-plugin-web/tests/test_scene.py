@@ -96,6 +96,16 @@ def test_a_robot_without_shapes_says_why(tmp_path: Path) -> None:
     assert "XML" in broken["problem"]
 
 
+def test_a_broken_urdf_beside_an_mjcf_hides_no_shapes(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(seven_joints())
+    (tmp_path / "arm.urdf").write_text("<robot>")
+    mount = {"camera": True, "rpy": [0.0, 0.0, 0.0], "quaternion": None, "xyz": [0.0, 0.0, 0.0]}
+    mounts = [{**mount, "name": "ahead", "frame": "ahead_frame", "parent": "link2"}]
+    described = {"mjcf": str(tmp_path / "arm.xml"), "urdf": str(tmp_path / "arm.urdf"), "tip": "tip", "mounts": mounts}
+    scene = make_scene(described)
+    assert [camera["body"] for camera in scene["cameras"]] == [7, 3]
+
+
 def test_cameras_of_the_robot_yaml_are_where_their_mounts_say(tmp_path: Path) -> None:
     (tmp_path / "arm.xml").write_text(seven_joints())
     mount = {"camera": True, "rpy": [0.0, 0.0, 0.0], "quaternion": None, "xyz": [0.0, 0.0, 0.0]}

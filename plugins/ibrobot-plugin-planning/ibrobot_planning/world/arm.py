@@ -1,6 +1,6 @@
 """The collision model of the arm: joints and the shapes of its links, from the MJCF.
 
-MuJoCo reads the file, Pinocchio places the links, Coal finds contacts (ADR 31).
+Pinocchio places the links, Coal finds contacts (ADR 31).
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any
 
 import attrs
 import numpy as np
-from ibrobot_kinematics.poses import homogeneous
-from ibrobot_kinematics.rotations import from_quaternion
+from ibrobot_kinematics.errors import KinematicsError
+from ibrobot_kinematics.mjcf import placement, read_mjcf
 
 from ibrobot_core.api import PlanningError, Robot, Vector
 from ibrobot_core.app import PlanCode
@@ -25,8 +25,6 @@ ADJACENT, ALWAYS, NEVER, SRDF = "Adjacent", "Always", "Never", "SRDF"
 """Reasons not to check a pair of links; the first three are those of MoveIt's setup assistant."""
 _PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = 0, 2, 3, 5, 6, 7
 """Values of mujoco.mjtGeom."""
-_HINGE, _SLIDE = 3, 2
-"""Values of mujoco.mjtJoint."""
 
 type Pair = tuple[str, str]
 
@@ -173,49 +171,34 @@ def read_arm(path: Path, joints: tuple[str, ...]) -> Arm:
     """
     import pinocchio
 
-    source = _compiled(path)
-    known = {source.joint(i).name: i for i in range(source.njnt)}
-    for name in joints:
-        if name not in known:
-            raise _unusable(f"{path} has no joint {name!r}; it has: {', '.join(known)}")
-        if source.jnt_type[known[name]] not in (_SLIDE, _HINGE):
-            raise _unusable(f"{path}: joint {name!r} is neither a hinge nor a slide")
-    ids = [known[name] for name in joints]
+    try:
+        mjcf = read_mjcf(path)
+        source = mjcf.solid
+        tree = mjcf.tree(source, joints)
+    except KinematicsError as error:
+        raise _unusable(str(error)) from error
     model = pinocchio.Model()
-    numbers: dict[int, int] = {}
-    bodies = {0: (0, np.eye(4))}
-    for body in range(1, source.nbody):
-        number, placed = bodies[int(source.body_parentid[body])]
-        placed = placed @ _placement(source.body_pos[body], source.body_quat[body])
-        first = int(source.body_jntadr[body])
-        for joint in range(first, first + int(source.body_jntnum[body])):
-            if joint not in ids:
-                continue
-            anchor = _placement(source.jnt_pos[joint], (1, 0, 0, 0))
-            axis = source.jnt_axis[joint].copy()
-            kind = (
-                pinocchio.JointModelPrismaticUnaligned
-                if source.jnt_type[joint] == _SLIDE
-                else pinocchio.JointModelRevoluteUnaligned
-            )
-            number = model.addJoint(number, kind(axis), pinocchio.SE3(placed @ anchor), source.joint(joint).name)
-            numbers[joint] = number
-            placed = np.linalg.inv(anchor)
-        bodies[body] = number, placed
+    for joint in tree.joints:
+        kind = pinocchio.JointModelPrismaticUnaligned if joint.slides else pinocchio.JointModelRevoluteUnaligned
+        model.addJoint(joint.parent + 1, kind(joint.axis), pinocchio.SE3(joint.placement), joint.name)
+    numbers = [model.getJointId(name) for name in joints]
+    moving = [tree.joints[number - 1] for number in numbers]
+    bodies = [(carrier + 1, frame) for carrier, frame in tree.bodies]
     shapes = tuple(_shapes(source, bodies))
     if not shapes:
         raise _unusable(f"{path} has no geometry that could collide")
+    limits = source.jnt_range[[source.joint(name).id for name in joints]]
     return Arm(
         joint_names=joints,
         model=model,
-        columns=np.array([model.joints[numbers[joint]].idx_q for joint in ids], dtype=np.intp),
-        reference=source.qpos0[source.jnt_qposadr[ids]].copy(),
-        lower=source.jnt_range[ids, 0].copy(),
-        upper=source.jnt_range[ids, 1].copy(),
+        columns=np.array([model.joints[number].idx_q for number in numbers], dtype=np.intp),
+        reference=np.array([joint.reference for joint in moving]),
+        lower=limits[:, 0].copy(),
+        upper=limits[:, 1].copy(),
         shapes=shapes,
-        frames={source.body(body).name: place for body, place in bodies.items()},
-        numbers=np.array([numbers[joint] for joint in ids], dtype=np.intp),
-        slides=source.jnt_type[ids] == _SLIDE,
+        frames={source.body(body).name: place for body, place in enumerate(bodies)},
+        numbers=np.array(numbers, dtype=np.intp),
+        slides=np.array([joint.slides for joint in moving], dtype=bool),
     )
 
 
@@ -223,34 +206,14 @@ def _unusable(message: str) -> PlanningError:
     return PlanningError(message, PlanCode.COLLISION_CHECKING_UNAVAILABLE)
 
 
-def _compiled(path: Path) -> Any:
-    import mujoco
-
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        for body in spec.bodies:
-            geoms = list(body.geoms)
-            if not any(geom.contype or geom.conaffinity for geom in geoms):
-                for geom in geoms:
-                    geom.contype = 1  # makes the compiler compute its hull
-        return spec.compile()
-    except ValueError as error:
-        raise _unusable(f"{path} cannot be loaded: {error}") from error
-
-
-def _placement(position: Sequence[float] | Vector, quaternion: Sequence[float] | Vector) -> Vector:
-    """The matrix of a position and a quaternion (w, x, y, z)."""
-    return homogeneous(from_quaternion(np.roll(quaternion, -1)), np.asarray(position, dtype=float))
-
-
-def _shapes(source: Any, bodies: dict[int, tuple[int, Vector]]) -> list[LinkShape]:
+def _shapes(source: Any, bodies: Sequence[tuple[int, Vector]]) -> list[LinkShape]:
     shapes = []
     for geom in range(source.ngeom):
         if not (source.geom_contype[geom] or source.geom_conaffinity[geom]):
             continue
         body = int(source.geom_bodyid[geom])
         joint, frame = bodies[body]
-        placed = frame @ _placement(source.geom_pos[geom], source.geom_quat[geom])
+        placed = frame @ placement(source.geom_pos[geom], source.geom_quat[geom])
         shapes.append(LinkShape(source.body(body).name, joint, placed, _geometry(source, geom)))
     return shapes
 
