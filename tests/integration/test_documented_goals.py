@@ -1,4 +1,4 @@
-"""Every goal of the documentation, by page, service, program and command line: all plan the same."""
+"""Every goal of the documentation, by page, service, program, task and command line: all plan the same."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from command_line import run_here
 from ibrobot_planning.client import Client
+from ibrobot_planning.execution.requests import PlanAhead
+from ibrobot_planning.execution.services import PLAN_GOAL
+from ibrobot_planning.tasks.reading import read_task
+from ibrobot_planning.world.objects import World
 from ibrobot_web.commands import Commands
 from ibrobot_web.messages import Sent, from_page
 
@@ -85,6 +90,30 @@ def by_program(run: Runtime, goal: str) -> Answer:
         return str(error)
 
 
+def by_task(run: Runtime, goal: str) -> Answer:
+    (step,) = read_task(yaml.safe_dump({"steps": [{"move": as_step(goal)}]}), "goal.yaml").task.steps
+    assert step.move is not None
+    robot = run.session.config.robot
+    target = step.move.target(robot, robot.groups["arm"], World())
+    answer = run.session.bus.call(PLAN_GOAL, PlanAhead(target))
+    return answer.message or ended(answer.trajectory)
+
+
+def as_step(goal: str) -> dict[str, Any]:
+    """A goal as the step `move` takes it."""
+    if "=" not in goal:
+        return {"pose": goal}
+    step: dict[str, Any] = {}
+    for key, value in (each.split("=", 1) for each in re.split(r"[ ](?=[a-z])|,(?=[a-z])", goal)):
+        if key in ("xyz", "axis", "rpy", "quaternion"):
+            step[key] = value if value.isalpha() else [float(number) for number in value.split(",")]
+        elif key == "beyond_reach":
+            step[key] = value
+        else:
+            step.setdefault("joints", {})[key] = float(value)
+    return step
+
+
 def ended(trajectory: JointTrajectory) -> Answer:
     last = trajectory.points[-1]
     return last.positions.tolist(), last.time_from_start_ns / 1e9
@@ -102,6 +131,8 @@ def by_command(goal: str) -> Answer:
 def test_every_entrance_plans_the_same(run: Runtime, goal: str) -> None:
     answer = by_service(run, goal)
     assert by_program(run, goal) == answer
+    if not ("xyz" in goal and "gripper" in goal):  # two steps of a task
+        assert by_task(run, goal) == answer
     for other in (by_page(run, goal), by_command(goal)):
         if isinstance(answer, str) or isinstance(other, str):
             assert other == answer
