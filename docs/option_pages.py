@@ -90,11 +90,11 @@ def jobs_page() -> Iterator[str]:
     yield "A plugin declares the options and events of its command; command line, forms and checks derive from that. A"
     yield "program in Python reads a line with {py:func}`~ibrobot_core.events.decode_event`.\n"
     registry = installed_plugins()
-    for name, command in sorted(registry.declarations().items()):
+    for name, command in sorted(registry.commands.items()):
         if not command.events:
             continue
         yield f"## `ibrobot {name}`\n"
-        yield f"From `{registry.command_packages[name.partition(' ')[0]]}`: {command.summary}\n"
+        yield f"From `{registry.command_packages[name]}`: {command.summary}\n"
         if fields(command.options):
             yield from _table(command.options, links=False)
         for event in command.events:

@@ -134,7 +134,6 @@ from ibrobot_core.interfaces.policy import (
 
 # Episodes and datasets
 from ibrobot_core.interfaces.reader import find_episode as find_episode
-from ibrobot_core.contract.metadata import robot_metadata as robot_metadata
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, FrameSampler as FrameSampler
 from ibrobot_core.selection import (
     Selection as Selection,
@@ -153,21 +152,24 @@ from ibrobot_core.units import NORM_MODES as NORM_MODES
 # Commands
 from ibrobot_core.cli.run import run_robot as run_robot
 from ibrobot_core.cli.options import (
-    run_options as run_options,
-    check_end as check_end,
-    run_overrides as run_overrides,
-    EpisodePath as EpisodePath,
+    ConfigOptions as ConfigOptions,
+    RunOptions as RunOptions,
+    ModeOptions as ModeOptions,
 )
 from ibrobot_core.cli.declared import (
-    declared as declared,
-    emit as emit,
     flag_of as flag_of,
     read_options as read_options,
 )
 from ibrobot_core.options import fields as fields, default_of as default_of
-from ibrobot_core.events import Event as Event, Failed as Failed, Shown as Shown, decode_event as decode_event
+from ibrobot_core.events import (
+    Event as Event,
+    Emit as Emit,
+    Failed as Failed,
+    Shown as Shown,
+    decode_event as decode_event,
+)
 from ibrobot_core.events import Ask as Ask, Choice as Choice, Sight as Sight, Answer as Answer
-from ibrobot_core.safe_output import echo as echo, LogFormatter as LogFormatter
+from ibrobot_core.safe_output import echo as echo, confirm as confirm, prompt as prompt, LogFormatter as LogFormatter
 from ibrobot_core.screen import Screen as Screen, styled as styled
 from ibrobot_core.terminal import KeyReader as KeyReader, check_key as check_key
 from ibrobot_core.signals import on_signals as on_signals, end_signals as end_signals
@@ -177,9 +179,6 @@ from ibrobot_core.interfaces.pool import (
     Job as Job,
     Done as Done,
     Pool as Pool,
-    on_option as on_option,
-    shard_option as shard_option,
-    shard_of as shard_of,
 )
 
 # Guides
@@ -213,6 +212,7 @@ from ibrobot_core.errors import (
     InUse as InUse,
     DiskFull as DiskFull,
     Declined as Declined,
+    Unsuccessful as Unsuccessful,
     WireError as WireError,
     wrong_input as wrong_input,
 )

@@ -58,9 +58,12 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """Commands that need no other plugin."""
-    yield Command("launch", "Run a robot, real or simulated.", Late("ibrobot_core.cli.launch:launch").load)
-    yield Command("config", "Check and show robot YAMLs.", Late("ibrobot_core.cli.config:config").load)
-    yield Command("plugins", "List what the installed plugins offer.", Late("ibrobot_core.cli.plugins:plugins").load)
-    yield Command(
-        "doctor", "Check this machine, and print a remedy for each fault.", Late("ibrobot_core.cli.doctor:doctor").load
-    )
+    yield Command("launch", Late("ibrobot_core.cli.launch:Launch"), "Run a robot, real or simulated.")
+    about = "CONFIG is a file, or the name of a config shipped with ibrobot or a plugin; so101 by default."
+    yield Command("config", summary="Check and show robot YAMLs.", about=about)
+    yield Command("config check", Late("ibrobot_core.cli.config:CheckConfig"))
+    yield Command("config show", Late("ibrobot_core.cli.config:ShowConfig"))
+    yield Command("plugins", Late("ibrobot_core.cli.plugins:ListPlugins"), "List what the installed plugins offer.")
+    yield Command("plugins show", Late("ibrobot_core.cli.plugins:ShowPlugin"))
+    summary = "Check this machine, and print a remedy for each fault."
+    yield Command("doctor", Late("ibrobot_core.cli.doctor:Doctor"), summary)

@@ -14,8 +14,6 @@ from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.options import NoOptions, OptionFault, OptionName, documented, not_a_key, option
 
 if TYPE_CHECKING:
-    import click
-
     from ibrobot_core import interfaces
     from ibrobot_core.component import Component, SourceWorker, TransportLink
     from ibrobot_core.events import Event
@@ -38,12 +36,17 @@ class Late:
     """`MODULE:NAME`."""
 
     def load(self) -> Any:
-        """Import it, and return it; for `Command.load`."""
+        """Import it, and return it."""
         return resolve_name(self.place)
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """Import it, and call it."""
         return self.load()(*arguments, **options)
+
+
+def _answer(default: object) -> Any:
+    """A field for a function that is asked, e.g. about options; by default it answers this."""
+    return attrs.field(default=lambda *asked: default, kw_only=True)
 
 
 @attrs.frozen
@@ -62,27 +65,25 @@ class Descriptor[T]:
     """What it does, in the words of an operator who chooses it, e.g. `follow the leader arm`; empty: its summary."""
     options: builtins.type[Any] = NoOptions
     """A frozen attrs class made with `ibrobot_core.options.option`."""
-    check: Callable[[], None] = attrs.field(default=lambda: None, kw_only=True)
+    check: Callable[[], None] = _answer(None)
     """Checks dependencies other than Python packages; imports nothing heavy.
 
     Raises:
         MissingDependency: e.g. if a system library is missing. A run continues without a sensor that it does not need.
     """
-    check_options: Callable[[Any, Robot, tuple[str, ...]], Iterable[OptionFault]] = attrs.field(
-        default=lambda options, robot, joints: (), kw_only=True
-    )
+    check_options: Callable[[Any, Robot, tuple[str, ...]], Iterable[OptionFault]] = _answer(())
     """Yields faults of the options for a robot, e.g. an unknown joint. The third argument is the joints that the
     component owns, or all joints if its kind owns none. Opens no device, and imports nothing heavy."""
-    devices: Callable[[Any], Mapping[str, str]] = attrs.field(default=lambda options: {}, kw_only=True)
+    devices: Callable[[Any], Mapping[str, str]] = _answer({})
     """Maps options to devices that only one component can open at a time, in a canonical form."""
-    peripherals: Callable[[Any], Iterable[OptionName]] = attrs.field(default=lambda options: (), kw_only=True)
+    peripherals: Callable[[Any], Iterable[OptionName]] = _answer(())
     """The peripherals of the robot YAML that options name."""
-    publishes: Callable[[Any], Iterable[OptionName]] = attrs.field(default=lambda options: (), kw_only=True)
+    publishes: Callable[[Any], Iterable[OptionName]] = _answer(())
     """The topics that options name and the component publishes, which nothing else may publish."""
-    calibration: Callable[[Any], str | None] = attrs.field(default=lambda options: None, kw_only=True)
+    calibration: Callable[[Any], str | None] = _answer(None)
     """Name or path of the calibration in the options, for `load_calibration`; recordings contain that of hardware. None
     without a calibration."""
-    offers: Callable[[Any, str], bool] = attrs.field(default=lambda options, service: False, kw_only=True)
+    offers: Callable[[Any, str], bool] = _answer(False)
     """Whether other programs can call a service of the run, by its name, through a component with these options."""
     default: bool = attrs.field(default=False, kw_only=True)
     """Whether commands use this type by default; at most one type of each kind."""
@@ -105,10 +106,10 @@ class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
     """For simulated hardware: sensor kind, e.g. `camera` -> sensor type that replaces it."""
     torque_off: str = ""
     """For joints that hold even without a process that commands them: the command that switches their torque off."""
-    anchored: Callable[[Any], tuple[str, ...]] = attrs.field(default=lambda options: (), kw_only=True)
+    anchored: Callable[[Any], tuple[str, ...]] = _answer(())
     """The joints whose calibrated closed end is at their lower limit, such as a gripper. In LeRobot's units they range
     from 0 to 100."""
-    scene: Callable[[Any, Robot], Sequence[interfaces.SceneObject]] = attrs.field(default=lambda o, r: (), kw_only=True)
+    scene: Callable[[Any, Robot], Sequence[interfaces.SceneObject]] = _answer(())
     """For simulated hardware: the objects around the robot, for planners."""
     film: Mapping[str, Any] = attrs.field(factory=dict, kw_only=True)
     """For simulated hardware: the keys of a peripheral of kind `camera` that films the robot and all of its scene."""
@@ -152,9 +153,9 @@ class SensorDescriptor(Descriptor["interfaces.Sensor"]):
     """A sensor of a kind, e.g. `camera` or `imu`."""
 
     kind: str = "camera"
-    picture: Callable[[Any], tuple[int, int] | None] = attrs.field(default=lambda options: None, kw_only=True)
+    picture: Callable[[Any], tuple[int, int] | None] = _answer(None)
     """Height and width of the images [px], if the options define them."""
-    find: Callable[[Any], None] = attrs.field(default=lambda options: None, kw_only=True)
+    find: Callable[[Any], None] = _answer(None)
     """Looks for the device that the options name, without opening it.
 
     Raises:
@@ -170,14 +171,12 @@ class SensorDescriptor(Descriptor["interfaces.Sensor"]):
 class TeleopDescriptor(Descriptor["interfaces.Teleop"]):
     """A teleoperation device."""
 
-    events: Callable[[Any], Collection[interfaces.OperatorEvent]] = attrs.field(
-        default=lambda options: (), kw_only=True
-    )
+    events: Callable[[Any], Collection[interfaces.OperatorEvent]] = _answer(())
     """The events for which the device has a button, by its options, e.g. `start` to begin an episode."""
-    keys: Callable[[Any, Robot], Mapping[str, str]] = attrs.field(default=lambda options, robot: {}, kw_only=True)
+    keys: Callable[[Any, Robot], Mapping[str, str]] = _answer({})
     """Maps the keys that the device reads from the terminal to what they do, e.g. `space` to `deadman`, by its options
     and the robot that it moves. Devices of one mode share a key only if it does the same for all of them."""
-    needs_terminal: Callable[[Any], bool] = attrs.field(default=lambda options: False, kw_only=True)
+    needs_terminal: Callable[[Any], bool] = _answer(False)
     """Whether the device works only in runs with a terminal, by its options."""
 
     def kept(self, options: Any) -> Mapping[str, Any]:
@@ -189,7 +188,7 @@ class TeleopDescriptor(Descriptor["interfaces.Teleop"]):
 class PolicyDescriptor(Descriptor["interfaces.Policy"]):
     """A policy."""
 
-    reads: Callable[[Path], bool] = attrs.field(default=lambda path: False, kw_only=True)
+    reads: Callable[[Path], bool] = _answer(False)
     """Whether a folder has a trained policy of this type, the option `path`; checks only names."""
 
 
@@ -264,11 +263,9 @@ class TransportDescriptor(Descriptor["interfaces.Transport"]):
     listen: Callable[[Sequence[str]], Mapping[str, Any]] | None = None
     """Maps endpoints to the options of a server that listens there and does not connect; without endpoints, it listens
     on this machine only. None if servers cannot use this transport."""
-    used: Callable[[Any], bool] = attrs.field(default=lambda options: False, kw_only=True)
+    used: Callable[[Any], bool] = _answer(False)
     """Whether a run with these options uses the transport even if no mode needs it."""
-    components: Callable[[Any, RunAccess, TransportLink], Sequence[Component]] = attrs.field(
-        default=lambda options, session, link: (), kw_only=True
-    )
+    components: Callable[[Any, RunAccess, TransportLink], Sequence[Component]] = _answer(())
     """Returns components that the options add to a run with this transport, e.g. to send topics to other machines. Each
     needs `link.name`; when it starts, `link.transport` is open."""
 
@@ -306,11 +303,11 @@ class SectionDescriptor(Descriptor["Component"]):
     make: Callable[[Any, RunAccess], Component] = attrs.field(kw_only=True)  # type: ignore[assignment]
     """Makes the component, from options and session. The options are None if the component runs without its section.
     Imports what it needs when it is called, and opens nothing."""
-    without_section: Callable[[RobotConfig], bool] = attrs.field(default=lambda config: False, kw_only=True)
+    without_section: Callable[[RobotConfig], bool] = _answer(False)
     """Whether the component also runs if the YAML lacks the section."""
     records_episodes: bool = attrs.field(default=False, kw_only=True)
     """Whether its component is the `EpisodeRecorder` of runs with a section `recording`."""
-    check_config: Callable[[RobotConfig], Iterable[OptionFault]] = attrs.field(default=lambda config: (), kw_only=True)
+    check_config: Callable[[RobotConfig], Iterable[OptionFault]] = _answer(())
     """Yields faults of a robot config in any section, also if the component does not run; opens no device. The `option`
     of a fault is a path from the top of the file: `("peripherals", 0, "transform")`."""
 
@@ -374,7 +371,7 @@ class FeatureDescriptor:
     """Model, paths, and for an action the joints that it moves -> the numbers. Raises ContractError."""
     vectors: Callable[..., Any]
     """The subclass of `JointUnits` that converts vectors of contracts whose actions have such paths."""
-    check_config: Callable[[RobotConfig], Iterable[OptionFault]] = attrs.field(default=lambda config: (), kw_only=True)
+    check_config: Callable[[RobotConfig], Iterable[OptionFault]] = _answer(())
     """As `SectionDescriptor.check_config`."""
 
 
@@ -430,25 +427,43 @@ class ConfigFile:
 
 @attrs.frozen
 class Command:
-    """A command of a plugin: `ibrobot NAME …`; `load` imports it when it is called.
+    """A command `ibrobot NAME …`, e.g. `port list`: a name of one or more words, and a class.
 
-    Its parameters, forms for it, and the checks and errors of both derive from `options`; see `declared`.
+    The class is a frozen attrs class: its fields are the options, its docstring is the help, and an object of it does
+    the work when it is called. What the call returns is the result: if the class has a method `show`, that prints it,
+    and `--json` prints it as JSON instead. Command line, shell completion, forms, checks and reference derive from it.
+
+        Command("port list", Late("my_package.ports:ListPorts"))
+
+    A command without a class describes those whose names begin with its own.
     """
 
     name: str
-    summary: str
-    load: Callable[[], click.Command]
-    options: builtins.type[Any] = NoOptions
-    """A frozen attrs class made with `ibrobot_core.options.option`."""
+    does: builtins.type[Any] | Late | None = None
+    """The class, or the place of it, which is imported when the command is called."""
+    _summary: str = attrs.field(default="", alias="summary")
     events: tuple[builtins.type[Event], ...] = ()
-    """The classes of what it prints with `--events`. Pages can run a command with events, and show its progress."""
-    check: Callable[[], None] = attrs.field(default=lambda: None, kw_only=True)
+    """The classes of what it prints with `--events`. The call then gets a function that prints one, or without the flag
+    None. Pages can run a command with events, and show its progress."""
+    about: str = attrs.field(default="", kw_only=True)
+    """Without a class: the help below the summary."""
+    hidden: bool = attrs.field(default=False, kw_only=True)
+    """Whether lists of commands leave it out."""
+    check: Callable[[], None] = _answer(None)
     """As `Descriptor.check`."""
-    takes: Callable[[Mapping[str, Any]], str] = attrs.field(default=lambda values: "", kw_only=True)
+    takes: Callable[[Mapping[str, Any]], str] = _answer("")
     """Returns what a file with these plain values is, e.g. `a contract of Rosetta`, if it is no robot YAML but the
     command takes it; errors then name the command. Otherwise empty."""
-    commands: tuple[Command, ...] = attrs.field(default=(), kw_only=True)
-    """The commands below it that programs use; their names begin with its own, e.g. `episodes trim`."""
+
+    @property
+    def options(self) -> builtins.type[Any]:
+        """The class."""
+        return self.does.load() if isinstance(self.does, Late) else self.does or NoOptions
+
+    @property
+    def summary(self) -> str:
+        """The line for lists of commands; by default the first one of the class's docstring."""
+        return self._summary or (self.options.__doc__ or "").partition("\n")[0]
 
 
 @attrs.frozen

@@ -247,6 +247,20 @@ class ComponentFailed(IbrobotError):
         self.exit_code = exit_code
 
 
+class Unsuccessful(IbrobotError):
+    """A command ends with an exit code after it has printed its result, e.g. a check that finds faults.
+
+    Args:
+        result: what the command would return.
+        exit_code: the exit code.
+    """
+
+    def __init__(self, result: Any = None, exit_code: int = 1) -> None:
+        super().__init__()
+        self.result = result
+        self.exit_code = exit_code
+
+
 class NotSupported(IbrobotError):
     """An implementation does not support a feature, e.g. `control.stop: relax` without torque control."""
 
@@ -274,7 +288,9 @@ def wrong_input() -> Iterator[None]:
     try:
         yield
     except IbrobotError as error:
-        if not (isinstance(error, DiskFull | InUse | ComponentFailed | Declined) or _is_of_the_machine(error)):
+        if not (
+            isinstance(error, DiskFull | InUse | ComponentFailed | Declined | Unsuccessful) or _is_of_the_machine(error)
+        ):
             error.exit_code = ConfigError.exit_code
         raise
 

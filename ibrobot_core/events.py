@@ -8,7 +8,7 @@ own. A line of another shape is an error.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import attrs
 
@@ -41,6 +41,10 @@ class Event:
     def shown(self) -> Shown:
         """The event in words for a person; by default none."""
         return Shown()
+
+
+type Emit = Callable[[Event], None] | None
+"""Prints an event of a command; None without `--events`."""
 
 
 @attrs.frozen

@@ -61,7 +61,7 @@ def option(
     le: float | None = None, lt: float | None = None, choices: Sequence[Any] | Mapping[str, str] | None = None,
     open: bool = False, factory: Any = None, validator: Any = None, secret: bool = False, key: str | None = None,
     plain: Any = None, label: str | None = "", more: bool = False, names: str = "", suggest: str = "",
-    argument: bool = False, flag: str = "",
+    typed: str = "",
 ) -> Any:  # fmt: skip
     """An attrs field for an options class.
 
@@ -82,17 +82,18 @@ def option(
         plain: type of the value in files and requests, if programs may set others as well.
         label: what forms and their errors call it; the key by default. None: it is for terminals, and not in forms.
         more: whether forms show it among further options.
-        names: what a text or path names, for forms: `episodes`, `dataset`, `policy`, `robot` or `calibration`.
+        names: what a text or path names: `episodes`, `dataset`, `policy`, `robot`, `calibration`, `viewer`, or the
+            `options` of another program.
         suggest: a value that forms enter, e.g. `datasets/{episodes}`: a name in braces stands for the last part of the
             path that is given for the option of this name.
-        argument: whether it is an argument of the command line, and not a flag.
-        flag: its flag on the command line, if that is not made of the key, e.g. `--from`.
+        typed: what a command line calls it, if that is not made of the key: flags and value, e.g. `-o FILE`, or an
+            argument, e.g. `EPISODES`. A value `[HZ=40]` may be left out.
     """
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
     metadata: dict[str, Any] = {"unit": unit, "help": help, "suggest": suggest, **bounds}
     metadata["choices"] = tuple(choices) if choices is not None else None
-    metadata |= {"secret": secret, "plain": plain, "label": label, "more": more, "names": names, "argument": argument}
-    metadata |= {"flag": flag, "open": open, "words": dict(choices) if isinstance(choices, Mapping) else {}}
+    metadata |= {"secret": secret, "plain": plain, "label": label, "more": more, "names": names, "typed": typed}
+    metadata |= {"open": open, "words": dict(choices) if isinstance(choices, Mapping) else {}}
     shown: Any = _hidden if secret else True
 
     def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
@@ -101,10 +102,10 @@ def option(
         for item in value if isinstance(value, tuple) else (value,):
             if choices is not None and not open and item not in choices:
                 raise ValueError(f"{item!r} is not one of: {', '.join(str(c) for c in choices)}")
-        for name, bound in bounds.items():
-            fits, words = _BOUNDS[name]
-            if bound is not None and not fits(value, bound):  # so that NaN fits none
-                raise ValueError(f"{value} is too {words} {bound}{f' {unit}' if unit else ''}")
+            for name, bound in bounds.items():
+                fits, words = _BOUNDS[name]
+                if bound is not None and not fits(item, bound):  # so that NaN fits none
+                    raise ValueError(f"{item} is too {words} {bound}{f' {unit}' if unit else ''}")
         if isinstance(value, float) and not abs(value) <= (_LONGEST_S if unit == "s" else _LARGEST):
             raise ValueError(f"{value} is {'too large' if math.isfinite(value) else 'not a finite number'}")
 

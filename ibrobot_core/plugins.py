@@ -141,19 +141,15 @@ class Registry:
             raise self.not_found(kind, type_)
         return entry.descriptor
 
-    def declarations(self) -> dict[str, descriptors.Command]:
-        """The commands, and those below them that programs use, e.g. `episodes trim`, by name."""
-        return {each.name: each for first in self.commands.values() for each in (first, *first.commands)}
-
     def command(self, name: str) -> descriptors.Command:
-        """The declaration of a command.
+        """A command.
 
         Raises:
-            PluginError: if no installed plugin declares it; names the package to install, or the broken plugin.
+            PluginError: if no installed plugin offers it; names the package to install, or the broken plugin.
         """
-        if (declaration := self.declarations().get(name)) is None:
+        if name not in self.commands:
             raise self.not_found("command", name.partition(" ")[0])
-        return declaration
+        return self.commands[name]
 
     def sections(self, config: RobotConfig) -> Iterator[tuple[descriptors.SectionDescriptor, Any]]:
         """The plugins' sections for a robot with their options; None for a section that the file lacks."""
@@ -363,7 +359,7 @@ def _offered(manager: pluggy.PluginManager, hook: str) -> list[Any]:
             raise TypeError(f"expected a {expected.__name__}, got {each!r}")
         for field in attrs.fields(type(each)):
             if not isinstance(value := getattr(each, field.name), _CLASSES.get(field.type, object)):
-                raise TypeError(f"{expected.__name__}.{field.name} must be a {field.type}, not {value!r}")
+                raise TypeError(f"{expected.__name__}.{field.alias} must be a {field.type}, not {value!r}")
     ((plugin, _),) = manager.list_name_plugin()
     return [attrs.evolve(each, **_contained(each, f"plugin {plugin!r} failed in %s of {hook}: %s")) for each in offers]
 

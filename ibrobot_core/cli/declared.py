@@ -1,66 +1,88 @@
-"""Command lines from the declarations of their commands: parameters, checks and events."""
+"""Command lines from the declarations of commands: parameters, checks, results, events and shell completion."""
 
 from __future__ import annotations
 
-import functools
+import inspect
 import json
-from collections.abc import Callable, Mapping
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Protocol, get_args, override, runtime_checkable
 
 import attrs
 import click
 
-from ibrobot_core.cli.options import EpisodePath
 from ibrobot_core.convert import Converter, Faults, error_message, is_sequence, is_union
-from ibrobot_core.descriptors import Command
-from ibrobot_core.errors import IbrobotError, RequestError
+from ibrobot_core.descriptors import Command, ViewerDescriptor
+from ibrobot_core.errors import IbrobotError, RequestError, Unsuccessful
 from ibrobot_core.events import Event, Failed, encode_event
 from ibrobot_core.options import default_of, fields
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.safe_output import echo
 
 
-def declared[C: Callable[..., Any]](command: Command) -> Callable[[C], C]:
-    """The parameters of a command line, from the declaration of its command.
+class EpisodePath(click.Path):
+    """A recorded episode or a folder of them: a path, or a short name such as `pick:1`; see `find_episode`."""
 
-    Returns:
-        A decorator for the function of a click command. The function gets an object of `Command.options`. If the
-        command has events, it also gets `events`: whether to print them by `emit`. Errors are then printed as `Failed`.
-    """
-    known = fields(command.options)
+    @override
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        from ibrobot_core.interfaces.reader import find_episode
+
+        return find_episode(Path(os.fsdecode(super().convert(value, param, ctx))))
+
+
+@runtime_checkable
+class _Shows(Protocol):
+    """A command that prints its result."""
+
+    def show(self, result: Any) -> None: ...
+
+
+def click_command(command: Command) -> click.Command:
+    """The command line of a command that has a class."""
+    kind = command.options
+    known = fields(kind)
     names = {name: flag_of(name, field) for name, field in known.items()}
+    params = [each for name, field in known.items() for each in _parameters(name, field)]
+    if command.events:
+        params.append(click.Option(["--events", "_events"], is_flag=True, help="Print the progress as JSON lines."))
+    if issubclass(kind, _Shows):
+        params.append(click.Option(["--json", "_json"], is_flag=True, help="Print JSON."))
+    params.sort(key=lambda each: isinstance(each, click.Option) or not each.required)  # as one types arguments
 
-    def add(function: C) -> C:
-        @functools.wraps(function)
-        def run(**given: Any) -> Any:
-            parsed = {name: value for name in known if (value := given.pop(name)) is not None}
-            plain = json.loads(json.dumps(parsed, default=str))  # no tuples and paths
-            try:
-                return function(read_options(command.options, plain, Path, names), **given)
-            except (IbrobotError, click.ClickException) as error:
-                if not given.get("events"):
-                    raise
-                emit(command, Failed(error.message if isinstance(error, click.ClickException) else str(error)))
-                raise SystemExit(error.exit_code) from error
+    def run(**given: Any) -> None:
+        parsed = {name: value for name in known if (value := given[name]) is not None}
+        plain = json.loads(json.dumps(parsed, default=str))  # no tuples and paths
+        emit = partial(_emit, command) if given.get("_events") else None
+        try:
+            made = read_options(kind, plain, Path, names)
+            result, code = made(*([emit] if command.events else [])), 0
+        except Unsuccessful as error:
+            result, code = error.result, error.exit_code
+        except IbrobotError as error:
+            if emit is None:
+                raise
+            emit(Failed(str(error)))
+            raise SystemExit(error.exit_code) from error
+        if given.get("_json") and result is not None:
+            echo(json.dumps(result, indent=2, default=_plain))
+        elif isinstance(made, _Shows) and result is not None:
+            made.show(result)
+        if code:
+            raise SystemExit(code)
 
-        events = click.option("--events", is_flag=True, help="Print the progress as JSON lines.")
-        decorated: Any = events(run) if command.events else run
-        for name, field in reversed(list(known.items())):
-            decorated = _parameter(name, field)(decorated)
-        return decorated  # type: ignore[no-any-return]
-
-    return add
+    name, text = command.name.rpartition(" ")[2], inspect.cleandoc(kind.__doc__ or "")
+    foreign = any(field.metadata["names"] == "options" for field in known.values())
+    settings = {"ignore_unknown_options": foreign}
+    return click.Command(name, settings, params=params, callback=run, help=text, hidden=command.hidden)
 
 
-def emit(command: Command, event: Event) -> None:
-    """Print an event of a command for the program that started it.
-
-    Raises:
-        TypeError: if the command does not declare it.
-    """
-    if not isinstance(event, (*command.events, Failed)):
-        raise TypeError(f"ibrobot {command.name} does not declare the event {type(event).__name__}")
-    echo(encode_event(event))
+def viewer_flags() -> dict[str, str]:
+    """Type of an installed viewer -> its flag."""
+    viewers = installed_plugins().of_kind("viewer")
+    return {each.type: each.flag for each in viewers if isinstance(each, ViewerDescriptor) and each.flag}
 
 
 def read_options(
@@ -88,24 +110,60 @@ def read_options(
 
 def flag_of(name: str, field: attrs.Attribute[Any]) -> str:
     """What the command line calls an option, e.g. `--norm-mode`, or `EPISODES` for an argument."""
-    return name.upper() if field.metadata["argument"] else field.metadata["flag"] or f"--{name.replace('_', '-')}"
+    flags, value = _typed(name, field)
+    return flags[-1] if flags else value
 
 
-def _parameter(name: str, field: attrs.Attribute[Any]) -> Callable[[Any], Any]:
-    """The parameter of click for an option. Its value is checked by `read_options`."""
+def _typed(name: str, field: attrs.Attribute[Any]) -> tuple[list[str], str]:
+    """The flags of an option, the long one last, and what stands for its value; without flags, it is an argument."""
+    words = field.metadata["typed"].split()
+    flags, value = [word for word in words if word[0] == "-"], " ".join(word for word in words if word[0] != "-")
+    if (flags or not value) and not any(flag.startswith("--") for flag in flags):
+        flags.append(f"--{name.replace('_', '-')}")
+    return flags, value
+
+
+def _emit(command: Command, event: Event) -> None:
+    """Print an event for the program that started the command; one that it does not declare is a bug."""
+    if not isinstance(event, (*command.events, Failed)):
+        raise TypeError(f"ibrobot {command.name} does not declare the event {type(event).__name__}")
+    echo(encode_event(event))
+
+
+def _plain(value: Any) -> Any:
+    """A part of a result for JSON."""
+    return attrs.asdict(value) if attrs.has(type(value)) else str(value)
+
+
+def _parameters(name: str, field: attrs.Attribute[Any]) -> Iterator[click.Parameter]:
+    """The parameters of click for an option. Its value is checked by `read_options`."""
     metadata, default = field.metadata, default_of(field)
     kind: Any = get_args(field.type)[0] if is_union(field.type) else field.type
     several, required = is_sequence(kind), default is attrs.NOTHING
     item = get_args(kind)[0] if several else kind
-    type_ = EpisodePath() if metadata["names"] == "episodes" else item if item in (int, float) else str
-    if metadata["argument"]:
-        return click.argument(name, nargs=-1 if several else 1, required=required, type=type_)
-    words = "; ".join(f"{value}: {text}" for value, text in metadata["words"].items() if text != value)
-    text = f"{metadata['help'][:1].upper()}{metadata['help'][1:]}{f' ({words})' if words else ''}."
-    choices = "|".join(map(str, metadata["choices"] or ())) + ("|…" if metadata["choices"] and metadata["open"] else "")
-    metavar = choices or metadata["unit"].upper() or ("PATH" if item is Path else None)
-    more: dict[str, Any] = {"required": required, "show_default": default not in (None, "", ()), "metavar": metavar}
+    plain: Any = get_args(item) or (item if item in (int, float) else click.Path() if item is Path else str)
+    choices = [str(choice) for choice in metadata["choices"] or ()]
+    flags, value = _typed(name, field)
+    more: dict[str, Any] = {"type": EpisodePath() if metadata["names"] == "episodes" else plain, "required": required}
+    if choices:
+        more["shell_complete"] = lambda ctx, param, begun: [each for each in choices if each.startswith(begun)]
     if not required:
         more["default"] = default
-    more |= {"is_flag": True, "show_default": False} if kind is bool else {"type": type_, "multiple": several}
-    return click.option(flag_of(name, field), name, help=text, **more)
+    if not flags:
+        dots = "..." if several and value[0] != "[" else ""
+        metavar = f"{value if required or value[0] == '[' else f'[{value}]'}{dots}"
+        yield click.Argument([name], nargs=-1 if several else 1, metavar=metavar, **more)
+        return
+    words = "; ".join(f"{value}: {text}" for value, text in metadata["words"].items() if text != value)
+    more["help"] = f"{metadata['help'][:1].upper()}{metadata['help'][1:]}{f' ({words})' if words else ''}."
+    more["show_default"] = default not in (None, "", ()) and kind is not bool
+    listed = "|".join([*choices, *("…" if choices and metadata["open"] else ())])
+    more["metavar"] = value or listed or metadata["unit"].upper() or ("PATH" if item is Path else None)
+    if kind is bool:
+        yield click.Option([*flags, name], is_flag=True, **{**more, "type": None, "metavar": None})
+        return
+    if (bare := re.fullmatch(r"\[\w+=(.+)\]", value)) is not None:
+        more |= {"is_flag": False, "flag_value": plain(bare[1])}
+    yield click.Option([*flags, name], multiple=several, **more)
+    for type_, flag in (viewer_flags() if metadata["names"] == "viewer" else {}).items():
+        yield click.Option([flag, name], flag_value=type_, help=f"As {flags[-1]} {type_}.")

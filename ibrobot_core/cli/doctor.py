@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import resource
 import shutil
-import sys
 
 import attrs
-import click
 
 from ibrobot_core.control.realtime import PERMIT
 from ibrobot_core.descriptors import Check
+from ibrobot_core.errors import Unsuccessful
 from ibrobot_core.plugins import Registry, installed_plugins
 from ibrobot_core.safe_output import echo
 
@@ -23,21 +21,23 @@ MLOCK_BYTES = 512 * 1024 * 1024
 """Memory locked by a control process with a simulation, with a margin [bytes]."""
 
 
-@click.command()
-@click.option("--json", "as_json", is_flag=True, help="Print a list of {name, ok, matters, found, remedy}.")
-def doctor(as_json: bool) -> None:
+@attrs.frozen
+class Doctor:
     """Check this machine, and print a remedy for each fault; exit with 1 if an important check fails."""
-    checks = examine(installed_plugins())
-    if as_json:
-        echo(json.dumps([attrs.asdict(check) for check in checks], indent=2))
-    else:
+
+    def __call__(self) -> list[Check]:
+        checks = examine(installed_plugins())
+        if any(check.matters and not check.ok for check in checks):
+            raise Unsuccessful(checks)
+        return checks
+
+    def show(self, checks: list[Check]) -> None:
+        """Print them."""
         for check in checks:
             word = "ok  " if check.ok else ("FAIL" if check.matters else "note")
             echo(f"{word}  {check.name}: {check.found}")
             if not check.ok and check.remedy:
                 echo(f"      {check.remedy}")
-    if any(check.matters and not check.ok for check in checks):
-        sys.exit(1)
 
 
 def examine(registry: Registry) -> list[Check]:

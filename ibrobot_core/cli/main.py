@@ -8,13 +8,15 @@ import os
 import re
 import sys
 from difflib import get_close_matches
-from typing import override
+from typing import Any, override
 
 import click
+from click.shell_completion import shell_complete
 
 from ibrobot_core import __version__
 from ibrobot_core.bug_reports import DEBUG, describe_bug
 from ibrobot_core.cli.command import let_interrupts_raise
+from ibrobot_core.descriptors import Command
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.plugins import CORE, installed_plugins, official_plugins
 from ibrobot_core.safe_output import echo
@@ -22,39 +24,75 @@ from ibrobot_core.safe_output import echo
 _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
 """Exit codes of errors without their own; docs/reference/exit-codes.md lists all."""
 
+_COMPLETE = "_IBROBOT_COMPLETE"
+"""With this variable, a shell asks how to complete a command line."""
 _OUTPUT_REFUSED = (errno.ENOSPC, errno.EPIPE, errno.EIO)
 """Errors of a full device, a reader that is gone, and a terminal that is gone."""
 
 
-class LazyGroup(click.Group):
-    """A group that imports commands when they are called; it lists commands of plugins after those of core."""
+def _click_command(command: Command) -> click.Command:
+    from ibrobot_core.cli.declared import click_command  # not for the help of `ibrobot`, which would import numpy
+
+    return click_command(command)
+
+
+class Commands(click.Group):
+    """The commands whose names begin with the same words; each is imported when it is called.
+
+    A command may have others below it, as `ibrobot plugins` has `ibrobot plugins show`: the first argument decides.
+    """
+
+    def __init__(self, words: str = "", **settings: Any) -> None:
+        self._prefix = f"{words} " if words else ""
+        if (command := installed_plugins().commands.get(words)) is not None:
+            settings = {"help": f"{command.summary}\n\n{command.about}"}
+            if command.does is not None:
+                own = _click_command(command)
+                settings = {"help": own.help, "params": own.params, "callback": own.callback}
+        settings.setdefault("name", words.rpartition(" ")[2])
+        super().__init__(invoke_without_command=bool(words) and "callback" in settings, **settings)
+        self.allow_interspersed_args = self.invoke_without_command
 
     @override
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        packages = installed_plugins().command_packages
-        own = [name for name, package in packages.items() if package == CORE]
-        return [*own, *sorted(name for name in set(packages) - set(own) if " " not in name)]
+    def list_commands(self, ctx: click.Context | None) -> list[str]:
+        # The next words of the names, sorted; at the top those of core come first.
+        packages = {n: p for n, p in installed_plugins().command_packages.items() if n.startswith(self._prefix)}
+        words = {name: name.removeprefix(self._prefix).partition(" ")[0] for name in packages}
+        own = [words[name] for name, package in packages.items() if package == CORE and not self._prefix]
+        return list(dict.fromkeys([*own, *sorted(words.values())]))
 
     @override
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        registry = installed_plugins()
-        if (declared := registry.commands.get(cmd_name)) is None:
-            if any(cmd_name in offers.get("command", ()) for offers in official_plugins().values()):
-                raise registry.not_found("command", cmd_name)
+        registry, name = installed_plugins(), f"{self._prefix}{cmd_name}"
+        if name in registry.commands and registry.command_packages[name] != CORE:
+            let_interrupts_raise()  # a run of core handles signals itself
+        if any(each.startswith(f"{name} ") for each in registry.commands):
+            return Commands(name)
+        if name not in registry.commands:
+            if any(name in offers.get("command", ()) for offers in official_plugins().values()):
+                raise registry.not_found("command", name)
             return None
-        command = declared.load()
-        if registry.command_packages[cmd_name] != CORE:  # a run of core handles signals itself
-            let_interrupts_raise()
-        return command
+        return _click_command(registry.commands[name])
+
+    @override
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        named = args[0] if args and args[0] in self.list_commands(None) else ""
+        command = self.get_command(click.Context(self), named) if named and self.invoke_without_command else None
+        if command is None:
+            return super().make_context(info_name, args, parent, **extra)
+        return command.make_context(f"{info_name} {named}", args[1:], parent, **extra)
 
     @override
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         commands = installed_plugins().commands
+        known = ((name, commands.get(f"{self._prefix}{name}")) for name in self.list_commands(ctx))
         with formatter.section("Commands"):
-            formatter.write_dl([(name, commands[name].summary) for name in self.list_commands(ctx)])
+            formatter.write_dl([(name, each.summary) for name, each in known if each is not None and not each.hidden])
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="ibrobot")
 @click.option("--debug", is_flag=True, help="Print the traceback of a bug.")
 def cli(debug: bool) -> None:
@@ -72,6 +110,8 @@ def main() -> None:
     code = 0
     try:
         try:  # not `cli()`, which would exit without a word if the reader of the output is gone
+            if asked := os.environ.get(_COMPLETE):
+                sys.exit(shell_complete(cli, {}, "ibrobot", _COMPLETE, asked))
             with cli.make_context("ibrobot", sys.argv[1:]) as context:
                 cli.invoke(context)
         finally:
@@ -120,14 +160,12 @@ def _error_lines(error: BaseException) -> tuple[list[str], int]:
     """The message lines of an error, and the exit code."""
     if isinstance(error, IbrobotError):
         return str(error).splitlines(), error.exit_code
-    if isinstance(error, click.Abort | KeyboardInterrupt):
+    if isinstance(error, KeyboardInterrupt):
         return ["stopped"], _INTERRUPTED
     if isinstance(error, click.UsageError):
         hint = f"; see {error.ctx.command_path} --help" if error.ctx is not None else ""
         message = error.format_message().replace("\n", " ").removesuffix(".")
         return [f"{message}{_suggestion(message, error.ctx)}{hint}"], _WRONG
-    if isinstance(error, click.ClickException):
-        return error.format_message().splitlines(), _WRONG if isinstance(error, click.FileError) else error.exit_code
     if isinstance(error, OSError) and (system_error := _system_error(error)) is not None:
         return system_error
     return [describe_bug(error)], _FAILED

@@ -15,11 +15,10 @@ from collections.abc import Callable
 from contextlib import ExitStack, nullcontext, suppress
 
 import attrs
-import click
 
 from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.errors import IbrobotError, TeleopError
+from ibrobot_core.errors import IbrobotError, RequestError, TeleopError
 from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.keys import RELEASE, REPEAT
 from ibrobot_core.launch.models import check_models
@@ -65,7 +64,7 @@ def run_robot(
         SystemExit: at the end of a run without failed components; docs/reference/exit-codes.md lists the codes.
     """
     if request.lockstep and not config.simulated:
-        raise click.UsageError("--lockstep is for simulation: add --sim")
+        raise RequestError("--lockstep is for simulation: add --sim")
     if headless and config.viewer is not None:
         config = attrs.evolve(config, viewer=None)
     with ExitStack() as stack:
@@ -101,7 +100,7 @@ def _run(runtime: Runtime, hooks: RunHooks, signals: _Signals, *, live: bool, as
     Status goes to standard output, or to standard error with `as_json`.
 
     Raises:
-        click.Abort: if a signal came before the run began.
+        KeyboardInterrupt: if a signal came before the run began.
     """
     session = runtime.session
     where = "simulation" if session.config.simulated else "hardware"
@@ -113,7 +112,7 @@ def _run(runtime: Runtime, hooks: RunHooks, signals: _Signals, *, live: bool, as
         runtime.start(display.starting)
         stack.callback(runtime.stop)
         if signals.came:
-            raise click.Abort
+            raise KeyboardInterrupt
         while not (runtime.step() if session.request.lockstep else runtime.wait(1.0 / _PANEL_HZ)):
             hooks.step()
             display.show()

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import attrs
-import click
 import pytest
 from click.testing import CliRunner, Result
-from plugins.counting import COUNT, Counted, CountOptions, count
+from plugins.counting import COUNT, Count, Counted
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Command, Event, Failed, Shown, WireError, declared, decode_event, emit
+from ibrobot_core.app import Command, Emit, Event, Failed, Shown, WireError, decode_event
+from ibrobot_core.cli.declared import click_command
 from ibrobot_core.errors import ConfigError, IbrobotError
 
 
@@ -26,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def run(*words: object) -> Result:
-    return CliRunner().invoke(count, [str(word) for word in words])
+    return CliRunner().invoke(click_command(COUNT), [str(word) for word in words])
 
 
 def error(*words: object) -> str:
@@ -54,6 +53,18 @@ def test_errors_of_values_name_the_flag(folder: Path) -> None:
     assert error(folder, "--at-least=-1", "--kind=x") == (
         "--kind: 'x' is not one of: all, text; --at-least: -1 is too small, must be at least 0 bytes"
     )
+
+
+def test_the_result_is_shown_or_printed_as_json(folder: Path, tmp_path: Path) -> None:
+    assert json.loads(run(folder, "--json").output) == [{"folder": str(folder), "files": 2}]
+    assert "--json" not in CliRunner().invoke(click_command(Command("every", Every)), ["--help"]).output
+
+
+@pytest.mark.parametrize("words", [(), ("--json",)])
+def test_a_result_that_is_not_good_is_printed_before_the_exit_code(folder: Path, words: tuple[str, ...]) -> None:
+    result = run(folder, "--at-least=100", *words)
+    assert result.exit_code == 1
+    assert str(folder) in result.output
 
 
 def test_events_are_lines_of_their_classes(folder: Path) -> None:
@@ -106,25 +117,40 @@ class Undeclared(Event):
 
 
 def test_an_undeclared_event_is_a_bug() -> None:
-    with pytest.raises(TypeError, match="ibrobot count does not declare the event Undeclared"):
-        emit(COUNT, Undeclared())
+    @attrs.frozen
+    class Shouting:
+        """Print an event."""
+
+        def __call__(self, emit: Emit) -> None:
+            assert emit is not None
+            emit(Undeclared())
+
+    command = click_command(Command("shout", Shouting, events=(Counted,)))
+    with pytest.raises(TypeError, match="ibrobot shout does not declare the event Undeclared"):
+        CliRunner().invoke(command, ["--events"], catch_exceptions=False)
 
 
 @attrs.frozen(kw_only=True)
 class Every:
     """An option of each sort."""
 
-    config: Path = option(argument=True, help="a file")
+    config: Path = option(typed="CONFIG", help="a file")
     length_s: float | None = option(None, unit="s", help="a time")
     tags: tuple[str, ...] = option(("a",), choices=("a", "b"), help="tags")
     device: str = option("auto", choices=("auto", "cpu"), open=True, help="a device")
     sure: bool = option(False, help="whether")
+    rate: float | None = option(None, typed="-r --rate [HZ=40]", gt=0, help="a value that may be left out")
+    pairs: tuple[tuple[int, int], ...] = option((), typed="--pair ID BITS", help="two numbers each")
+    seen: ClassVar[list[Every]] = []
+
+    def __call__(self) -> None:
+        self.seen.append(self)
 
 
 def every(*words: str) -> Every:
-    seen: list[Every] = []
-    command: Callable[..., Any] = declared(Command("every", "", lambda: click.Command("every"), Every))(seen.append)
-    result = CliRunner().invoke(click.command()(command), list(words))
+    seen = Every.seen
+    seen.clear()
+    result = CliRunner().invoke(click_command(Command("every", Every)), list(words))
     if result.exception is not None:
         raise result.exception
     (found,) = seen
@@ -136,10 +162,13 @@ def test_every_sort_of_option_is_read() -> None:
     assert every("x", "--length-s", "2", "--tags=b", "--tags=a", "--device=cuda:1", "--sure") == Every(
         config=Path("x"), length_s=2.0, tags=("b", "a"), device="cuda:1", sure=True
     )
+    assert every("x", "-r").rate == 40.0
+    assert every("x", "--rate", "2").rate == 2.0
+    assert every("--pair", "1", "2", "--pair", "3", "4", "x").pairs == ((1, 2), (3, 4))
     with pytest.raises(IbrobotError, match="--tags: 'c' is not one of: a, b"):
         every("x", "--tags=c")
 
 
 def test_the_classes_describe_themselves() -> None:
-    assert COUNT.options is CountOptions
-    assert all(field.metadata["help"] for kind in (CountOptions, Counted, Failed) for field in attrs.fields(kind))
+    assert COUNT.options is Count
+    assert all(field.metadata["help"] for kind in (Count, Counted, Failed) for field in attrs.fields(kind))

@@ -40,12 +40,6 @@ def bugs(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (("odd", "xyzzy"), 2, "No such command 'xyzzy'; see ibrobot odd --help"),
         (("confg",), 2, "No such command 'confg', did you mean 'config'?; see ibrobot --help"),
         (("odd", "read", "no.txt"), 2, "no.txt: No such file or directory"),
-        (
-            ("odd", "take", "no.txt"),
-            2,
-            "Invalid value for 'FILE': 'no.txt': No such file or directory; see ibrobot odd take --help",
-        ),
-        (("odd", "refuse"), 1, "not today"),
         (("odd", "ask"), 130, "stopped"),
     ],
 )

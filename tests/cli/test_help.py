@@ -14,6 +14,8 @@ from ibrobot_core import __version__
 from ibrobot_core.plugins import Registry, discover
 
 if TYPE_CHECKING:
+    from ibrobot_testing.site import Site
+
     from tests.cli.conftest import Ran
 
 Ibrobot = Callable[..., "Ran"]
@@ -25,9 +27,9 @@ def test_help_lists_every_command_and_those_of_plugins(ibrobot: Ibrobot, robot: 
 
     lines = [line.split(maxsplit=1) for line in ran.out.splitlines()]
     assert ran.code == 0
-    own = discover([]).commands
-    assert list(own) == ["launch", "config", "plugins", "doctor"]
-    for command in own.values():
+    own = [command for name, command in discover([]).commands.items() if " " not in name]
+    assert [command.name for command in own] == ["launch", "config", "plugins", "doctor"]
+    for command in own:
         assert [command.name, command.summary] in lines
     assert ["greet", "Say hello."] in lines
 
@@ -89,3 +91,35 @@ def test_a_group_without_a_command_shows_its_help(ibrobot: Ibrobot, command: tup
     assert (ran.code, ran.out) == (2, "")
     assert ran.err.splitlines() == ibrobot(*command, "--help").out.splitlines()
     assert ran.err.startswith(" ".join(("Usage: ibrobot", *command)))
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("la", {"launch"}),
+        ("config ", {"check", "show"}),
+        ("plugins sh", {"show"}),
+        ("plugins show --", {"--json", "--help"}),
+        ("launch --lock", {"--lockstep"}),
+        ("feed --from b", {"bowl", "bottle"}),
+        ("feed --what ", {"milk", "mash"}),
+        ("feed EPI", {"EPISODE"}),
+    ],
+)
+def test_a_shell_completes_commands_options_choices_and_paths(
+    ibrobot: Ibrobot, site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, typed: str, offered: set[str]
+) -> None:
+    site.add("fake-feeding", "feeding.py")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("_IBROBOT_COMPLETE", "bash_complete")
+    monkeypatch.setenv("COMP_WORDS", f"ibrobot {typed}")
+    monkeypatch.setenv("COMP_CWORD", str(len(typed.split(" "))))
+    ran = ibrobot()
+
+    lines = [line.partition(",") for line in ran.out.splitlines()]
+    assert ran.code == 0
+    if typed == "feed EPI":  # the shell completes paths itself
+        assert [kind for kind, _, _ in lines] == ["file"]
+    else:
+        assert offered <= {text for _, _, text in lines}
+        assert all(text.startswith(typed.rsplit(" ", maxsplit=1)[-1]) for _, _, text in lines)

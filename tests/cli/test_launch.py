@@ -389,8 +389,8 @@ def test_missing_checkpoint_has_the_same_exit_code_as_in_a_dry_run(
     [
         (("--sim", "--viewer", "any", "--headless"), "--viewer and --headless exclude each other"),
         (("--lockstep",), "--lockstep is for simulation: add --sim"),
-        (("--sim", "--episodes", "0"), "'--episodes'"),
-        (("--sim", "--duration", "-1"), "'--duration'"),
+        (("--sim", "--episodes", "0"), "--episodes: 0 is too small"),
+        (("--sim", "--duration", "-1"), "--duration: -1.0 is too small"),
         ((*LOCKSTEP, "--mode", "plan"), "--lockstep: nothing sends mode plan a goal: add --goal, --duration or --epis"),
         (
             ("--sim", "--set", "executors.position.stale_timeout=1e300"),

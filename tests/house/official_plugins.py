@@ -53,7 +53,8 @@ def offers() -> dict[str, dict[str, list[str]]]:
             kinds["feature"] = sorted(registry.features)
         if registry.guides:
             kinds["guide"] = sorted(guide.name for guide in registry.guides)
-        if commands := sorted(name for name, owner in registry.command_packages.items() if owner == package):
+        own = {name for name, owner in registry.command_packages.items() if owner == package}
+        if commands := sorted(name for name in own if " " not in name or name.partition(" ")[0] not in own):
             kinds["command"] = commands
         if jobs := [name for name in commands if registry.commands[name].events]:
             kinds["job"] = jobs

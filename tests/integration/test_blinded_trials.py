@@ -16,7 +16,6 @@ from contextlib import chdir, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
 import pytest
 from blinded_arm import ARM, NAMES
 from command_line import run_here
@@ -25,7 +24,8 @@ from ibrobot_core.config import find_config
 from ibrobot_core.plugins import installed_plugins
 
 if TYPE_CHECKING:
-    from ibrobot_testing.site import Site
+    from ibrobot_testing.command import command_line
+from ibrobot_testing.site import Site
 
 pytestmark = pytest.mark.integration
 PATIENCE_S = 240.0
@@ -209,9 +209,7 @@ def test_reset_task_is_performed_by_the_command_for_tasks() -> None:
     options = EvalOptions(config=("arm.yaml",), out=Path("blind"), reset_task=Path("clear table.yaml"), sim=True)
     program, _, _, name, verb, *words = reset_of(options)
     assert (program, name, verb) == (sys.executable, "task", "run")
-    tasks = installed_plugins().command(name).load()
-    assert isinstance(tasks, click.Group)
-    given = tasks.commands[verb].make_context(verb, words).params
+    given = command_line(f"{name} {verb}").make_context(verb, words).params
     assert (given["file"], given["config"], given["sim"], given["headless"]) == (
         "clear table.yaml",
         "arm.yaml",

@@ -116,6 +116,8 @@ def commands(command: click.Command = cli, names: tuple[str, ...] = ()) -> Itera
     if not isinstance(command, click.Group):
         yield " ".join(names)
         return
+    if command.invoke_without_command:
+        yield " ".join(names)
     context = click.Context(command)
     for name in command.list_commands(context):
         inner = command.get_command(context, name)
@@ -261,7 +263,7 @@ main()
 def takes_json() -> set[str]:
     """The commands with --json."""
     found = set()
-    for name in (*commands(), "plugins"):
+    for name in commands():
         command: click.Command = cli
         for word in name.split():
             assert isinstance(command, click.Group)

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from fake_runs import runs, site
-from ibrobot_mcap.commands import episodes
 from ibrobot_policy_servers.openpi import OpenpiConnection
 from ibrobot_policy_servers.options import ActionMap, ObservationMap, OpenpiOptions
 from ibrobot_policy_servers.served import ServedPolicy
@@ -24,9 +23,11 @@ from openpi_server import OpenpiServer, towards_a_goal
 
 if TYPE_CHECKING:
     from fake_runs import Runs
+    from ibrobot_testing.command import command_line
     from ibrobot_testing.site import Site
+from ibrobot_core.launch.runtime import Runtime
 
-    from ibrobot_core.launch.runtime import Runtime
+episodes = command_line("episodes")
 
 __all__ = ["runs", "site"]
 pytestmark = pytest.mark.integration

@@ -220,16 +220,16 @@ def check_options(declared: Mapping[str, Command]) -> None:
 
 def test_the_page_names_options_that_their_commands_have() -> None:
     assert len(set(used_options())) >= 9
-    check_options(installed_plugins().declarations())
+    check_options(dict(installed_plugins().commands))
 
 
 @pytest.mark.parametrize(
     ("command", "old"), [("episodes trim", "begin_s"), ("episodes mark", "outcome"), ("datasets info", "dataset")]
 )
 def test_another_name_of_an_option_fails(command: str, old: str) -> None:
-    declared = installed_plugins().declarations()
+    declared = dict(installed_plugins().commands)
     options = changed(declared[command].options, old, "renamed")
-    declared[command] = attrs.evolve(declared[command], options=options)
+    declared[command] = attrs.evolve(declared[command], does=options)
     with pytest.raises(AssertionError, match=f"{command}: {old}"):
         check_options(declared)
 
@@ -258,14 +258,14 @@ def check_events(declared: Mapping[str, Command]) -> None:
 
 
 def test_scripts_read_fields_that_events_have() -> None:
-    check_events(installed_plugins().declarations())
+    check_events(dict(installed_plugins().commands))
 
 
 @pytest.mark.parametrize(
     ("command", "event", "old"), [("datasets info", "Contents", "fps"), ("episodes trash", "InTrash", "size_bytes")]
 )
 def test_another_name_of_a_field_of_an_event_fails(command: str, event: str, old: str) -> None:
-    declared = installed_plugins().declarations()
+    declared = dict(installed_plugins().commands)
     events = tuple(
         changed(each, old, "renamed") if each.__name__ == event else each for each in declared[command].events
     )
@@ -279,6 +279,7 @@ TERMINAL = {
     "--shard": "parts of a work on several machines, which a terminal starts",
     "--to": "from a dataset to episodes, which no page does",
     "--episodes": "episodes of a dataset, with --to bag",
+    "--names": "names of a dataset's elements, with --to bag",
     "--output": "a new episode, where a page replaces the old one",
     "--yes": "an answer in a terminal",
     "--open": "blinded trials, which need a terminal",
@@ -305,7 +306,7 @@ def check_flags(declared: Mapping[str, Command]) -> None:
         named = {
             flag_of(name, field)
             for command in declared.values()
-            if command.events and str(command.load().callback.__module__).startswith(f"{module}.")
+            if command.events and str(command.options.__module__).startswith(f"{module}.")
             for name, field in fields(command.options).items()
             if field.metadata["label"] is not None
         }
@@ -317,13 +318,13 @@ def check_flags(declared: Mapping[str, Command]) -> None:
 
 
 def test_errors_name_options_that_a_page_has_labels_for() -> None:
-    check_flags(installed_plugins().declarations())
+    check_flags(dict(installed_plugins().commands))
 
 
 def test_an_error_that_names_an_option_of_another_name_fails() -> None:
-    declared = installed_plugins().declarations()
+    declared = dict(installed_plugins().commands)
     options = changed(declared["convert"].options, "force_contract", "renamed")
-    declared["convert"] = attrs.evolve(declared["convert"], options=options)
+    declared["convert"] = attrs.evolve(declared["convert"], does=options)
     with pytest.raises(AssertionError, match="--force-contract"):
         check_flags(declared)
 
@@ -335,7 +336,7 @@ def test_the_page_names_no_package() -> None:
 
 
 def test_every_command_and_event_explains_its_fields() -> None:
-    for name, command in installed_plugins().declarations().items():
+    for name, command in dict(installed_plugins().commands).items():
         for kind in (command.options, *command.events):
             bare = [key for key, field in fields(kind).items() if not field.metadata.get("help")]
             assert not bare, f"{name}: {kind.__name__} has fields without help"

@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from ibrobot_lerobot.options import LeRobotOptions
-from ibrobot_lerobot.train import train
 from ibrobot_lerobot.training_checkpoints import newest_checkpoint
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
 from ibrobot_testing import ibrobot_command
+from ibrobot_testing.command import command_line
 
 from ibrobot_core.api import Feature, MissingDependency
+
+train = command_line("train")
 
 pytestmark = pytest.mark.lerobot
 STEPS = 12

@@ -59,8 +59,14 @@ def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot camera …`."""
     yield Command(
-        "camera", "List and preview cameras, and save snapshots.", Late("ibrobot_camera.commands:camera").load
+        "camera",
+        summary="List and preview cameras, and save snapshots.",
+        about="SOURCE is a device as in a robot YAML (a number, a path, a stable id, a URL, a video file), or a robot "
+        "YAML, which means all its `opencv` cameras.",
     )
+    yield Command("camera list", Late("ibrobot_camera.commands.list_cameras:ListCameras"))
+    yield Command("camera preview", Late("ibrobot_camera.commands.preview:Preview"))
+    yield Command("camera snapshot", Late("ibrobot_camera.commands.snapshot:Snapshot"))
 
 
 @hookimpl

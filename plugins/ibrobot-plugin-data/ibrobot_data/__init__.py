@@ -7,38 +7,22 @@ from typing import TYPE_CHECKING
 
 from ibrobot_core.api import Late, hookimpl
 from ibrobot_core.app import Command, SectionDescriptor, SourceDescriptor
-from ibrobot_data.conversion import EVENTS, ConvertOptions
+from ibrobot_data.conversion import EVENTS
 from ibrobot_data.options import EpisodesOptions, check_keys
-from ibrobot_data.recording_session import RecordOptions
 from ibrobot_data.recording_session import Session as SessionEvent
 
 if TYPE_CHECKING:
     from ibrobot_core.app import Component, RecordedRun, RobotConfig
 
 
-CONVERT = Command(
-    "convert",
-    "Make a dataset for training from episodes.",
-    Late("ibrobot_data.command:convert").load,
-    ConvertOptions,
-    EVENTS,
-)
-
-RECORD = Command(
-    "record",
-    "Run a robot and record its episodes.",
-    Late("ibrobot_data.record:record").load,
-    RecordOptions,
-    (SessionEvent,),
-)
-
-
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot convert`, `ibrobot record` and `ibrobot replay`."""
-    yield CONVERT
-    yield RECORD
-    yield Command("replay", "Play a recorded episode on a robot, and compare.", Late("ibrobot_data.replay:replay").load)
+    summary = "Make a dataset for training from episodes."
+    yield Command("convert", Late("ibrobot_data.command:Convert"), summary, EVENTS)
+    summary = "Run a robot and record its episodes."
+    yield Command("record", Late("ibrobot_data.record:Record"), summary, (SessionEvent,))
+    yield Command("replay", Late("ibrobot_data.replay:Replay"), "Play a recorded episode on a robot, and compare.")
 
 
 @hookimpl

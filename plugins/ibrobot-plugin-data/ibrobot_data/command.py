@@ -13,25 +13,30 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import attrs
-import click
-from click.core import ParameterSource
+from ibrobot_provenance.work_options import shard_of
 
-from ibrobot_core.api import Contract, DatasetDescriptor, DatasetError
+from ibrobot_core.api import Contract, DatasetDescriptor, DatasetError, option
 from ibrobot_core.app import (
+    NORM_MODES,
+    Emit,
+    Event,
     Failed,
-    declared,
+    Override,
+    RequestError,
+    Unsuccessful,
+    default_of,
     echo,
-    emit,
+    fields,
+    flag_of,
     installed_plugins,
-    shard_of,
     wrong_input,
 )
-from ibrobot_data import CONVERT, conversion
+from ibrobot_data import conversion
 from ibrobot_data.conversion import ConvertOptions
 from ibrobot_data.plural import plural
 from ibrobot_data.prompt import check_prompt
 from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
-from ibrobot_data.stated import listed_joints, names_option
+from ibrobot_data.stated import listed_joints, names_of, names_option
 
 if TYPE_CHECKING:
     from ibrobot_core.app import RobotConfig
@@ -48,93 +53,107 @@ _MUCH = 0.1
 """The report lists episodes that lost more than this fraction of their ticks."""
 
 
-def _writer_flags() -> dict[str, click.Option]:
-    """Option of a dataset writer -> its flag on this command line."""
+def _writer_flags() -> dict[str, Any]:
+    """Option of a dataset writer -> the option of this command."""
     flags = {}
-    for entry in installed_plugins().entries.values():
-        writer = entry.descriptor
+    for writer in installed_plugins().of_kind("dataset"):
         for name in writer.flags if isinstance(writer, DatasetDescriptor) else ():
             known = attrs.fields_dict(writer.options)[name]
+            text = f"{writer.type}: {known.metadata['help']}"
             off = known.default is True
-            help_text = f"{writer.type}: {known.metadata['help']}."
-            flags[name] = click.Option([f"--no-{name}" if off else f"--{name}", name], is_flag=off, help=help_text)
+            flags[name] = option(False if off else None, typed=f"--no-{name}" if off else "", label=None, help=text)
     return flags
 
 
-@click.command()
-@declared(CONVERT)
-@click.option("--to", type=click.Choice(("dataset", "bag")), default="dataset", show_default=True, help="What to make.")
-@click.option("--episodes", "numbers", metavar="N,N-M", help="With --to bag: only these episodes, counted from 0.")
-@names_option("With --to bag: names of a feature's elements in their order, for a dataset that does not have them.")
-@click.option("--type", "type_", help="Dataset writer; by default that of an installed plugin.")
-@click.option("--set", "sets", multiple=True, metavar="OPTION=VALUE", help="Any other option of the dataset writer.")
-@click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
-@click.pass_context
-def convert(
-    context: click.Context, options: ConvertOptions, /, *, to: str, numbers: str | None,
-    names: Mapping[str, list[str]], type_: str | None, sets: tuple[str, ...], as_json: bool, events: bool, **flags: Any,
-) -> None:  # fmt: skip
+_WRITER_FLAGS = _writer_flags()
+
+
+def _with_writer_flags[C](kind: type[C]) -> type[C]:
+    """Class decorator: add the options of the installed dataset writers."""
+    for name, flag in _WRITER_FLAGS.items():
+        setattr(kind, name, flag)
+        kind.__annotations__[name] = "bool" if flag._default is False else "str | None"
+    return kind
+
+
+@attrs.frozen(kw_only=True)
+@_with_writer_flags
+class Convert(ConvertOptions):
     """Make a dataset for training from recorded episodes, or with --to bag episodes from a dataset.
 
     EPISODES are episodes, folders of them such as episodes/default, or DATASET:N; with --to bag it is one dataset.
     After an interruption, run the same command again to continue. An episode that cannot be converted is reported and
     left out; the command then exits with 1.
     """
-    given = {
-        each.name: each.opts[0]
-        for each in context.command.params
-        if context.get_parameter_source(each.name or "") is ParameterSource.COMMANDLINE
-    }
-    only_other = ("numbers", "names") if to == "dataset" else (*_ONLY_TO_DATASET, *_writer_flags())
-    if wrong := [flag for name, flag in given.items() if name in only_other]:
-        raise click.UsageError(f"{wrong[0]} does not apply to --to {to}")
-    try:
-        with wrong_input():
-            check_prompt(options.prompt)
-            progress = _events if events else partial(_progress, quiet=as_json)
-            if to == "bag":
-                from ibrobot_data.config_metadata import metadata_from_config
 
-                unit = options.norm_mode if "norm_mode" in given else None
-                robot, calibration = _stated(options)
-                stated = metadata_from_config(robot, unit, calibration, names) if robot is not None else {}
-                report = _to_bags(options, numbers, robot, stated, sets, progress)
+    to: str = option("dataset", choices=("dataset", "bag"), label=None, help="what to make")
+    numbers: str | None = option(
+        None, typed="--episodes N,N-M", label=None, help="with --to bag: only these episodes, counted from 0"
+    )
+    names: tuple[str, ...] = names_option(
+        "with --to bag: names of a feature's elements in their order, for a dataset that does not have them"
+    )
+    type_: str | None = option(
+        None, typed="--type TYPE", label=None, help="dataset writer; by default that of an installed plugin"
+    )
+    sets: tuple[str, ...] = option(
+        (), typed="--set OPTION=VALUE", label=None, help="any other option of the dataset writer"
+    )
+    as_json: bool = option(False, typed="--json", label=None, help="print the report as JSON")
+
+    def __call__(self, emit: Emit) -> None:
+        self._check_applies()
+        try:
+            with wrong_input():
+                check_prompt(self.prompt)
+                progress = partial(_progress, quiet=self.as_json) if emit is None else partial(_events, emit)
+                report = (_to_bags if self.to == "bag" else _to_dataset)(self, progress)
+        except KeyboardInterrupt:
+            if emit is not None:
+                emit(Failed("interrupted; finished episodes are kept: the same conversion continues with the others"))
             else:
-                report = _to_dataset(options, type_, (*_overrides(flags), *sets), progress)
-    except KeyboardInterrupt:
-        if events:
-            why = "interrupted; finished episodes are kept: the same conversion continues with the others"
-            emit(CONVERT, Failed(why))
+                echo("interrupted; finished episodes are kept: run the same command again to continue", err=True)
+            raise Unsuccessful(exit_code=130) from None
+        if emit is not None:
+            emit(conversion.Report(**report.summary()))  # each episode had its event
+        elif self.as_json:
+            echo(json.dumps({**report.summary(), "reports": [attrs.asdict(each) for each in report.episodes]}))
         else:
-            echo("interrupted; finished episodes are kept: run the same command again to continue", err=True)
-        sys.exit(130)
-    if events:
-        emit(CONVERT, conversion.Report(**report.summary()))  # each episode had its event
-    elif as_json:
-        echo(json.dumps({**report.summary(), "reports": [attrs.asdict(each) for each in report.episodes]}))
-    else:
-        _print_report(report)
-    if report.failed or not (report.converted or all(each.passed_over for each in report.episodes)):
-        sys.exit(1)
+            _print_report(report)
+        if report.failed or not (report.converted or all(each.passed_over for each in report.episodes)):
+            raise Unsuccessful
+
+    def _check_applies(self) -> None:
+        """Refuse options that are of the other direction."""
+        only_other = ("numbers", "names") if self.to == "dataset" else (*_ONLY_TO_DATASET, *_WRITER_FLAGS)
+        for name, field in fields(type(self)).items():
+            if name in only_other and getattr(self, name) != default_of(field):
+                raise RequestError(f"{flag_of(name, field)} does not apply to --to {self.to}")
+
+    def writer_overrides(self) -> tuple[str, ...]:
+        """The options of the dataset writer, as overrides."""
+        overrides: list[str] = []
+        for name in _WRITER_FLAGS:
+            if (value := getattr(self, name)) is True:
+                overrides.append(Override.of(f"--no-{name}", f"{name}=false"))
+            elif value:
+                overrides.append(Override.of(f"--{name} {value}", f"{name}={value}"))
+        return (*overrides, *self.sets)
 
 
-convert.params += _writer_flags().values()
-
-
-def _to_dataset(
-    options: ConvertOptions, type_: str | None, overrides: Sequence[str], progress: _Progress
-) -> Report:  # fmt: skip
+def _to_dataset(options: Convert, progress: _Progress) -> Report:
     from ibrobot_data.run import convert as run
     from ibrobot_data.run import find_episodes
 
     installed_plugins().check_pool(options.on)
-    type_ = type_ or installed_plugins().default("dataset")
-    writer_options = _options("dataset", type_, overrides)
+    type_ = options.type_ or installed_plugins().default("dataset")
+    writer_options = _options("dataset", type_, options.writer_overrides())
     robot, calibration = _stated(options)
     request = ConversionRequest(
         options.out, writer_options, type_, append=options.append, outcomes=options.outcome,
-        jobs=options.jobs, on=options.on, norm_mode=options.norm_mode, missing=options.missing, prompt=options.prompt,
-        success=options.success, only=options.only, context=options.context, any_robot=options.any_robot,
+        jobs=options.jobs, on=options.on, norm_mode=options.norm_mode or NORM_MODES[0], missing=options.missing,
+        prompt=options.prompt, success=options.success, only=options.only, context=options.context,
+        any_robot=options.any_robot,
         force_contract=options.force_contract, calibration=calibration,
         contract=Contract.from_config(robot) if robot is not None else None,
         document=json.loads(json.dumps(robot.document, default=str)) if robot is not None else None,
@@ -145,24 +164,26 @@ def _to_dataset(
         return run(request, episodes, watch)
 
 
-def _to_bags(
-    options: ConvertOptions, numbers: str | None, robot: RobotConfig | None, stated: Mapping[str, str],
-    sets: tuple[str, ...], progress: _Progress,
-) -> Report:  # fmt: skip
+def _to_bags(options: Convert, progress: _Progress) -> Report:
     from ibrobot_core.api import EpisodeAddress
+    from ibrobot_data.config_metadata import metadata_from_config
     from ibrobot_data.episode import make_writer
     from ibrobot_data.to_bags import BagRequest, convert_to_bags
 
+    names = names_of(options.names)
+    robot, calibration = _stated(options)
+    stated = metadata_from_config(robot, options.norm_mode, calibration, names) if robot is not None else {}
     if len(options.episodes) != 1:
-        raise click.UsageError("--to bag takes one dataset at a time")
+        raise RequestError("--to bag takes one dataset at a time")
     address = EpisodeAddress.of(options.episodes[0])
     dataset, recorder = installed_plugins().default("dataset"), installed_plugins().default("recorder")
     writer = make_writer(ConversionRequest(address.path, _options("dataset", dataset, ()), dataset))
     if (summary := writer.summary(address.path)) is None:
         raise DatasetError(f"{address.path}: not a dataset of type {dataset}")
-    chosen = (address.number,) if address.number is not None else _numbers(numbers, summary.episodes)
+    chosen = (address.number,) if address.number is not None else _numbers(options.numbers, summary.episodes)
     request = BagRequest(
-        address.path, chosen, options.out, _options("recorder", recorder, sets), recorder, prompt=options.prompt,
+        address.path, chosen, options.out, _options("recorder", recorder, options.sets), recorder,
+        prompt=options.prompt,
         contract=Contract.from_config(robot) if robot is not None else None,
         given=stated,
     )  # fmt: skip
@@ -174,7 +195,7 @@ def _numbers(text: str | None, total: int) -> tuple[int, ...]:
     """Parse e.g. `0,3-5`; returns the numbers in order.
 
     Raises:
-        click.BadParameter: for anything else, or a number beyond the dataset.
+        RequestError: for anything else, or a number beyond the dataset.
     """
     if text is None:
         return tuple(range(total))
@@ -182,27 +203,12 @@ def _numbers(text: str | None, total: int) -> tuple[int, ...]:
     for piece in text.split(","):
         ends = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", piece)
         if ends is None:
-            raise click.BadParameter(
-                f"{piece!r} is neither a number nor a range; write e.g. 0,3-5", param_hint="--episodes"
-            )
+            raise RequestError(f"--episodes: {piece!r} is neither a number nor a range; write e.g. 0,3-5")
         numbers |= set(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
     if not numbers or max(numbers) >= total:
         there = f"0 to {total - 1}" if total else "none"
-        raise click.BadParameter(f"{text}: the dataset's episodes are {there}", param_hint="--episodes")
+        raise RequestError(f"--episodes: {text}: the dataset's episodes are {there}")
     return tuple(sorted(numbers))
-
-
-def _overrides(flags: Mapping[str, Any]) -> list[str]:
-    """Flags of dataset writers as overrides of their options."""
-    from ibrobot_core.app import Override
-
-    overrides: list[str] = []
-    for name, flag in _writer_flags().items():
-        if (value := flags[name]) is True:
-            overrides.append(Override.of(flag.opts[0], f"{name}=false"))
-        elif value:
-            overrides.append(Override.of(f"{flag.opts[0]} {value}", f"{name}={value}"))
-    return overrides
 
 
 def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:
@@ -218,7 +224,7 @@ def _stated(options: ConvertOptions) -> tuple[RobotConfig | None, Mapping[str, M
     from ibrobot_data.config_metadata import load_contract, with_anchored
 
     if options.anchored is not None and (options.calibration is None or options.config is None):
-        raise click.UsageError("--anchored needs --calibration and --config, which has the joints' limits")
+        raise RequestError("--anchored needs --calibration and --config, which has the joints' limits")
     calibration = load_calibration(options.calibration).snapshot() if options.calibration is not None else None
     robot = load_contract(find_config(options.config, installed_plugins())) if options.config is not None else None
     if robot is not None and calibration is not None:
@@ -227,7 +233,7 @@ def _stated(options: ConvertOptions) -> tuple[RobotConfig | None, Mapping[str, M
 
 
 @contextmanager
-def _events(episodes: int) -> Iterator[Any]:
+def _events(emit: Callable[[Event], None], episodes: int) -> Iterator[Any]:
     """Yield a function that prints events: one for each episode, and at most ten a second in between."""
     begin = last = time.monotonic()
     done = 0
@@ -244,9 +250,9 @@ def _events(episodes: int) -> Iterator[Any]:
             done=done, of=episodes, frames=frames, total_frames=max(total, frames), seconds=round(now - begin, 3),
             episode=episode, error=error,
         )  # fmt: skip
-        emit(CONVERT, event)
+        emit(event)
 
-    emit(CONVERT, conversion.Begin(episodes))
+    emit(conversion.Begin(episodes))
     yield watch
 
 

@@ -7,6 +7,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ibrobot_provenance.robot_metadata import robot_metadata
+
 from ibrobot_core.api import CalibrationError, Contract, Robot
 from ibrobot_core.app import (
     ExecutorConfig,
@@ -14,7 +16,6 @@ from ibrobot_core.app import (
     contract_alone,
     load_config,
     read_document,
-    robot_metadata,
     with_closed_ends,
 )
 

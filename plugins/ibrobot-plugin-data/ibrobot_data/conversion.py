@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import override
 
 import attrs
+from ibrobot_provenance.work_options import on_option, shard_option
 
 from ibrobot_core.api import option
-from ibrobot_core.app import NORM_MODES, Event, Shown, on_option, shard_option
+from ibrobot_core.app import NORM_MODES, Event, Shown
 from ibrobot_data.plural import plural
 
 OUTCOMES = {"success": "successful", "failure": "failed", "unknown": "not judged"}
@@ -28,7 +29,7 @@ class ConvertOptions:
     """Which episodes are converted into which dataset, and how."""
 
     episodes: tuple[Path, ...] = option(
-        argument=True, names="episodes", validator=_some, help="episodes, or folders of them"
+        typed="EPISODES", names="episodes", validator=_some, help="episodes, or folders of them"
     )
     out: Path = option(
         names="dataset", open=True, suggest="datasets/{episodes}", label="Dataset", help="folder of the dataset"
@@ -54,8 +55,12 @@ class ConvertOptions:
         more=True,
         help="what to do if an observation is missing at a tick",
     )
-    norm_mode: str = option(
-        "radians", choices=UNITS, label="Unit of joints", more=True, help="unit of the dataset's joints"
+    norm_mode: str | None = option(
+        None,
+        choices=UNITS,
+        label="Unit of joints",
+        more=True,
+        help="unit of the dataset's joints; by default radians, or that of the dataset with --to bag",
     )
     success: bool = option(
         False, label="Add next.success", more=True, help="add a feature that is true in the last row of a success"

@@ -4,54 +4,36 @@ from __future__ import annotations
 
 import json
 import sys
-from functools import partial
 from pathlib import Path
-from typing import Any
 
-import click
+import attrs
 
+from ibrobot_core.api import option
 from ibrobot_core.app import (
+    Emit,
     LaunchRequest,
+    ModeOptions,
     Override,
+    RequestError,
     RobotConfig,
     Runtime,
-    check_end,
-    declared,
     echo,
-    emit,
-    find_config,
     installed_plugins,
-    load_config,
-    run_options,
-    run_overrides,
     run_robot,
 )
-from ibrobot_data import RECORD
 from ibrobot_data.cues import Cues
 from ibrobot_data.episode_dataset import EpisodeDataset, count_complete
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.operator import Operator
 from ibrobot_data.plural import plural
-from ibrobot_data.recording_session import RecordOptions
+from ibrobot_data.prompt import check_prompt
+
+CUES = ("beep", "speech", "none")
+"""Kinds of cues; see `Cues`."""
 
 
-@click.command()
-@run_options(
-    "config",
-    "sim",
-    "lockstep",
-    "seed",
-    "mode",
-    "overrides",
-    "duration",
-    "goals",
-    "viewer",
-    "headless",
-    "dry_run",
-    "as_json",
-)
-@declared(RECORD)
-def record(options: RecordOptions, config: str | None, events: bool, **run: Any) -> None:
+@attrs.frozen(kw_only=True)
+class Record(ModeOptions):
     """Run a robot and record its episodes as bags.
 
     CONFIG is a robot YAML as for `ibrobot launch`. If it has no `recording` section, episodes go to episodes/default.
@@ -62,55 +44,87 @@ def record(options: RecordOptions, config: str | None, events: bool, **run: Any)
 
     Exits as `ibrobot launch` does.
     """
-    if options.continuous and (options.auto or options.episodes is not None or options.reset_time):
-        raise click.UsageError("--continuous records one episode: leave --auto, --episodes and --reset-time out")
-    robot = _recorded(config, options.dataset, options.root, run)
-    check_end(robot, {**run, "episodes": options.episodes})
-    assert robot.recording is not None
-    folder, prompt, earlier = robot.recording.folder, options.prompt, 0
-    if options.resume:
-        earlier = count_complete(folder)
-        prompt = prompt or EpisodeDataset(folder).prompt or None
-    if options.episodes is not None and earlier >= options.episodes:
-        echo(f"{folder}: has {earlier} {plural(earlier, 'episode')} already")
-        return
-    live = sys.stdin.isatty() and sys.stdout.isatty() and not run["headless"]
-    cues = Cues(options.cues, sys.stdout.fileno() if live else None)
 
-    def operator(runtime: Runtime) -> Operator:
-        service = runtime.session.episodes
-        assert isinstance(service, EpisodeService)
-        service.earlier = earlier
-        return Operator(
-            runtime.session, service, options.episodes, options.reset_time, prompt, auto=options.auto,
-            continuous=options.continuous, keys=live, report=partial(emit, RECORD) if events else None,
-            cues=cues,
+    prompt: str | None = option(
+        None,
+        validator=attrs.validators.optional(lambda _, __, prompt: check_prompt(prompt)),
+        label="Task",
+        help="description of the task, e.g. pick the cube; keys ask for it if left out",
+    )
+    dataset: str | None = option(None, label="Dataset", help="name of the dataset, a folder of episodes below the root")
+    root: Path | None = option(None, label=None, help="folder of all datasets")
+    episodes: int | None = option(
+        None, ge=1, label="Episodes", help="number of episodes after which the session ends; without one, it goes on"
+    )
+    resume: bool = option(
+        False,
+        label="Go on",
+        more=True,
+        help="count the dataset's episodes of earlier runs, and keep their last prompt unless --prompt gives another",
+    )
+    cues: str = option(
+        "beep",
+        choices=CUES,
+        label=None,
+        help="what is heard when an episode begins, ends in three seconds, and is saved: bells of the terminal, or "
+        "words by spd-say, say or espeak",
+    )
+    auto: bool = option(
+        False,
+        label="Automatic",
+        more=True,
+        help="begin episodes automatically; end them after contract.max_duration_s",
+    )
+    continuous: bool = option(
+        False, label="Without a break", more=True, help="record one episode, from the start of the run to its end"
+    )
+    reset_time: float = option(0.0, ge=0, unit="s", label="Pause", more=True, help="pause between episodes")
+
+    def __call__(self, emit: Emit) -> None:
+        if self.continuous and (self.auto or self.episodes is not None or self.reset_time):
+            raise RequestError("--continuous records one episode: leave --auto, --episodes and --reset-time out")
+        robot = self._recorded()
+        self.check_end(robot, self.episodes)
+        assert robot.recording is not None
+        folder, prompt, earlier = robot.recording.folder, self.prompt, 0
+        if self.resume:
+            earlier = count_complete(folder)
+            prompt = prompt or EpisodeDataset(folder).prompt or None
+        if self.episodes is not None and earlier >= self.episodes:
+            echo(f"{folder}: has {earlier} {plural(earlier, 'episode')} already")
+            return
+        live = sys.stdin.isatty() and sys.stdout.isatty() and not self.headless
+        cues = Cues(self.cues, sys.stdout.fileno() if live else None)
+
+        def operator(runtime: Runtime) -> Operator:
+            service = runtime.session.episodes
+            assert isinstance(service, EpisodeService)
+            service.earlier = earlier
+            return Operator(
+                runtime.session, service, self.episodes, self.reset_time, prompt, auto=self.auto,
+                continuous=self.continuous, keys=live, report=emit,
+                cues=cues,
+            )  # fmt: skip
+
+        request = LaunchRequest(
+            self.lockstep, self.seed, self.duration, self.episodes and self.episodes - earlier, self.goals,
+            prompt=prompt or "", by_operator=True,
+        )  # fmt: skip
+        run_robot(
+            robot, request, headless=self.headless, dry_run=self.dry_run, as_json=self.as_json, make_hooks=operator
         )  # fmt: skip
 
-    request = LaunchRequest(
-        run["lockstep"], run["seed"], run["duration"], options.episodes and options.episodes - earlier, run["goals"],
-        prompt=prompt or "", by_operator=True,
-    )  # fmt: skip
-    shown = {name: run[name] for name in ("headless", "dry_run", "as_json")}
-    run_robot(robot, request, **shown, make_hooks=operator)
-
-
-def _recorded(config: str | None, dataset: str | None, root: Path | None, options: dict[str, Any]) -> RobotConfig:
-    """The robot of a YAML, with a section `recording` added if the YAML has none."""
-    registry = installed_plugins()
-    path = find_config(config, registry)
-    changes = run_overrides(options)
-    # An override within the section must not count as the section.
-    known = [change for change in changes if not change.startswith("recording.")]
-    robot = load_config(path, overrides=known, mode=options["mode"], sim=options["sim"], registry=registry)
-    made = []
-    if robot.recording is None:
-        made = [f"recording={{type: {registry.default('recorder')}, root: episodes, topics: contract}}"]
-    named = [
-        Override.of(f"--{key} {value}", f"recording.{key}={json.dumps(str(value))}")
-        for key, value in (("dataset", dataset), ("root", root))
-        if value is not None
-    ]
-    return load_config(
-        path, overrides=(*made, *changes, *named), mode=options["mode"], sim=options["sim"], registry=registry
-    )
+    def _recorded(self) -> RobotConfig:
+        """The robot of the YAML, with a section `recording` added if the YAML has none."""
+        changes, made = self.changes(), []
+        # An override within the section must not count as the section.
+        robot = self.load(self.mode, [change for change in changes if not change.startswith("recording.")])
+        if robot.recording is None:
+            recorder = installed_plugins().default("recorder")
+            made = [f"recording={{type: {recorder}, root: episodes, topics: contract}}"]
+        named = [
+            Override.of(f"--{key} {value}", f"recording.{key}={json.dumps(str(value))}")
+            for key, value in (("dataset", self.dataset), ("root", self.root))
+            if value is not None
+        ]
+        return self.load(self.mode, (*made, *changes, *named))

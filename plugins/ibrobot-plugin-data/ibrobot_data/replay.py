@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import attrs
-import click
 import numpy as np
 
-from ibrobot_core.api import Contract, ContractError, EpisodeSummary, RecorderError, Robot, load_calibration, ns
+from ibrobot_core.api import Contract, ContractError, EpisodeSummary, RecorderError, Robot, load_calibration, ns, option
 from ibrobot_core.app import (
     NORM_MODES,
-    EpisodePath,
     LaunchRequest,
+    RequestError,
     RobotConfig,
+    RunOptions,
     echo,
     find_config,
     from_document,
     installed_plugins,
     load_config,
-    run_options,
-    run_overrides,
     run_robot,
     wrong_input,
 )
@@ -34,7 +31,7 @@ from ibrobot_data.episode import recorded_contract
 from ibrobot_data.playback import Playback, read_playback
 from ibrobot_data.replay_source import ReplaySource
 from ibrobot_data.same_robot import Identity
-from ibrobot_data.stated import listed_joints, names_option
+from ibrobot_data.stated import listed_joints, names_of, names_option
 
 _FAR = 0.5
 """Maximum distance of a command from its limits, as a fraction of the joint's range; the safety layer clips it."""
@@ -42,32 +39,8 @@ _MODE = "replay"
 """The name of the mode in which an episode is replayed."""
 
 
-@click.command()
-@click.argument("episode", type=EpisodePath())
-@run_options("config", "sim", "lockstep")
-@click.option(
-    "--speed",
-    type=click.FloatRange(min=0, min_open=True),
-    default=1.0,
-    show_default=True,
-    metavar="X",
-    help="Speed; 0.5 plays at half the recorded speed.",
-)
-@click.option("--force-contract", is_flag=True, help="Replay even if the observations of CONFIG differ.")
-@click.option("--any-robot", is_flag=True, help="Replay even if robot, robot type or calibration differ.")
-@click.option("--norm-mode", type=click.Choice(NORM_MODES), help="Unit of joints in a dataset that does not state it.")
-@click.option("--calibration", metavar="NAME", help="Calibration for such a dataset, if its unit needs one.")
-@click.option(
-    "--anchored",
-    metavar="JOINT,…",
-    help="With --calibration: joints that range from 0 to 100; by default those of the robot YAML's hardware.",
-)
-@names_option("Names of a feature's elements in their order, for a dataset that does not have them.")
-@run_options("overrides", "viewer", "headless", "dry_run", "as_json")
-def replay(
-    episode: Path, config: str | None, speed: float, force_contract: bool, any_robot: bool, norm_mode: str | None,
-    calibration: str | None, anchored: str | None, names: Mapping[str, list[str]], **options: Any,
-) -> None:  # fmt: skip
+@attrs.frozen(kw_only=True)
+class Replay(RunOptions):
     """Play the commands of a recorded EPISODE, and compare the joints with the recorded ones.
 
     EPISODE is a folder such as episodes/pick/episodes/episode_000001, or DATASET:N, episode N from 0 of a dataset.
@@ -77,35 +50,58 @@ def replay(
 
     Exits as `ibrobot launch` does; with 3 if the recorded episode succeeded in its scene and the replay does not.
     """
-    changes, sim = run_overrides(options), options["sim"]
-    robot = _named(config, changes, sim=sim) if config is not None else None
-    numbers = load_calibration(calibration).snapshot() if calibration is not None else None
-    if anchored is not None and (robot is None or numbers is None):
-        raise click.UsageError("--anchored needs --calibration and CONFIG, which has the joints' limits")
-    if robot is not None and numbers is not None:
-        with wrong_input():
-            numbers = with_anchored(numbers, robot, listed_joints(anchored))
-    given = metadata_from_config(robot, norm_mode, numbers, names) if robot is not None else None
-    with wrong_input(), closing(installed_plugins().open_episode(episode, given)) as reader:
-        summary = reader.summary()
-        robot = robot or _recorded(summary, changes, sim=sim)
-        contract = Contract.from_config(robot)
-        _check(contract, summary, str(robot.source), force=force_contract)
-        if not any_robot:
-            _check_robot(robot, summary)
-        playback = read_playback(reader, contract, ns(1.0 / robot.control.rate_hz))
-        _check_limits(playback, robot.robot, episode)
-    if still := [joint for joint in contract.action_joints if joint not in playback.joints]:
-        echo(f"{episode}: has no commands of {', '.join(still)}, which hold their positions", err=True)
-    if not summary.finished:
-        echo(f"{episode}: is unfinished; {playback.duration:.2f} s of it can be replayed", err=True)
-    request = LaunchRequest(
-        options["lockstep"],
-        playback.seed or 0,
-        source=lambda session, mode: ReplaySource(session, mode, str(episode), playback, speed),
+
+    episode: Path = option(typed="EPISODE", names="episodes", help="the episode")
+    speed: float = option(1.0, typed="--speed X", gt=0, help="speed; 0.5 plays at half the recorded speed")
+    force_contract: bool = option(False, help="replay even if the observations of CONFIG differ")
+    any_robot: bool = option(False, help="replay even if robot, robot type or calibration differ")
+    norm_mode: str | None = option(None, choices=NORM_MODES, help="unit of joints in a dataset that does not state it")
+    calibration: str | None = option(
+        None, typed="--calibration NAME", help="calibration for such a dataset, if its unit needs one"
     )
-    shown = {name: options[name] for name in ("headless", "dry_run", "as_json")}
-    run_robot(_without_sensors(robot), request, **shown)
+    anchored: str | None = option(
+        None,
+        typed="--anchored JOINT,…",
+        help="with --calibration: joints that range from 0 to 100; by default those of the robot YAML's hardware",
+    )
+
+    names: tuple[str, ...] = names_option(
+        "names of a feature's elements in their order, for a dataset that does not have them"
+    )
+    dry_run: bool = option(False, help="print the plan, compare model and contract; start nothing")
+
+    def __call__(self) -> None:
+        changes, sim = self.changes(), self.sim
+        robot = _named(self.config, changes, sim=sim) if self.config is not None else None
+        numbers = load_calibration(self.calibration).snapshot() if self.calibration is not None else None
+        if self.anchored is not None and (robot is None or numbers is None):
+            raise RequestError("--anchored needs --calibration and CONFIG, which has the joints' limits")
+        if robot is not None and numbers is not None:
+            with wrong_input():
+                numbers = with_anchored(numbers, robot, listed_joints(self.anchored))
+        given = (
+            metadata_from_config(robot, self.norm_mode, numbers, names_of(self.names)) if robot is not None else None
+        )
+        with wrong_input(), closing(installed_plugins().open_episode(self.episode, given)) as reader:
+            summary = reader.summary()
+            robot = robot or _recorded(summary, changes, sim=sim)
+            contract = Contract.from_config(robot)
+            _check(contract, summary, str(robot.source), force=self.force_contract)
+            if not self.any_robot:
+                _check_robot(robot, summary)
+            playback = read_playback(reader, contract, ns(1.0 / robot.control.rate_hz))
+            _check_limits(playback, robot.robot, self.episode)
+        if still := [joint for joint in contract.action_joints if joint not in playback.joints]:
+            echo(f"{self.episode}: has no commands of {', '.join(still)}, which hold their positions", err=True)
+        if not summary.finished:
+            echo(f"{self.episode}: is unfinished; {playback.duration:.2f} s of it can be replayed", err=True)
+        request = LaunchRequest(
+            self.lockstep,
+            playback.seed or 0,
+            source=lambda session, mode: ReplaySource(session, mode, str(self.episode), playback, self.speed),
+        )
+        robot = _without_sensors(robot)
+        run_robot(robot, request, headless=self.headless, dry_run=self.dry_run, as_json=self.as_json)
 
 
 def _check_robot(robot: RobotConfig, summary: EpisodeSummary) -> None:

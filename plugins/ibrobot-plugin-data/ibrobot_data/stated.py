@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-import click
+from ibrobot_core.api import option
+from ibrobot_core.app import RequestError
 
 
-def _parsed(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> Mapping[str, list[str]]:
-    """Feature -> names, from texts such as `action=pan,lift`."""
+def names_option(help: str) -> Any:
+    """The option `--names`; see `names_of`."""
+    return option((), typed="--names FEATURE=NAME,…", label=None, help=help)
+
+
+def names_of(texts: Iterable[str]) -> Mapping[str, list[str]]:
+    """Feature -> names of its elements in their order, from texts such as `action=pan,lift`."""
     by_name: dict[str, list[str]] = {}
-    for text in values:
+    for text in texts:
         key, _, listed = text.partition("=")
         names = [name.strip() for name in listed.split(",")]
         if not key or not all(names) or key in by_name:
-            raise click.BadParameter(f"{text!r} must be the only FEATURE=NAME,NAME,… of its feature")
+            raise RequestError(f"--names: {text!r} must be the only FEATURE=NAME,NAME,… of its feature")
         by_name[key] = names
     return by_name
-
-
-def names_option(help_text: str) -> Callable[[Any], Any]:
-    """The option `--names`; the command receives feature -> names of its elements in their order."""
-    return click.option("--names", multiple=True, metavar="FEATURE=NAME,…", callback=_parsed, help=help_text)
 
 
 def listed_joints(text: str | None) -> tuple[str, ...] | None:

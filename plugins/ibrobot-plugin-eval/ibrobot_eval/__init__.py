@@ -7,21 +7,15 @@ from pathlib import Path
 
 from ibrobot_core.api import Late, hookimpl
 from ibrobot_core.app import Command, ReportDescriptor
-from ibrobot_eval.options import EVENTS, KIND, SETTINGS, EvalOptions
-
-EVAL = Command(
-    "eval",
-    "Count the successes of policies, and compare them.",
-    Late("ibrobot_eval.command:evaluate").load,
-    EvalOptions,
-    EVENTS,
-)
+from ibrobot_eval.options import EVENTS, KIND, SETTINGS
 
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot eval`."""
-    yield EVAL
+    summary = "Count the successes of policies, and compare them."
+    yield Command("eval", Late("ibrobot_eval.command:Evaluate"), summary, EVENTS)
+    yield Command("eval merge", Late("ibrobot_eval.merge:Merge"))
 
 
 def _is_evaluation(folder: Path) -> bool:

@@ -5,19 +5,26 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
 import attrs
-import click
 
-from ibrobot_core.app import ComponentFailed, Failed, declared, echo, emit, installed_plugins, run_options, wrong_input
-from ibrobot_eval import EVAL
+from ibrobot_core.api import option
+from ibrobot_core.app import (
+    ComponentFailed,
+    Emit,
+    Event,
+    Failed,
+    RequestError,
+    Unsuccessful,
+    echo,
+    installed_plugins,
+    wrong_input,
+)
 from ibrobot_eval.blinded import Blinded, reset_of
 from ibrobot_eval.episodes import Result
 from ibrobot_eval.evaluation import Evaluation, Watch, opened
-from ibrobot_eval.merge import WithMerge
 from ibrobot_eval.operators import AtPage, AtTerminal, Operator
 from ibrobot_eval.options import Begin, EvalOptions, Progress, Told, outcome_of
 from ibrobot_eval.options import Report as ReportEvent
@@ -29,11 +36,8 @@ _INTERRUPTED = 130
 _KEPT = "interrupted; finished episodes are kept: {} to continue"
 
 
-@click.command("eval", cls=WithMerge)
-@declared(EVAL)
-@run_options("overrides")
-@click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
-def evaluate(options: EvalOptions, /, *, overrides: tuple[str, ...], as_json: bool, events: bool) -> None:
+@attrs.frozen(kw_only=True)
+class Evaluate(EvalOptions):
     """Count the successes of policies, and compare them.
 
     Each CONFIG is a robot YAML as for `ibrobot launch`, evaluated in each --mode with each --model. In simulation, all
@@ -47,79 +51,84 @@ def evaluate(options: EvalOptions, /, *, overrides: tuple[str, ...], as_json: bo
     valid however often you look and whenever you stop. Exits with 0 whatever the policies achieve, but with 1 if all
     episodes of one ended in an error.
     """
-    with wrong_input():
-        policies = find_policies(options.config, options.mode, options.model, overrides, options.vary, sim=options.sim)
-        options = attrs.evolve(options, trials=_checked(options, policies))
-        installed_plugins().check_pool(options.on)
-        reset = reset_of(options)
-        try:
-            with opened(options, policies) as evaluation:
-                if options.trials:
-                    report = _judged(options, policies, reset, AtPage() if events else AtTerminal())
+
+    overrides: tuple[str, ...] = option(
+        (), typed="--set PATH=VALUE", label=None, help="override a key, e.g. control.rate_hz=50"
+    )
+    as_json: bool = option(False, typed="--json", label=None, help="print the report as JSON")
+
+    def __call__(self, emit: Emit) -> None:
+        with wrong_input():
+            policies = find_policies(self.config, self.mode, self.model, self.overrides, self.vary, sim=self.sim)
+            options = attrs.evolve(self, trials=_checked(self, policies))
+            installed_plugins().check_pool(options.on)
+            reset = reset_of(options)
+            try:
+                with opened(options, policies) as evaluation:
+                    if options.trials:
+                        report = _judged(options, policies, reset, AtTerminal() if emit is None else AtPage(emit))
+                    else:
+                        report = _evaluated(evaluation, emit, quiet=self.as_json)
+            except KeyboardInterrupt:
+                if emit is not None:
+                    emit(Failed(_KEPT.format("start the same evaluation again")))
                 else:
-                    report = _evaluated(evaluation, events=events, quiet=as_json)
-        except KeyboardInterrupt:
-            if events:
-                emit(EVAL, Failed(_KEPT.format("start the same evaluation again")))
-            else:
-                echo(_KEPT.format("run the same command again"), err=True)
-            sys.exit(_INTERRUPTED)
-    if report is None:
-        if events:
-            emit(EVAL, Told(text="not finished: start the same evaluation again to continue"))
+                    echo(_KEPT.format("run the same command again"), err=True)
+                raise Unsuccessful(exit_code=_INTERRUPTED) from None
+        if report is not None:
+            self._tell(report, emit)
+            if evaluation.broken:
+                raise ComponentFailed(evaluation.broken)
+        elif emit is not None:
+            emit(Told(text="not finished: start the same evaluation again to continue"))
         else:
             echo("not finished: run the same command again to continue")
-    else:
-        _tell(options.out, report, events=events, as_json=as_json)
-        if evaluation.broken:
-            raise ComponentFailed(evaluation.broken)
+
+    def _tell(self, report: Report, emit: Emit) -> None:
+        """Print the report."""
+        if emit is not None:
+            emit(ReportEvent(out=str(self.out), lines=tuple(report.lines())))
+        elif self.as_json:
+            echo(json.dumps(report.facts()))
+        else:
+            for line in report.lines():
+                echo(line)
+            echo(f"report: {self.out / 'report.html'}")
 
 
 def _checked(options: EvalOptions, policies: Sequence[Policy]) -> bool:
     """Return whether the evaluation consists of blinded trials.
 
     Raises:
-        UsageError: for options that do not fit together.
+        RequestError: for options that do not fit together.
     """
     if options.until_decided and len(policies) < 2:
-        raise click.UsageError("--until-decided compares policies: give at least two")
+        raise RequestError("--until-decided compares policies: give at least two")
     simulated = {each.load().simulated for each in policies}
     if len(simulated) > 1:
-        raise click.UsageError("some of the robots are simulated, others are not: add --sim")
+        raise RequestError("some of the robots are simulated, others are not: add --sim")
     trials = options.trials or simulated == {False}
     if trials and options.vary:
-        raise click.UsageError("--vary is for episodes in simulation, not for blinded trials")
+        raise RequestError("--vary is for episodes in simulation, not for blinded trials")
     if options.shard and (trials or options.until_decided):
-        raise click.UsageError("--shard has a fixed number of episodes; give neither --until-decided nor --trials")
+        raise RequestError("--shard has a fixed number of episodes; give neither --until-decided nor --trials")
     if not options.seeds:
-        raise click.UsageError(f"--shard {options.shard}: there are more shards than episodes ({options.episodes})")
+        raise RequestError(f"--shard {options.shard}: there are more shards than episodes ({options.episodes})")
     for given, flag in ((options.reset, "--reset"), (options.reset_task, "--reset-task"), (options.open, "--open")):
         if given and not trials:
-            raise click.UsageError(f"{flag} is for blinded trials, not for episodes in simulation")
+            raise RequestError(f"{flag} is for blinded trials, not for episodes in simulation")
     if options.reset and options.reset_task:
-        raise click.UsageError("--reset and --reset-task exclude each other")
+        raise RequestError("--reset and --reset-task exclude each other")
     return trials
 
 
-def _tell(out: Path, report: Report, *, events: bool, as_json: bool) -> None:
-    """Print the report."""
-    if events:
-        emit(EVAL, ReportEvent(out=str(out), lines=tuple(report.lines())))
-    elif as_json:
-        echo(json.dumps(report.facts()))
-    else:
-        for line in report.lines():
-            echo(line)
-        echo(f"report: {out / 'report.html'}")
-
-
-def _evaluated(evaluation: Evaluation, *, events: bool, quiet: bool) -> Report:
+def _evaluated(evaluation: Evaluation, emit: Emit, *, quiet: bool) -> Report:
     """Run the missing episodes, and write the report."""
-    with (_events if events else _lines)(evaluation, quiet) as watch:
+    with _lines(evaluation, quiet) if emit is None else _events(evaluation, emit) as watch:
         results = evaluation.run(watch)
 
     def filming(failures: int) -> None:
-        if not (events or quiet):
+        if emit is None and not quiet:
             echo(f"filming {failures} failures", err=True)
 
     options = evaluation.options
@@ -149,18 +158,18 @@ def _judged(
 
 
 @contextmanager
-def _events(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
+def _events(evaluation: Evaluation, emit: Callable[[Event], None]) -> Iterator[Watch]:
     """Yield a function that prints an event for each episode."""
     begin = time.monotonic()
     total = len(evaluation.options.seeds) * len(evaluation.policies)
-    emit(EVAL, Begin(of=total, done=evaluation.resumed))
+    emit(Begin(of=total, done=evaluation.resumed))
 
     def tell(done: int, total: int, policy: Policy, result: Result) -> None:
         event = Progress(
             done=done, of=total, policy=policy.label, seed=result.seed, success=result.success, time_s=result.time_s,
             error=result.error if result.is_error else "", seconds=round(time.monotonic() - begin, 1),
         )  # fmt: skip
-        emit(EVAL, event)
+        emit(event)
 
     yield tell
 

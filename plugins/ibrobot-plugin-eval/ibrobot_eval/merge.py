@@ -6,13 +6,12 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, override
+from typing import Any
 
 import attrs
-import click
 from ibrobot_provenance.ownership import Ownership
 
-from ibrobot_core.api import DatasetError
+from ibrobot_core.api import DatasetError, option
 from ibrobot_core.app import echo, wrong_input
 from ibrobot_eval.episodes import Place, Result, write
 from ibrobot_eval.evaluation import ASKED, differences, read_settings
@@ -105,33 +104,20 @@ def _result(parts: Sequence[_Part], label: str, seed: int) -> Result:
     return next(part.results[label][seed] for part in parts if seed in part.results[label])
 
 
-@click.command()
-@click.argument("folders", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder for the whole evaluation.")
-@wrong_input()
-def merge(folders: tuple[Path, ...], out: Path) -> None:
+@attrs.frozen(kw_only=True)
+class Merge:
     """Join evaluations of the same policies on other seeds, e.g. of --shard.
 
     The parts must agree in everything else, and no episode may be in two of them. The result equals that of one
     evaluation of all episodes, and the command without --shard can continue it.
     """
-    report = merge_evaluations(folders, out)
-    for line in report.lines():
-        echo(line)
-    echo(f"report: {out / 'report.html'}")
 
+    folders: tuple[Path, ...] = option(typed="FOLDERS", help="the parts")
+    out: Path = option(help="folder for the whole evaluation")
 
-class WithMerge(click.Command):
-    """The command `eval`, with `eval merge` below it."""
-
-    @override
-    def make_context(
-        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
-    ) -> click.Context:
-        if args[:1] == ["merge"]:
-            return merge.make_context(f"{info_name} merge", args[1:], parent, **extra)
-        return super().make_context(info_name, args, parent, **extra)
-
-    @override
-    def invoke(self, ctx: click.Context) -> Any:
-        return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
+    @wrong_input()
+    def __call__(self) -> None:
+        report = merge_evaluations(self.folders, self.out)
+        for line in report.lines():
+            echo(line)
+        echo(f"report: {self.out / 'report.html'}")

@@ -5,13 +5,12 @@ from __future__ import annotations
 import queue
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import override
 
 from ibrobot_core.api import TeleopError
-from ibrobot_core.app import Choice, KeyReader, Sight, echo, emit
-from ibrobot_eval import EVAL
+from ibrobot_core.app import Choice, Event, KeyReader, Sight, echo
 from ibrobot_eval.options import Told
 from ibrobot_eval.questions import Questions
 
@@ -136,7 +135,8 @@ class AtPage(Operator):
 
     sees = True
 
-    def __init__(self) -> None:
+    def __init__(self, emit: Callable[[Event], None]) -> None:
+        self._emit = emit
         self._questions = Questions()
 
     @override
@@ -145,11 +145,11 @@ class AtPage(Operator):
 
     @override
     def say(self, text: str) -> None:
-        emit(EVAL, Told(text=text))
+        self._emit(Told(text=text))
 
     @override
     def put(self, text: str, choices: Sequence[Choice] = (), sights: Sequence[Sight] = ()) -> None:
-        emit(EVAL, self._questions.next(text, choices, sights))
+        self._emit(self._questions.next(text, choices, sights))
 
     @override
     def answer(self, timeout_s: float) -> str | None:

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import override
 
 import attrs
+from ibrobot_provenance.work_options import on_option, shard_of, shard_option
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Ask, Event, Shown, on_option, shard_of, shard_option
+from ibrobot_core.app import Ask, Event, Shown
 
 SETTINGS = "evaluation.json"
 """File in the folder of an evaluation with its settings."""
@@ -23,7 +24,7 @@ MARGIN = 0.1
 class EvalOptions:
     """Which policies are evaluated, on how many episodes, and where the results go."""
 
-    config: tuple[str, ...] = option(argument=True, names="robot", label="Robot YAML", help="robot YAMLs")
+    config: tuple[str, ...] = option(typed="CONFIG", names="robot", label="Robot YAML", help="robot YAMLs")
     mode: tuple[str, ...] = option((), label="Modes", help="a control mode with a policy; repeatable")
     model: tuple[str, ...] = option(
         (), label="Models", more=True, help="a model of the YAML, in place of the mode's; repeatable"

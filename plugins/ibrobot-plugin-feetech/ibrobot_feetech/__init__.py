@@ -113,9 +113,18 @@ def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot feetech …`."""
     yield Command(
         "feetech",
-        "Set up, calibrate, monitor and emulate the servos of an SO-101.",
-        Late("ibrobot_feetech.commands:feetech").load,
+        summary="Set up, calibrate, monitor and emulate the servos of an SO-101.",
+        about="PORT may be omitted if exactly one SO-101 adapter is plugged in.",
     )
+    yield Command("feetech find-port", Late("ibrobot_feetech.commands.find_port:FindPort"))
+    yield Command("feetech scan", Late("ibrobot_feetech.commands.scan:Scan"))
+    yield Command("feetech setup-motors", Late("ibrobot_feetech.commands.setup_motors:SetUpMotors"))
+    yield Command("feetech calibrate", Late("ibrobot_feetech.commands.calibrate:Calibrate"))
+    yield Command("feetech import", Late("ibrobot_feetech.commands.import_:ImportCalibration"))
+    yield Command("feetech check", Late("ibrobot_feetech.commands.check:CheckArm"))
+    yield Command("feetech monitor", Late("ibrobot_feetech.commands.monitor:Monitor"))
+    yield Command("feetech torque", Late("ibrobot_feetech.commands.torque:Torque"))
+    yield Command("feetech emulate", Late("ibrobot_feetech.commands.emulate:Emulate"))
 
 
 @hookimpl

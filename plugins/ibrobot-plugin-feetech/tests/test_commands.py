@@ -10,13 +10,15 @@ from pathlib import Path
 import attrs
 import pytest
 from click.testing import CliRunner
-from ibrobot_feetech.commands import feetech
 from ibrobot_feetech.commands.joints import Joint, joints_of
 from ibrobot_feetech.commands.ranges import Range, doubtful
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 from ibrobot_testing import terminal as terminal_module
+from ibrobot_testing.command import command_line
 
 from ibrobot_core.api import CalibrationError, load_calibration
+
+feetech = command_line("feetech")
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 MIDDLES = {1: 2500, 2: 300, 3: 2048, 4: 3900, 5: 1000, 6: 100}

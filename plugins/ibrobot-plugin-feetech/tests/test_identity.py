@@ -12,7 +12,6 @@ from click.testing import CliRunner
 from ibrobot_feetech import ibrobot_doctor
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.calibration import save_calibration
-from ibrobot_feetech.commands import feetech
 from ibrobot_feetech.commands.check import differences
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_feetech.errors import PortError, PortForbidden, PortHeld
@@ -20,6 +19,7 @@ from ibrobot_feetech.follower import FeetechFollower
 from ibrobot_feetech.leader import LeaderTeleop
 from ibrobot_feetech.options import FollowerOptions, LeaderOptions
 from ibrobot_feetech.port import SerialPort
+from ibrobot_testing.command import command_line
 from ibrobot_testing.contexts import control_context, host_context
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
@@ -28,6 +28,8 @@ from ibrobot_core.api import HardwareError, TeleopError, load_calibration
 
 from .conftest import arm_calibration, prepare
 from .line import Line
+
+feetech = command_line("feetech")
 
 
 @pytest.fixture(autouse=True)

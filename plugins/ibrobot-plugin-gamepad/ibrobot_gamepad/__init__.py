@@ -45,9 +45,11 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot gamepad …`."""
-    yield Command(
-        "gamepad", "List, test and map gamepads and SpaceMice.", Late("ibrobot_gamepad.commands:gamepad").load
-    )
+    yield Command("gamepad", summary="List, test and map gamepads and SpaceMice.")
+    yield Command("gamepad list", Late("ibrobot_gamepad.commands.show:ListDevices"))
+    yield Command("gamepad test", Late("ibrobot_gamepad.commands.show:ShowControls"))
+    yield Command("gamepad map", Late("ibrobot_gamepad.commands.map_controls:MapControls"))
+    yield Command("gamepad udev", Late("ibrobot_gamepad.commands.show:Udev"))
 
 
 @hookimpl

@@ -11,15 +11,17 @@ import attrs
 import pytest
 import yaml
 from click.testing import CliRunner
-from ibrobot_gamepad import ibrobot_commands, ibrobot_doctor
-from ibrobot_gamepad.commands import gamepad
+from ibrobot_gamepad import ibrobot_doctor
 from ibrobot_gamepad.permissions import checks
+from ibrobot_testing.command import command_line
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import TeleopError
 
 from .fake_hid import DUALSENSE, SPACEMOUSE, FakeHidapi, Plugged, dualsense, mouse_buttons, spacemouse
 from .test_options import ROBOT
+
+gamepad = command_line("gamepad")
 
 
 @attrs.define
@@ -156,8 +158,3 @@ def test_doctor_names_devices_and_what_to_do(hidapi: FakeHidapi, tmp_path: Path,
     )
     assert mouse.ok
     assert (joystick.ok, joystick.remedy) == (False, "sudo usermod -aG input $USER, log in again")
-
-
-def test_the_command_is_offered():
-    (command,) = ibrobot_commands()
-    assert command.load() is gamepad

@@ -18,6 +18,5 @@ def _takes(values: Mapping[str, Any]) -> str:
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot config import` and `ibrobot config schema`."""
     summary = "Make a robot YAML from a config of IB-Robot, Rosetta or LeRobot."
-    yield Command("config import", summary, Late("ibrobot_import.command:import_").load, takes=_takes)
-    summary = "Print a JSON Schema of robot YAMLs, for editors."
-    yield Command("config schema", summary, Late("ibrobot_import.schema:print_schema").load)
+    yield Command("config import", Late("ibrobot_import.command:ImportConfig"), summary, takes=_takes)
+    yield Command("config schema", Late("ibrobot_import.schema:PrintSchema"))

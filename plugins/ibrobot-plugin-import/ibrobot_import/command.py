@@ -10,8 +10,8 @@ from typing import Any
 from uuid import uuid4
 
 import attrs
-import click
 
+from ibrobot_core.api import option
 from ibrobot_core.app import (
     ConfigError,
     Problem,
@@ -60,11 +60,8 @@ class Imported:
         return Counter(each.fate for each in self.verdicts)
 
 
-@click.command("import")
-@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
-@click.argument("out", required=False, type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--contract", "contract", is_flag=True, help="Import the contract of Rosetta alone, to convert its bags.")
-def import_(file: Path, out: Path | None, contract: bool) -> None:
+@attrs.frozen(kw_only=True)
+class ImportConfig:
     """Make a robot YAML from FILE of IB-Robot, Rosetta or LeRobot.
 
     FILE is a robot YAML or contract of IB-Robot, a contract of Rosetta (version 2), or of LeRobot a calibration, or the
@@ -72,25 +69,31 @@ def import_(file: Path, out: Path | None, contract: bool) -> None:
     Comments in OUT say where each line comes from. The command lists the values that were changed, and those that have
     no counterpart, and why.
     """
-    converted = convert_file(file, contract=contract)
-    target = out or Path(f"{converted.name}.yaml")
-    note = write(converted, file, target)
-    count = converted.count()
-    echo(
-        f"{target}: from {converted.format.name}: {count[Fate.TAKEN]} values taken, {count[Fate.CHANGED]} changed, "
-        f"{count[Fate.REFUSED]} without a counterpart"
-    )
-    for fate, title in ((Fate.CHANGED, "changed:"), (Fate.REFUSED, "without a counterpart:")):
-        chosen = [each for each in converted.verdicts if each.fate is fate]
-        for line in (title, *(f"  {each}" for each in chosen)) if chosen else ():
-            echo(line)
-    if note:
-        echo(f"note: {note}")
-    if converted.alone:
-        echo(f"use it: ibrobot convert BAG --config {target} --out DATASET")
-        echo(f"not for ibrobot launch: {_missing(target)}. {_TO_LAUNCH}")
-    else:
-        echo(f"try it: ibrobot launch {target} --sim --mode web --web")
+
+    file: Path = option(typed="FILE", help="the file")
+    out: Path | None = option(None, typed="OUT", help="the new file")
+    contract: bool = option(False, help="import the contract of Rosetta alone, to convert its bags")
+
+    def __call__(self) -> None:
+        converted = convert_file(self.file, contract=self.contract)
+        target = self.out or Path(f"{converted.name}.yaml")
+        note = write(converted, self.file, target)
+        count = converted.count()
+        echo(
+            f"{target}: from {converted.format.name}: {count[Fate.TAKEN]} values taken, {count[Fate.CHANGED]} changed, "
+            f"{count[Fate.REFUSED]} without a counterpart"
+        )
+        for fate, title in ((Fate.CHANGED, "changed:"), (Fate.REFUSED, "without a counterpart:")):
+            chosen = [each for each in converted.verdicts if each.fate is fate]
+            for line in (title, *(f"  {each}" for each in chosen)) if chosen else ():
+                echo(line)
+        if note:
+            echo(f"note: {note}")
+        if converted.alone:
+            echo(f"use it: ibrobot convert BAG --config {target} --out DATASET")
+            echo(f"not for ibrobot launch: {_missing(target)}. {_TO_LAUNCH}")
+        else:
+            echo(f"try it: ibrobot launch {target} --sim --mode web --web")
 
 
 def convert_file(path: Path, *, contract: bool = False) -> Imported:

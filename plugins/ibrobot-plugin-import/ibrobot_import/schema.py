@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import attrs
-import click
 
 from ibrobot_core.api import SceneConfig
 from ibrobot_core.app import (
@@ -40,13 +39,15 @@ _SCALARS: Mapping[Any, Schema] = {
 _BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
 
 
-@click.command("schema")
-def print_schema() -> None:
+@attrs.frozen
+class PrintSchema:
     """Print a JSON Schema of robot YAMLs, for editors.
 
     It has the options of every installed plugin.
     """
-    echo(json.dumps(json_schema(installed_plugins()), indent=2))
+
+    def __call__(self) -> None:
+        echo(json.dumps(json_schema(installed_plugins()), indent=2))
 
 
 def json_schema(registry: Registry) -> Schema:

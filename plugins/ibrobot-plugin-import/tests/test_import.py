@@ -12,9 +12,10 @@ import pytest
 import yaml
 from click.testing import CliRunner
 from ibrobot_import import command
-from ibrobot_import.command import convert_file, import_, write
+from ibrobot_import.command import convert_file, write
 from ibrobot_import.draft import scalar
 from ibrobot_import.source import Fate
+from ibrobot_testing.command import command_line
 
 from ibrobot_core.app import ConfigError, parse_yaml
 
@@ -123,7 +124,9 @@ def test_contract_alone_of_robot_without_driver(name: str, tmp_path: Path) -> No
 
 
 def test_what_a_contract_alone_lacks_for_a_launch_is_printed(tmp_path: Path) -> None:
-    done = CliRunner().invoke(import_, [str(FILES / "ib_robot_contract.yaml"), str(tmp_path / "new.yaml")])
+    done = CliRunner().invoke(
+        command_line("config import"), [str(FILES / "ib_robot_contract.yaml"), str(tmp_path / "new.yaml")]
+    )
     assert done.exit_code == 0, done.output
     assert "12 values taken, 0 changed, 7 without a counterpart" in done.output
     lacks = "it has no robot, executors, control_modes, default_control_mode, hardware"

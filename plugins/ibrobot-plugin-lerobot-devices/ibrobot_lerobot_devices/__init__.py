@@ -85,8 +85,7 @@ def ibrobot_doctor() -> Iterable[Check]:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot lerobot …`."""
-    yield Command(
-        "lerobot",
-        "List LeRobot's robots, teleoperators and cameras.",
-        Late("ibrobot_lerobot_devices.commands:lerobot").load,
-    )
+    yield Command("lerobot", summary="List LeRobot's robots, teleoperators and cameras.")
+    yield Command("lerobot list", Late("ibrobot_lerobot_devices.commands:ListDevices"))
+    yield Command("lerobot new", Late("ibrobot_lerobot_devices.commands:NewRobot"))
+    yield Command("lerobot torque-off", Late("ibrobot_lerobot_devices.commands:TorqueOff"))

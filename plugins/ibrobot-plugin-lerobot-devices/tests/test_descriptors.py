@@ -8,22 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import attrs
-import click
 import ibrobot_lerobot_devices
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from ibrobot_lerobot_devices import link, new_robot, registry
-from ibrobot_lerobot_devices.commands import lerobot
 from ibrobot_lerobot_devices.link import DeviceLink
 from ibrobot_lerobot_devices.options import CameraOptions, CmdVelOptions, RobotOptions, TeleopOptions
+from ibrobot_testing.command import command_line
 from ibrobot_testing.contexts import make_robot
 from ibrobot_testing.descriptor import check_descriptor
 
 from ibrobot_core.api import HardwareError
-from ibrobot_core.app import ConfigError, load_config, parse_yaml
+from ibrobot_core.app import ConfigError, RequestError, load_config, parse_yaml
 
 from .conftest import JOINTS, Motors, install_package
+
+lerobot = command_line("lerobot")
 
 
 @pytest.mark.parametrize(
@@ -208,9 +209,7 @@ class TestNew:
     def test_a_wrong_unit_is_named(self, lerobot: Path, tmp_path: Path, unit: str) -> None:
         install_package(lerobot, "lerobot_robot_strange")
         out = tmp_path / "arm.yaml"
-        with pytest.raises(
-            (HardwareError, click.BadParameter), match=f"'{unit.rpartition('=')[2]}'|has no '(x|)'|say the"
-        ):
+        with pytest.raises((HardwareError, RequestError), match=f"'{unit.rpartition('=')[2]}'|has no '(x|)'|say the"):
             new(out, "strange_follower", "--unit", unit)
         assert not out.exists()
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from ibrobot_core.api import Check, DatasetDescriptor, Late, PolicyDescriptor, ReaderDescriptor, hookimpl
 from ibrobot_core.app import Command
-from ibrobot_lerobot.contents import Contents, InfoOptions
+from ibrobot_lerobot.contents import Contents
 from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions
-from ibrobot_lerobot.training import EVENTS, TrainOptions, check_trainer
+from ibrobot_lerobot.training import EVENTS, check_trainer
 
 
 def _reads(path: Path) -> bool:
@@ -65,26 +65,15 @@ def ibrobot_doctor() -> Iterable[Check]:
     yield check()
 
 
-_DATASETS = Late("ibrobot_lerobot.commands:datasets").load
-INFO = Command("datasets info", "Show what a dataset contains.", _DATASETS, InfoOptions, (Contents,))
-TRAIN = Command(
-    "train",
-    "Train a policy with LeRobot.",
-    Late("ibrobot_lerobot.train:train").load,
-    TrainOptions,
-    EVENTS,
-    check=check_trainer,
-)
-
-
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """`ibrobot datasets info`, `ibrobot export` and `ibrobot train`."""
-    yield Command(
-        "datasets",
-        "Show, join, upload and download LeRobot datasets.",
-        _DATASETS,
-        commands=(INFO,),
-    )
-    yield Command("export", "Convert a checkpoint to run without torch.", Late("ibrobot_lerobot.commands:export").load)
-    yield TRAIN
+    """`ibrobot datasets …`, `ibrobot export` and `ibrobot train`."""
+    commands = "ibrobot_lerobot.commands"
+    yield Command("datasets", summary="Show, join, upload and download LeRobot datasets.")
+    yield Command("datasets info", Late(f"{commands}:ShowDataset"), "Show what a dataset contains.", (Contents,))
+    yield Command("datasets merge", Late(f"{commands}:Merge"))
+    yield Command("datasets push", Late(f"{commands}:Push"))
+    yield Command("datasets pull", Late(f"{commands}:Pull"))
+    yield Command("export", Late(f"{commands}:Export"), "Convert a checkpoint to run without torch.")
+    train = Late("ibrobot_lerobot.train:Train")
+    yield Command("train", train, "Train a policy with LeRobot.", EVENTS, check=check_trainer)

@@ -2,131 +2,143 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
 import attrs
-import click
 from rich.table import Table
 
-from ibrobot_core.app import Screen, declared, echo, emit, wrong_input
-from ibrobot_lerobot import INFO
-from ibrobot_lerobot.contents import FeatureContents, InfoOptions
+from ibrobot_core.api import option
+from ibrobot_core.app import Emit, Screen, echo, wrong_input
+from ibrobot_lerobot.contents import Contents, FeatureContents
 
 
-@click.group()
-def datasets() -> None:
-    """Show, join, upload and download LeRobot datasets."""
-
-
-@datasets.command()
-@declared(INFO)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON, with all episodes.")
-@wrong_input()
-def info(options: InfoOptions, as_json: bool, events: bool) -> None:
+@attrs.frozen(kw_only=True)
+class ShowDataset:
     """Show the counts, features, units and statistics of a DATASET."""
-    from ibrobot_lerobot.read_contents import dataset_contents
 
-    contents = dataset_contents(options.dataset)
-    if events:
-        emit(INFO, contents)
-        return
-    if as_json:
-        echo(json.dumps(attrs.asdict(contents), indent=2))
-        return
-    console = Screen(width=None if sys.stdout.isatty() else 1000)
-    console.print(
-        f"{contents.path}: LeRobot {contents.version}, {contents.episodes} episodes, {contents.frames} frames at "
-        f"{contents.fps:g} Hz, {contents.seconds:.1f} s, {contents.bytes / 1e6:.1f} MB",
-        soft_wrap=True,
-    )
-    for note in contents.notes:
-        console.print(f"note: {note}", soft_wrap=True)
-    for task in contents.tasks:
-        console.print(f"task: {task or '(empty)'}", soft_wrap=True)
-    table = Table(box=None, padding=(0, 1))
-    for heading in ("feature", "type", "shape", "unit", "value", "min", "mean", "max", "std"):
-        table.add_column(heading, justify="right" if heading in ("min", "mean", "max", "std") else "left")
-    for feature in contents.features:
-        for row in _rows(feature):
-            table.add_row(*row)
-    console.print(table)
-    for feature in contents.features:
-        for text in feature.texts:
-            console.print(f"{feature.key}: {text}", soft_wrap=True, markup=False)
+    dataset: Path = option(typed="DATASET", names="dataset", help="the dataset")
+
+    @wrong_input()
+    def __call__(self, emit: Emit) -> Contents | None:
+        from ibrobot_lerobot.read_contents import dataset_contents
+
+        contents = dataset_contents(self.dataset)
+        if emit is None:
+            return contents
+        emit(contents)
+        return None
+
+    def show(self, contents: Contents) -> None:
+        """Print a table of the features."""
+        console = Screen(width=None if sys.stdout.isatty() else 1000)
+        console.print(
+            f"{contents.path}: LeRobot {contents.version}, {contents.episodes} episodes, {contents.frames} frames at "
+            f"{contents.fps:g} Hz, {contents.seconds:.1f} s, {contents.bytes / 1e6:.1f} MB",
+            soft_wrap=True,
+        )
+        for note in contents.notes:
+            console.print(f"note: {note}", soft_wrap=True)
+        for task in contents.tasks:
+            console.print(f"task: {task or '(empty)'}", soft_wrap=True)
+        table = Table(box=None, padding=(0, 1))
+        for heading in ("feature", "type", "shape", "unit", "value", "min", "mean", "max", "std"):
+            table.add_column(heading, justify="right" if heading in ("min", "mean", "max", "std") else "left")
+        for feature in contents.features:
+            for row in _rows(feature):
+                table.add_row(*row)
+        console.print(table)
+        for feature in contents.features:
+            for text in feature.texts:
+                console.print(f"{feature.key}: {text}", soft_wrap=True, markup=False)
 
 
-@datasets.command()
-@click.argument("parts", nargs=-1, required=True, metavar="DATASET...", type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder of the whole dataset.")
-@wrong_input()
-def merge(parts: tuple[Path, ...], out: Path) -> None:
+@attrs.frozen(kw_only=True)
+class Merge:
     """Join datasets, or copy an older one, to LeRobot v3.0.
 
     Those of `ibrobot convert --shard` become one. Datasets must have the same contract and settings, or the same
     features where other programs made them. A single one of v2.0 or v2.1 becomes v3.0. An episode that two of them
     have is an error. Nothing is encoded again.
     """
-    from ibrobot_lerobot.join import join_datasets
 
-    episodes = join_datasets(parts, out)
-    echo(f"{episodes} episodes of {len(parts)} datasets -> {out}")
+    parts: tuple[Path, ...] = option(typed="DATASET", help="the datasets")
+    out: Path = option(help="folder of the whole dataset")
+
+    @wrong_input()
+    def __call__(self) -> None:
+        from ibrobot_lerobot.join import join_datasets
+
+        episodes = join_datasets(self.parts, self.out)
+        echo(f"{episodes} episodes of {len(self.parts)} datasets -> {self.out}")
 
 
-@datasets.command()
-@click.argument("dataset", type=click.Path(path_type=Path))
-@click.argument("repository", metavar="OWNER/NAME")
-@click.option("--private", is_flag=True, help="Make a new repository private.")
-@wrong_input()
-def push(dataset: Path, repository: str, private: bool) -> None:
+@attrs.frozen(kw_only=True)
+class Push:
     """Upload DATASET to the Hugging Face Hub.
 
     The token is that of `hf auth login`, or HF_TOKEN. After an interruption, run the same command again.
     """
-    from ibrobot_lerobot.hub import push as push_dataset
 
-    echo(f"{dataset} -> {push_dataset(dataset, repository, private=private)}")
+    dataset: Path = option(typed="DATASET", help="the dataset")
+    repository: str = option(typed="OWNER/NAME", help="repository on the hub")
+    private: bool = option(False, help="make a new repository private")
+
+    @wrong_input()
+    def __call__(self) -> None:
+        from ibrobot_lerobot.hub import push as push_dataset
+
+        echo(f"{self.dataset} -> {push_dataset(self.dataset, self.repository, private=self.private)}")
 
 
-@datasets.command()
-@click.argument("repository", metavar="OWNER/NAME")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the dataset; by default datasets/NAME.")
-@click.option("--revision", help="A branch, tag or commit; by default the newest.")
-@wrong_input()
-def pull(repository: str, out: Path | None, revision: str | None) -> None:
+@attrs.frozen(kw_only=True)
+class Pull:
     """Download a dataset from the Hugging Face Hub.
 
     After an interruption, run the same command again.
     """
-    from ibrobot_lerobot.hub import pull as pull_dataset
-    from ibrobot_lerobot.read_contents import dataset_contents
 
-    out = out or Path("datasets") / repository.rpartition("/")[2]
-    pull_dataset(repository, out, revision=revision)
-    contents = dataset_contents(out)
-    echo(f"{repository} -> {out}: {contents.episodes} episodes, {contents.frames} frames at {contents.fps:g} Hz")
+    repository: str = option(typed="OWNER/NAME", help="repository on the hub")
+    out: Path | None = option(None, help="folder of the dataset; by default datasets/NAME")
+    revision: str | None = option(None, help="a branch, tag or commit; by default the newest")
+
+    @wrong_input()
+    def __call__(self) -> None:
+        from ibrobot_lerobot.hub import pull as pull_dataset
+        from ibrobot_lerobot.read_contents import dataset_contents
+
+        out = self.out or Path("datasets") / self.repository.rpartition("/")[2]
+        pull_dataset(self.repository, out, revision=self.revision)
+        contents = dataset_contents(out)
+        echo(
+            f"{self.repository} -> {out}: {contents.episodes} episodes, {contents.frames} frames at {contents.fps:g} Hz"
+        )
 
 
-@click.command()
-@click.argument("checkpoint", metavar="CHECKPOINT", type=click.Path(path_type=Path))
-@click.option("--to", "format_", required=True, type=click.Choice(["onnx"]), help="Format.")
-@click.option("--out", type=click.Path(path_type=Path), help="New folder; by default CHECKPOINT-onnx.")
-@wrong_input()
-def export(checkpoint: Path, format_: str, out: Path | None) -> None:
+@attrs.frozen(kw_only=True)
+class Export:
     """Convert CHECKPOINT, a folder of LeRobot, to run without torch.
 
     The new folder has the network as ONNX graphs and a manifest, with the contract and the statistics. A robot runs it
     with a model of type onnx. ACT, VQ-BeT and Diffusion can be converted.
     """
-    from ibrobot_lerobot.export import export_onnx
 
-    exported = export_onnx(checkpoint, out or checkpoint.with_name(f"{checkpoint.name}-{format_}"))
-    echo(
-        f"{exported.type}: {exported.bytes / 1e6:.1f} MB in {exported.seconds:.0f} s; outputs differ from torch's by "
-        f"at most {exported.largest_difference:.1e}"
-    )
-    echo(f"exported: {exported.folder}")
+    checkpoint: Path = option(typed="CHECKPOINT", help="folder of LeRobot")
+    format_: str = option(typed="--to", choices=["onnx"], help="format")
+    out: Path | None = option(None, help="new folder; by default CHECKPOINT-onnx")
+
+    @wrong_input()
+    def __call__(self) -> None:
+        from ibrobot_lerobot.export import export_onnx
+
+        exported = export_onnx(
+            self.checkpoint, self.out or self.checkpoint.with_name(f"{self.checkpoint.name}-{self.format_}")
+        )
+        echo(
+            f"{exported.type}: {exported.bytes / 1e6:.1f} MB in {exported.seconds:.0f} s; outputs differ from "
+            f"torch's by at most {exported.largest_difference:.1e}"
+        )
+        echo(f"exported: {exported.folder}")
 
 
 def _rows(feature: FeatureContents) -> list[tuple[str, ...]]:

@@ -1,22 +1,14 @@
-"""Options and event of `ibrobot datasets info`: the contents of a dataset."""
+"""Event of `ibrobot datasets info`: the contents of a dataset."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import override
 
 import attrs
 
 from ibrobot_core.api import option
 from ibrobot_core.app import Event, Shown
-
-
-@attrs.frozen(kw_only=True)
-class InfoOptions:
-    """Which dataset."""
-
-    dataset: Path = option(argument=True, names="dataset", help="the dataset")
 
 
 @attrs.frozen(kw_only=True)

@@ -13,6 +13,7 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_provenance.robot_metadata import robot_metadata
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
@@ -30,7 +31,6 @@ from ibrobot_core.api import (
     RecorderError,
     TopicSummary,
 )
-from ibrobot_core.app import robot_metadata
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.compose import Composer
 from ibrobot_lerobot.rows import EpisodeRows

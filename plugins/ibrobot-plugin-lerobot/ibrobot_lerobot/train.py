@@ -6,18 +6,16 @@ Several policies, for seeds or other settings, are the jobs of a pool.
 from __future__ import annotations
 
 import itertools
-import sys
 import time
 from collections.abc import Callable, Iterable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import attrs
-import click
 
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import Event, Failed, Job, declared, echo, emit, installed_plugins, wrong_input
-from ibrobot_lerobot import TRAIN
+from ibrobot_core.app import Emit, Event, Failed, Job, Unsuccessful, echo, installed_plugins, wrong_input
 from ibrobot_lerobot.trainer import INTERRUPTED, progress, run_training, saving_step
 from ibrobot_lerobot.training import Begin, Phase, Progress, Report, TrainOptions
 from ibrobot_lerobot.training_checkpoints import TrainingCheckpoint
@@ -31,48 +29,49 @@ _PHASES = {
 _KEPT = "interrupted; the newest checkpoints are kept: the same command continues from there"
 
 
-@click.command(context_settings={"ignore_unknown_options": True})
-@declared(TRAIN)
-@wrong_input()
-def train(options: TrainOptions, events: bool) -> None:
+@attrs.frozen(kw_only=True)
+class Train(TrainOptions):
     """Train a policy on a DATASET with LeRobot, which must be installed.
 
     The same command continues a training that was interrupted, from its newest checkpoint.
     LEROBOT_OPTIONS are passed to lerobot-train, e.g. --seed=1. With --each seed=1,2,3 it trains a policy for each of
     these seeds, in folders below --out.
     """
-    if options.each or options.on:
-        train_several(options, events=events)
-        return
-    code, newest = run_training(options, _report if events else None)
-    if code or newest is None:
-        first = options.save_every or saving_step(options.steps)
-        _tell_end(newest, first, interrupted=code == INTERRUPTED, events=events)
-        sys.exit(code or 1)
-    trained = options.out / "checkpoints" / "last" / newest.policy.name
-    tell(f"trained: {trained}", Report(str(trained)), events=events)
+
+    @wrong_input()
+    def __call__(self, emit: Emit) -> None:
+        if self.each or self.on:
+            train_several(self, emit)
+            return
+        code, newest = run_training(self, partial(_report, emit) if emit is not None else None)
+        if code or newest is None:
+            first = self.save_every or saving_step(self.steps)
+            _tell_end(newest, first, emit, interrupted=code == INTERRUPTED)
+            raise Unsuccessful(exit_code=code or 1)
+        trained = self.out / "checkpoints" / "last" / newest.policy.name
+        tell(f"trained: {trained}", Report(str(trained)), emit)
 
 
-def _tell_end(newest: TrainingCheckpoint | None, first: int, *, interrupted: bool, events: bool) -> None:
+def _tell_end(newest: TrainingCheckpoint | None, first: int, emit: Emit, *, interrupted: bool) -> None:
     """Tell what is kept of a training that has ended early."""
     text = "interrupted" if interrupted else "the training failed"
     if newest is None:
         text += f"; nothing is kept, since the first checkpoint would have been written at step {first}"
     else:
         text += f"; kept: {newest.folder} (step {newest.step}); the same command continues from there"
-    tell(text, Failed(text.replace("the same command", "the same training")), events=events, err=True)
+    tell(text, Failed(text.replace("the same command", "the same training")), emit, err=True)
 
 
-def _report(output: Iterable[str], begun: int, steps: int) -> None:
+def _report(emit: Callable[[Event], None], output: Iterable[str], begun: int, steps: int) -> None:
     """Print the progress as events, and all other lines as they are."""
     begin, reports = time.monotonic(), 0
     first: tuple[int, float] | None = None
     """Step and time [s] of the first report, before which LeRobot loads."""
-    emit(TRAIN, Begin(begun, steps))
-    emit(TRAIN, Phase("loading torch and LeRobot"))
+    emit(Begin(begun, steps))
+    emit(Phase("loading torch and LeRobot"))
     for line in output:
         for text in (text for mark, text in _PHASES.items() if mark in line):
-            emit(TRAIN, Phase(text))
+            emit(Phase(text))
         if (event := progress(line, reports, steps, begun)) is None:
             echo(line.rstrip("\n"), err=True)
             continue
@@ -83,7 +82,7 @@ def _report(output: Iterable[str], begun: int, steps: int) -> None:
             first = step, seconds
         elif step > first[0]:
             left_s = round((seconds - first[1]) / (step - first[0]) * (steps - step), 1)
-        emit(TRAIN, Progress(step=step, steps=steps, loss=loss, lr=rate, seconds=seconds, left_s=left_s))
+        emit(Progress(step=step, steps=steps, loss=loss, lr=rate, seconds=seconds, left_s=left_s))
 
 
 def trainings(options: TrainOptions) -> list[TrainOptions]:
@@ -99,7 +98,7 @@ def trainings(options: TrainOptions) -> list[TrainOptions]:
     return runs
 
 
-def train_several(options: TrainOptions, *, events: bool) -> None:
+def train_several(options: TrainOptions, emit: Emit) -> None:
     """Train all; exits with 1 if some fail, and then keeps the others."""
     jobs = [Job(train_in_pool, each, gpus=1) for each in trainings(options)]
     failed = 0
@@ -109,22 +108,22 @@ def train_several(options: TrainOptions, *, events: bool) -> None:
             for number, done in enumerate(finished, 1):
                 failed += done.error is not None
                 text = f"{done.job.argument.out}: {done.error or 'trained'} ({number} of {len(jobs)})"
-                tell(text, Phase(text), events=events, err=done.error is not None)
+                tell(text, Phase(text), emit, err=done.error is not None)
     except KeyboardInterrupt:
-        tell(_KEPT, Failed(_KEPT), events=events, err=True)
-        sys.exit(130)
+        tell(_KEPT, Failed(_KEPT), emit, err=True)
+        raise Unsuccessful(exit_code=INTERRUPTED) from None
     if failed:
         text = f"{failed} of {len(jobs)} trainings failed; the same command continues with them"
-        tell(text, Failed(text), events=events, err=True)
-        sys.exit(1)
-    if events:
-        emit(TRAIN, Report(str(options.out)))
+        tell(text, Failed(text), emit, err=True)
+        raise Unsuccessful
+    if emit is not None:
+        emit(Report(str(options.out)))
 
 
-def tell(text: str, event: Event, *, events: bool, err: bool = False) -> None:
+def tell(text: str, event: Event, emit: Emit, *, err: bool = False) -> None:
     """Print an event for the program that started the command, or text for a terminal."""
-    if events:
-        emit(TRAIN, event)
+    if emit is not None:
+        emit(event)
     else:
         echo(text, err=err)
 

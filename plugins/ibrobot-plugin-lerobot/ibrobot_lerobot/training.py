@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, override
 
 import attrs
+from ibrobot_provenance.work_options import on_option
 
 from ibrobot_core.api import MissingDependency, how_to_install, option
-from ibrobot_core.app import Event, Shown, on_option
+from ibrobot_core.app import Event, Shown
 
 LEROBOT = "lerobot[dataset,training]"
 SMALL = "small_act"
@@ -68,8 +69,10 @@ def _check_each(instance: object, attribute: object, each: tuple[str, ...]) -> N
 class TrainOptions:
     """What is trained, on what and how long."""
 
-    dataset: Path = option(argument=True, names="dataset", label="Dataset", help="dataset to train on")
-    lerobot_options: tuple[str, ...] = option((), argument=True, label=None, help="further options, e.g. --seed=1")
+    dataset: Path = option(typed="DATASET", names="dataset", label="Dataset", help="dataset to train on")
+    lerobot_options: tuple[str, ...] = option(
+        (), typed="LEROBOT_OPTIONS", names="options", label=None, help="further options, e.g. --seed=1"
+    )
     policy: str = option(
         SMALL,
         choices=POLICIES,

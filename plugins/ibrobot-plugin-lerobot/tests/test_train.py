@@ -16,15 +16,13 @@ from typing import Any
 import attrs
 import pytest
 from click.testing import CliRunner
-from ibrobot_lerobot import TRAIN
 from ibrobot_lerobot import merge as merging
 from ibrobot_lerobot import trainer as lerobot_train
-from ibrobot_lerobot.commands import datasets
-from ibrobot_lerobot.train import train
 from ibrobot_lerobot.trainer import arguments, progress
-from ibrobot_lerobot.training import Begin, Progress, Report, TrainOptions
+from ibrobot_lerobot.training import EVENTS, Begin, Progress, Report, TrainOptions
 from ibrobot_lerobot.training_checkpoints import newest_checkpoint
 from ibrobot_testing import ibrobot_command
+from ibrobot_testing.command import command_line
 from trainer import install
 
 from ibrobot_core.api import DatasetError, Feature, MissingDependency
@@ -33,6 +31,8 @@ from ibrobot_core.app import InUse, RequestError, Shown, decode_event
 from .conftest import CAMERA, FPS, rows, write
 
 FEATURES = {"observation.state": Feature("float32", (2,), ("a.pos", "b.pos")), "observation.images.top": CAMERA}
+
+datasets, train = command_line("datasets"), command_line("train")
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_what_is_shown_of_a_training() -> None:
 
 def test_the_time_left_is_known_after_two_reports(dataset: Path, tmp_path: Path) -> None:
     lines = run(train, dataset, "--out", tmp_path / "out", "--steps", 10, "--events", "--pause=0.01")
-    steps = [event for line in lines if isinstance(event := decode_event(line, TRAIN.events), Progress)]
+    steps = [event for line in lines if isinstance(event := decode_event(line, EVENTS), Progress)]
     assert [each.left_s is None for each in steps] == [True, *[False] * 9]
     assert steps[-1].left_s == 0.0
 
@@ -158,11 +158,11 @@ def interrupted(
 
 SCRIPT = """
 import sys
-from ibrobot_lerobot import TRAIN
+from ibrobot_testing.command import command_line
 from ibrobot_lerobot import merge as merging
 from ibrobot_lerobot import train, trainer
 trainer.find_trainer = lambda: sys.argv[1]
-train.train(sys.argv[2:])
+command_line("train").main(sys.argv[2:])
 """
 
 

@@ -6,15 +6,7 @@ from collections.abc import Iterable
 
 from ibrobot_core.api import DecoderDescriptor, Late, ReaderDescriptor, RecorderDescriptor, hookimpl
 from ibrobot_core.app import Command
-from ibrobot_mcap.changes import (
-    Changed,
-    DeleteOptions,
-    InTrash,
-    MarkOptions,
-    RepairOptions,
-    TrashOptions,
-    TrimOptions,
-)
+from ibrobot_mcap.changes import Changed, InTrash
 from ibrobot_mcap.options import McapOptions
 
 
@@ -47,22 +39,27 @@ def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
     yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), Late("ibrobot_ros2.pictures:decode_picture").load)
 
 
-_EPISODES = Late("ibrobot_mcap.commands:episodes").load
-MARK = Command("episodes mark", "Judge episodes.", _EPISODES, MarkOptions, (Changed,))
-TRIM = Command("episodes trim", "Keep a part of an episode.", _EPISODES, TrimOptions, (Changed,))
-DELETE = Command("episodes delete", "Delete episodes.", _EPISODES, DeleteOptions, (Changed,))
-LIST_TRASH = Command(
-    "episodes trash", "List, restore or delete what is in a trash.", _EPISODES, TrashOptions, (Changed, InTrash)
-)
-REPAIR = Command("episodes repair", "Make unfinished episodes whole.", _EPISODES, RepairOptions, (Changed,))
-_CHANGES = (MARK, TRIM, DELETE, LIST_TRASH, REPAIR)
-
-
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot episodes …` and `ibrobot contract init`."""
-    summary = "List, check, repair, trim, plot and export recorded episodes."
-    yield Command("episodes", summary, _EPISODES, commands=_CHANGES)
     yield Command(
-        "contract", "Draft a contract for foreign bags.", Late("ibrobot_mcap.commands.contract:contract").load
+        "episodes",
+        summary="List, check, repair, trim, plot and export recorded episodes.",
+        about="An episode is a folder such as episodes/pick_cube/episodes/episode_000001. Commands that take several "
+        "episodes also accept a dataset, or the folder of all datasets.",
     )
+    yield Command("episodes list", Late("ibrobot_mcap.commands.list_episodes:ListEpisodes"))
+    yield Command("episodes info", Late("ibrobot_mcap.commands.list_episodes:ShowEpisode"))
+    yield Command("episodes answers", Late("ibrobot_mcap.commands.answers:ShowAnswers"))
+    yield Command("episodes verify", Late("ibrobot_mcap.commands.verify:Verify"))
+    yield Command("episodes plot", Late("ibrobot_mcap.commands.plot:Plot"))
+    yield Command("episodes export", Late("ibrobot_mcap.commands.export:Export"))
+    change = "ibrobot_mcap.commands.change"
+    yield Command("episodes mark", Late(f"{change}:Mark"), "Judge episodes.", (Changed,))
+    yield Command("episodes trim", Late(f"{change}:Trim"), "Keep a part of an episode.", (Changed,))
+    yield Command("episodes delete", Late(f"{change}:Delete"), "Delete episodes.", (Changed,))
+    summary = "List, restore or delete what is in a trash."
+    yield Command("episodes trash", Late(f"{change}:ListTrash"), summary, (Changed, InTrash))
+    yield Command("episodes repair", Late(f"{change}:Repair"), "Make unfinished episodes whole.", (Changed,))
+    yield Command("contract", summary="Draft a contract for foreign bags.")
+    yield Command("contract init", Late("ibrobot_mcap.commands.contract:DraftContract"))

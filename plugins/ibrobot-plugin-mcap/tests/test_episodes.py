@@ -7,15 +7,14 @@ import json
 import shutil
 import sys
 
-import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from ibrobot_mcap import metadata, rewrite
-from ibrobot_mcap.commands import episodes
 from ibrobot_mcap.commands.plot import PlotData, actions_of
 from ibrobot_mcap.reader import Rosbag2Reader
 from ibrobot_mcap.storage import Storage
+from ibrobot_testing.command import command_line
 from mcap.reader import make_reader
 from PIL import Image as Png
 from rosbags.rosbag2 import Reader as RosbagsReader
@@ -24,8 +23,11 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ibrobot_core.api import JointState, RecorderError, String
+from ibrobot_core.app import RequestError
 
 from .conftest import CAMERA, JOINTS, Bench, joints, picture, stamp
+
+episodes = command_line("episodes")
 
 
 def run(*arguments, code=0):
@@ -391,18 +393,13 @@ def test_plot_without_matplotlib_says_how_to_install_it(tmp_path, monkeypatch):
         run("plot", path)
 
 
-def _ended(question):
-    raise click.Abort
-
-
 def test_delete_asks_and_takes_nothing_but_episodes(tmp_path, monkeypatch):
     path = made(tmp_path)
     CliRunner().invoke(episodes, ["delete", str(path)], input="n\n")
     assert path.is_dir()
-    monkeypatch.setattr(click, "confirm", _ended)  # standard input has ended
-    unanswered = CliRunner().invoke(episodes, ["delete", str(path)])
-    assert (unanswered.exit_code, path.is_dir()) == (2, True)
-    assert "Standard input has no answer: run it in a terminal, or give --yes" in unanswered.output
+    with pytest.raises(RequestError, match="Standard input has no answer: run it in a terminal, or give --yes"):
+        CliRunner().invoke(episodes, ["delete", str(path)], catch_exceptions=False)
+    assert path.is_dir()
     with pytest.raises(RecorderError, match="is not an episode; nothing was deleted"):
         run("delete", "--yes", path, tmp_path)
     assert path.is_dir()

@@ -7,13 +7,15 @@ import json
 import pytest
 from click.testing import CliRunner
 from ibrobot_mcap import trash
-from ibrobot_mcap.commands import episodes
 from ibrobot_mcap.commands.find_episodes import episodes_in
 from ibrobot_mcap.reader import Rosbag2Reader
+from ibrobot_testing.command import command_line
 
 from ibrobot_core.api import RecorderError
 
 from .conftest import JOINTS, Bench, read, stamp, summary
+
+episodes = command_line("episodes")
 
 
 @pytest.fixture

@@ -66,9 +66,8 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot config new`."""
-    yield Command(
-        "config new", "Write a robot YAML for the arm in a URDF or MJCF.", Late("ibrobot_mujoco.new_robot:new").load
-    )
+    summary = "Write a robot YAML for the arm in a URDF or MJCF."
+    yield Command("config new", Late("ibrobot_mujoco.new_robot:NewRobot"), summary)
 
 
 @hookimpl

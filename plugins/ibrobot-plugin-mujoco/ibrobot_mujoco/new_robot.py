@@ -12,93 +12,89 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import attrs
-import click
 
-from ibrobot_core.api import HardwareError
-from ibrobot_core.app import ConfigError, dump_yaml, echo, installed_plugins, load_config, wrong_input
+from ibrobot_core.api import HardwareError, option
+from ibrobot_core.app import ConfigError, RequestError, dump_yaml, echo, installed_plugins, load_config, wrong_input
 from ibrobot_mujoco.chains import Chain
 from ibrobot_mujoco.mjcf_model import complete_model
 from ibrobot_mujoco.urdf_model import DrivenJoint, RobotModel, make_model
 
-_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
 
 
-@click.command("new")
-@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--urdf", type=_FILE, help="URDF or xacro file of the arm.")
-@click.option("--mjcf", type=_FILE, help="Instead of a URDF: an MJCF of the arm, whose drives stay.")
-@click.option("--lerobot", metavar="ROBOT", help="Instead of a URDF: a robot of LeRobot's, e.g. koch_follower.")
-@click.option(
-    "--unit",
-    "units",
-    multiple=True,
-    metavar="[NAME=]UNIT",
-    help="With --lerobot: unit of the joint or axis NAME, or of all joints, where LeRobot does not say it.",
-)
-@click.option(
-    "--tip", metavar="LINK", help="Link, body or site whose frame is the tool's.  [default: found by its name]"
-)
-@click.option(
-    "--package",
-    "packages",
-    multiple=True,
-    metavar="NAME=FOLDER",
-    help="Folder of a ROS package that the file names.  [default: a folder of that name above or beside the file]",
-)
-@click.option(
-    "--xacro-arg", "arguments", multiple=True, metavar="NAME=VALUE", help="Value of an argument of a xacro file."
-)
-@click.pass_context
-def new(
-    context: click.Context, out: Path, urdf: Path | None, mjcf: Path | None, lerobot: str | None,
-    units: tuple[str, ...], tip: str | None, packages: tuple[str, ...], arguments: tuple[str, ...],
-) -> None:  # fmt: skip
+@attrs.frozen(kw_only=True)
+class NewRobot:
     """Write a robot YAML for an arm in a URDF or an MJCF, or of LeRobot's.
 
     OUT is a new file, e.g. arm.yaml. Beside it, the folder arm_model holds an MJCF and the meshes. The YAML states
     every value that was guessed. Several arms in one file get a joint group each.
     """
-    if sum(each is not None for each in (urdf, mjcf, lerobot)) != 1:
-        raise click.UsageError("give one of --urdf, --mjcf and --lerobot")
-    if units and lerobot is None:
-        raise click.UsageError("--unit is of --lerobot")
-    if lerobot is not None:
-        context.invoke(_command_of_lerobot(), out=out, robot=lerobot, id_=None, units=units)
-        return
-    source = urdf or mjcf
-    assert source is not None
-    folders = {}
-    for each in packages:
-        name, equals, place = each.partition("=")
-        if not equals or not name or not Path(place).is_dir():
-            raise click.BadParameter(
-                f"expected NAME=FOLDER of an existing folder, got {each!r}", param_hint="--package"
-            )
-        folders[name] = Path(place).absolute()
-    values = {}
-    for each in arguments:
-        name, equals, value = each.partition(":=" if ":=" in each else "=")
-        if not equals or not name:
-            raise click.BadParameter(f"expected NAME=VALUE, got {each!r}", param_hint="--xacro-arg")
-        values[name] = value
-    try:
-        source.read_bytes()
-    except OSError as error:
-        raise click.FileError(str(source), hint=error.strerror) from error
-    with wrong_input(), _prepared(out) as (draft, folder):
-        model = make_model(urdf, folder, folders, tip, values) if urdf else complete_model(source, folder, tip)
-        draft.write_text(robot_yaml(model, source, folder.name), encoding="utf-8")
+
+    out: Path = option(typed="OUT", help="the new file")
+    urdf: Path | None = option(None, help="URDF or xacro file of the arm")
+    mjcf: Path | None = option(None, help="instead of a URDF: an MJCF of the arm, whose drives stay")
+    lerobot: str | None = option(
+        None, typed="--lerobot ROBOT", help="instead of a URDF: a robot of LeRobot's, e.g. koch_follower"
+    )
+    units: tuple[str, ...] = option(
+        (),
+        typed="--unit [NAME=]UNIT",
+        help="with --lerobot: unit of the joint or axis NAME, or of all joints, where LeRobot does not say it",
+    )
+    tip: str | None = option(
+        None, typed="--tip LINK", help="link, body or site whose frame is the tool's; by default found by its name"
+    )
+    packages: tuple[str, ...] = option(
+        (),
+        typed="--package NAME=FOLDER",
+        help="folder of a ROS package that the file names; by default a folder of that name above or beside the file",
+    )
+    arguments: tuple[str, ...] = option((), typed="--xacro-arg NAME=VALUE", help="value of an argument of a xacro file")
+
+    def __call__(self) -> None:
+        if sum(each is not None for each in (self.urdf, self.mjcf, self.lerobot)) != 1:
+            raise RequestError("give one of --urdf, --mjcf and --lerobot")
+        if self.units and self.lerobot is None:
+            raise RequestError("--unit is of --lerobot")
+        if self.lerobot is not None:
+            of_lerobot = installed_plugins().command("lerobot new").options
+            of_lerobot(out=self.out, robot=self.lerobot, units=self.units)()
+            return
+        source = self.urdf or self.mjcf
+        assert source is not None
+        folders = {}
+        for each in self.packages:
+            name, equals, place = each.partition("=")
+            if not equals or not name or not Path(place).is_dir():
+                raise RequestError(f"--package: expected NAME=FOLDER of an existing folder, got {each!r}")
+            folders[name] = Path(place).absolute()
+        values = {}
+        for each in self.arguments:
+            name, equals, value = each.partition(":=" if ":=" in each else "=")
+            if not equals or not name:
+                raise RequestError(f"--xacro-arg: expected NAME=VALUE, got {each!r}")
+            values[name] = value
         try:
-            load_config(draft, sim=True)
-        except ConfigError as error:
-            raise ConfigError(attrs.evolve(each, file=str(out)) for each in error.problems) from None
-    echo(f"{out}: {model.name}, {_summary(model.chains)}")
-    for note in model.notes:
-        echo(f"note: {note}")
-    for doubt in model.doubts:
-        echo(f"check: {doubt}")
-    echo(f"try it: ibrobot launch {out} --sim --mode web --web")
+            source.read_bytes()
+        except OSError as error:
+            raise RequestError(f"{source}: cannot be read: {error.strerror}") from error
+        with wrong_input(), _prepared(self.out) as (draft, folder):
+            model = (
+                make_model(self.urdf, folder, folders, self.tip, values)
+                if self.urdf
+                else complete_model(source, folder, self.tip)
+            )
+            draft.write_text(robot_yaml(model, source, folder.name), encoding="utf-8")
+            try:
+                load_config(draft, sim=True)
+            except ConfigError as error:
+                raise ConfigError(attrs.evolve(each, file=str(self.out)) for each in error.problems) from None
+        echo(f"{self.out}: {model.name}, {_summary(model.chains)}")
+        for note in model.notes:
+            echo(f"note: {note}")
+        for doubt in model.doubts:
+            echo(f"check: {doubt}")
+        echo(f"try it: ibrobot launch {self.out} --sim --mode web --web")
 
 
 @contextmanager
@@ -120,13 +116,6 @@ def _prepared(out: Path) -> Iterator[tuple[Path, Path]]:
                 raise
     except OSError as error:
         raise HardwareError(f"{out} cannot be written: {error.strerror or error}") from error
-
-
-def _command_of_lerobot() -> click.Command:
-    """`ibrobot lerobot new`, of another plugin."""
-    group = installed_plugins().command("lerobot").load()
-    assert isinstance(group, click.Group)
-    return group.commands["new"]
 
 
 def _summary(chains: Sequence[Chain]) -> str:

@@ -13,8 +13,6 @@ from ibrobot_planning.world.engines import find_engines
 from ibrobot_planning.world.options import WorldOptions
 
 if TYPE_CHECKING:
-    import click
-
     from ibrobot_core.api import Robot
     from ibrobot_core.app import Component, RunView
 
@@ -160,22 +158,14 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
     )
 
 
-def _description() -> click.Command:
-    find_engines()
-    from ibrobot_planning.commands.description import description
-
-    return description
-
-
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot plan`, `ibrobot description …` and `ibrobot task …`."""
     yield Command(
-        "plan", "Plan a motion without moving, and print or plot it.", Late("ibrobot_planning.commands.plan:plan").load
+        "plan", Late("ibrobot_planning.commands.plan:PlanMotion"), "Plan a motion without moving, and print or plot it."
     )
-    yield Command("description", "Make files that describe a robot, e.g. an SRDF.", _description)
-    yield Command(
-        "task",
-        "Perform tasks: files of motions, grasps, policies and other steps.",
-        Late("ibrobot_planning.tasks.command:task").load,
-    )
+    yield Command("description", summary="Make files that describe a robot, e.g. an SRDF.")
+    yield Command("description srdf", Late("ibrobot_planning.commands.description:Srdf"))
+    yield Command("task", summary="Perform tasks: files of motions, grasps, policies and other steps.")
+    yield Command("task check", Late("ibrobot_planning.tasks.command:CheckTask"))
+    yield Command("task run", Late("ibrobot_planning.tasks.command:RunTask"))

@@ -10,8 +10,8 @@ import pytest
 from click.testing import CliRunner, Result
 from ibrobot_kinematics.srdf import GroupState, Srdf, read_srdf
 from ibrobot_kinematics.urdf import read_urdf
-from ibrobot_planning.commands.description import description
 from ibrobot_planning.goals.text import target
+from ibrobot_testing.command import command_line
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import PlanningError
@@ -19,6 +19,8 @@ from ibrobot_core.app import ConfigError, installed_plugins, load_config
 
 from .table_arm import ARM
 from .test_motion import robot_yaml
+
+description = command_line("description")
 
 LINKS = ("base", "turret", "upper", "lower", "wrist", "hand", "finger")
 JOINTS = dict(zip((*ARM, "jaw"), pairwise(LINKS), strict=True))

@@ -13,10 +13,10 @@ import pytest
 from click.testing import CliRunner
 from ibrobot_planning import ibrobot_planners
 from ibrobot_planning.client import Client
-from ibrobot_planning.commands.plan import plan
 from ibrobot_planning.execution.requests import GoTo
 from ibrobot_planning.execution.source import GO_TO
 from ibrobot_testing import PlannerSuite
+from ibrobot_testing.command import command_line
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import Context, PlanningError
@@ -34,6 +34,8 @@ from ibrobot_core.app import (
 from .other_planners import BatchOptions, BatchPlanner
 from .table_arm import ARM, make_robot
 from .test_motion import finish, robot_yaml
+
+plan = command_line("plan")
 
 
 class TestBatchPlanner(PlannerSuite):

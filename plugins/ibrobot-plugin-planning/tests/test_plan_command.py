@@ -9,13 +9,15 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
-from ibrobot_planning.commands.plan import plan
+from ibrobot_testing.command import command_line
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import IbrobotError, MissingDependency, NotSupported, PlanningError
 from ibrobot_core.app import ConfigError
 
 from .test_motion import robot_yaml
+
+plan = command_line("plan")
 
 WORLD = "world={objects: {wall: {shape: box, size: [0.3, 0.02, 0.3], position: [0.2, 0, 0.15]}}}"
 

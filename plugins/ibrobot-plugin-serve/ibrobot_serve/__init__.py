@@ -31,4 +31,4 @@ def ibrobot_engines() -> Iterable[EngineDescriptor]:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot serve`."""
-    yield Command("serve", "Run a model for robots on other machines.", Late("ibrobot_serve.command:serve").load)
+    yield Command("serve", Late("ibrobot_serve.command:Serve"), "Run a model for robots on other machines.")

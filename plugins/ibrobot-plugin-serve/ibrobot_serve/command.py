@@ -15,14 +15,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import click
+import attrs
 from ibrobot_http.probes import ProbeServer
 
-from ibrobot_core.api import Context, Policy, RealClock, Robot, Transport, TransportDescriptor
+from ibrobot_core.api import Context, Policy, RealClock, Robot, Transport, TransportDescriptor, option
 from ibrobot_core.app import (
     LogFormatter,
     Override,
     Registry,
+    RequestError,
     RobotConfig,
     apply_overrides,
     build_policy,
@@ -47,91 +48,19 @@ _PORTS = {"openpi": 8000, "gr00t": 5555}
 """Protocols of other projects, with their usual ports."""
 
 
-def _share(ctx: click.Context, param: click.Parameter, value: str) -> float:
+def _share(text: str) -> float:
     """Parse a percentage."""
     try:
-        share = float(value.removesuffix("%")) / 100
+        share = float(text.removesuffix("%")) / 100
     except ValueError:
         share = math.nan
-    if not value.endswith("%") or not 0 <= share <= LARGEST_CANARY:
-        raise click.BadParameter(f"{value!r} is not a percentage from 0% to {LARGEST_CANARY:.0%}, e.g. 10%")
+    if not text.endswith("%") or not 0 <= share <= LARGEST_CANARY:
+        raise RequestError(f"--canary: {text!r} is not a percentage from 0% to {LARGEST_CANARY:.0%}, e.g. 10%")
     return share
 
 
-@click.command()
-@click.argument("what", metavar="CONFIG|MODEL_DIR")
-@click.option("--model", help="Name of the model in CONFIG; optional if it has only one.")
-@click.option("--sim", is_flag=True, help="Read CONFIG as for a simulation: its hardware plugins are not needed.")
-@click.option("--type", "type_", help="Plugin of the policy in MODEL_DIR, e.g. lerobot.")
-@click.option("--name", help="Name of the model for robots; by default its name in CONFIG, or the folder's.")
-@click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="PATH=VALUE",
-    help="Override a key of CONFIG, e.g. control.rate_hz=50, or an option of the policy in MODEL_DIR, e.g. device=cpu.",
-)
-@click.option(
-    "--listen",
-    multiple=True,
-    metavar="ENDPOINT",
-    help="Address for robots, in place of the transport's connect; with MODEL_DIR, by default this machine.",
-)
-@click.option(
-    "--transport",
-    "transport_options",
-    multiple=True,
-    metavar="OPTION=VALUE",
-    help="Option of the transport, e.g. users=users.txt.",
-)
-@click.option("--batch", type=click.IntRange(min=1), default=8, show_default=True, help="Maximum requests per batch.")
-@click.option("--queue", type=click.IntRange(min=1), default=64, show_default=True, help="Maximum waiting requests.")
-@click.option(
-    "--patience",
-    type=click.FloatRange(0, 1000),
-    default=0.0,
-    show_default=True,
-    metavar="MS",
-    help="How long an incomplete batch waits for more requests.",
-)
-@click.option(
-    "--hang-timeout",
-    type=click.FloatRange(min=0, min_open=True),
-    default=30.0,
-    show_default=True,
-    metavar="S",
-    help="A model that works on one batch for longer counts as hanging: requests fail, and the server restarts.",
-)
-@click.option(
-    "--canary",
-    callback=_share,
-    default="0%",
-    show_default=True,
-    metavar="SHARE",
-    help="Share of all robots that try this server although its weights differ, up to 50%; 0%: none.",
-)
-@click.option(
-    "--metrics-port",
-    type=click.IntRange(0, 65535),
-    metavar="PORT",
-    help="Port of 127.0.0.1 for /metrics (Prometheus), /healthz and /readyz; 0: any free port.",
-)
-@click.option(
-    "--drain",
-    type=click.FloatRange(min=0),
-    default=10.0,
-    show_default=True,
-    metavar="S",
-    help="How long to wait for pending requests at the end.",
-)
-@click.option(
-    "--protocol",
-    type=click.Choice(["ibrobot", *_PORTS]),
-    default="ibrobot",
-    show_default=True,
-    help="Protocol of the clients; for openpi and gr00t, --listen is HOST:PORT, by default on this machine.",
-)
-def serve(what: str, **options: Any) -> None:
+@attrs.frozen(kw_only=True)
+class Serve:
     """Run a model for robots on other machines.
 
     CONFIG is a robot YAML, which names model and transport; MODEL_DIR is a folder with a model, for --type.
@@ -139,46 +68,93 @@ def serve(what: str, **options: Any) -> None:
     With --protocol openpi or gr00t, it answers clients of these projects, which must send the key in the environment
     variable IBROBOT_API_KEY, if that is set.
     """
-    registry = installed_plugins()
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
-    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
-    _LOG.setLevel(logging.INFO)
-    if options["protocol"] in _PORTS:
-        _serve_clients(what, registry, options)
-        return
-    with wrong_input():
-        name, policy, make_transport = (
-            _from_folder(Path(what), registry, options) if options["type_"] else _from_config(what, registry, options)
-        )
-    hung = threading.Event()
-    with _loaded(policy, name) as stopping, ExitStack() as ending:
 
-        def replace() -> None:
-            hung.set()
-            stopping.set()
+    what: str = option(typed="CONFIG|MODEL_DIR", help="robot YAML, or folder with a model")
+    model: str | None = option(None, help="name of the model in CONFIG; optional if it has only one")
+    sim: bool = option(False, help="read CONFIG as for a simulation: its hardware plugins are not needed")
+    type_: str | None = option(None, typed="--type", help="plugin of the policy in MODEL_DIR, e.g. lerobot")
+    name: str | None = option(None, help="name of the model for robots; by default its name in CONFIG, or the folder's")
+    overrides: tuple[str, ...] = option(
+        (),
+        typed="--set PATH=VALUE",
+        help="override a key of CONFIG, e.g. control.rate_hz=50, or an option of the policy in MODEL_DIR, "
+        "e.g. device=cpu",
+    )
+    listen: tuple[str, ...] = option(
+        (),
+        typed="--listen ENDPOINT",
+        help="address for robots, in place of the transport's connect; with MODEL_DIR, by default this machine",
+    )
+    transport_options: tuple[str, ...] = option(
+        (), typed="--transport OPTION=VALUE", help="option of the transport, e.g. users=users.txt"
+    )
+    batch: int = option(8, ge=1, help="maximum requests per batch")
+    queue: int = option(64, ge=1, help="maximum waiting requests")
+    patience: float = option(0.0, ge=0, le=1000, unit="ms", help="how long an incomplete batch waits for more requests")
+    hang_timeout: float = option(
+        30.0,
+        gt=0,
+        unit="s",
+        help="a model that works on one batch for longer counts as hanging: requests fail, and the server restarts",
+    )
+    canary: str = option(
+        "0%",
+        typed="--canary SHARE",
+        help="share of all robots that try this server although its weights differ, up to 50%; 0%: none",
+    )
+    metrics_port: int | None = option(
+        None,
+        typed="--metrics-port PORT",
+        ge=0,
+        le=65535,
+        help="port of 127.0.0.1 for /metrics (Prometheus), /healthz and /readyz; 0: any free port",
+    )
+    drain: float = option(10.0, ge=0, unit="s", help="how long to wait for pending requests at the end")
+    protocol: str = option(
+        "ibrobot",
+        choices=("ibrobot", *_PORTS),
+        help="protocol of the clients; for openpi and gr00t, --listen is HOST:PORT, by default on this machine",
+    )
 
-        ending.callback(lambda: _start_again() if hung.is_set() else None)  # closing the policy could hang as well
-        transport = make_transport()
-        ending.callback(transport.close)
-        limits = ServiceOptions(
-            options["batch"], options["queue"], options["patience"] / 1000, options["hang_timeout"],
-            canary=options["canary"],
-        )  # fmt: skip
-        service = InferenceService(policy, transport, name, limits, policy.picture_codec(), replace)
-        with ExitStack() as answering:
-            answering.callback(service.close)
-            service.start()
-            some = f" for {limits.canary:.0%} of the robots" if limits.canary else ""
-            _LOG.info("server %s of %s%s", service.id, name, some)
-            if options["metrics_port"] is not None:
-                metrics = answering.enter_context(closing(ProbeServer(options["metrics_port"], probes(service))))
-                _LOG.info("metrics on %s", metrics.url)
-            echo(f"serving {name} (policy {policy.fingerprint()}); Ctrl-C ends")
-            _show(service, stopping)
-            if not hung.is_set() and not service.drain(options["drain"]):
-                _LOG.warning("pending requests were not answered in time")
-        echo(_line(service.statistics()))
+    def __call__(self) -> None:
+        registry = installed_plugins()
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
+        logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+        _LOG.setLevel(logging.INFO)
+        if self.protocol in _PORTS:
+            _serve_clients(self, registry)
+            return
+        with wrong_input():
+            name, policy, make_transport = _from_folder(self, registry) if self.type_ else _from_config(self, registry)
+        hung = threading.Event()
+        with _loaded(policy, name) as stopping, ExitStack() as ending:
+
+            def replace() -> None:
+                hung.set()
+                stopping.set()
+
+            ending.callback(lambda: _start_again() if hung.is_set() else None)  # closing the policy could hang as well
+            transport = make_transport()
+            ending.callback(transport.close)
+            limits = ServiceOptions(
+                self.batch, self.queue, self.patience / 1000, self.hang_timeout,
+                canary=_share(self.canary),
+            )  # fmt: skip
+            service = InferenceService(policy, transport, name, limits, policy.picture_codec(), replace)
+            with ExitStack() as answering:
+                answering.callback(service.close)
+                service.start()
+                some = f" for {limits.canary:.0%} of the robots" if limits.canary else ""
+                _LOG.info("server %s of %s%s", service.id, name, some)
+                if self.metrics_port is not None:
+                    metrics = answering.enter_context(closing(ProbeServer(self.metrics_port, probes(service))))
+                    _LOG.info("metrics on %s", metrics.url)
+                echo(f"serving {name} (policy {policy.fingerprint()}); Ctrl-C ends")
+                _show(service, stopping)
+                if not hung.is_set() and not service.drain(self.drain):
+                    _LOG.warning("pending requests were not answered in time")
+            echo(_line(service.statistics()))
 
 
 @contextmanager
@@ -203,20 +179,20 @@ def _start_again() -> None:
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
-def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tuple[str, Policy, Callable[[], Transport]]:
+def _from_config(options: Serve, registry: Registry) -> tuple[str, Policy, Callable[[], Transport]]:
     """Name, policy and transport of a robot YAML."""
-    if Path(what).is_dir():
-        raise click.UsageError(f"{what} is a folder: name the plugin of its model, e.g. --type lerobot")
-    path = find_config(what, registry)
-    transport = _transport_type(path, options["overrides"])
-    endpoints = options["listen"] if transport else ()
+    if Path(options.what).is_dir():
+        raise RequestError(f"{options.what} is a folder: name the plugin of its model, e.g. --type lerobot")
+    path = find_config(options.what, registry)
+    transport = _transport_type(path, options.overrides)
+    endpoints = options.listen if transport else ()
     listening = _listening(registry, transport, endpoints, "transport.") if endpoints else []
-    given = [Override.of(f"--transport {each}", f"transport.{each}") for each in options["transport_options"]]
-    changes = (*options["overrides"], *listening, *given)
-    config = load_config(path, overrides=changes, sim=options["sim"], registry=registry, communicates=True)
-    served, section = _of_config(config, path, registry, options), config.transport
+    given = [Override.of(f"--transport {each}", f"transport.{each}") for each in options.transport_options]
+    changes = (*options.overrides, *listening, *given)
+    config = load_config(path, overrides=changes, sim=options.sim, registry=registry, communicates=True)
+    served, section = _of_config(options, config, path, registry), config.transport
     if section is None or section.type == "local":
-        raise click.UsageError(
+        raise RequestError(
             f"{path} names no transport to robots: add "
             f"--set 'transport={{type: {example_type('transport')}}}' --listen ENDPOINT"
         )
@@ -224,56 +200,53 @@ def _from_config(what: str, registry: Registry, options: dict[str, Any]) -> tupl
     return *served, make
 
 
-def _from_folder(
-    folder: Path, registry: Registry, options: dict[str, Any]
-) -> tuple[str, Policy, Callable[[], Transport]]:
+def _from_folder(options: Serve, registry: Registry) -> tuple[str, Policy, Callable[[], Transport]]:
     """Name, policy and transport of a folder with a model."""
-    name, policy, context = _of_folder(folder, registry, options)
+    name, policy, context = _of_folder(options, registry)
     transport = registry.default("transport")
     transports = registry.find("transport", transport)
-    given = [*_listening(registry, transport, options["listen"]), *options["transport_options"]]
+    given = [*_listening(registry, transport, options.listen), *options.transport_options]
     settings = single_options(transports.options, given, "--listen, --transport", "--transport")
     return name, policy, partial(transports.make, settings, context)
 
 
-def _of_folder(folder: Path, registry: Registry, options: dict[str, Any]) -> tuple[str, Policy, Context]:
+def _of_folder(options: Serve, registry: Registry) -> tuple[str, Policy, Context]:
     """Name and policy of a folder with a model, and the context for its transport."""
+    folder = Path(options.what)
     if not folder.is_dir():
-        raise click.UsageError(f"{folder}: no such folder; with --type, give a folder with a model")
-    if options["model"]:
-        raise click.UsageError("--model selects a model of CONFIG; MODEL_DIR has only one, which --name names")
+        raise RequestError(f"{folder}: no such folder; with --type, give a folder with a model")
+    if options.model:
+        raise RequestError("--model selects a model of CONFIG; MODEL_DIR has only one, which --name names")
     context = _context(Robot("server", ()))
-    policies = registry.find("policy", options["type_"])
-    overrides = [f"path={folder.absolute()}", *options["overrides"]]
+    policies = registry.find("policy", options.type_ or "")
+    overrides = [f"path={folder.absolute()}", *options.overrides]
     policy = policies.make(single_options(policies.options, overrides, str(folder)), context)
-    return options["name"] or folder.absolute().name, policy, context
+    return options.name or folder.absolute().name, policy, context
 
 
-def _of_config(config: RobotConfig, path: Path, registry: Registry, options: dict[str, Any]) -> tuple[str, Policy]:
+def _of_config(options: Serve, config: RobotConfig, path: Path, registry: Registry) -> tuple[str, Policy]:
     """Name and policy of the model to serve."""
-    model: str = options["model"] or (next(iter(config.models)) if len(config.models) == 1 else "")
+    model: str = options.model or (next(iter(config.models)) if len(config.models) == 1 else "")
     if model not in config.models:
-        raise click.UsageError(
-            f"--model: one of {', '.join(config.models) or 'none'} in {path}, got {options['model']}"
-        )
-    return options["name"] or model, build_policy(config, registry, model)
+        raise RequestError(f"--model: one of {', '.join(config.models) or 'none'} in {path}, got {options.model}")
+    return options.name or model, build_policy(config, registry, model)
 
 
-def _serve_clients(what: str, registry: Registry, options: dict[str, Any]) -> None:
+def _serve_clients(options: Serve, registry: Registry) -> None:
     """Answer clients of another project until a signal."""
     from ibrobot_serve.client_model import ClientModel
     from ibrobot_serve.gr00t_server import Gr00tServer
     from ibrobot_serve.openpi_server import OpenpiServer
 
-    key, protocol = os.environ.get("IBROBOT_API_KEY") or None, options["protocol"]
-    host, port = _host_and_port(options["listen"], key, _PORTS[protocol])
+    key, protocol = os.environ.get("IBROBOT_API_KEY") or None, options.protocol
+    host, port = _host_and_port(options.listen, key, _PORTS[protocol])
     with wrong_input():
-        if options["type_"]:
-            name, policy, _ = _of_folder(Path(what), registry, options)
+        if options.type_:
+            name, policy, _ = _of_folder(options, registry)
         else:
-            path = find_config(what, registry)
-            config = load_config(path, overrides=options["overrides"], sim=options["sim"], registry=registry)
-            name, policy = _of_config(config, path, registry, options)
+            path = find_config(options.what, registry)
+            config = load_config(path, overrides=options.overrides, sim=options.sim, registry=registry)
+            name, policy = _of_config(options, config, path, registry)
     with _loaded(policy, name) as stopping:
         with wrong_input():
             try:
@@ -281,7 +254,7 @@ def _serve_clients(what: str, registry: Registry, options: dict[str, Any]) -> No
                 kind = OpenpiServer if protocol == "openpi" else Gr00tServer
                 server: OpenpiServer | Gr00tServer = kind(model, host, port, key)
             except OSError as error:
-                raise click.UsageError(f"--listen: {host}:{port} cannot be used: {error.strerror}") from None
+                raise RequestError(f"--listen: {host}:{port} cannot be used: {error.strerror}") from None
         with closing(server):
             scheme = "ws" if protocol == "openpi" else "tcp"
             echo(f"serving {name} to clients of {protocol} on {scheme}://{host}:{server.port}; Ctrl-C ends")
@@ -293,14 +266,14 @@ def _host_and_port(listen: Sequence[str], key: str | None, usual: int = 8000) ->
     """The address of a server for clients of another project; `usual` is its usual port.
 
     Raises:
-        click.UsageError: if it is not one HOST:PORT, or others could use the model without a key.
+        RequestError: if it is not one HOST:PORT, or others could use the model without a key.
     """
     given = listen or (f"127.0.0.1:{usual}",)
     host, _, port = given[0].rpartition(":")
     if len(given) != 1 or not host or not port.isdecimal() or int(port) > 65535:
-        raise click.UsageError(f"--listen: {' '.join(given)!r} must be one HOST:PORT, e.g. 127.0.0.1:8000")
+        raise RequestError(f"--listen: {' '.join(given)!r} must be one HOST:PORT, e.g. 127.0.0.1:8000")
     if key is None and host not in ("127.0.0.1", "localhost", "::1"):
-        raise click.UsageError(
+        raise RequestError(
             f"--listen: other machines could use the model at {host} without a password: set IBROBOT_API_KEY, which "
             "clients then need as their api_key"
         )
@@ -319,7 +292,7 @@ def _listening(registry: Registry, transport: str, endpoints: Sequence[str], sec
     """Overrides of a transport's options, below `section`, for a server that listens."""
     descriptor = registry.find("transport", transport)
     if not isinstance(descriptor, TransportDescriptor) or descriptor.listen is None:
-        raise click.UsageError(f"--listen: a server cannot listen with transport {transport!r}")
+        raise RequestError(f"--listen: a server cannot listen with transport {transport!r}")
     typed = " ".join(f"--listen {each}" for each in endpoints)
     options = descriptor.listen(endpoints)
     return [Override.of(typed, f"{section}{option}={json.dumps(value)}") for option, value in options.items()]

@@ -19,13 +19,14 @@ import jsonschema
 import pytest
 import yaml
 from ibrobot_http.probes import Probes, ProbeServer
-from ibrobot_serve.command import serve
+from ibrobot_testing.command import command_line
 
 DEPLOY = Path(__file__).parents[1] / "deploy"
 SCHEMA = json.loads((Path(__file__).parent / "kubernetes/schema.json").read_text())
 OBJECTS: list[dict[str, Any]] = list(yaml.safe_load_all((DEPLOY / "kubernetes.yaml").read_text()))
 POD = next(each for each in OBJECTS if each["kind"] == "StatefulSet")["spec"]["template"]["spec"]
 CONTAINERFILE = (DEPLOY / "Containerfile").read_text().replace("\\\n", "")
+serve = command_line("serve")
 UNIT = DEPLOY / "ibrobot-serve@.service"
 
 

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import attrs
-import click
 import numpy as np
 import pytest
 from ibrobot_policy_wire import pack, unpack
@@ -20,6 +19,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from ibrobot_core.api import Frame, PolicyError
+from ibrobot_core.app import RequestError
 
 from .client_requests import STATE, damaged
 
@@ -156,8 +156,8 @@ def test_a_policy_that_needs_earlier_observations_is_refused(model: ClientModel)
 def test_the_address_is_checked() -> None:
     assert _host_and_port((), None) == ("127.0.0.1", 8000)
     assert _host_and_port(("0.0.0.0:9000",), "key") == ("0.0.0.0", 9000)
-    with pytest.raises(click.UsageError, match="set IBROBOT_API_KEY"):
+    with pytest.raises(RequestError, match="set IBROBOT_API_KEY"):
         _host_and_port(("0.0.0.0:9000",), None)
     for wrong in (("8000",), ("127.0.0.1:x",), ("127.0.0.1:70000",), ("127.0.0.1:1", "127.0.0.1:2")):
-        with pytest.raises(click.UsageError, match="must be one HOST:PORT"):
+        with pytest.raises(RequestError, match="must be one HOST:PORT"):
             _host_and_port(wrong, None)

@@ -48,9 +48,6 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot ui` and `ibrobot config copy`."""
-    yield Command("ui", "Set up, launch and record robots in the browser.", Late("ibrobot_web.ui.command:ui").load)
-    yield Command(
-        "config copy",
-        "Copy a robot YAML, with your ports and cameras.",
-        Late("ibrobot_web.ui.copying:config_copy").load,
-    )
+    yield Command("ui", Late("ibrobot_web.ui.command:ServeUi"), "Set up, launch and record robots in the browser.")
+    summary = "Copy a robot YAML, with your ports and cameras."
+    yield Command("config copy", Late("ibrobot_web.ui.copying:CopyConfig"), summary)

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 import pytest
 from click.testing import CliRunner, Result
 from fake_runs import site
+from ibrobot_testing.command import command_line
 from ibrobot_testing.terminal import Terminal
-from ibrobot_web.ui.copying import config_copy
 
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site
+
+config_copy = command_line("config copy")
 
 __all__ = ["site"]
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from ibrobot_testing.command import command_line
 from ibrobot_web.playback import Playback
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import choices_of
@@ -130,7 +131,7 @@ def test_a_model_outside_the_opened_folders_is_not_read(episode: Path, tmp_path:
 def run_here(command: Sequence[str], **_: Any) -> subprocess.CompletedProcess[str]:
     """A command in this process, which is faster."""
     group, *arguments = command[len(IBROBOT) :]
-    result = CliRunner().invoke(installed_plugins().commands[group].load(), arguments, catch_exceptions=False)
+    result = CliRunner().invoke(command_line(group), arguments, catch_exceptions=False)
     errors = result.stderr if result.stderr_bytes is not None else ""  # the oldest click mixes it into stdout
     return subprocess.CompletedProcess(command, result.exit_code, result.stdout, errors)
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, override
 
 import attrs
-import click
 import pytest
+from ibrobot_testing.command import command_line
 from ibrobot_web.ui import forms
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
@@ -19,15 +19,15 @@ from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.jobs import answer, event_reader, sight
 
 from ibrobot_core.api import IbrobotError, MissingDependency, option
-from ibrobot_core.app import Ask, Command, Event, Registry, Shown, declared
+from ibrobot_core.app import Ask, Command, Event, Registry, Shown
 from ibrobot_core.events import encode_event
 
 
 @attrs.frozen(kw_only=True)
-class BrewOptions:
+class Brew:
     """An option of each sort."""
 
-    water: Path = option(argument=True, label="Water", help="where it is")
+    water: Path = option(typed="WATER", label="Water", help="where it is")
     beans: tuple[Path, ...] = option((), names="episodes", help="which")
     heat: float = option(95.0, ge=0, le=100, unit="degC", label="Heat", help="how hot")
     cups: int | None = option(None, ge=1, help="how many")
@@ -53,7 +53,7 @@ class Poured(Event):
         return Shown(f"{self.cups} cups", self.cups / self.of, self.spilt, {"cup": self.cups, "ml": 2.5}, made)
 
 
-BREW = Command("brew", "Brew coffee.", lambda: click.Command("brew"), BrewOptions, (Poured,))
+BREW = Command("brew", Brew, "Brew coffee.", (Poured,))
 
 
 @pytest.fixture
@@ -82,12 +82,12 @@ def test_a_form_has_all_that_its_owner_declares(ui: Ui) -> None:
     assert {"value": "so101", "text": "so101"} in form["known"]["robot"]
 
 
-def test_values_of_a_form_become_arguments_that_give_the_same_options(ui: Ui, tmp_path: Path) -> None:
+def test_values_of_a_form_become_arguments_that_give_the_same_options(
+    ui: Ui, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     values = {"water": "well", "cups": 2, "roast": "light", "flavour": ["nut", "berry"], "milk": True, "heat": 90.5}
     found = read_form(ui, BREW, values)
-    assert found == BrewOptions(
-        water=tmp_path / "well", cups=2, roast="light", flavour=("nut", "berry"), milk=True, heat=90.5
-    )
+    assert found == Brew(water=tmp_path / "well", cups=2, roast="light", flavour=("nut", "berry"), milk=True, heat=90.5)
     words = arguments(found)
     assert words == [
         "--heat=90.5",
@@ -100,13 +100,13 @@ def test_values_of_a_form_become_arguments_that_give_the_same_options(ui: Ui, tm
         str(tmp_path / "well"),
     ]
     seen: list[Any] = []
-    attrs_only = attrs.evolve(BREW, events=())
-    click.command()(declared(attrs_only)(seen.append)).main(words, standalone_mode=False)
+    monkeypatch.setattr(Brew, "__call__", lambda self: seen.extend([self]), raising=False)
+    command_line(attrs.evolve(BREW, events=())).main(words, standalone_mode=False)
     assert seen == [found]
 
 
 def test_empty_fields_leave_the_choice_to_the_command(ui: Ui, tmp_path: Path) -> None:
-    assert read_form(ui, BREW, {"water": "a", "cups": "", "heat": None}) == BrewOptions(water=tmp_path / "a")
+    assert read_form(ui, BREW, {"water": "a", "cups": "", "heat": None}) == Brew(water=tmp_path / "a")
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ for number, text, choices in ((1, "go on?", yes_or_no), (2, "why?", ())):
 """
 
     def __init__(self, folder: Path) -> None:
-        command = Command("brew", "Brew coffee.", lambda: click.Command("brew"), BrewOptions, (Poured, Ask))
+        command = Command("brew", Brew, "Brew coffee.", (Poured, Ask))
         self.ui = Ui(Folders([folder]), Jobs(folder))
         self.job = self.ui.jobs.start(
             "brew",

@@ -50,18 +50,24 @@ def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
     yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), Late("ibrobot_ros2.pictures:decode_picture").load)
 
 
-_COMMANDS = {
-    "action": "List actions on the network, and send goals to them.",
-    "bag": "Play recorded episodes to machines on the network.",
-    "topic": "List, show, measure and publish topics shared over the network.",
-    "service": "List, show and call services shared over the network.",
-    "certs": "Make certificates for a server and its robots.",
-}
-"""Commands, each in a module of its name."""
-
-
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
     """Commands for topics, services, bags and certificates."""
-    for name, summary in _COMMANDS.items():
-        yield Command(name, summary, Late(f"ibrobot_zenoh.commands.{name}:{name}").load)
+    yield Command("action", summary="List actions on the network, and send goals to them.")
+    yield Command("action list", Late("ibrobot_zenoh.commands.action:ListActions"))
+    yield Command("action send", Late("ibrobot_zenoh.commands.action:SendGoal"))
+    yield Command("action send_goal", Late("ibrobot_zenoh.commands.action:SendGoal"), hidden=True)
+    yield Command("bag", summary="Play recorded episodes to machines on the network.")
+    yield Command("bag play", Late("ibrobot_zenoh.commands.bag:Play"))
+    yield Command("topic", summary="List, show, measure and publish topics shared over the network.")
+    yield Command("topic list", Late("ibrobot_zenoh.commands.topic:ListTopics"))
+    yield Command("topic echo", Late("ibrobot_zenoh.commands.topic:Echo"))
+    yield Command("topic hz", Late("ibrobot_zenoh.commands.topic:Rate"))
+    yield Command("topic pub", Late("ibrobot_zenoh.commands.topic:Publish"))
+    yield Command("service", summary="List, show and call services shared over the network.")
+    yield Command("service list", Late("ibrobot_zenoh.commands.service:ListServices"))
+    yield Command("service show", Late("ibrobot_zenoh.commands.service:ShowService"))
+    yield Command("service call", Late("ibrobot_zenoh.commands.service:CallService"))
+    yield Command(
+        "certs", Late("ibrobot_zenoh.commands.certs:MakeCertificates"), "Make certificates for a server and its robots."
+    )

@@ -14,7 +14,7 @@ import zenoh
 import zenoh.ext
 from click.testing import CliRunner
 from ibrobot_ros2 import encode
-from ibrobot_zenoh.commands.certs import certs
+from ibrobot_testing.command import command_line
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.ros2 import Node, typed
 from ibrobot_zenoh.transport import ZenohTransport
@@ -24,6 +24,8 @@ from ibrobot_core.api import Message as RosMessage
 from ibrobot_core.app import single_options
 
 from .pair import WAIT_S, free_endpoint, keep
+
+certs = command_line("certs")
 
 REQUESTS = 20
 CLAIMED = [

@@ -11,9 +11,9 @@ import click
 import pytest
 from click.testing import CliRunner
 from ibrobot_ros2.interfaces import action_type, service_type, to_cdr
+from ibrobot_testing.command import command_line
 from ibrobot_zenoh.arrivals import Arrivals
 from ibrobot_zenoh.commands import network as network_module
-from ibrobot_zenoh.commands.action import action
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.ros_goals import Status
 from ibrobot_zenoh.ros_parameters import ParameterType, RosParameters, flat, from_parameter, to_parameter
@@ -22,6 +22,8 @@ from ibrobot_zenoh.transport import ZenohTransport
 from ibrobot_core.api import NotSupported, RealClock, TransportError
 
 from .pair import WAIT_S, client, free_endpoint, router
+
+action = command_line("action")
 
 type Ask = Callable[..., dict[str, Any]]
 GRIP = action_type("control_msgs/action/GripperCommand")

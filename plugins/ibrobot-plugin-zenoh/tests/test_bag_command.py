@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from ibrobot_ros2.codec import decode, encode
+from ibrobot_testing.command import command_line
 from ibrobot_zenoh.commands import network as network_module
-from ibrobot_zenoh.commands.bag import CLOCK, Player, bag, choose, commands
+from ibrobot_zenoh.commands.bag import CLOCK, Player, choose, commands
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
@@ -42,6 +43,8 @@ from ibrobot_core.api import (
 from ibrobot_core.app import Registry
 
 from .pair import WAIT_S, free_endpoint, router
+
+bag = command_line("bag")
 
 START_NS = 1_700_000_000_000_000_000
 MS = 1_000_000

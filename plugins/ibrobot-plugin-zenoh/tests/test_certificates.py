@@ -25,15 +25,18 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import NameOID
 from ibrobot_testing import make_session
+from ibrobot_testing.command import command_line
 from ibrobot_zenoh.certificates import Authority
-from ibrobot_zenoh.commands.certs import certs
 from ibrobot_zenoh.options import Tls
 from ibrobot_zenoh.panel import peer_rows
 from ibrobot_zenoh.reasons import why_not
 
 from ibrobot_core.api import Int32, String, TransportError
+from ibrobot_core.app import RequestError
 
 from .pair import WAIT_S, client, free_endpoint, router, settle, wait_for
+
+certs = command_line("certs")
 
 
 def run(*arguments: Any) -> Result:
@@ -401,6 +404,5 @@ def test_an_authority_that_cannot_sign_is_refused(damage: str, tmp_path: Path):
     [(), ("--robot", "../up"), ("--robot", "robot-1"), ("--server", "a b"), ("--robot", ""), ("--server", ",")],
 )
 def test_wrong_arguments(arguments: tuple[str, ...], tmp_path: Path):
-    result = run(tmp_path / "lab", *arguments)
-    assert result.exit_code == 2
+    assert isinstance(run(tmp_path / "lab", *arguments).exception, RequestError)
     assert not (tmp_path / "lab").exists()

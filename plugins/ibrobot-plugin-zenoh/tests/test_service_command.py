@@ -10,14 +10,16 @@ from click.testing import CliRunner
 from ibrobot_ros2 import CodecError
 from ibrobot_ros2.interfaces import service_type
 from ibrobot_ros2.services import Answer, decode_call, encode_answer, endpoint
+from ibrobot_testing.command import command_line
 from ibrobot_zenoh.commands import network as network_module
-from ibrobot_zenoh.commands.service import service
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
 from ibrobot_core.api import NotSupported, Payload, TransportError
 
 from .pair import WAIT_S, free_endpoint, router
+
+service = command_line("service")
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Never
 
 import attrs
-import click
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import Command, HardwareDescriptor, SensorDescriptor
@@ -41,12 +40,14 @@ def ibrobot_sensors():
     yield SensorDescriptor("fake_arm", unused, "the camera in its hand")
 
 
-@click.command()
-def greet():
+@attrs.frozen
+class Greet:
     """Say hello."""
-    raise HardwareError("nobody there")
+
+    def __call__(self):
+        raise HardwareError("nobody there")
 
 
 @hookimpl
 def ibrobot_commands():
-    yield Command("greet", "Say hello.", lambda: greet)
+    yield Command("greet", Greet)

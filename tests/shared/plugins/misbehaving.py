@@ -56,7 +56,7 @@ WITHOUT_NAME: Mapping[str, Callable[[], object]] = {
     "ibrobot_decoders": lambda: DecoderDescriptor,
     "ibrobot_features": lambda: FeatureDescriptor(3, _nothing, _nothing, _nothing),  # type: ignore[arg-type]
     "ibrobot_configs": lambda: ConfigFile("x", "robot.yaml"),  # type: ignore[arg-type]
-    "ibrobot_commands": lambda: Command(3, "x", _nothing),  # type: ignore[arg-type]
+    "ibrobot_commands": lambda: Command(3),  # type: ignore[arg-type]
     "ibrobot_panels": lambda: PanelDescriptor(3, (), _nothing),  # type: ignore[arg-type]
     "ibrobot_guides": lambda: GuideDescriptor("x", Path("x"), "x", _nothing),  # type: ignore[arg-type]
     "ibrobot_reports": lambda: ReportDescriptor("x", 3, _nothing, _nothing, _nothing),  # type: ignore[arg-type]

@@ -5,21 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, override
 
-import click
+import attrs
 import numpy as np
 
-from ibrobot_core.api import hookimpl
+from ibrobot_core.api import hookimpl, option
 from ibrobot_core.app import (
     Command,
     ControlMode,
     LaunchRequest,
+    ModeOptions,
     Session,
     SourceWorker,
-    find_config,
-    installed_plugins,
-    load_config,
-    run_options,
-    run_overrides,
     run_robot,
 )
 
@@ -59,17 +55,18 @@ class Nod(SourceWorker):
         return {"nodded": self._joint}
 
 
-@click.command()
-@run_options("config", "sim", "lockstep", "mode", "overrides", "viewer", "headless", "dry_run", "as_json")
-@click.option("--joint", required=True)
-def nod(config: str | None, joint: str, **options: Any) -> None:
+@attrs.frozen(kw_only=True)
+class NodOnce(ModeOptions):
     """Nod."""
-    path = find_config(config, installed_plugins())
-    robot = load_config(path, overrides=run_overrides(options), mode=options["mode"], sim=options["sim"])
-    request = LaunchRequest(options["lockstep"], source=lambda session, mode: Nod(session, mode, joint))
-    run_robot(robot, request, headless=options["headless"], dry_run=options["dry_run"], as_json=options["as_json"])
+
+    joint: str = option(help="the joint")
+
+    def __call__(self) -> None:
+        request = LaunchRequest(self.lockstep, source=lambda session, mode: Nod(session, mode, self.joint))
+        robot = self.load(self.mode)
+        run_robot(robot, request, headless=self.headless, dry_run=self.dry_run, as_json=self.as_json)
 
 
 @hookimpl
 def ibrobot_commands() -> Iterator[Command]:
-    yield Command("nod", "Nod.", lambda: nod)
+    yield Command("nod", NodOnce)

@@ -20,7 +20,7 @@ def ibrobot_readers() -> Iterator[ReaderDescriptor]:
 
 @hookimpl
 def ibrobot_commands() -> Iterator[Command]:
-    yield Command("odd", "does odd things", no, takes=no)  # type: ignore[arg-type]
+    yield Command("odd", summary="does odd things", takes=no)  # type: ignore[arg-type]
 
 
 @hookimpl

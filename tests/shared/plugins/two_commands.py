@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import click
-
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import Command
 
 
 @hookimpl
 def ibrobot_commands() -> Iterator[Command]:
-    yield Command("doctor", "treats another patient", lambda: click.Command("doctor"))
-    yield Command("juggle", f"juggles, as {__name__} does", lambda: click.Command("juggle"))
+    yield Command("doctor", summary="treats another patient")
+    yield Command("juggle", summary=f"juggles, as {__name__} does")

@@ -2,39 +2,39 @@
 
 from __future__ import annotations
 
-import json
-
 import attrs
-import click
 from rich.table import Table
 
 from ibrobot_camera import v4l2
 from ibrobot_core.app import Screen, echo, styled
 
 
-@click.command("list")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def list_cameras(as_json: bool) -> None:
+@attrs.frozen
+class ListCameras:
     """List the cameras of this machine.
 
     It shows path, stable id, name, and formats, sizes and rates of each.
     """
-    connected = v4l2.cameras()
-    if as_json:
-        echo(json.dumps([attrs.asdict(camera) for camera in connected], indent=2))
-        return
-    if not connected:
-        echo("no camera: there is no /dev/video*; is it plugged in, and does `lsusb` show it?")
-        return
-    console = Screen()
-    for camera in connected:
-        console.print(styled(camera.path, "bold") + styled(f"  {camera.name}"))
-        if camera.stable_id:
-            console.print(f"  device: {camera.stable_id}", soft_wrap=True)
-        if camera.problem:
-            console.print(styled(f"  {camera.problem}", "red") + styled(": sudo usermod -aG video $USER, log in again"))
-        else:
-            console.print(_table(camera))
+
+    def __call__(self) -> list[v4l2.Camera]:
+        return v4l2.cameras()
+
+    def show(self, connected: list[v4l2.Camera]) -> None:
+        """Print them with their formats."""
+        if not connected:
+            echo("no camera: there is no /dev/video*; is it plugged in, and does `lsusb` show it?")
+            return
+        console = Screen()
+        for camera in connected:
+            console.print(styled(camera.path, "bold") + styled(f"  {camera.name}"))
+            if camera.stable_id:
+                console.print(f"  device: {camera.stable_id}", soft_wrap=True)
+            if camera.problem:
+                console.print(
+                    styled(f"  {camera.problem}", "red") + styled(": sudo usermod -aG video $USER, log in again")
+                )
+            else:
+                console.print(_table(camera))
 
 
 def _table(camera: v4l2.Camera) -> Table:

@@ -9,9 +9,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
-import click
+import attrs
 
-from ibrobot_core.api import SensorError
+from ibrobot_core.api import SensorError, option
 from ibrobot_core.app import echo, on_signals
 
 if TYPE_CHECKING:
@@ -57,38 +57,41 @@ class Newest:
                 self._changed.notify_all()
 
 
-@click.command()
-@click.argument("source")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="0: any free port.")
-@click.option("--seconds", type=click.FloatRange(min=0), help="Stop after this many seconds.")
-def preview(source: str, host: str, port: int, seconds: float | None) -> None:
+@attrs.frozen(kw_only=True)
+class Preview:
     """Show the cameras of SOURCE in a browser.
 
     Prints the page's address, which contains a secret token. Without --host, only this machine can open it. To open it
     from another machine, set --port and run `ssh -L 8000:127.0.0.1:PORT robot`. Ctrl-C ends it.
     """
-    from ibrobot_camera.commands.sources import opened
 
-    ended = threading.Event()
-    on_signals(ended.set)
-    token = secrets.token_urlsafe(16)
-    with opened(source) as cameras:
-        views = {name: Newest(name, camera, ended) for name, camera in cameras.items()}
-        server = ThreadingHTTPServer((host, port), _handler(views, token, ended))
-        server.daemon_threads = True
-        for thread in (*(view.thread for view in views.values()), threading.Thread(target=server.serve_forever)):
-            thread.start()
-        echo(f"http://{host}:{server.server_address[1]}/?token={token}")
-        ended.wait(seconds)
-        ended.set()
-        server.shutdown()
-        server.server_close()
+    source: str = option(typed="SOURCE", help="a device, or a robot YAML")
+    host: str = option("127.0.0.1", help="address to listen on")
+    port: int = option(0, ge=0, le=65535, help="0: any free port")
+    seconds: float | None = option(None, ge=0, help="stop after this many seconds")
+
+    def __call__(self) -> None:
+        from ibrobot_camera.commands.sources import opened
+
+        ended = threading.Event()
+        on_signals(ended.set)
+        token = secrets.token_urlsafe(16)
+        with opened(self.source) as cameras:
+            views = {name: Newest(name, camera, ended) for name, camera in cameras.items()}
+            server = ThreadingHTTPServer((self.host, self.port), _handler(views, token, ended))
+            server.daemon_threads = True
+            for thread in (*(view.thread for view in views.values()), threading.Thread(target=server.serve_forever)):
+                thread.start()
+            echo(f"http://{self.host}:{server.server_address[1]}/?token={token}")
+            ended.wait(self.seconds)
+            ended.set()
+            server.shutdown()
+            server.server_close()
+            for view in views.values():
+                view.thread.join()
         for view in views.values():
-            view.thread.join()
-    for view in views.values():
-        if view.problem:
-            raise click.ClickException(view.problem)
+            if view.problem:
+                raise SensorError(view.problem)
 
 
 def _handler(views: dict[str, Newest], token: str, ended: threading.Event) -> type[BaseHTTPRequestHandler]:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-import click
+import attrs
 
-from ibrobot_core.api import Calibration, HardwareError, IbrobotError, JointCalibration, calibration_path
+from ibrobot_core.api import Calibration, HardwareError, IbrobotError, JointCalibration, calibration_path, option
 from ibrobot_core.app import Declined, Guide
 from ibrobot_feetech.arm import calibrated_registers, relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
@@ -17,7 +17,7 @@ from ibrobot_feetech.calibration import ZERO_AT, save_calibration
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import by_servo, joints_of
 from ibrobot_feetech.commands.measure import Answers, Measurement
-from ibrobot_feetech.commands.ports import opened, port_argument
+from ibrobot_feetech.commands.ports import OnPort, opened
 from ibrobot_feetech.commands.zero import zero_text
 from ibrobot_feetech.usb import usb_port
 
@@ -25,44 +25,41 @@ FULL_TURN = ("wrist_roll",)
 """Joints of an SO-101 that can make a full turn."""
 
 
-@click.command()
-@port_argument
-@click.option("--name", help="Name of the calibration, or a path.  [default: so101_follower, or so101_leader]")
-@click.option("--leader", is_flag=True, help="A leader arm, whose gripper has a different range.")
-@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
-@click.option("--arm", help="Name of the arm, for the records.  [default: the adapter's serial number]")
-@click.option(
-    "--full-turn", multiple=True, default=FULL_TURN, show_default=True, help="Joint that can make a full turn."
-)
-@click.option(
-    "--zero-at",
-    type=click.Choice(list(ZERO_AT)),
-    default="pose",
-    show_default=True,
-    help="0 rad: the middle pose, set by hand, or the middle of each range, as in LeRobot.",
-)
-@click.option("--prefix", default="", help="Prefix of the joints' names, e.g. left_ for one of two arms.")
-@click.option("--check-signs", is_flag=True, help="Ask to turn each joint in its positive direction.")
-@click.option("--middle-now", is_flag=True, help="The arm is in its middle pose: do not ask.")
-@click.option("--range-seconds", type=click.FloatRange(0.1), help="Measure the ranges for this long, not until Enter.")
-@click.option("--accept-ranges", is_flag=True, help="Accept ranges that differ from the joints' limits.")
-@click.option("--yes", is_flag=True, help="Switch torque off and overwrite without asking; the old file is kept.")
-def calibrate(
-    port: str | None, name: str | None, leader: bool, robot: str | None, arm: str | None, full_turn: tuple[str, ...],
-    zero_at: str, prefix: str, check_signs: bool, middle_now: bool, range_seconds: float | None, accept_ranges: bool,
-    yes: bool,
-) -> None:  # fmt: skip
+@attrs.frozen(kw_only=True)
+class Calibrate(OnPort):
     """Calibrate an arm, moving its joints by hand.
 
     Put it in its middle pose, then move each joint to both ends of its range.
 
     Nothing is written to the servos or to disk before everything is measured.
     """
-    calibrate_arm(
-        TerminalGuide(), port, name or ("so101_leader" if leader else "so101_follower"), leader=leader, robot=robot,
-        arm=arm, full_turn=full_turn, zero_at=zero_at, prefix=prefix, yes=yes,
-        answers=Answers(middle_now, range_seconds, accept_ranges, check_signs),
-    )  # fmt: skip
+
+    name: str | None = option(
+        None, help="name of the calibration, or a path; by default so101_follower, or so101_leader"
+    )
+    leader: bool = option(False, help="a leader arm, whose gripper has a different range")
+    robot: str | None = option(None, typed="--robot CONFIG", help="robot YAML with the joints; by default an SO-101")
+    arm: str | None = option(None, help="name of the arm, for the records; by default the adapter's serial number")
+    full_turn: tuple[str, ...] = option(FULL_TURN, help="joint that can make a full turn")
+    zero_at: str = option(
+        "pose",
+        choices=tuple(ZERO_AT),
+        help="0 rad: the middle pose, set by hand, or the middle of each range, as in LeRobot",
+    )
+    prefix: str = option("", help="prefix of the joints' names, e.g. left_ for one of two arms")
+    check_signs: bool = option(False, help="ask to turn each joint in its positive direction")
+    middle_now: bool = option(False, help="the arm is in its middle pose: do not ask")
+    range_seconds: float | None = option(None, ge=0.1, help="measure the ranges for this long, not until Enter")
+    accept_ranges: bool = option(False, help="accept ranges that differ from the joints' limits")
+    yes: bool = option(False, help="switch torque off and overwrite without asking; the old file is kept")
+
+    def __call__(self) -> None:
+        calibrate_arm(
+            TerminalGuide(), self.port, self.name or ("so101_leader" if self.leader else "so101_follower"),
+            leader=self.leader, robot=self.robot, arm=self.arm, full_turn=self.full_turn, zero_at=self.zero_at,
+            prefix=self.prefix, yes=self.yes,
+            answers=Answers(self.middle_now, self.range_seconds, self.accept_ranges, self.check_signs),
+        )  # fmt: skip
 
 
 def calibrate_arm(

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 
 import attrs
-import click
 
-from ibrobot_core.api import Calibration, load_calibration
-from ibrobot_core.app import Declined, Guide
+from ibrobot_core.api import Calibration, load_calibration, option
+from ibrobot_core.app import Declined, Guide, Unsuccessful
 from ibrobot_feetech.arm import calibrated_registers, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import joints_of
-from ibrobot_feetech.commands.ports import opened, port_argument
+from ibrobot_feetech.commands.ports import OnPort, opened
 from ibrobot_feetech.commands.zero import zero_text
 from ibrobot_feetech.errors import NoReply
 from ibrobot_feetech.options import TOOL, FollowerOptions
@@ -39,16 +37,18 @@ class Difference:
     matters: bool = True
 
 
-@click.command()
-@port_argument
-@click.option("--name", default="so101_follower", show_default=True, help="Name of the calibration, or a path.")
-@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
-@click.option("--write", is_flag=True, help="Write the file's values to servos that differ; switches their torque off.")
-@click.option("--yes", is_flag=True, help="Write without asking.")
-def check(port: str | None, name: str, robot: str | None, write: bool, yes: bool) -> None:
+@attrs.frozen(kw_only=True)
+class CheckArm(OnPort):
     """Compare the servos with a calibration. If they differ, print a table and exit with 1."""
-    if not check_arm(TerminalGuide(), port, name, robot=robot, write=write, yes=yes):
-        sys.exit(1)
+
+    name: str = option("so101_follower", help="name of the calibration, or a path")
+    robot: str | None = option(None, typed="--robot CONFIG", help="robot YAML with the joints; by default an SO-101")
+    write: bool = option(False, help="write the file's values to servos that differ; switches their torque off")
+    yes: bool = option(False, help="write without asking")
+
+    def __call__(self) -> None:
+        if not check_arm(TerminalGuide(), self.port, self.name, robot=self.robot, write=self.write, yes=self.yes):
+            raise Unsuccessful
 
 
 def check_arm(

@@ -9,22 +9,14 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import override
 
-import click
 from rich.box import SIMPLE_HEAD
 from rich.live import Live
 from rich.table import Table
 
-from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Guide, KeyReader, Screen, echo
+from ibrobot_core.app import Guide, KeyReader, RequestError, Screen, confirm, echo, prompt
 
 _PERIOD_S = 0.03
 """Time between two updates of a table [s]."""
-
-
-class Unanswered(IbrobotError):
-    """A question without a terminal, e.g. in a script that lacks the flag that answers it."""
-
-    exit_code = 2
 
 
 def interactive() -> bool:
@@ -53,9 +45,7 @@ class TerminalGuide(Guide):
 
     @override
     def confirm(self, question: str, *, flag: str = "", default: bool = False) -> bool:
-        if not interactive():
-            raise Unanswered(f"{question} There is no terminal to ask; run the command in one, or give {flag}")
-        return click.confirm(question, default=default)
+        return confirm(question, flag=flag, default=default)
 
     @override
     def wait(
@@ -64,9 +54,9 @@ class TerminalGuide(Guide):
     ) -> None:  # fmt: skip
         if seconds is None and not interactive():
             done = f"{request} " if rows is None else ""
-            raise Unanswered(f"{done}There is no terminal to press Enter in; run the command in one, or give {flag}")
+            raise RequestError(f"{done}There is no terminal to press Enter in; run the command in one, or give {flag}")
         if rows is None:
-            click.prompt(f"{request} Then press Enter", default="", show_default=False, prompt_suffix=" ")
+            prompt(f"{request} Then press Enter ", flag=flag)
             return
         end = "Enter ends it" if seconds is None else f"for {seconds:g} s"
         echo(f"{request.removesuffix('.')} ({end}).")

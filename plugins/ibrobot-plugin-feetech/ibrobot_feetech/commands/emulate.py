@@ -11,10 +11,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
+import attrs
 
-from ibrobot_core.api import Calibration, JointCalibration, calibration_path, load_calibration
-from ibrobot_core.app import echo, on_signals
+from ibrobot_core.api import Calibration, JointCalibration, calibration_path, load_calibration, option
+from ibrobot_core.app import RequestError, echo, on_signals
 from ibrobot_feetech.arm import Arm, calibrated_registers
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.commands.joints import SO101
@@ -29,72 +29,81 @@ if TYPE_CHECKING:
 _JOINTS = tuple(SO101)
 _GRIPPER = _JOINTS[-1]
 
+_CHANCES = ("drop", "corrupt", "duplicate", "late", "late_s", "delay_s")
+"""The options that are attributes of the emulator's faults."""
 _PRIORITY = 70
 """Real-time priority, above that of a control process, which waits for the servos."""
 _SWITCH_S = 2e-4
 """Longest time for which the physics may delay the servos' answers [s]."""
 
 
-@click.command()
-@click.option(
-    "--servos", type=click.IntRange(1, 253), default=6, show_default=True, help="How many servos, ids from 1."
-)
-@click.option("--baud", type=int, default=1_000_000, show_default=True, help="Initial baud rate of the servos.")
-@click.option("--throttle", is_flag=True, help="Delay bytes by their time on a real wire.")
-@click.option("--link", type=click.Path(path_type=Path), help="Path of a symbolic link to the port.")
-@click.option("--calibration", metavar="NAME", help="Calibration of the servos; created if it does not exist.")
-@click.option("--prefix", default="", help="Prefix of the joints' names, e.g. left_ for one of two arms.")
-@click.option("--physics", metavar="CONFIG", help="Move the joints with the simulation of this robot YAML.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of random faults and of the scene.")
-@click.option("--drop", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply is lost.")
-@click.option("--corrupt", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply's byte is damaged.")
-@click.option("--duplicate", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply is sent twice.")
-@click.option("--late", type=click.FloatRange(0, 1), default=0.0, help="Probability that a reply is late.")
-@click.option("--late-s", type=click.FloatRange(min=0), default=0.05, show_default=True, help="How late [s].")
-@click.option("--delay-s", type=click.FloatRange(min=0), default=0.0, help="Additional delay of every reply [s].")
-@click.option("--silent", type=int, multiple=True, metavar="ID", help="A servo that ignores requests.")
-@click.option("--blocked", type=int, multiple=True, metavar="ID", help="A servo whose joint does not move.")
-@click.option("--overloaded", type=int, multiple=True, metavar="ID", help="A servo under its maximum load.")
-@click.option("--disconnected", type=int, multiple=True, metavar="ID", help="A servo without its cable.")
-@click.option("--error", "errors", type=(int, int), multiple=True, metavar="ID BITS", help="Error bits of a servo.")
-def emulate(
-    servos: int, baud: int, throttle: bool, link: Path | None, calibration: str | None, prefix: str,
-    physics: str | None, seed: int, silent: tuple[int, ...], blocked: tuple[int, ...], overloaded: tuple[int, ...],
-    disconnected: tuple[int, ...], errors: tuple[tuple[int, int], ...], **chances: float,
-) -> None:  # fmt: skip
+@attrs.frozen(kw_only=True)
+class Emulate:
     """Emulate a bus of STS3215 servos on a pseudo-terminal.
 
     The first line of the output is the path of the port. With --physics the simulation of a robot YAML moves the
     joints, and the run that uses the port can read the simulation's scene. Ctrl-C ends it.
     """
-    from ibrobot_feetech.emulator import Emulator
 
-    if link is not None and link.exists() and not link.is_symlink():
-        raise click.BadParameter(f"{link} exists already and is not a link: choose another path", param_hint="--link")
-    ended = threading.Event()
-    on_signals(ended.set)
-    config = _config(physics) if physics is not None else None
-    joints = config.robot.joint_names if config is not None else [f"{prefix}{joint}" for joint in _JOINTS[:servos]]
-    count = len(joints) if config is not None else servos
-    with ExitStack() as stack:
-        emulator = stack.enter_context(Emulator(count, baud_rate=baud, throttle=throttle, seed=seed, link=link))
-        for name, value in chances.items():
-            setattr(emulator.faults, name, value)
-        faults = emulator.faults
-        faults.silent, faults.blocked = set(silent), set(blocked)
-        faults.overloaded, faults.disconnected = set(overloaded), set(disconnected)
-        faults.errors = dict(errors)
-        calibrated = _calibrate(emulator, calibration, joints, config.robot if config is not None else None)
-        echo(str(link) if link is not None else emulator.port)
-        arm = None
-        if config is not None:
-            assert calibrated is not None
-            arm = _physics(config, calibrated, emulator, seed)
-            arm.start()
-            stack.callback(arm.stop)
-        _hurry()
-        echo(f"{count} servos at {baud} baud; Ctrl-C ends it", err=True)
-        _wait(ended, arm)
+    servos: int = option(6, ge=1, le=253, help="how many servos, ids from 1")
+    baud: int = option(1_000_000, help="initial baud rate of the servos")
+    throttle: bool = option(False, help="delay bytes by their time on a real wire")
+    link: Path | None = option(None, help="path of a symbolic link to the port")
+    calibration: str | None = option(
+        None, typed="--calibration NAME", help="calibration of the servos; created if it does not exist"
+    )
+    prefix: str = option("", help="prefix of the joints' names, e.g. left_ for one of two arms")
+    physics: str | None = option(
+        None, typed="--physics CONFIG", help="move the joints with the simulation of this robot YAML"
+    )
+    seed: int = option(0, help="seed of random faults and of the scene")
+    drop: float = option(0.0, ge=0, le=1, help="probability that a reply is lost")
+    corrupt: float = option(0.0, ge=0, le=1, help="probability that a reply's byte is damaged")
+    duplicate: float = option(0.0, ge=0, le=1, help="probability that a reply is sent twice")
+    late: float = option(0.0, ge=0, le=1, help="probability that a reply is late")
+    late_s: float = option(0.05, ge=0, unit="s", help="how late")
+    delay_s: float = option(0.0, ge=0, unit="s", help="additional delay of every reply")
+    silent: tuple[int, ...] = option((), typed="--silent ID", help="a servo that ignores requests")
+    blocked: tuple[int, ...] = option((), typed="--blocked ID", help="a servo whose joint does not move")
+    overloaded: tuple[int, ...] = option((), typed="--overloaded ID", help="a servo under its maximum load")
+    disconnected: tuple[int, ...] = option((), typed="--disconnected ID", help="a servo without its cable")
+    errors: tuple[tuple[int, int], ...] = option((), typed="--error ID BITS", help="error bits of a servo")
+
+    def __call__(self) -> None:
+        from ibrobot_feetech.emulator import Emulator
+
+        if self.link is not None and self.link.exists() and not self.link.is_symlink():
+            raise RequestError(f"--link: {self.link} exists already and is not a link: choose another path")
+        ended = threading.Event()
+        on_signals(ended.set)
+        config = _config(self.physics) if self.physics is not None else None
+        joints = (
+            config.robot.joint_names
+            if config is not None
+            else [f"{self.prefix}{joint}" for joint in _JOINTS[: self.servos]]
+        )
+        count = len(joints) if config is not None else self.servos
+        with ExitStack() as stack:
+            emulator = stack.enter_context(
+                Emulator(count, baud_rate=self.baud, throttle=self.throttle, seed=self.seed, link=self.link)
+            )
+            for name in _CHANCES:
+                setattr(emulator.faults, name, getattr(self, name))
+            faults = emulator.faults
+            faults.silent, faults.blocked = set(self.silent), set(self.blocked)
+            faults.overloaded, faults.disconnected = set(self.overloaded), set(self.disconnected)
+            faults.errors = dict(self.errors)
+            calibrated = _calibrate(emulator, self.calibration, joints, config.robot if config is not None else None)
+            echo(str(self.link) if self.link is not None else emulator.port)
+            arm = None
+            if config is not None:
+                assert calibrated is not None
+                arm = _physics(config, calibrated, emulator, self.seed)
+                arm.start()
+                stack.callback(arm.stop)
+            _hurry()
+            echo(f"{count} servos at {self.baud} baud; Ctrl-C ends it", err=True)
+            _wait(ended, arm)
 
 
 def _hurry() -> None:
@@ -136,7 +145,7 @@ def _physics(config: RobotConfig, calibration: Calibration, emulator: Emulator, 
             config, installed_plugins(), Arm(robot.joint_names, calibration, closed), emulator, socket, seed
         )
     except OSError as error:
-        raise click.BadParameter(f"cannot create a socket at {socket}: {error}", param_hint="--link") from None
+        raise RequestError(f"--link: cannot create a socket at {socket}: {error}") from None
     echo(f"signals on {socket}")
     return arm
 

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import click
+import attrs
 
-from ibrobot_core.api import HardwareError
+from ibrobot_core.api import HardwareError, option
 from ibrobot_core.app import Guide
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.usb import UsbPort, usb_ports
 
 
-@click.command()
-@click.option("--list", "only_list", is_flag=True, help="Only list the ports.")
-def find_port(only_list: bool) -> None:
+@attrs.frozen(kw_only=True)
+class FindPort:
     """Find the port of an arm by unplugging its USB cable."""
-    guide = TerminalGuide()
-    before = list_ports(guide)
-    if not only_list:
-        find_arm(guide, before)
+
+    only_list: bool = option(False, typed="--list", help="only list the ports")
+
+    def __call__(self) -> None:
+        guide = TerminalGuide()
+        before = list_ports(guide)
+        if not self.only_list:
+            find_arm(guide, before)
 
 
 def list_ports(guide: Guide) -> list[UsbPort]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import attrs
-import click
 
-from ibrobot_core.api import Calibration, CalibrationError, HardwareError, calibration_path, load_calibration
+from ibrobot_core.api import Calibration, CalibrationError, HardwareError, calibration_path, load_calibration, option
 from ibrobot_core.app import Declined, echo
 from ibrobot_feetech.calibration import ZERO_AT, save_calibration
 from ibrobot_feetech.commands.calibrate import backup
@@ -18,46 +17,50 @@ from ibrobot_feetech.commands.zero import zero_text
 from ibrobot_feetech.usb import usb_port
 
 
-@click.command("import")
-@click.argument("file")
-@click.option("--name", help="Name of the new calibration, or a path.  [default: FILE itself]")
-@click.option(
-    "--zero-at",
-    type=click.Choice(list(ZERO_AT)),
-    help="0 rad: the pose set by hand, or the middle of each range.  [default: that of FILE; range for LeRobot's]",
-)
-@click.option("--port", help="Port of the arm, to store the serial number of its adapter.")
-@click.option("--arm", help="Name of the arm, for the records.")
-@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
-@click.option("--prefix", default="", help="Prefix of the joints' names, e.g. left_ for one of two arms.")
-@click.option("--yes", is_flag=True, help="Overwrite without asking; the old file is kept.")
-def import_calibration(
-    file: str, name: str | None, zero_at: str | None, port: str | None, arm: str | None, robot: str | None,
-    prefix: str, yes: bool,
-) -> None:  # fmt: skip
+@attrs.frozen(kw_only=True)
+class ImportCalibration:
     """Import a calibration, and set where its 0 rad is.
 
     FILE is a path or a name. With --prefix, the joints in FILE may have the prefix or not; those of other parts, such
     as a second arm or wheels, are left out. The command shows what does not fit the joints' limits, and does not access
     any servo.
     """
-    path = calibration_path(name or file)
-    wanted = joints_of(robot, name, "" if robot else prefix)
-    imported, left_out = _load(file, wanted, prefix, zero_at)
-    doubts = _doubts(imported, wanted)
-    if path.exists() and not yes and not TerminalGuide().confirm(f"{path} exists already. Overwrite it?", flag="--yes"):
-        raise Declined
-    adapter = imported.adapter if port is None else _adapter(port)
-    made = attrs.evolve(imported, robot=arm or imported.robot, adapter=adapter)
-    if kept := backup(path):
-        echo(f"the old file is kept: {kept}")
-    save_calibration(made, path, overwrite=True)
-    echo(f"saved: {path}")
-    echo(zero_text(made))
-    if left_out:
-        echo(f"left out: {', '.join(left_out)}")
-    for doubt in doubts:
-        echo(f"check: {doubt}")
+
+    file: str = option(typed="FILE", help="a calibration, by path or name")
+    name: str | None = option(None, help="name of the new calibration, or a path; by default FILE itself")
+    zero_at: str | None = option(
+        None,
+        choices=tuple(ZERO_AT),
+        help="0 rad: the pose set by hand, or the middle of each range; by default that of FILE; range for LeRobot's",
+    )
+    port: str | None = option(None, help="port of the arm, to store the serial number of its adapter")
+    arm: str | None = option(None, help="name of the arm, for the records")
+    robot: str | None = option(None, typed="--robot CONFIG", help="robot YAML with the joints; by default an SO-101")
+    prefix: str = option("", help="prefix of the joints' names, e.g. left_ for one of two arms")
+    yes: bool = option(False, help="overwrite without asking; the old file is kept")
+
+    def __call__(self) -> None:
+        path = calibration_path(self.name or self.file)
+        wanted = joints_of(self.robot, self.name, "" if self.robot else self.prefix)
+        imported, left_out = _load(self.file, wanted, self.prefix, self.zero_at)
+        doubts = _doubts(imported, wanted)
+        if (
+            path.exists()
+            and not self.yes
+            and not TerminalGuide().confirm(f"{path} exists already. Overwrite it?", flag="--yes")
+        ):
+            raise Declined
+        adapter = imported.adapter if self.port is None else _adapter(self.port)
+        made = attrs.evolve(imported, robot=self.arm or imported.robot, adapter=adapter)
+        if kept := backup(path):
+            echo(f"the old file is kept: {kept}")
+        save_calibration(made, path, overwrite=True)
+        echo(f"saved: {path}")
+        echo(zero_text(made))
+        if left_out:
+            echo(f"left out: {', '.join(left_out)}")
+        for doubt in doubts:
+            echo(f"check: {doubt}")
 
 
 def _load(file: str, wanted: Sequence[Joint], prefix: str, zero_at: str | None) -> tuple[Calibration, list[str]]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import attrs
-import click
 
+from ibrobot_core.app import RequestError
 from ibrobot_feetech.options import FollowerOptions
 
 SO101 = {
@@ -63,12 +63,12 @@ def chosen(joints: Sequence[Joint], names: Sequence[str]) -> list[Joint]:
     """The joints with these names; all if no name is given.
 
     Raises:
-        BadParameter: if a name is unknown.
+        RequestError: if a name is unknown.
     """
     known = {joint.name: joint for joint in joints}
     for name in names:
         if name not in known:
-            raise click.BadParameter(f"no joint {name!r}; available: {', '.join(known)}", param_hint="--joint")
+            raise RequestError(f"--joint: no joint {name!r}; available: {', '.join(known)}")
     return [known[name] for name in names] or list(joints)
 
 

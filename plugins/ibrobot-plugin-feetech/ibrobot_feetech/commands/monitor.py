@@ -7,16 +7,17 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import click
+import attrs
 from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
+from ibrobot_core.api import option
 from ibrobot_core.app import Screen, echo, styled
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import table
 from ibrobot_feetech.commands.joints import Joint, by_servo, joints_of
-from ibrobot_feetech.commands.ports import opened, port_argument
+from ibrobot_feetech.commands.ports import OnPort, opened
 from ibrobot_feetech.protocol import faults
 from ibrobot_feetech.sync import SyncReader
 from ibrobot_feetech.ticks import MIDDLE_TICK, TICKS_PER_TURN
@@ -30,40 +31,42 @@ _UNITS = {
 }
 
 
-@click.command()
-@port_argument
-@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
-@click.option("--period", type=click.FloatRange(0.01), default=0.1, show_default=True, help="Reading interval [s].")
-@click.option("--once", is_flag=True, help="Print one reading, then exit.")
-@click.option("--json", "as_json", is_flag=True, help="Print one line of JSON per reading.")
-def monitor(port: str | None, robot: str | None, period: float, once: bool, as_json: bool) -> None:
+@attrs.frozen(kw_only=True)
+class Monitor(OnPort):
     """Show the state of every servo.
 
     It shows position, speed, load, temperature, voltage, current and errors. Ctrl-C ends it.
     """
-    joints = joints_of(robot)
-    with opened(port, joints=by_servo(joints)) as bus:
-        reader = SyncReader(bus, [joint.servo for joint in joints], "present_position", "present_current")
-        try:
-            if as_json:
-                while True:
-                    echo(json.dumps({"servos": reading(reader, joints), "bus": dict(bus.counters)}))
-                    if once:
-                        return
-                    time.sleep(period)
-            console = Screen()
-            if once or not console.is_terminal:
-                console.print(_panel(bus, reader, joints))
-                while not once:
-                    time.sleep(period)
+
+    robot: str | None = option(None, typed="--robot CONFIG", help="robot YAML with the joints; by default an SO-101")
+    period: float = option(0.1, ge=0.01, unit="s", help="reading interval")
+    once: bool = option(False, help="print one reading, then exit")
+    as_json: bool = option(False, typed="--json", help="print one line of JSON per reading")
+
+    def __call__(self) -> None:
+        joints = joints_of(self.robot)
+        with opened(self.port, joints=by_servo(joints)) as bus:
+            reader = SyncReader(bus, [joint.servo for joint in joints], "present_position", "present_current")
+            try:
+                if self.as_json:
+                    while True:
+                        echo(json.dumps({"servos": reading(reader, joints), "bus": dict(bus.counters)}))
+                        if self.once:
+                            return
+                        time.sleep(self.period)
+                console = Screen()
+                if self.once or not console.is_terminal:
                     console.print(_panel(bus, reader, joints))
+                    while not self.once:
+                        time.sleep(self.period)
+                        console.print(_panel(bus, reader, joints))
+                    return
+                with Live(_panel(bus, reader, joints), console=console, auto_refresh=False) as live:
+                    while True:
+                        time.sleep(self.period)
+                        live.update(_panel(bus, reader, joints), refresh=True)
+            except KeyboardInterrupt:
                 return
-            with Live(_panel(bus, reader, joints), console=console, auto_refresh=False) as live:
-                while True:
-                    time.sleep(period)
-                    live.update(_panel(bus, reader, joints), refresh=True)
-        except KeyboardInterrupt:
-            return
 
 
 def reading(reader: SyncReader, joints: Sequence[Joint]) -> list[dict[str, Any]]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
 
-import click
+import attrs
 
-from ibrobot_core.api import HardwareError
+from ibrobot_core.api import HardwareError, option
 from ibrobot_core.app import echo, wrong_input
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.usb import ADAPTER_VENDOR, usb_ports
@@ -39,9 +38,11 @@ def the_port(port: str | None) -> str:
     return arms[0]
 
 
-def port_argument[F: Callable[..., Any]](command: F) -> F:
-    """Add the argument PORT."""
-    return click.argument("port", required=False)(command)
+@attrs.frozen(kw_only=True)
+class OnPort:
+    """The argument PORT."""
+
+    port: str | None = option(None, typed="PORT", help="serial port; by default that of the only adapter")
 
 
 @contextmanager

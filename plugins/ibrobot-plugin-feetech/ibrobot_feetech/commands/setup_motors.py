@@ -5,37 +5,37 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 
-import click
+import attrs
 
-from ibrobot_core.api import HardwareError
-from ibrobot_core.app import Declined, Guide
+from ibrobot_core.api import HardwareError, option
+from ibrobot_core.app import Declined, Guide, RequestError
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of
-from ibrobot_feetech.commands.ports import opened, port_argument
-from ibrobot_feetech.commands.scan import BaudRates, search
+from ibrobot_feetech.commands.ports import OnPort, opened
+from ibrobot_feetech.commands.scan import rates_of, rates_option, search
 from ibrobot_feetech.errors import NoReply
 from ibrobot_feetech.registers import BAUD_RATES, MODEL_STS3215
 
 _RATE = 1_000_000
 
 
-@click.command()
-@port_argument
-@click.option("--joint", "names", multiple=True, metavar="NAME", help="Only this joint; may be repeated.")
-@click.option("--robot", metavar="CONFIG", help="Robot YAML with the joints; by default an SO-101.")
-@click.option(
-    "--baud", type=BaudRates(), default="all", show_default=True, help="Rates at which to look for the servo."
-)
-@click.option("--yes", is_flag=True, help="The servo is connected: do not ask; needs exactly one --joint.")
-def setup_motors(port: str | None, names: tuple[str, ...], robot: str | None, baud: tuple[int, ...], yes: bool) -> None:
+@attrs.frozen(kw_only=True)
+class SetUpMotors(OnPort):
     """Set the id and the baud rate of each servo, one by one.
 
     Only one servo is connected at a time, beginning with the last joint. The baud rate becomes 1 Mbaud.
     """
-    if yes and len(names) != 1:
-        raise click.UsageError("--yes needs exactly one --joint, because only one servo may be connected")
-    set_up_motors(TerminalGuide(), port, names, robot=robot, rates=baud, yes=yes)
+
+    names: tuple[str, ...] = option((), typed="--joint NAME", help="only this joint; may be repeated")
+    robot: str | None = option(None, typed="--robot CONFIG", help="robot YAML with the joints; by default an SO-101")
+    baud: str = rates_option("all", "rates at which to look for the servo")
+    yes: bool = option(False, help="the servo is connected: do not ask; needs exactly one --joint")
+
+    def __call__(self) -> None:
+        if self.yes and len(self.names) != 1:
+            raise RequestError("--yes needs exactly one --joint, because only one servo may be connected")
+        set_up_motors(TerminalGuide(), self.port, self.names, robot=self.robot, rates=rates_of(self.baud), yes=self.yes)
 
 
 def set_up_motors(

@@ -5,17 +5,25 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from typing import Any
 
-import click
+import attrs
 
-from ibrobot_core.api import TeleopError
+from ibrobot_core.api import TeleopError, option
 from ibrobot_gamepad.controls import Controls
 from ibrobot_gamepad.devices import Device, DeviceGone, Found
 from ibrobot_gamepad.finder import Finder, open_first
 from ibrobot_gamepad.reports import KINDS, Kind
 
 _POLL_S = 0.01
+
+
+@attrs.frozen(kw_only=True)
+class OnDevice:
+    """The options of a command that works with a device."""
+
+    device: str = option(
+        "", typed="--device ID", help="VENDOR:PRODUCT, as `ibrobot gamepad list` prints; by default the first"
+    )
 
 
 def find_all(kinds: tuple[Kind, ...] = KINDS) -> list[tuple[Kind, Found]]:
@@ -62,8 +70,3 @@ def watch(device: Device, seconds: float, see: Callable[[Controls], bool]) -> bo
     except DeviceGone as error:
         raise TeleopError(f"the device is gone: {error}") from error
     return False
-
-
-device_option: Callable[[Any], Any] = click.option(
-    "--device", default="", metavar="ID", help="VENDOR:PRODUCT, as `ibrobot gamepad list` prints; default: the first."
-)

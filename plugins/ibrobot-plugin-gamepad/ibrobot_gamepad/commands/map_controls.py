@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-import click
+import attrs
 
+from ibrobot_core.api import option
 from ibrobot_core.app import dump_yaml, echo, find_config, installed_plugins, load_config
-from ibrobot_gamepad.commands.devices import device_option, opened, watch
+from ibrobot_gamepad.commands.devices import OnDevice, opened, watch
 from ibrobot_gamepad.controls import Controls
 from ibrobot_gamepad.devices import Device, Found
 from ibrobot_gamepad.options import FUNCTIONS, TOOL_AXES
@@ -36,11 +37,8 @@ _Find = Callable[[Controls, Controls], str | None]
 """State and state at rest -> the chosen control."""
 
 
-@click.command("map")
-@click.argument("config", required=False)
-@device_option
-@click.option("--wait", type=click.FloatRange(min=0), default=5.0, show_default=True, help="Time for each control [s].")
-def map_controls(config: str | None, device: str, wait: float) -> None:
+@attrs.frozen(kw_only=True)
+class MapControls(OnDevice):
     """Learn the controls of a device, and print them as YAML.
 
     The YAML is for the section `teleoperation`.
@@ -48,23 +46,28 @@ def map_controls(config: str | None, device: str, wait: float) -> None:
     CONFIG is a robot YAML as for `ibrobot launch`; it names the joints. The command asks for one control after another:
     press it, or move it to its end, then let go. A function whose control you do not touch in time keeps its default.
     """
-    registry = installed_plugins()
-    robot = load_config(find_config(config, registry), registry=registry).robot
-    with opened(device) as (kind, listed, open_device):
-        echo(f"{listed.name} ({listed.id}): let go of all controls")
-        learner = _Learner(open_device, wait)
-        joints = {
-            name: f"Move what moves {name} towards its upper limit"
-            for name in robot.joint_names
-            if name not in robot.groups.get("gripper", ())
-        }
-        learned = {
-            "joints": learner.axes(joints),
-            "tool": learner.axes({axis: f"Move what moves the tool {_WAYS[axis]} ({axis})" for axis in TOOL_AXES}),
-            "buttons": learner.buttons({name: f"Press the button {_PRESSES[name]} ({name})" for name in FUNCTIONS}),
-        }
-    echo("")
-    echo(dump_yaml({"teleoperation": {kind: _section(kind, listed, learned)}}).rstrip())
+
+    config: str | None = option(None, typed="CONFIG", names="robot", help="robot YAML")
+    wait: float = option(5.0, ge=0, unit="s", help="time for each control")
+
+    def __call__(self) -> None:
+        registry = installed_plugins()
+        robot = load_config(find_config(self.config, registry), registry=registry).robot
+        with opened(self.device) as (kind, listed, open_device):
+            echo(f"{listed.name} ({listed.id}): let go of all controls")
+            learner = _Learner(open_device, self.wait)
+            joints = {
+                name: f"Move what moves {name} towards its upper limit"
+                for name in robot.joint_names
+                if name not in robot.groups.get("gripper", ())
+            }
+            learned = {
+                "joints": learner.axes(joints),
+                "tool": learner.axes({axis: f"Move what moves the tool {_WAYS[axis]} ({axis})" for axis in TOOL_AXES}),
+                "buttons": learner.buttons({name: f"Press the button {_PRESSES[name]} ({name})" for name in FUNCTIONS}),
+            }
+        echo("")
+        echo(dump_yaml({"teleoperation": {kind: _section(kind, listed, learned)}}).rstrip())
 
 
 def _section(kind: str, listed: Found, learned: Mapping[str, Mapping[str, str]]) -> dict[str, object]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
+import attrs
 
-import click
-
+from ibrobot_core.api import option
 from ibrobot_core.app import echo
-from ibrobot_gamepad.commands.devices import device_option, find_all, opened, watch
+from ibrobot_gamepad.commands.devices import OnDevice, find_all, opened, watch
 from ibrobot_gamepad.controls import Controls
 from ibrobot_gamepad.permissions import udev_rules
 
@@ -16,16 +15,15 @@ _STEP = 0.05
 """Change of an axis before it is shown again."""
 
 
-@click.command("list")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def list_devices(as_json: bool) -> None:
+@attrs.frozen
+class ListDevices:
     """List gamepads and SpaceMice.
 
     It shows name, id for the option `device`, model, and how each is read.
     """
-    devices = find_all()
-    if as_json:
-        rows = [
+
+    def __call__(self) -> list[dict[str, str]]:
+        return [
             {
                 "type": kind,
                 "name": each.name,
@@ -34,37 +32,41 @@ def list_devices(as_json: bool) -> None:
                 "via": each.via,
                 "path": each.path,
             }
-            for kind, each in devices
+            for kind, each in find_all()
         ]
-        echo(json.dumps(rows, indent=2))
-        return
-    if not devices:
-        echo("no gamepad or SpaceMouse is plugged in; `ibrobot doctor` names those without permission")
-        return
-    table = [(kind, each.name, each.id, each.model, f"read by {_VIA[each.via]}") for kind, each in devices]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    for row in table:
-        echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+    def show(self, devices: list[dict[str, str]]) -> None:
+        """Print a table."""
+        if not devices:
+            echo("no gamepad or SpaceMouse is plugged in; `ibrobot doctor` names those without permission")
+            return
+        columns = ("type", "name", "device", "model")
+        table = [(*(each[column] for column in columns), f"read by {_VIA[each['via']]}") for each in devices]
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        for row in table:
+            echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
-@click.command("test")
-@device_option
-@click.option("--seconds", type=click.FloatRange(min=0), default=60.0, show_default=True, help="Stop after this time.")
-def show(device: str, seconds: float) -> None:
+@attrs.frozen(kw_only=True)
+class ShowControls(OnDevice):
     """Show the axes and buttons of a device as they change. Ctrl-C ends it."""
-    last = ""
 
-    def tell(controls: Controls) -> bool:
-        nonlocal last
-        line = describe(controls)
-        if line != last:
-            last = line
-            echo(line)
-        return False
+    seconds: float = option(60.0, ge=0, help="stop after this time")
 
-    with opened(device) as (_, listed, open_device):
-        echo(f"{listed.name} ({listed.id}, {listed.model}): move its axes, press its buttons")
-        watch(open_device, seconds, tell)
+    def __call__(self) -> None:
+        last = ""
+
+        def tell(controls: Controls) -> bool:
+            nonlocal last
+            line = describe(controls)
+            if line != last:
+                last = line
+                echo(line)
+            return False
+
+        with opened(self.device) as (_, listed, open_device):
+            echo(f"{listed.name} ({listed.id}, {listed.model}): move its axes, press its buttons")
+            watch(open_device, self.seconds, tell)
 
 
 def describe(controls: Controls) -> str:
@@ -74,10 +76,12 @@ def describe(controls: Controls) -> str:
     return "  ".join(parts) or "at rest"
 
 
-@click.command()
-def udev() -> None:
+@attrs.frozen
+class Udev:
     """Print the udev rule that lets users open devices.
 
     It covers gamepads and SpaceMice, for the user logged in at this machine.
     """
-    echo(udev_rules())
+
+    def __call__(self) -> None:
+        echo(udev_rules())

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import attrs
-import click
 import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from ibrobot_core.api import MODEL_ANSWERS, NS_PER_S, EpisodeReader, Float64MultiArray, ModelAnswer, RecorderError
-from ibrobot_core.app import EpisodePath, Screen, echo, wrong_input
+from ibrobot_core.api import (
+    MODEL_ANSWERS,
+    NS_PER_S,
+    EpisodeReader,
+    Float64MultiArray,
+    ModelAnswer,
+    RecorderError,
+    option,
+)
+from ibrobot_core.app import Screen, wrong_input
 
 
 @attrs.frozen(eq=False)
@@ -30,42 +37,57 @@ class Executed:
     """Largest difference between the commands of that time and the chunk [rad]; None without commands."""
 
 
-@click.command()
-@click.argument("episode", type=EpisodePath())
-@click.option("--json", "as_json", is_flag=True, help="Print JSON, with the actions of each chunk.")
-@wrong_input()
-def answers(episode: Path, as_json: bool) -> None:
+@attrs.frozen(kw_only=True)
+class ShowAnswers:
     """Show what a model was asked and answered.
 
     The table has a row for each request in the EPISODE, and what the robot executed of its chunk: from its arrival
     until the next one was used. Commands differ from it where chunks blend, and where a limit or an operator
     intervenes.
     """
-    from ibrobot_mcap.commands.find_episodes import opened
 
-    with opened(episode) as reader:
-        start_ns = reader.summary().start_ns
-        listed = list(executed(reader))
-    if not listed:
-        raise RecorderError(f"{episode}: has no answers of a model: {MODEL_ANSWERS} is missing or empty")
-    if as_json:
-        echo(json.dumps([_json(each) for each in listed], indent=2))
-        return
-    console = Screen(width=None if sys.stdout.isatty() else 1000)
-    table = Table(box=None, padding=(0, 1))
-    for heading in ("request", "asked s", "ms", "model ms", "queue ms", "outcome", "actions", "executed", "rad off"):
-        table.add_column(heading, justify="left" if heading == "outcome" else "right")
-    source = None
-    for each in listed:
-        answer = each.answer
-        if source != (source := (answer.model, answer.server, answer.weights, answer.prompt)):
-            console.print(_source(answer), soft_wrap=True)
-        table.add_row(
-            str(answer.request), f"{(answer.observed_ns - start_ns) / NS_PER_S:.2f}", f"{answer.latency_ms:.0f}",
-            f"{answer.infer_ms:.1f}", f"{answer.queue_ms:.1f}", f"{answer.outcome} {answer.error}".strip(),
-            str(len(each.chunk)), str(each.count), "" if each.deviation is None else f"{each.deviation:.4f}",
-        )  # fmt: skip
-    console.print(table)
+    episode: Path = option(typed="EPISODE", names="episodes", help="the episode")
+
+    @wrong_input()
+    def __call__(self) -> list[dict[str, Any]]:
+        from ibrobot_mcap.commands.find_episodes import opened
+
+        with opened(self.episode) as reader:
+            listed = [_json(each) for each in executed(reader)]
+        if not listed:
+            raise RecorderError(f"{self.episode}: has no answers of a model: {MODEL_ANSWERS} is missing or empty")
+        return listed
+
+    def show(self, listed: list[dict[str, Any]]) -> None:
+        """Print a table, without the actions."""
+        from ibrobot_mcap.commands.find_episodes import summary_of
+
+        start_ns = summary_of(self.episode).start_ns
+        console = Screen(width=None if sys.stdout.isatty() else 1000)
+        table = Table(box=None, padding=(0, 1))
+        for heading in (
+            "request",
+            "asked s",
+            "ms",
+            "model ms",
+            "queue ms",
+            "outcome",
+            "actions",
+            "executed",
+            "rad off",
+        ):
+            table.add_column(heading, justify="left" if heading == "outcome" else "right")
+        source = ""
+        for each in listed:
+            if source != (source := _source(each)):
+                console.print(source, soft_wrap=True)
+            table.add_row(
+                str(each["request"]), f"{(each['observed_ns'] - start_ns) / NS_PER_S:.2f}",
+                f"{each['latency_ms']:.0f}", f"{each['infer_ms']:.1f}", f"{each['queue_ms']:.1f}",
+                f"{each['outcome']} {each['error']}".strip(), str(len(each["actions"])), str(each["executed"]),
+                "" if each["deviation_rad"] is None else f"{each['deviation_rad']:.4f}",
+            )  # fmt: skip
+        console.print(table)
 
 
 def executed(reader: EpisodeReader) -> Iterator[Executed]:
@@ -115,13 +137,14 @@ def _next_used(in_order: Iterable[ModelAnswer], end_ns: int) -> list[int]:
     return times[::-1]
 
 
-def _source(answer: ModelAnswer) -> str:
+def _source(answer: Mapping[str, Any]) -> str:
     """The model of an answer, and the prompt of its request."""
-    parts = [f"model {answer.model}", answer.server, f"weights {answer.weights}" if answer.weights else ""]
-    return ", ".join(part for part in [*parts, f"prompt {answer.prompt!r}" if answer.prompt else ""] if part)
+    weights, prompt = answer["weights"], answer["prompt"]
+    parts = [f"model {answer['model']}", answer["server"], f"weights {weights}" if weights else ""]
+    return ", ".join(part for part in [*parts, f"prompt {prompt!r}" if prompt else ""] if part)
 
 
-def _json(each: Executed) -> dict[str, object]:
+def _json(each: Executed) -> dict[str, Any]:
     document = attrs.asdict(each.answer, recurse=False)
     return {
         **document, "header": attrs.asdict(each.answer.header), "joint_names": list(each.answer.joint_names),

@@ -4,37 +4,35 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import click
+import attrs
 
-from ibrobot_core.api import RecorderError
-from ibrobot_core.app import EpisodePath, echo, wrong_input
-
-
-@click.group()
-def contract() -> None:
-    """Contracts for foreign bags."""
+from ibrobot_core.api import RecorderError, option
+from ibrobot_core.app import echo, wrong_input
 
 
-@contract.command()
-@click.argument("bag", type=EpisodePath())
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="The new file; by default, print the contract.")
-@wrong_input()
-def init(bag: Path, output: Path | None) -> None:
+@attrs.frozen(kw_only=True)
+class DraftContract:
     """Draft a contract for BAG from its topics and their first messages.
 
     The draft is a YAML file for `ibrobot convert --config`. Lines marked CHOOSE need a decision: read them all.
     """
-    from ibrobot_mcap.commands.find_episodes import opened
-    from ibrobot_mcap.draft import draft
 
-    with opened(bag) as reader:
-        text = draft(reader)
-    if output is None:
-        echo(text, nl=False)
-        return
-    try:
-        with output.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except OSError as error:
-        raise RecorderError(f"{output}: cannot be written: {error.strerror}") from error
-    echo(f"{output}: read it, then ibrobot convert {bag} --config {output} --out DATASET")
+    bag: Path = option(typed="BAG", names="episodes", help="the bag")
+    output: Path | None = option(None, typed="-o", help="the new file; by default, print the contract")
+
+    @wrong_input()
+    def __call__(self) -> None:
+        from ibrobot_mcap.commands.find_episodes import opened
+        from ibrobot_mcap.draft import draft
+
+        with opened(self.bag) as reader:
+            text = draft(reader)
+        if self.output is None:
+            echo(text, nl=False)
+            return
+        try:
+            with self.output.open("x", encoding="utf-8") as file:
+                file.write(text)
+        except OSError as error:
+            raise RecorderError(f"{self.output}: cannot be written: {error.strerror}") from error
+        echo(f"{self.output}: read it, then ibrobot convert {self.bag} --config {self.output} --out DATASET")

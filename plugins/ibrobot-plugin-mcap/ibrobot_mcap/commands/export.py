@@ -9,47 +9,47 @@ from pathlib import Path
 from typing import Any
 
 import attrs
-import click
 import numpy as np
 
-from ibrobot_core.api import Image, Message, RecorderError
-from ibrobot_core.app import EpisodePath, echo, wrong_input
+from ibrobot_core.api import Image, Message, RecorderError, option
+from ibrobot_core.app import echo, wrong_input
 
 _TO_RGB = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, 3), "bgra8": (2, 1, 0, 3)}
 """Encoding -> its channels in PNG order."""
 
 
-@click.command()
-@click.argument("episode", type=EpisodePath())
-@click.argument("topic")
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), required=True, help="A .csv file, or a folder for images."
-)
-@wrong_input()
-def export(episode: Path, topic: str, output: Path) -> None:
+@attrs.frozen(kw_only=True)
+class Export:
     """Export a TOPIC of an EPISODE to CSV or PNG files.
 
     Numbers and texts become a CSV file, images PNG files and a CSV file of their stamps.
     """
-    from ibrobot_mcap.commands.find_episodes import opened
 
-    with opened(episode) as reader:
-        topics = reader.summary().topics
-        if topic not in topics:
-            raise RecorderError(f"{episode}: has no topic {topic!r}; available: {', '.join(topics)}")
-        if output.exists():
-            raise RecorderError(f"{output}: exists already")
-        items = ((item.received_ns, item.message) for item in reader.messages({topic}))
-        making = output.with_name(f".{output.name}.making")
-        _remove(making)
-        try:
-            count = (_pictures if topics[topic].type == Image.ros_type else _rows)(items, making)
-            making.rename(output)
-        except OSError as error:
-            raise RecorderError(f"{output}: cannot be written: {error.strerror}") from error
-        finally:
+    episode: Path = option(typed="EPISODE", names="episodes", help="the episode")
+    topic: str = option(typed="TOPIC", help="the topic")
+    output: Path = option(typed="-o", help="a .csv file, or a folder for images")
+
+    @wrong_input()
+    def __call__(self) -> None:
+        from ibrobot_mcap.commands.find_episodes import opened
+
+        with opened(self.episode) as reader:
+            topics = reader.summary().topics
+            if self.topic not in topics:
+                raise RecorderError(f"{self.episode}: has no topic {self.topic!r}; available: {', '.join(topics)}")
+            if self.output.exists():
+                raise RecorderError(f"{self.output}: exists already")
+            items = ((item.received_ns, item.message) for item in reader.messages({self.topic}))
+            making = self.output.with_name(f".{self.output.name}.making")
             _remove(making)
-    echo(f"{output}: {count} messages of {topic}")
+            try:
+                count = (_pictures if topics[self.topic].type == Image.ros_type else _rows)(items, making)
+                making.rename(self.output)
+            except OSError as error:
+                raise RecorderError(f"{self.output}: cannot be written: {error.strerror}") from error
+            finally:
+                _remove(making)
+        echo(f"{self.output}: {count} messages of {self.topic}")
 
 
 def _remove(making: Path) -> None:

@@ -7,32 +7,44 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-import click
+import attrs
 import numpy as np
 
-from ibrobot_core.api import NS_PER_S, Contract, Float64MultiArray, Image, JointState, RecorderError, how_to_install
-from ibrobot_core.app import EpisodePath, echo, wrong_input
+from ibrobot_core.api import (
+    NS_PER_S,
+    Contract,
+    Float64MultiArray,
+    Image,
+    JointState,
+    RecorderError,
+    how_to_install,
+    option,
+)
+from ibrobot_core.app import echo, wrong_input
 
 _THUMBNAILS = 8
 
 
-@click.command()
-@click.argument("episode", type=EpisodePath())
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="A .png file; by default NAME.png.")
-@wrong_input()
-def plot(episode: Path, output: Path | None) -> None:
+@attrs.frozen(kw_only=True)
+class Plot:
     """Plot an EPISODE.
 
     It shows joints and actions over time, rates and gaps of every topic, and some images.
     """
-    try:
-        import matplotlib as mpl
-    except ImportError:
-        raise RecorderError(f"plot needs matplotlib: {how_to_install('ibrobot-plugin-mcap[plot]')}") from None
-    mpl.use("Agg")
-    output = output or Path(f"{episode.name}.png")
-    _draw(PlotData(episode), output)
-    echo(str(output))
+
+    episode: Path = option(typed="EPISODE", names="episodes", help="the episode")
+    output: Path | None = option(None, typed="-o", help="a .png file; by default NAME.png")
+
+    @wrong_input()
+    def __call__(self) -> None:
+        try:
+            import matplotlib as mpl
+        except ImportError:
+            raise RecorderError(f"plot needs matplotlib: {how_to_install('ibrobot-plugin-mcap[plot]')}") from None
+        mpl.use("Agg")
+        output = self.output or Path(f"{self.episode.name}.png")
+        _draw(PlotData(self.episode), output)
+        echo(str(output))
 
 
 class PlotData:

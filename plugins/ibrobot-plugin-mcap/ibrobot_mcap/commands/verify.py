@@ -6,18 +6,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
-import click
+import attrs
 
-from ibrobot_core.app import EpisodePath, Job, echo, installed_plugins, wrong_input
+from ibrobot_core.api import option
+from ibrobot_core.app import Job, Unsuccessful, echo, installed_plugins, wrong_input
 
 
-@click.command()
-@click.argument("path", type=EpisodePath())
-@click.option("--gap", type=click.FloatRange(min=1), default=5.0, show_default=True, help="Longest pause, in periods.")
-@click.option("--on", default="", metavar="TYPE[://ADDRESS]", help="Pool that checks the episodes, e.g. processes.")
-@click.option("--jobs", type=click.IntRange(min=1), help="Episodes at once; with --on by default one per core.")
-@wrong_input()
-def verify(path: Path, gap: float, on: str, jobs: int | None) -> None:
+@attrs.frozen(kw_only=True)
+class Verify:
     """Check every message of the episodes in PATH.
 
     Prints problems, one on each line, and exits with 1 if there are any.
@@ -26,22 +22,34 @@ def verify(path: Path, gap: float, on: str, jobs: int | None) -> None:
     messages, topics of the contract without messages, header stamps that decrease, pauses in a topic longer than --gap
     times its median period, and different contracts within one dataset.
     """
-    from ibrobot_mcap.commands.find_episodes import episodes_in
 
-    bad = 0
-    contracts: dict[Path, tuple[str, Path]] = {}
-    episodes = episodes_in(path)
-    checks = _in_pool(episodes, gap, on, jobs) if on or jobs else (check((each, gap)) for each in episodes)
-    for episode, (problems, fingerprint) in zip(episodes, checks, strict=True):
-        first, where = contracts.setdefault(episode.parent, (fingerprint, episode))
-        if fingerprint != first:
-            problems.append(f"its contract is {fingerprint[:12]}, that of {where.name} is {first[:12]}")
-        bad += bool(problems)
-        echo(f"{episode}: {f'{len(problems)} problems' if len(problems) > 1 else ''.join(problems) or 'good'}")
-        for problem in problems if len(problems) > 1 else ():
-            echo(f"  {problem}")
-    if bad:
-        raise SystemExit(1)
+    path: Path = option(typed="PATH", names="episodes", help="an episode, or a folder of them")
+    gap: float = option(5.0, ge=1, help="longest pause, in periods")
+    on: str = option("", typed="--on TYPE[://ADDRESS]", help="pool that checks the episodes, e.g. processes")
+    jobs: int | None = option(None, ge=1, help="episodes at once; with --on by default one per core")
+
+    @wrong_input()
+    def __call__(self) -> None:
+        from ibrobot_mcap.commands.find_episodes import episodes_in
+
+        bad = 0
+        contracts: dict[Path, tuple[str, Path]] = {}
+        episodes = episodes_in(self.path)
+        checks = (
+            _in_pool(episodes, self.gap, self.on, self.jobs)
+            if self.on or self.jobs
+            else (check((each, self.gap)) for each in episodes)
+        )
+        for episode, (problems, fingerprint) in zip(episodes, checks, strict=True):
+            first, where = contracts.setdefault(episode.parent, (fingerprint, episode))
+            if fingerprint != first:
+                problems.append(f"its contract is {fingerprint[:12]}, that of {where.name} is {first[:12]}")
+            bad += bool(problems)
+            echo(f"{episode}: {f'{len(problems)} problems' if len(problems) > 1 else ''.join(problems) or 'good'}")
+            for problem in problems if len(problems) > 1 else ():
+                echo(f"  {problem}")
+        if bad:
+            raise Unsuccessful
 
 
 def check(order: tuple[Path, float], progress: Callable[[int], None] = lambda more: None) -> tuple[list[str], str]:

@@ -4,31 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
-import click
-from ibrobot_kinematics.urdf import read_urdf
+import attrs
 
-from ibrobot_core.api import Robot
+from ibrobot_core.api import Robot, option
 from ibrobot_core.app import echo, find_config, installed_plugins, load_config
-from ibrobot_planning.world.arm import Pair, robot_arm, sorted_pair
-from ibrobot_planning.world.checked_arm import urdf_names
-from ibrobot_planning.world.collision import unchecked_pairs
+from ibrobot_planning.world.engines import find_engines
+
+if TYPE_CHECKING:
+    from ibrobot_planning.world.arm import Pair
 
 
-@click.group()
-def description() -> None:
-    """Make files that describe a robot."""
-
-
-@description.command()
-@click.argument("config", metavar="CONFIG")
-@click.option("--samples", type=click.IntRange(min=1), default=10_000, show_default=True, help="Random configurations.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random configurations.")
-@click.option(
-    "--output", type=click.Path(dir_okay=False, path_type=Path), help="The file; without it, standard output."
-)
-def srdf(config: str, samples: int, seed: int, output: Path | None) -> None:
+@attrs.frozen(kw_only=True)
+class Srdf:
     """Write an SRDF of the robot in CONFIG.
 
     It has groups, poses, and links whose collisions need no check.
@@ -36,17 +26,31 @@ def srdf(config: str, samples: int, seed: int, output: Path | None) -> None:
     Two links need no check if one joint connects them, or if they touch in nearly all or in none of the random
     configurations, as in MoveIt's setup assistant. Links have the names of the URDF or, without a URDF, of the MJCF.
     """
-    registry = installed_plugins()
-    robot = load_config(find_config(config, registry), sim=True, registry=registry).robot
-    arm = robot_arm(robot)
-    pairs = unchecked_pairs(arm, samples=samples, seed=seed, never=True)
-    urdf = robot.description.urdf
-    names = {link: link for link in arm.frames} if urdf is None else urdf_names(arm, read_urdf(urdf))
-    text = srdf_of(robot, pairs, names)
-    if output is None:
-        echo(text.removesuffix("\n"))
-    else:
-        output.write_text(text, encoding="utf-8")
+
+    config: str = option(typed="CONFIG", names="robot", help="robot YAML")
+    samples: int = option(10_000, ge=1, help="random configurations")
+    seed: int = option(0, help="seed of the random configurations")
+    output: Path | None = option(None, help="the file; without it, standard output")
+
+    def __call__(self) -> None:
+        find_engines()
+        from ibrobot_kinematics.urdf import read_urdf
+
+        from ibrobot_planning.world.arm import robot_arm
+        from ibrobot_planning.world.checked_arm import urdf_names
+        from ibrobot_planning.world.collision import unchecked_pairs
+
+        registry = installed_plugins()
+        robot = load_config(find_config(self.config, registry), sim=True, registry=registry).robot
+        arm = robot_arm(robot)
+        pairs = unchecked_pairs(arm, samples=self.samples, seed=self.seed, never=True)
+        urdf = robot.description.urdf
+        names = {link: link for link in arm.frames} if urdf is None else urdf_names(arm, read_urdf(urdf))
+        text = srdf_of(robot, pairs, names)
+        if self.output is None:
+            echo(text.removesuffix("\n"))
+        else:
+            self.output.write_text(text, encoding="utf-8")
 
 
 def srdf_of(robot: Robot, pairs: Mapping[Pair, str], names: Mapping[str, str]) -> str:
@@ -71,6 +75,8 @@ def srdf_of(robot: Robot, pairs: Mapping[Pair, str], names: Mapping[str, str]) -
                 for joint in joints
             ]
             lines += ["  </group_state>"]
+    from ibrobot_planning.world.arm import sorted_pair
+
     renamed = {sorted_pair(names[a], names[b]): reason for (a, b), reason in pairs.items() if a in names and b in names}
     lines += [
         f"  <disable_collisions link1={quoteattr(a)} link2={quoteattr(b)} reason={quoteattr(reason)}/>"

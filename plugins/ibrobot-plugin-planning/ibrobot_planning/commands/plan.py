@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -12,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import attrs
-import click
 import numpy as np
 
 from ibrobot_core.api import (
@@ -23,8 +20,10 @@ from ibrobot_core.api import (
     Robot,
     Vector,
     how_to_install,
+    option,
 )
 from ibrobot_core.app import (
+    ConfigOptions,
     ControlMode,
     LaunchRequest,
     PlanCode,
@@ -32,11 +31,9 @@ from ibrobot_core.app import (
     PositionGoal,
     RobotConfig,
     Session,
+    Unsuccessful,
     echo,
-    find_config,
     installed_plugins,
-    load_config,
-    run_options,
     wrong_input,
 )
 from ibrobot_planning.execution.plans import GoalPlans, arm_joints
@@ -70,24 +67,8 @@ class Plan:
     """Positions of the tool [m], shape (N, 3); None without a model of the arm."""
 
 
-@click.command()
-@click.option("--from", "start", required=True, metavar="START", help="A pose, or joint=rad,… (others at 0).")
-@click.option(
-    "--goal",
-    required=True,
-    metavar="GOAL",
-    help="A pose, joint=rad,…, or xyz=X,Y,Z with axis, rpy or quaternion.",
-)
-@click.option(
-    "--speed",
-    type=click.FloatRange(0, 1, min_open=True),
-    default=1.0,
-    show_default=True,
-    help="Fraction of the velocity limits.",
-)
-@click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Also draw the plan: .png, .svg or .pdf.")
-@run_options("config", "sim", "seed", "mode", "overrides", "as_json")
-def plan(start: str, goal: str, speed: float, plot: Path | None, config: str | None, **options: Any) -> None:
+@attrs.frozen(kw_only=True)
+class PlanMotion(ConfigOptions):
     """Plan a motion of the robot in CONFIG, without moving it.
 
     The planner and the world are those of the robot YAML. Prints the joints at the goal, path length,
@@ -95,60 +76,64 @@ def plan(start: str, goal: str, speed: float, plot: Path | None, config: str | N
 
     Exits with 0 if there is a plan, 3 if there is none, 2 for a wrong command line, YAML or goal.
     """
-    with wrong_input():
-        if plot is not None:
-            _check_plot(plot)
-        loaded, mode = _loaded(config, options)
-        robot = loaded.robot
-        joints = arm_joints(loaded, mode)
-        from_ = _positions(start, robot)
-        aim = target(goal, robot, speed)
-    report: dict[str, Any] = {
-        "robot": robot.name,
-        "mode": mode.name,
-        "planner": mode.planner.type if mode.planner else "",
-        "from": start,
-        "goal": goal,
-        "kind": _kind(aim),
-    }
-    try:
-        sampled = _planned(loaded, mode, options["seed"], joints, from_, aim, report)
-    except PlanningError as error:
-        report |= {"success": False, "code": error.code.name, "message": str(error)}
-        if options["as_json"]:
-            echo(json.dumps(report, indent=2))
+
+    start: str = option(typed="--from START", help="a pose, or joint=rad,… (others at 0)")
+    goal: str = option(typed="--goal GOAL", help="a pose, joint=rad,…, or xyz=X,Y,Z with axis, rpy or quaternion")
+    speed: float = option(1.0, gt=0, le=1, help="fraction of the velocity limits")
+    plot: Path | None = option(None, help="also draw the plan: .png, .svg or .pdf")
+    seed: int = option(0, help="seed of the planner")
+    mode: str | None = option(None, typed="--mode MODE", help="the mode whose planner plans")
+
+    def __call__(self) -> dict[str, Any]:
+        with wrong_input():
+            if self.plot is not None:
+                _check_plot(self.plot)
+            loaded, mode = self._loaded()
+            robot = loaded.robot
+            joints = arm_joints(loaded, mode)
+            from_ = _positions(self.start, robot)
+            aim = target(self.goal, robot, self.speed)
+        report: dict[str, Any] = {
+            "robot": robot.name,
+            "mode": mode.name,
+            "planner": mode.planner.type if mode.planner else "",
+            "from": self.start,
+            "goal": self.goal,
+            "kind": _kind(aim),
+        }
+        try:
+            sampled = _planned(loaded, mode, self.seed, joints, from_, aim, report)
+        except PlanningError as error:
+            report |= {"success": False, "code": error.code.name, "message": str(error)}
+            raise Unsuccessful(report, _NO_PLAN) from None
+        if self.plot is not None:
+            _figure(sampled, robot, self.goal).savefig(self.plot)
+        return report
+
+    def show(self, report: dict[str, Any]) -> None:
+        """Print the figures of the plan, or why there is none."""
+        if report["success"]:
+            echo(_text(report))
         else:
-            echo(f"error: no plan: {error.code.name}: {error}", err=True)
-        sys.exit(_NO_PLAN)
-    if plot is not None:
-        _figure(sampled, robot, goal).savefig(plot)
-    echo(json.dumps(report, indent=2) if options["as_json"] else _text(report))
+            echo(f"error: no plan: {report['code']}: {report['message']}", err=True)
 
+    def _loaded(self) -> tuple[RobotConfig, ControlMode]:
+        """The robot, and its mode with a planner.
 
-def _loaded(config: str | None, options: dict[str, Any]) -> tuple[RobotConfig, ControlMode]:
-    """The robot, and its mode with a planner.
-
-    Raises:
-        NotSupported: if the mode has no planner, or several modes have one and none is named.
-    """
-    registry = installed_plugins()
-    loaded = load_config(
-        find_config(config, registry),
-        overrides=options["overrides"],
-        mode=options["mode"],
-        sim=options["sim"],
-        registry=registry,
-    )
-    planning = [name for name, mode in loaded.control_modes.items() if mode.planner is not None]
-    name = loaded.default_control_mode
-    if name not in planning:
-        if options["mode"] is not None or not planning:
-            there = f"--mode {' or --mode '.join(planning)}" if planning else "this robot has none"
-            raise NotSupported(f"mode {name} has no planner: {there}")
-        if len(planning) > 1:
-            raise NotSupported(f"several modes have a planner: --mode {' or --mode '.join(planning)}")
-        name = planning[0]
-    return loaded, loaded.control_modes[name]
+        Raises:
+            NotSupported: if the mode has no planner, or several modes have one and none is named.
+        """
+        loaded = self.load(self.mode)
+        planning = [name for name, mode in loaded.control_modes.items() if mode.planner is not None]
+        name = loaded.default_control_mode
+        if name not in planning:
+            if self.mode is not None or not planning:
+                there = f"--mode {' or --mode '.join(planning)}" if planning else "this robot has none"
+                raise NotSupported(f"mode {name} has no planner: {there}")
+            if len(planning) > 1:
+                raise NotSupported(f"several modes have a planner: --mode {' or --mode '.join(planning)}")
+            name = planning[0]
+        return loaded, loaded.control_modes[name]
 
 
 def _positions(text: str, robot: Robot) -> Vector:

@@ -5,23 +5,21 @@ from __future__ import annotations
 import json
 from typing import Any, override
 
-import click
+import attrs
 
-from ibrobot_core.api import IbrobotError
+from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import (
     ConfigError,
+    ConfigOptions,
     LaunchRequest,
     Problem,
     Registry,
     RobotConfig,
     RunHooks,
+    RunOptions,
     Runtime,
     echo,
-    find_config,
     installed_plugins,
-    load_config,
-    run_options,
-    run_overrides,
     run_robot,
 )
 from ibrobot_planning.tasks.checks import CheckedTask, Situation, check_task
@@ -32,41 +30,27 @@ from ibrobot_planning.world.section import SECTION, first_world, scene_objects
 
 TASKS = "tasks"
 """The section whose component performs tasks."""
-_PARAM = click.option(
-    "--param", "parameters", multiple=True, metavar="NAME=VALUE", help="Value of a parameter of the task."
-)
 
 
-@click.group()
-def task() -> None:
-    """Perform tasks: files of motions, grasps, policies and other steps."""
-
-
-@task.command()
-@click.argument("file")
-@run_options("config", "sim")
-@_PARAM
-@run_options("overrides")
-def check(file: str, config: str | None, **options: Any) -> None:
+@attrs.frozen(kw_only=True)
+class CheckTask(ConfigOptions):
     """Check the task in FILE for a robot, and move nothing.
 
     CONFIG is a robot YAML as for `ibrobot launch`. Checks names, limits, models and the order of the steps, and by
     inverse kinematics whether the tool can reach every goal whose position is known.
     """
-    registry, read = installed_plugins(), _read(file, options["parameters"])
-    robot = load_config(
-        find_config(config, registry), overrides=options["overrides"], sim=options["sim"], registry=registry
-    )
-    checked = _checked(read, robot, registry)
-    echo(f"{file}: {len(checked.file.task.steps)} steps for {robot.robot.name}, in mode {checked.mode.name}")
+
+    file: str = option(typed="FILE", help="the task")
+    parameters: tuple[str, ...] = option((), typed="--param NAME=VALUE", help="value of a parameter of the task")
+
+    def __call__(self) -> None:
+        robot = self.load()
+        checked = _checked(_read(self.file, self.parameters), robot, installed_plugins())
+        echo(f"{self.file}: {len(checked.file.task.steps)} steps for {robot.robot.name}, in mode {checked.mode.name}")
 
 
-@task.command()
-@click.argument("file")
-@run_options("config", "sim", "lockstep", "seed")
-@_PARAM
-@run_options("overrides", "viewer", "headless", "as_json")
-def run(file: str, config: str | None, **options: Any) -> None:
+@attrs.frozen(kw_only=True)
+class RunTask(RunOptions):
     """Perform the task in FILE, after a check of all of it.
 
     FILE is a path, or the name of a task that comes with ibrobot. CONFIG is a robot YAML as for `ibrobot launch`.
@@ -74,20 +58,23 @@ def run(file: str, config: str | None, **options: Any) -> None:
 
     Exits as `ibrobot launch` does; with 3 if a step did not succeed.
     """
-    registry, read = installed_plugins(), _read(file, options["parameters"])
-    path, changes, sim = find_config(config, registry), run_overrides(options), options["sim"]
-    robot = load_config(path, overrides=changes, sim=sim, registry=registry)
-    mode = _checked(read, robot, registry).mode.name
-    section = () if TASKS in robot.plugin_sections else (f"{TASKS}={{}}",)
-    robot = load_config(path, overrides=(*changes, *section), mode=mode, sim=sim, registry=registry)
-    request = LaunchRequest(options["lockstep"], options["seed"], by_operator=robot.recording is not None)
-    run_robot(
-        robot,
-        request,
-        headless=options["headless"],
-        as_json=options["as_json"],
-        make_hooks=lambda runtime: TaskHooks(runtime, read),
-    )
+
+    file: str = option(typed="FILE", help="the task")
+    parameters: tuple[str, ...] = option((), typed="--param NAME=VALUE", help="value of a parameter of the task")
+    seed: int = option(0, help="first episode's seed; later ones add 1")
+
+    def __call__(self) -> None:
+        read, robot = _read(self.file, self.parameters), self.load()
+        mode = _checked(read, robot, installed_plugins()).mode.name
+        section = () if TASKS in robot.plugin_sections else (f"{TASKS}={{}}",)
+        robot = self.load(mode, (*self.changes(), *section))
+        run_robot(
+            robot,
+            LaunchRequest(self.lockstep, self.seed, by_operator=robot.recording is not None),
+            headless=self.headless,
+            as_json=self.as_json,
+            make_hooks=lambda runtime: TaskHooks(runtime, read),
+        )
 
 
 def _read(file: str, parameters: tuple[str, ...]) -> TaskFile:

@@ -9,10 +9,11 @@ import signal
 import sys
 from pathlib import Path
 
-import click
+import attrs
 from ibrobot_http.server import HttpServer
 
-from ibrobot_core.app import LogFormatter, echo, end_signals
+from ibrobot_core.api import option
+from ibrobot_core.app import LogFormatter, RequestError, echo, end_signals
 from ibrobot_web.desktop import open_browser
 from ibrobot_web.options import WebOptions
 from ibrobot_web.server.page_guard import page_guard
@@ -22,38 +23,41 @@ from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.server import make_app
 
 
-@click.command()
-@click.argument(
-    "folders", nargs=-1, metavar="[FOLDER]...", type=click.Path(exists=True, file_okay=False, path_type=Path)
-)
-@click.option("--port", type=click.IntRange(0, 65535), default=8090, show_default=True, help="0: any free port.")
-@click.option("--no-browser", is_flag=True, help="Do not open the page in the browser of this desktop.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address; beyond this machine it needs TLS.")
-@click.option("--certificate", type=click.Path(path_type=Path), help="TLS certificate, with its chain.")
-@click.option("--key", type=click.Path(path_type=Path), help="Private key of the certificate.")
-@click.option("--name", "names", multiple=True, help="Further host name of this machine in browsers.")
-def ui(
-    folders: tuple[Path, ...], port: int, no_browser: bool, host: str, certificate: Path | None, key: Path | None,
-    names: tuple[str, ...],
-) -> None:  # fmt: skip
+@attrs.frozen(kw_only=True)
+class ServeUi:
     """Set up, launch and record robots in the browser.
 
     Reads and writes the files of each FOLDER, and no others; of the current folder by default. Prints the address of
     the page and one to watch only, each with its token. Ctrl-C ends the page, and every run and job that it started.
     """
-    try:
-        options = WebOptions(host=host, port=port, names=names, certificate=certificate, key=key)
-    except ValueError as error:
-        raise click.UsageError(str(error)) from None
-    opened = Folders(folders or (Path(),))
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
-    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
-    context = Ui(opened, Jobs(opened.first), _run_options(options))
-    try:
-        asyncio.run(_serve(options, context, browser=not no_browser))
-    finally:
-        context.close()
+
+    folders: tuple[Path, ...] = option((), typed="FOLDER", help="folders with files; by default this one")
+    port: int = option(8090, ge=0, le=65535, help="0: any free port")
+    no_browser: bool = option(False, help="do not open the page in the browser of this desktop")
+    host: str = option("127.0.0.1", help="address; beyond this machine it needs TLS")
+    certificate: Path | None = option(None, help="TLS certificate, with its chain")
+    key: Path | None = option(None, help="private key of the certificate")
+    names: tuple[str, ...] = option((), typed="--name", help="further host name of this machine in browsers")
+
+    def __call__(self) -> None:
+        for each in self.folders:
+            if not each.is_dir():
+                raise RequestError(f"{each}: there is no such folder")
+        try:
+            options = WebOptions(
+                host=self.host, port=self.port, names=self.names, certificate=self.certificate, key=self.key
+            )
+        except ValueError as error:
+            raise RequestError(str(error)) from None
+        opened = Folders(self.folders or (Path(),))
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
+        logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+        context = Ui(opened, Jobs(opened.first), _run_options(options))
+        try:
+            asyncio.run(_serve(options, context, browser=not self.no_browser))
+        finally:
+            context.close()
 
 
 def _run_options(options: WebOptions) -> tuple[str, ...]:

@@ -7,9 +7,20 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-import click
+import attrs
 
-from ibrobot_core.app import VARIABLE, ConfigError, Problem, echo, find_config, installed_plugins, load_config
+from ibrobot_core.api import option
+from ibrobot_core.app import (
+    VARIABLE,
+    ConfigError,
+    Problem,
+    RequestError,
+    echo,
+    find_config,
+    installed_plugins,
+    load_config,
+    prompt,
+)
 
 _ODD = re.compile(r"[{}\"'#\s\\]|:$")
 
@@ -69,33 +80,37 @@ def write_copy(source: Path, copy: Path, defaults: Mapping[str, str]) -> None:
         raise ConfigError([Problem(copy, 0, "", f"cannot be written: {error.strerror}")]) from error
 
 
-@click.command("copy")
-@click.argument("config")
-@click.argument("copy", type=click.Path(path_type=Path, dir_okay=False))
-@click.option(
-    "--value", "values", multiple=True, metavar="NAME=VALUE",
-    help="Default of the variable ${NAME} in the copy, e.g. IBROBOT_FOLLOWER_PORT=/dev/ttyACM1.",
-)  # fmt: skip
-@click.option("--defaults", is_flag=True, help="Keep all other defaults; do not ask.")
-def config_copy(config: str, copy: Path, values: tuple[str, ...], defaults: bool) -> None:
+@attrs.frozen(kw_only=True)
+class CopyConfig:
     """Copy CONFIG to a file of your own, with your ports and cameras.
 
     The copy has the same text, with its comments. In a terminal, the command asks for the default of each variable,
     such as ${IBROBOT_FOLLOWER_PORT:/dev/ttyACM0}; the environment still overrides it. `ibrobot doctor` lists what is
     connected. The copy is checked at the end.
     """
-    source = find_config(config, installed_plugins())
-    chosen = {}
-    for each in values:
-        name, equals, value = each.partition("=")
-        if not equals or not value:
-            raise click.BadParameter(f"expected NAME=VALUE, got {each!r}", param_hint="--value")
-        chosen[name] = value
-    if not defaults and sys.stdin.isatty():
-        for name, default in variables_of(source).items():
-            if name not in chosen:
-                chosen[name] = click.prompt(name, default=default or None, err=True)
-    write_copy(source, copy, chosen)
-    loaded = load_config(copy)
-    body = "simulation" if loaded.simulated else "hardware"
-    echo(f"{copy}: ok ({loaded.robot.name}, {len(loaded.robot.joints)} joints, {body})")
+
+    config: str = option(typed="CONFIG", names="robot", help="robot YAML")
+    copy: Path = option(typed="COPY", help="the new file")
+    values: tuple[str, ...] = option(
+        (),
+        typed="--value NAME=VALUE",
+        help="default of the variable ${NAME} in the copy, e.g. IBROBOT_FOLLOWER_PORT=/dev/ttyACM1",
+    )
+    defaults: bool = option(False, help="keep all other defaults; do not ask")
+
+    def __call__(self) -> None:
+        source = find_config(self.config, installed_plugins())
+        chosen = {}
+        for each in self.values:
+            name, equals, value = each.partition("=")
+            if not equals or not value:
+                raise RequestError(f"--value: expected NAME=VALUE, got {each!r}")
+            chosen[name] = value
+        if not self.defaults and sys.stdin.isatty():
+            for name, default in variables_of(source).items():
+                if name not in chosen:
+                    chosen[name] = prompt(f"{name} [{default}]: ", flag="--defaults") or default
+        write_copy(source, self.copy, chosen)
+        loaded = load_config(self.copy)
+        body = "simulation" if loaded.simulated else "hardware"
+        echo(f"{self.copy}: ok ({loaded.robot.name}, {len(loaded.robot.joints)} joints, {body})")

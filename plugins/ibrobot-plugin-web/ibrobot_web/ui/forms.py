@@ -39,7 +39,7 @@ WITH_ROBOT = frozenset({"record"})
 
 def job_commands() -> list[str]:
     """The commands that run by a form: those with events, and those that packages not installed here would add."""
-    declared = {name for name, command in installed_plugins().commands.items() if command.events}
+    declared = {name for name, each in installed_plugins().commands.items() if each.events and " " not in name}
     return sorted(declared.union(*(offers.get("job", ()) for offers in official_plugins().values())) - WITH_ROBOT)
 
 
@@ -74,13 +74,13 @@ def form_of(ui: Ui, command: str) -> dict[str, Any]:
 
 def takes(name: str) -> dict[str, str]:
     """Inputs of a command, as its arguments name them, e.g. `dataset` -> the field; empty if it is not installed."""
-    command = installed_plugins().declarations().get(name)
+    command = installed_plugins().commands.get(name)
     if command is None:
         return {}
     return {
         field.metadata["names"]: key
         for key, field in _shown(command).items()
-        if field.metadata["argument"] and field.metadata["names"]
+        if not flag_of(key, field).startswith("-") and field.metadata["names"]
     }
 
 
@@ -112,16 +112,16 @@ def arguments(options: Any) -> list[str]:
     for name, field in fields(type(options)).items():
         value = values[field.name]
         items = value if isinstance(value, tuple) else (value,)
-        if field.metadata["argument"]:
+        if (flag := flag_of(name, field))[0] != "-":
             operands += map(str, items)
         elif value != default_of(field):
-            flags += [flag_of(name, field) if item is True else f"{flag_of(name, field)}={item}" for item in items]
+            flags += [flag if item is True else f"{flag}={item}" for item in items]
     return [*flags, "--", *operands]
 
 
 def in_page_words(text: str, command: Command | None = None) -> str:
     """A text of a command with labels in place of its flags, e.g. `--missing skip`, and of commands of a terminal."""
-    declared = installed_plugins().declarations()
+    declared = installed_plugins().commands
     options = fields(command.options) if command is not None else {}
     known = {flag_of(name, field): (name, field) for name, field in options.items()}
 
@@ -163,7 +163,7 @@ def run_command(ui: Ui, name: str, **values: Any) -> list[Event]:
 
 def choices_of(name: str, option: str) -> list[list[str]]:
     """The choices of a command's option, each with its words; none if the command is not installed."""
-    command = installed_plugins().declarations().get(name)
+    command = installed_plugins().commands.get(name)
     if command is None:
         return []
     choices: list[list[str]] = _field_json(option, fields(command.options)[option])["choices"]

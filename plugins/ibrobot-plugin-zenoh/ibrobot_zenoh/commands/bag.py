@@ -8,7 +8,6 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 import attrs
-import click
 from ibrobot_ros2.convert import make_class
 from ibrobot_ros2.definitions import standard_types
 
@@ -26,9 +25,10 @@ from ibrobot_core.api import (
     RecorderError,
     did_you_mean,
     ns,
+    option,
 )
-from ibrobot_core.app import EpisodePath, echo, installed_plugins, wrong_input
-from ibrobot_zenoh.commands.network import Network, on_network
+from ibrobot_core.app import RequestError, echo, installed_plugins, wrong_input
+from ibrobot_zenoh.commands.network import OnNetwork
 
 CLOCK = "/clock"
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
@@ -38,52 +38,50 @@ _COMMAND_TYPES = ("trajectory_msgs/msg/JointTrajectory", "geometry_msgs/msg/Twis
 _COMMAND_NAME = re.compile(r"(?:^|[/_])(?:cmd|commands?|goal|target)(?:$|[/_])")
 
 
-@click.group()
-def bag() -> None:
-    """Play recorded episodes to machines on the network."""
-
-
-@bag.command()
-@click.argument("episode", type=EpisodePath())
-@on_network
-@click.option("-r", "--rate", default=1.0, show_default=True, type=click.FloatRange(0.001, 1000), help="Speed.")
-@click.option("-l", "--loop", is_flag=True, help="Begin again at the end, until Ctrl-C.")
-@click.option("--start-offset", default=0.0, metavar="S", type=click.FloatRange(0), help="Begin so many seconds in.")
-@click.option(
-    "--clock", "clock_hz", is_flag=False, flag_value=40.0, type=click.FloatRange(0.001, 1000), metavar="[HZ]",
-    help="Also publish the recorded time on /clock; 40 Hz without a number.",
-)  # fmt: skip
-@click.option("--topics", multiple=True, metavar="TOPIC", help="Play only this topic; can be repeated.")
-@click.option("--exclude-topics", multiple=True, metavar="TOPIC", help="Leave out this topic; can be repeated.")
-@click.option("-m", "--remap", "renamed", multiple=True, metavar="OLD:=NEW", help="Play a topic under another name.")
-def play(
-    network: Network, episode: Path, rate: float, loop: bool, start_offset: float, clock_hz: float | None,
-    topics: tuple[str, ...], exclude_topics: tuple[str, ...], renamed: tuple[str, ...],
-) -> None:  # fmt: skip
+@attrs.frozen(kw_only=True)
+class Play(OnNetwork):
     """Play EPISODE: publish its messages at their times, with their stamps.
 
     A run of ibrobot receives the topics of its `transport.share.subscribe`, and ROS 2 nodes receive all. Topics that
     command a robot are not played, so that no arm moves by it: the actions of the recorded contract, trajectories,
     twists, and names with cmd, command, goal or target. To look at one, give it another name with --remap.
     """
-    names = dict(_renaming(each) for each in renamed)
-    with wrong_input():
-        opened = installed_plugins().open_episode(episode)
-    with closing(opened) as reader:
-        summary = reader.summary()
-        chosen = choose(summary, topics, exclude_topics, names)
-        start_ns = summary.start_ns + ns(start_offset)
-        if start_ns > summary.end_ns:
-            length = (summary.end_ns - summary.start_ns) / NS_PER_S
-            raise RecorderError(f"{episode}: --start-offset {start_offset:g} is after its end; it lasts {length:.1f} s")
-        chosen = readable(reader, chosen, start_ns, topics)
-        with suppress(KeyboardInterrupt), network as transport:
-            player = Player(RealClock(), transport.publish_message, chosen, rate, clock_hz)
-            while True:
-                player.play(reader.messages_since(start_ns, list(chosen)), start_ns)
-                if not loop:
-                    break
-        echo(f"{player.count} messages on {len(chosen)} topics")
+
+    episode: Path = option(typed="EPISODE", names="episodes", help="the episode")
+    rate: float = option(1.0, typed="-r", ge=0.001, le=1000, help="speed")
+    loop: bool = option(False, typed="-l", help="begin again at the end, until Ctrl-C")
+    start_offset: float = option(0.0, ge=0, unit="s", help="begin so many seconds in")
+    clock_hz: float | None = option(
+        None, typed="--clock [HZ=40]", ge=0.001, le=1000,
+        help="also publish the recorded time on /clock; 40 Hz without a number",
+    )  # fmt: skip
+    topics: tuple[str, ...] = option((), typed="--topics TOPIC", help="play only this topic; can be repeated")
+    exclude_topics: tuple[str, ...] = option(
+        (), typed="--exclude-topics TOPIC", help="leave out this topic; can be repeated"
+    )
+    renamed: tuple[str, ...] = option((), typed="-m --remap OLD:=NEW", help="play a topic under another name")
+
+    def __call__(self) -> None:
+        names = dict(_renaming(each) for each in self.renamed)
+        with wrong_input():
+            opened = installed_plugins().open_episode(self.episode)
+        with closing(opened) as reader:
+            summary = reader.summary()
+            chosen = choose(summary, self.topics, self.exclude_topics, names)
+            start_ns = summary.start_ns + ns(self.start_offset)
+            if start_ns > summary.end_ns:
+                length = (summary.end_ns - summary.start_ns) / NS_PER_S
+                raise RecorderError(
+                    f"{self.episode}: --start-offset {self.start_offset:g} is after its end; it lasts {length:.1f} s"
+                )
+            chosen = readable(reader, chosen, start_ns, self.topics)
+            with suppress(KeyboardInterrupt), self.network() as transport:
+                player = Player(RealClock(), transport.publish_message, chosen, self.rate, self.clock_hz)
+                while True:
+                    player.play(reader.messages_since(start_ns, list(chosen)), start_ns)
+                    if not self.loop:
+                        break
+            echo(f"{player.count} messages on {len(chosen)} topics")
 
 
 @attrs.define
@@ -215,5 +213,5 @@ def readable(reader: EpisodeReader, chosen: Mapping[str, str], start_ns: int, as
 def _renaming(text: str) -> tuple[str, str]:
     old, sign, new = text.partition(":=")
     if not sign or not old or not new:
-        raise click.BadParameter(f"expected OLD:=NEW, got {text!r}", param_hint="--remap")
+        raise RequestError(f"--remap: expected OLD:=NEW, got {text!r}")
     return old, new

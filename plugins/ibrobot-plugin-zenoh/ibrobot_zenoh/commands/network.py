@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from functools import wraps
 from typing import Any
 
 import attrs
-import click
 
-from ibrobot_core.api import Context, NotSupported, RealClock, Robot, TransportError
+from ibrobot_core.api import Context, NotSupported, RealClock, Robot, TransportError, option
+from ibrobot_core.app import RequestError
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
@@ -21,39 +20,37 @@ _EVERYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
 """All addresses to listen on -> the one to reach such a server from this machine."""
 
 
-type Network = AbstractContextManager[ZenohTransport]
-"""A context with a connected transport."""
+@attrs.frozen(kw_only=True)
+class OnNetwork:
+    """The options that select the network."""
 
+    config: str | None = option(
+        None, typed="--config CONFIG", names="robot", help="the robot YAML whose transport section to use"
+    )
+    endpoints: tuple[str, ...] = option((), typed="--endpoint URL", help="e.g. tcp/127.0.0.1:7447")
+    domain: int | None = option(None, ge=0, le=232, help="ROS 2 domain; by default the YAML's, or 0")
 
-def on_network(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that select the network; `command` receives it as its first argument."""
-
-    @click.option("--config", metavar="CONFIG", help="The robot YAML whose transport section to use.")
-    @click.option("--endpoint", "endpoints", multiple=True, metavar="URL", help="E.g. tcp/127.0.0.1:7447.")
-    @click.option("--domain", type=click.IntRange(0, 232), help="ROS 2 domain.  [default: the YAML's, or 0]")
-    @wraps(command)
-    def run(config: str | None, endpoints: tuple[str, ...], domain: int | None, **arguments: Any) -> None:
-        command(_connected(config, endpoints, domain), **arguments)
-
-    return run
+    def network(self) -> AbstractContextManager[ZenohTransport]:
+        """A context with a connected transport."""
+        return _connected(options_from(self.config, self.endpoints, self.domain))
 
 
 def options_from(config: str | None, endpoints: tuple[str, ...], domain: int | None) -> ZenohOptions:
     """Transport options of a client on the network.
 
     Raises:
-        UsageError: if no network is given, or the endpoint is invalid.
+        RequestError: if no network is given, or the endpoint is invalid.
         NotSupported: if the YAML uses another transport.
     """
     if config is None and not endpoints:
-        raise click.UsageError("no network: give --config CONFIG, or --endpoint, e.g. --endpoint tcp/127.0.0.1:7447")
+        raise RequestError("no network: give --config CONFIG, or --endpoint, e.g. --endpoint tcp/127.0.0.1:7447")
     changes: dict[str, Any] = {} if domain is None else {"domain": domain}
     if config is None:
         try:
             return ZenohOptions(connect=endpoints, **changes)
         except ValueError as error:
             reason = "certificates are given by --config" if "needs tls" in str(error) else error
-            raise click.UsageError(f"--endpoint: {reason}") from None
+            raise RequestError(f"--endpoint: {reason}") from None
     from ibrobot_core.app import find_config, installed_plugins, load_config
 
     robot = load_config(find_config(config, installed_plugins()), communicates=True)
@@ -72,13 +69,12 @@ def _here(endpoint: str) -> str:
 
 
 @contextmanager
-def _connected(config: str | None, endpoints: tuple[str, ...], domain: int | None) -> Iterator[ZenohTransport]:
+def _connected(options: ZenohOptions) -> Iterator[ZenohTransport]:
     """The network.
 
     Raises:
         TransportError: if there is no answer.
     """
-    options = options_from(config, endpoints, domain)
     log = logging.getLogger("ibrobot.topic")
     log.setLevel(logging.ERROR)  # the error has the reason
     transport = ZenohTransport(options, Context("topic", RealClock(), log, Robot("command_line", ())))
