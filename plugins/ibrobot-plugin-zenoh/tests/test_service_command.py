@@ -16,6 +16,7 @@ from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
 from ibrobot_core.api import NotSupported, Payload, TransportError
+from ibrobot_core.app import RequestError
 
 from .pair import WAIT_S, free_endpoint, router
 
@@ -75,7 +76,7 @@ def test_services_of_ros_2_are_called_by_their_type(network: str):
         CodecError, match="'std_srvs/srv/No' is not defined here; defined are action_msgs/srv/CancelGoal"
     ):
         run(network, "call", "/b", "std_srvs/srv/No")
-    with pytest.raises(SystemExit):
+    with pytest.raises(RequestError, match="got 2 words after /b; quote REQUEST"):
         run(network, "call", "/b", "{x:", "1}")
 
 
