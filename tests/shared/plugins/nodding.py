@@ -14,8 +14,8 @@ from ibrobot_core.app import (
     ControlMode,
     LaunchRequest,
     ModeOptions,
-    Session,
     SourceWorker,
+    StreamingRun,
     run_robot,
 )
 
@@ -23,9 +23,10 @@ from ibrobot_core.app import (
 class Nod(SourceWorker):
     """Moves a joint to and fro once, and ends the run."""
 
+    session: StreamingRun
     autonomous = True
 
-    def __init__(self, session: Session, mode: ControlMode, joint: str) -> None:
+    def __init__(self, session: StreamingRun, mode: ControlMode, joint: str) -> None:
         super().__init__(session, mode, f"nods with {joint}")
         self._joint = joint
         self._end_ns = 0
