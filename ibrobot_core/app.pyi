@@ -175,11 +175,7 @@ from ibrobot_core.terminal import KeyReader as KeyReader, check_key as check_key
 from ibrobot_core.signals import on_signals as on_signals, end_signals as end_signals
 
 # Jobs
-from ibrobot_core.interfaces.pool import (
-    Job as Job,
-    Done as Done,
-    Pool as Pool,
-)
+from ibrobot_core.interfaces.pool import Job as Job, Done as Done, Pool as Pool
 
 # Guides
 from ibrobot_core.interfaces import Guide as Guide, Question as Question
@@ -196,7 +192,8 @@ from ibrobot_core.reports import (
 )
 
 # Processes
-from ibrobot_core.child import Child as Child, Channel as Channel, Failure as Failure, open_parent as open_parent
+from ibrobot_core.channel import Channel as Channel, ChannelMessage as ChannelMessage
+from ibrobot_core.child import Child as Child, run_child as run_child
 from ibrobot_core.memory import create_memory as create_memory, set_malloc as set_malloc
 from ibrobot_core.control.realtime import go_real_time as go_real_time
 from ibrobot_core.bug_reports import as_failure as as_failure

@@ -268,7 +268,7 @@ class ControlClient(ControlHost):
     def start(self) -> None:
         memory = create_memory()
         self._wake, wake = os.pipe()
-        child = self._child = Child("ibrobot_core.control.process", self._order, memory, wake)
+        child = self._child = Child("ibrobot_core.control.process", self._order, memory, wake, end_s=_STOP_TIMEOUT_S)
         os.close(wake)
         self._descriptor = memory
         try:
@@ -286,17 +286,18 @@ class ControlClient(ControlHost):
         while self._memory is None:
             try:
                 message = child.wait(_GLANCE_S)
-            except ComponentFailed:
-                raise self._failure(child, "the control process died while starting") from None
+            except ComponentFailed as death:
+                if child.failure is None:
+                    text = f"the control process died while starting ({death}){self._aftermath}"
+                    raise ComponentFailed(text) from None
+                self.holding = child.failure.holding
+                failure = HardwareError(child.failure.error)
+                failure.exit_code = child.failure.exit_code
+                raise failure from None
             if self._given_up.is_set():
                 raise ComponentFailed("given up while control started")
             if time.monotonic() > deadline_s:
                 raise ComponentFailed(f"the control process was not ready after {_START_TIMEOUT_S:.0f} s")
-            if child.failure is not None:
-                self.holding = child.failure.holding
-                failure = HardwareError(child.failure.error)
-                failure.exit_code = child.failure.exit_code
-                raise failure
             if message is not None and message["event"] == "ready":
                 self.signals = [(topic, size) for topic, size in message["signals"]]
                 self.refused = message["refused"]
@@ -364,7 +365,7 @@ class ControlClient(ControlHost):
 
     def _end(self, child: Child) -> None:
         """Wait for the process to end and release the shared resources."""
-        if child.end(_STOP_TIMEOUT_S):
+        if child.end():
             _LOG.error("the control process did not end within %g s: killed%s", _STOP_TIMEOUT_S, self._aftermath)
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
@@ -376,9 +377,6 @@ class ControlClient(ControlHost):
         else:
             os.close(self._descriptor)
         self._child = None
-
-    def _failure(self, child: Child, what: str) -> ComponentFailed:
-        return ComponentFailed(f"{what} ({child.cause(_STOP_TIMEOUT_S)}){self._aftermath}")
 
     def _receive(self, child: Child) -> None:
         try:
@@ -401,7 +399,7 @@ class ControlClient(ControlHost):
 
     def _death(self, child: Child) -> ComponentFailed:
         if child.failure is None or self._arrived.is_set():
-            return self._failure(child, "the control process died")
+            return ComponentFailed(f"the control process died ({child.cause()}){self._aftermath}")
         # The robot did not arrive, and control says why.
         return ComponentFailed(child.failure.error, child.failure.exit_code)
 

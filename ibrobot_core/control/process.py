@@ -12,12 +12,12 @@ import os
 import signal
 import sys
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.bug_reports import error_text, exit_code
-from ibrobot_core.child import FAREWELL_S, Channel, Failure, is_stopped, open_parent
+from ibrobot_core.channel import Channel
+from ibrobot_core.child import is_stopped, run_child
 from ibrobot_core.clock import RealClock
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
@@ -30,7 +30,6 @@ from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.safe_output import echo
 from ibrobot_core.units import NS_PER_S
 
-_STARTUP_TIMEOUT_S = 30.0
 _GLANCE_S = 0.03
 """Silence of the host from which its state is looked at [s]."""
 
@@ -40,7 +39,7 @@ class ControlProcess:
 
     def __init__(
         self, core: ControlCore, clock: RealClock, channel: Channel, memory: SharedMemory, wake: int, host: int,
-        ready: Mapping[str, Any], early: Iterable[Mapping[str, Any]] = (),
+        ready: Mapping[str, Any],
     ) -> None:  # fmt: skip
         self._core = core
         self._clock = clock
@@ -49,8 +48,6 @@ class ControlProcess:
         self._wake = wake
         self._host = host
         self._ready = ready
-        self._early = early
-        """Commands that arrived with the order, before there was anything to command."""
         self._arrived = False
         self._waiting: deque[Mapping[str, Any]] = deque()
         """Commands of the host that were received and not executed yet."""
@@ -71,7 +68,6 @@ class ControlProcess:
         signal.signal(signal.SIGTERM, self._terminate)
         self._report("report")  # the first call is slow, so make it before the first tick
         self._channel.send(self._ready)
-        self._sort(self._early)
         self._handle_commands()  # an emergency stop that came while the hardware was connected lets nothing move
         period = self._core.period_ns
         deadline = self._clock.now_ns() + period
@@ -110,10 +106,7 @@ class ControlProcess:
 
     def _receive(self) -> None:
         """Receive commands; emergency stops overtake all others."""
-        self._sort(self._channel.receive())
-
-    def _sort(self, commands: Iterable[Mapping[str, Any]]) -> None:
-        for command in commands:
+        for command in self._channel.receive():
             if command.get("do") == "estop":
                 self._channel.send(self._core.handle({"do": "estop", "id": command.get("id")}))
             else:
@@ -168,37 +161,33 @@ class ControlProcess:
         self._terminated = True
 
 
-def main(parent: int, memory: int, wake: int) -> int:
-    """Run with the host's channel, memory and wake descriptors; returns the exit status."""
-    channel = open_parent(parent)
-    core = None
-    try:
-        order, *early = channel.wait(_STARTUP_TIMEOUT_S)
+def main() -> int:
+    """Run the process; returns the exit status."""
+    holding: list[str] = []
+
+    def run(channel: Channel, order: Mapping[str, Any], memory: int, wake: int) -> None:
         clock = RealClock(order["epoch_offset_ns"])
         config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"])
         core = build_core(config, installed_plugins(), clock, order["seed"])
-        core.start(order["mode"])
-        shared = SharedMemory(memory, LinkLayout(len(config.robot.joints), core.signal_size))
-        os.set_blocking(wake, False)
-        refused = go_real_time(config.control.priority)
-        signals = [[signal.topic, signal.size] for signal in core.signals]
-        ready = {"event": "ready", "signals": signals, "refused": refused}
-        ControlProcess(core, clock, channel, shared, wake, order["host"], ready, early).run()
-    except Exception as error:  # noqa: BLE001 - a bug here must still stop the robot
-        if core is not None:
+        try:
+            core.start(order["mode"])
+            shared = SharedMemory(memory, LinkLayout(len(config.robot.joints), core.signal_size))
+            os.set_blocking(wake, False)
+            signals = [[signal.topic, signal.size] for signal in core.signals]
+            ready = {"event": "ready", "signals": signals, "refused": go_real_time(config.control.priority)}
+            ControlProcess(core, clock, channel, shared, wake, order["host"], ready).run()
+        except Exception:  # a bug here must still stop the robot
             core.abandon()
-        holding = core.holding() if core is not None else []
-        channel.report(Failure(error_text(error), exit_code(error), holding))
-        return 1
-    finally:
-        if core is not None:
+            holding[:] = core.holding()
+            raise
+        finally:
             core.close()
             if channel.closed:  # the host can no longer report it
                 for line in core.holding():
                     echo(line, err=True)
-        channel.flush(FAREWELL_S)
-    return 0
+
+    return run_child(run, holding)
 
 
 if __name__ == "__main__":
-    sys.exit(main(*(int(argument) for argument in sys.argv[1:])))
+    sys.exit(main())

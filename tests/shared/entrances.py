@@ -39,7 +39,7 @@ from ibrobot_webxr.messages import Hands, decode
 from plugin_tests import of_tests
 
 from ibrobot_core.api import Header, Pose, PoseStamped, Twist, TwistStamped, Vector3, ns
-from ibrobot_core.child import Channel
+from ibrobot_core.channel import Channel
 from ibrobot_core.config import RobotConfig, from_document, load_config
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.interfaces.run import LaunchRequest
@@ -530,13 +530,12 @@ class Program(_Stream):
     def __init__(self) -> None:
         ends = socket.socketpair()
         self._channel, self._program = Channel(ends[0]), Channel(ends[1])
-        self._pictures = os.pipe()
 
     @override
     def request(self) -> dict[str, Any]:
         def source(session: Any, mode: Any) -> ProgramSource:
             self._features = RobotFeatures.of_config(session.config, use_degrees=True)
-            return ProgramSource(session, mode, self._channel, self._pictures[1], self._features)
+            return ProgramSource(session, mode, self._channel, self._features)
 
         return {"source": source}
 
@@ -566,8 +565,6 @@ class Program(_Stream):
         super().close()
         for channel in (self._channel, self._program):
             channel.close()
-        for end in self._pictures:
-            os.close(end)
 
 
 class Gym(_Stream):

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import time
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.app import Child, ComponentFailed
+from ibrobot_core.app import ChannelMessage, Child, ComponentFailed
 from ibrobot_lerobot_program.features import RobotFeatures
-from ibrobot_lerobot_program.run import ANSWER, READY, load_robot
+from ibrobot_lerobot_program.run import READY, load_robot
 
 _MODULE = "ibrobot_lerobot_program.run"
 _START_S = 120.0
@@ -49,7 +47,6 @@ class ProgramLink:
             "calibration": calibration, "seed": seed,
         }  # fmt: skip
         self._child: Child | None = None
-        self._pipe = -1
         self.measured: Mapping[str, float] = {}
 
     @cached_property
@@ -81,11 +78,7 @@ class ProgramLink:
         Raises:
             ComponentFailed: with the run's own error.
         """
-        self._pipe, far_end = os.pipe()
-        try:
-            self._child = Child(_MODULE, self._order, far_end)
-        finally:
-            os.close(far_end)
+        self._child = Child(_MODULE, self._order, end_s=_END_S)
         try:
             if self._message(_START_S)["event"] != READY:
                 raise ComponentFailed("the run does not start")
@@ -105,7 +98,11 @@ class ProgramLink:
         answer = self._message(_ANSWER_S)
         if "error" in answer:
             raise ComponentFailed(answer["error"])
-        pictures = {name: self._picture(shape) for name, shape in self.features.pictures.items()}
+        pictures, begin = dict[str, NDArray[np.uint8]](), 0
+        for name, shape in self.features.pictures.items():
+            size = int(np.prod(shape))
+            pictures[name] = np.frombuffer(answer.payload, np.uint8, size, begin).reshape(shape)  # writable
+            begin += size
         self.measured = self.features.radians(answer["values"])
         return answer["values"], pictures
 
@@ -127,37 +124,19 @@ class ProgramLink:
         if child is not None:
             child.channel.send({"do": "end"})
             child.channel.close()
-            child.end(_END_S)
-            child.receive()
-        if self._pipe >= 0:
-            os.close(self._pipe)
-            self._pipe = -1
-
-    def _picture(self, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-        content, size = bytearray(), int(np.prod(shape))
-        while len(content) < size:
-            part = os.read(self._pipe, size - len(content))
-            if not part:
-                raise ComponentFailed("the run has ended")
-            content += part
-        return np.frombuffer(content, np.uint8).reshape(shape)  # writable, as LeRobot wants it
+            child.end()
 
     def _running(self) -> Child:
         if self._child is None:
             raise ComponentFailed("the run has not been started, or has ended")
         return self._child
 
-    def _message(self, timeout_s: float) -> Mapping[str, Any]:
+    def _message(self, timeout_s: float) -> ChannelMessage:
         child = self._running()
-        deadline_s = time.monotonic() + timeout_s
-        while (left_s := deadline_s - time.monotonic()) > 0:
-            try:
-                message = child.wait(left_s)
-            except ComponentFailed:
-                raise ComponentFailed(f"the run has ended: {child.cause(_END_S)}") from None
-            if message is not None:
-                assert message["event"] in (READY, ANSWER)
-                return message
-            if child.failure is not None:
-                raise ComponentFailed(child.cause(_END_S))
-        raise ComponentFailed(f"the run does not answer for {timeout_s:g} s")
+        try:
+            message = child.wait(timeout_s)
+        except ComponentFailed as death:
+            raise death if child.failure else ComponentFailed(f"the run has ended: {death}") from None
+        if message is None:
+            raise ComponentFailed(f"the run does not answer for {timeout_s:g} s")
+        return message

@@ -1,13 +1,12 @@
 """The run under a program of LeRobot's, in a process of its own: answers its requests, until it ends or dies.
 
-Started by `ProgramLink` as `python -m ibrobot_lerobot_program.run CHANNEL PICTURES`. The run has its own control
+Started by `ProgramLink` as `python -m ibrobot_lerobot_program.run CHANNEL`. The run has its own control
 process. If the program dies or goes silent, the arm holds.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 import sys
 import time
 from collections.abc import Mapping
@@ -21,7 +20,6 @@ from ibrobot_core.app import (
     Channel,
     ComponentFailed,
     ControlMode,
-    Failure,
     FrameSampler,
     LaunchRequest,
     RobotConfig,
@@ -33,7 +31,7 @@ from ibrobot_core.app import (
     find_config,
     installed_plugins,
     load_config,
-    open_parent,
+    run_child,
 )
 from ibrobot_lerobot_program.features import RobotFeatures
 
@@ -71,12 +69,9 @@ class ProgramSource(SourceWorker):
     urgent = True
     autonomous = True
 
-    def __init__(
-        self, session: StreamingRun, mode: ControlMode, channel: Channel, pictures: int, features: RobotFeatures
-    ) -> None:
+    def __init__(self, session: StreamingRun, mode: ControlMode, channel: Channel, features: RobotFeatures) -> None:
         super().__init__(session, mode, "a program of LeRobot's", (CONTROL,))
         self._channel = channel
-        self._pictures = pictures
         self._features = features
         self._contract = Contract.from_config(session.config)
         self._columns = session.config.robot.indices(features.joints)
@@ -103,15 +98,13 @@ class ProgramSource(SourceWorker):
 
     @override
     def work(self, timeout_s: float) -> None:
-        try:
-            requests = self._channel.wait(min(timeout_s, _GLANCE_S))
-        except ComponentFailed:
-            _LOG.warning("the program of LeRobot's is gone; the run ends")
-            self.session.finish()
-            return
+        requests = self._channel.receive(min(timeout_s, _GLANCE_S))
         with self.lock:
             for request in requests:
                 self._answer(request)
+        if self._channel.closed and not requests:
+            _LOG.warning("the program of LeRobot's is gone; the run ends")
+            self.session.finish()
 
     def _answer(self, request: Mapping[str, Any]) -> None:
         """Carry a request out; only one to read has an answer, with the error of an action before it."""
@@ -164,42 +157,31 @@ class ProgramSource(SourceWorker):
                 raise ComponentFailed(f"no picture of {', '.join(missing)} within {_FIRST_FRAME_S:g} s")
             time.sleep(0.005)
         position: Vector = session.measured().position[self._columns]
-        self._channel.send({"event": ANSWER, "values": self._features.values(position)})
-        for picture in pictures.values():
-            content = memoryview(np.ascontiguousarray(picture)).cast("B")
-            while content:
-                content = content[os.write(self._pictures, content) :]
-
-
-def main(parent: int, pictures: int) -> int:
-    """Run with the program's channel; returns the exit status."""
-    channel = open_parent(parent)
-    try:
-        order = channel.wait(None)[0]
-        config = load_robot(order)
-        features = RobotFeatures.of_config(config, use_degrees=order["use_degrees"], calibration=order["calibration"])
-        request = LaunchRequest(
-            seed=order["seed"],
-            source=lambda session, mode: ProgramSource(session, mode, channel, pictures, features),
+        self._channel.send(
+            {"event": ANSWER, "values": self._features.values(position)},
+            *(memoryview(np.ascontiguousarray(picture)) for picture in pictures.values()),
         )
-        runtime = Runtime(Session(config, installed_plugins(), request))
-        runtime.start()
-        try:
-            channel.send({"event": READY})
-            while not runtime.wait(_GLANCE_S):
-                pass
-        finally:
-            runtime.stop()
-        runtime.raise_failure()
-        for line in runtime.session.outcome.holding:
-            _LOG.warning("%s", line)
-    except Exception as error:  # noqa: BLE001 - the program reports it
-        channel.report(Failure(error_text(error)))
-        return 1
+
+
+def run(channel: Channel, order: Mapping[str, Any]) -> None:
+    """Run with the program's channel."""
+    config = load_robot(order)
+    features = RobotFeatures.of_config(config, use_degrees=order["use_degrees"], calibration=order["calibration"])
+    request = LaunchRequest(
+        seed=order["seed"], source=lambda session, mode: ProgramSource(session, mode, channel, features)
+    )
+    runtime = Runtime(Session(config, installed_plugins(), request))
+    runtime.start()
+    try:
+        channel.send({"event": READY})
+        while not runtime.wait(_GLANCE_S):
+            pass
     finally:
-        channel.flush()
-    return 0
+        runtime.stop()
+    runtime.raise_failure()
+    for line in runtime.session.outcome.holding:
+        _LOG.warning("%s", line)
 
 
 if __name__ == "__main__":
-    sys.exit(main(*(int(argument) for argument in sys.argv[1:])))
+    sys.exit(run_child(run))

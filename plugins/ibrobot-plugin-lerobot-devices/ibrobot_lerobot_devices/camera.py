@@ -10,6 +10,7 @@ import numpy as np
 from ibrobot_ros2.jpeg import to_jpeg
 
 from ibrobot_core.api import CompressedImage, Context, Header, Image, Message, Sensor, SensorError
+from ibrobot_core.app import ChannelMessage
 from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem, age_ns
 from ibrobot_lerobot_devices.options import CameraOptions
 
@@ -70,11 +71,11 @@ class LeRobotCamera(Sensor):
     def close(self) -> None:
         self._link.end()
 
-    def _message(self, answer: Mapping[str, Any]) -> Message:
+    def _message(self, answer: ChannelMessage) -> Message:
         # Two pictures never have the same time.
         stamp_ns = self._last_ns = max(self._ctx.clock.now_ns() - age_ns(answer), self._last_ns + 1)
         height, width, *channels = answer["shape"]
-        pixels = np.frombuffer(answer["content"], np.uint8)
+        pixels = np.frombuffer(answer.payload, np.uint8)
         image = Image(
             Header(stamp_ns, self._frame_id), height, width, self._encoding(answer, channels),
             pixels.size // height, pixels,

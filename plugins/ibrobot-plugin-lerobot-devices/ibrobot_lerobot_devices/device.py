@@ -1,7 +1,7 @@
 """The device process: has one device of LeRobot's and answers requests, until its parent ends it or dies.
 
-Started by `DeviceLink` as `python -m ibrobot_lerobot_devices.device CHANNEL PICTURES`. PICTURES is a pipe for the
-pictures of cameras. LeRobot's calls may block; a thread takes the requests meanwhile, and keeps the newest action.
+Started by `DeviceLink` as `python -m ibrobot_lerobot_devices.device CHANNEL`. LeRobot's calls may block; a thread takes
+the requests meanwhile, and keeps the newest action.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.app import Channel, ComponentFailed, Failure, open_parent
+from ibrobot_core.app import Channel, ComponentFailed, run_child
 from ibrobot_lerobot_devices.stand_in import replace_torch
 from ibrobot_lerobot_devices.units import driven
 
@@ -110,16 +110,11 @@ class Requests:
         self._waiting.put(request)
 
     def _take(self) -> None:
-        try:
-            while True:
-                for request in self.channel.wait(None):
-                    if request["do"] == "end":
-                        raise ComponentFailed("ended")
-                    self.put(request)
-        except ComponentFailed:
-            self._waiting.put(_END)
-            if not self.ended.wait(_FAREWELL_S):
-                os._exit(1)
+        while (request := self.channel.next(None)) is not None and request["do"] != "end":
+            self.put(request)
+        self._waiting.put(_END)
+        if not self.ended.wait(_FAREWELL_S):
+            os._exit(1)
 
 
 @attrs.define
@@ -158,15 +153,13 @@ class Device:
 
     Args:
         order: its kind, type and config.
-        pictures: the pipe for pictures.
     """
 
-    def __init__(self, order: Mapping[str, Any], pictures: int) -> None:
+    def __init__(self, order: Mapping[str, Any]) -> None:
         from ibrobot_lerobot_devices import library
 
         self._library = library
         self._order = order
-        self._pictures = pictures
         self._device: Any = None
         self._seen = Pictures(None)
         self._color = ""
@@ -214,7 +207,7 @@ class Device:
         return self._library.numbers(get())
 
     def picture(self) -> dict[str, Any]:
-        """Send the next new picture, once it is there, through the pipe; return its shape, type and colours."""
+        """The next new picture, once it is there: its shape, type, colours and content."""
         import numpy as np
 
         deadline_s = time.monotonic() + _PICTURE_MS / 1000
@@ -228,11 +221,9 @@ class Device:
             time.sleep(_LOOK_S)
         age_s = 0.0 if taken_s is None else max(0.0, time.perf_counter() - taken_s)
         made_ns = time.monotonic_ns() - round(age_s * 1e9)
-        content = memoryview(pixels).cast("B")
         return {
-            "shape": list(pixels.shape), "type": str(pixels.dtype),
-            "color": self._color, "made_ns": made_ns, "size": content.nbytes,
-            "content": content,
+            "shape": list(pixels.shape), "type": str(pixels.dtype), "color": self._color, "made_ns": made_ns,
+            "content": memoryview(pixels),
         }  # fmt: skip
 
     def act(self, action: Mapping[str, float], made_ns: int) -> None:
@@ -367,17 +358,11 @@ def carry_out(device: Device, request: Mapping[str, Any], channel: Channel) -> N
         return
     if what == "picture":
         content = values.pop("content")
-        channel.send(answer | values)
-        _send(device._pictures, content)
+        channel.send(answer | values, content)
     elif what == "read":
         channel.send(answer | {"values": values, "made_ns": (begun_ns + time.monotonic_ns()) // 2})
     else:
         channel.send(answer | {"found": values})
-
-
-def _send(pipe: int, content: memoryview) -> None:
-    while content:
-        content = content[os.write(pipe, content) :]
 
 
 def prefer() -> None:
@@ -392,48 +377,49 @@ def prefer() -> None:
         Path("/proc/self/autogroup").write_text(str(_NICE), encoding="ascii")  # Linux compares sessions first
 
 
-def main(parent: int, pictures: int) -> int:
-    """Run with the parent's channel; returns the exit status."""
-    prefer()
-    channel = open_parent(parent)
-    order, *early = channel.wait(None)
-    requests = Requests(channel)
-    for request in early:  # e.g. to connect, although it has just begun to import
-        requests.put(request)
-    try:
-        if not order["torch"]:
-            replace_torch()
-        if order["kind"] == "describe":
-            from ibrobot_lerobot_devices import library
+def run(channel: Channel, order: Mapping[str, Any]) -> None:
+    """Run with the parent's channel.
 
-            channel.send({"event": READY, "found": library.describe()})
-            return 0
-        device = Device(order, pictures)
-        if order["only_make"]:
-            channel.send({"event": READY, "found": device.make()})
-            return 0
-        requests.start()
-        if order["waits"]:
-            device.prepare()
-            if requests.next(None)["do"] != CONNECT:
-                return 0
-        requests.traffic.watch()
-        try:
-            description = device.connect()
-            channel.send({"event": READY, "found": description})
-            serve(device, requests)
-        finally:
-            device.disconnect()
-    except Exception as error:  # noqa: BLE001 - the parent reports it
-        channel.report(Failure(_one_line(error)))
-        return 1
+    Raises:
+        ComponentFailed: with LeRobot's error in one line.
+    """
+    requests = Requests(channel)
+    try:
+        _run(channel, order, requests)
+    except Exception as error:  # noqa: BLE001 - of LeRobot, whatever it is
+        raise ComponentFailed(_one_line(error)) from None
     finally:
-        channel.flush()
         requests.ended.set()
-    return 0
+
+
+def _run(channel: Channel, order: Mapping[str, Any], requests: Requests) -> None:
+    if not order["torch"]:
+        replace_torch()
+    if order["kind"] == "describe":
+        from ibrobot_lerobot_devices import library
+
+        channel.send({"event": READY, "found": library.describe()})
+        return
+    device = Device(order)
+    if order["only_make"]:
+        channel.send({"event": READY, "found": device.make()})
+        return
+    requests.start()
+    if order["waits"]:
+        device.prepare()
+        if requests.next(None)["do"] != CONNECT:
+            return
+    requests.traffic.watch()
+    try:
+        description = device.connect()
+        channel.send({"event": READY, "found": description})
+        serve(device, requests)
+    finally:
+        device.disconnect()
 
 
 if __name__ == "__main__":
-    status = main(*(int(argument) for argument in sys.argv[1:]))
+    prefer()
+    status = run_child(run)
     sys.stdout.flush()
     os._exit(status)  # threads of LeRobot's devices may never end

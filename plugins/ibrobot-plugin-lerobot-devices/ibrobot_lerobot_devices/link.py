@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import Any
 
 from ibrobot_core.api import how_to_install
-from ibrobot_core.app import Child, ComponentFailed
+from ibrobot_core.app import ChannelMessage, Child, ComponentFailed
 from ibrobot_lerobot_devices.device import ANSWER, CONNECT, DONE, READY, STAND, TRAFFIC
 
 INSTALL = how_to_install("lerobot")
@@ -62,7 +61,6 @@ class DeviceLink:
         self._number = 0
         self._asked_s: float | None = None
         """When the request without an answer was sent [s]; None if there is none."""
-        self._pipe = -1
         self.late = 0
         """How many readings came after the tick that asked for them."""
         self._stood: str | None = None
@@ -109,15 +107,7 @@ class DeviceLink:
             self._standby = self._start({**self._order, "waits": True})
 
     def _start(self, order: Mapping[str, Any]) -> Child:
-        far_end, pipe = os.pipe()
-        if order["waits"]:  # robots send no pictures
-            os.close(far_end)
-        else:
-            self._pipe = far_end
-        try:
-            return Child(_MODULE, order, pipe)
-        finally:
-            os.close(pipe)
+        return Child(_MODULE, order, end_s=_END_S)
 
     def poll_start(self, timeout_s: float) -> Mapping[str, Any] | None:
         """What the device says about itself, once it is connected; None if that takes more than `timeout_s` [s].
@@ -127,7 +117,7 @@ class DeviceLink:
         """
         return self._await(READY, timeout_s)
 
-    def read(self, wait_s: float) -> dict[str, Any] | None:
+    def read(self, wait_s: float) -> ChannelMessage | None:
         """The newest answer that was not returned yet; asks for one, and waits up to `wait_s` [s] for it.
 
         A request that is not answered yet is not repeated.
@@ -147,7 +137,7 @@ class DeviceLink:
             newest = answer if answer is not None else newest
         return newest
 
-    def picture(self, timeout_s: float) -> dict[str, Any] | None:
+    def picture(self, timeout_s: float) -> ChannelMessage | None:
         """The next answer with a picture, or with an error, or None if none arrives within `timeout_s` [s].
 
         Raises:
@@ -254,45 +244,29 @@ class DeviceLink:
         child, self._child = self._child, None
         if child is not None:
             child.channel.send({"do": "end"})
-            if child.end(_END_S):
+            if child.end():
                 logging.getLogger("ibrobot.lerobot").warning("%s did not end, and was killed", self.type)
             child.receive()  # what it has logged
             child.channel.close()
-        if self._pipe >= 0:
-            os.close(self._pipe)
-            self._pipe = -1
 
     def _end_standby(self) -> None:
         standby, self._standby = self._standby, None
         if standby is not None:
             standby.kill()  # it has touched nothing
-            standby.end(_END_S)
+            standby.end()
             standby.channel.close()
-
-    def _content(self, size: int) -> bytearray:
-        """The bytes of a picture, which follow its answer."""
-        content = bytearray()
-        while len(content) < size:
-            part = os.read(self._pipe, size - len(content))
-            if not part:
-                raise self._death()
-            content += part
-        return content
 
     def _running(self) -> Child:
         if self._child is None:
             raise DeviceProblem("is not connected")
         return self._child
 
-    def _next(self, timeout_s: float) -> dict[str, Any] | None:
+    def _next(self, timeout_s: float) -> ChannelMessage | None:
         """The next answer to a request to read; None if none arrives in time."""
         message = self._message(timeout_s)
         if message is None or message["event"] != ANSWER:
             return None
-        answer = dict(message)
-        if "size" in answer:
-            answer["content"] = self._content(answer["size"])
-        return answer
+        return message
 
     def _await(self, what: str, timeout_s: float) -> Mapping[str, Any] | None:
         """The result of a request, or of the start; None if there is none in time."""
@@ -304,13 +278,13 @@ class DeviceLink:
                 return dict(message["found"])
         return None
 
-    def _message(self, timeout_s: float) -> Mapping[str, Any] | None:
+    def _message(self, timeout_s: float) -> ChannelMessage | None:
+        child = self._running()
         try:
-            message = self._running().wait(timeout_s)
-        except ComponentFailed:
-            raise self._death() from None
-        if message is None and self._running().failure is not None:
-            raise self._death()
+            message = child.wait(timeout_s)
+        except ComponentFailed as death:
+            self._end_child()
+            raise DeviceProblem(f"{'' if child.failure else "LeRobot's process has ended: "}{death}") from None
         if message is not None and message["event"] == ANSWER and message["id"] == self._number:
             self._asked_s = None
         if message is not None and message["event"] == DONE:
@@ -319,10 +293,3 @@ class DeviceLink:
             elif message["do"] == STAND:
                 self._stood = message.get("error", "")
         return message
-
-    def _death(self) -> DeviceProblem:
-        child = self._running()
-        cause = child.cause(_END_S)
-        failed = child.failure is not None
-        self._end_child()
-        return DeviceProblem(cause if failed else f"LeRobot's process has ended: {cause}")

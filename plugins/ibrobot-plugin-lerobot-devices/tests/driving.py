@@ -137,13 +137,13 @@ class FakeChild:
 
     world: World  # set by `World`
 
-    def __init__(self, module: str, order: Mapping[str, Any], pipe: int) -> None:
+    def __init__(self, module: str, order: Mapping[str, Any], *, end_s: float) -> None:
         world = self.world
         self.pid = world.count = world.count + 1
         self.alive, self.failure, self.frozen, self.held = True, None, False, False
         self._outbox: list[tuple[int, dict[str, Any]]] = []
         self._inbox: list[dict[str, Any]] = []
-        self._device = device.Device(order, -1)
+        self._device = device.Device(order)
         self.channel = SimpleNamespace(send=self._receive, backlog=0, close=lambda: None)
         self._requests = device.Requests(SimpleNamespace(send=self._send))  # type: ignore[arg-type]
         self._waits = bool(order["waits"])
@@ -194,9 +194,9 @@ class FakeChild:
         while True:
             if self._outbox and self._outbox[0][0] <= self.world.clock.now_ns():
                 return self._outbox.pop(0)[1]
-            if not self.alive and self.failure is None:
-                raise ComponentFailed("gone")
-            if self.failure or self.world.clock.now_ns() >= deadline_ns:
+            if not self.alive:
+                raise ComponentFailed(self.failure.error if self.failure else "killed by SIGKILL")
+            if self.world.clock.now_ns() >= deadline_ns:
                 return None
             self.world.step()
 
@@ -209,11 +209,7 @@ class FakeChild:
     def kill(self) -> None:
         self.alive = False
 
-    def cause(self, timeout_s: float) -> str:
-        self.alive = False
-        return self.failure.error if self.failure else "killed by SIGKILL"
-
-    def end(self, timeout_s: float) -> bool:
+    def end(self) -> bool:
         if self.alive and self._connected and not self.frozen:
             self._device.disconnect()
         self.alive = False

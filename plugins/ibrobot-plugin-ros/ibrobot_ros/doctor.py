@@ -28,7 +28,7 @@ def checks() -> Iterator[Check]:
         problem = error.missing if isinstance(error, MissingDependency) else str(error)
         yield Check("ros", False, problem, REMEDY, matters=False)
         return
-    node.end()
+    node.close()
     yield Check("ros", True, f"{node.hello}, rclpy {node.hello.rclpy} ({interpreter.found})")
     for name, remedy in _MISSING.items():
         if name not in node.hello.interfaces:

@@ -74,9 +74,9 @@ class Ros2Control(Hardware):
         except IbrobotError as error:
             raise HardwareError(error_line(error)) from error
         types = {"positions": Float64MultiArray.ros_type, "trajectory": JointTrajectory.ros_type}
-        node.wire.send({"op": "publisher", "topic": self._topic, "type": types[options.command], "qos": "default"})
+        node.channel.send({"op": "publisher", "topic": self._topic, "type": types[options.command], "qos": "default"})
         states = {"topic": options.states, "type": JointState.ros_type, "qos": "default", "rate_hz": _RATE_HZ}
-        node.wire.send({"op": "subscriber", **states})
+        node.channel.send({"op": "subscriber", **states})
         try:
             self._await_controller()
         except BaseException:
@@ -116,10 +116,10 @@ class Ros2Control(Hardware):
     def write(self, position: Vector) -> None:
         if position.shape != (len(self.joints),):
             raise HardwareError(f"position must have shape ({len(self.joints)},), got {position.shape}")
-        wire = self._open().wire
-        if wire.backlog > _BACKLOG:
+        channel = self._open().channel
+        if channel.backlog > _BACKLOG:
             raise HardwareError("the ROS node of the hardware does not take commands: it is stopped, or overloaded")
-        wire.send({"op": "message", "topic": self._topic}, encode(self._command(position)).tobytes())
+        channel.send({"op": "message", "topic": self._topic}, encode(self._command(position)).tobytes())
 
     def _command(self, position: Vector) -> Message:
         if self._options.command == "positions":
@@ -132,14 +132,14 @@ class Ros2Control(Hardware):
         node, self._node = self._node, None
         self._last, self._listeners, self._fault = None, 0, ""
         if node is not None:
-            node.wire.send({"op": "end"})
-            node.wire.flush(1.0)
-            node.end()
+            node.channel.send({"op": "end"})
+            node.channel.flush(1.0)
+            node.close()
 
     @override
     def reset_faults(self) -> None:
         self._fault = ""
-        if self._node is None or self._node.wire.closed:
+        if self._node is None or self._node.channel.closed:
             self.connect()
 
     @override
@@ -154,17 +154,17 @@ class Ros2Control(Hardware):
         """
         if self._node is None:
             raise HardwareError("the hardware is not connected")
-        if self._node.wire.closed:
+        if self._node.channel.closed:
             raise HardwareError(f"the ROS node of the hardware died: {self._node.cause()}")
         return self._node
 
     def _take(self, timeout_s: float) -> None:
         """Take what has come; of several states, the newest."""
         node = self._open()
-        newest = b""
-        for head, payload in node.wire.wait(timeout_s):
+        newest = memoryview(b"")
+        for head in node.channel.receive(timeout_s):
             if head["op"] == "message":
-                newest = payload
+                newest = head.payload
             elif head["op"] == "matched":
                 self._listeners = head["subscribers"]
             elif head["op"] == "trouble":
@@ -174,7 +174,7 @@ class Ros2Control(Hardware):
         if not self._listeners and self._last is not None and not timeout_s:
             self._fault = self._fault or f"nobody subscribes {self._topic} any more: the controller is gone"
 
-    def _accept(self, payload: bytes) -> None:
+    def _accept(self, payload: memoryview) -> None:
         try:
             message = decode(JointState.ros_type, payload)
         except IbrobotError as error:

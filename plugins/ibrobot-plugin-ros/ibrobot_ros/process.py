@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import signal
-import socket
-import subprocess
+import inspect
+import os
 import tempfile
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import override
 
 import attrs
 
 from ibrobot_core.api import MissingDependency
-from ibrobot_core.app import ComponentFailed
+from ibrobot_core.app import Channel, Child, ComponentFailed
 from ibrobot_ros.installation import REMEDY, Interpreter, environment, find_interpreter
 from ibrobot_ros.options import RosInstallation
-from ibrobot_ros.wire import Wire
 
 _SCRIPT = Path(__file__).parent / "node" / "run.py"
 _START_S = 30.0
@@ -44,7 +44,7 @@ class Hello:
         return f"{name} with {self.rmw}, domain {self.domain}, discovery {reach}, {self.python}"
 
 
-class NodeProcess:
+class NodeProcess(Child):
     """Starts the node and waits until it is there.
 
     Args:
@@ -55,9 +55,7 @@ class NodeProcess:
         given_up: called while waiting; whether to stop waiting.
 
     Attributes:
-        wire: the connection.
         hello: what the node found.
-        printed: the last that it printed; known after `end`.
 
     Raises:
         MissingDependency: if there is no rclpy.
@@ -66,63 +64,47 @@ class NodeProcess:
 
     def __init__(
         self, options: RosInstallation, name: str, *, niceness: int = 0, probe: bool = False,
-        given_up: Any = lambda: False,
+        given_up: Callable[[], bool] = lambda: False,
     ) -> None:  # fmt: skip
-        self.printed = ""
         interpreter = find_interpreter(options)
-        own, other = socket.socketpair()
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `end`
-        with other:
-            self._process = subprocess.Popen(
-                [*interpreter.command, str(_SCRIPT), str(other.fileno())],
-                pass_fds=(other.fileno(),),
-                stdin=subprocess.DEVNULL,
-                stdout=self._said,
-                stderr=self._said,
-                start_new_session=True,
-                env=environment(options, interpreter),
-            )
-        self.wire = Wire(own)
-        self.wire.send({"op": "order", "name": name, "niceness": niceness, "probe": probe})
+        self._printed = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
+        super().__init__(
+            [*interpreter.command, str(_SCRIPT), inspect.getfile(Channel)],
+            {"op": "order", "name": name, "niceness": niceness, "probe": probe},
+            end_s=_END_S, env=environment(options, interpreter), stdout=self._printed, stderr=self._printed,
+        )  # fmt: skip
         try:
             self.hello = self._await_hello(interpreter, given_up)
         except BaseException:
-            self.end()
+            self.close()
             raise
 
-    def _await_hello(self, interpreter: Interpreter, given_up: Any) -> Hello:
+    def _await_hello(self, interpreter: Interpreter, given_up: Callable[[], bool]) -> Hello:
         deadline_s = time.monotonic() + _START_S
-        while not self.wire.closed and time.monotonic() < deadline_s and not given_up():
-            for head, _ in self.wire.wait(_GLANCE_S):  # one, since the node then waits for an order
-                if head.pop("op") == "hello":
-                    return Hello(**head)
-                raise MissingDependency(
-                    f"rclpy cannot be imported by {head['python']} ({interpreter.found}): {head['what']}", remedy=REMEDY
-                )
-        raise ComponentFailed(f"the ROS node did not start ({interpreter.found}): {self.cause()}")
+        head = None
+        with suppress(ComponentFailed):
+            while head is None and time.monotonic() < deadline_s and not given_up():
+                head = self.wait(_GLANCE_S)
+        if head is None:
+            self.channel.close()
+            raise ComponentFailed(f"the ROS node did not start ({interpreter.found}): {self.cause()}")
+        if head.pop("op") == "hello":
+            return Hello(**head)
+        raise MissingDependency(
+            f"rclpy cannot be imported by {head['python']} ({interpreter.found}): {head['what']}", remedy=REMEDY
+        )
 
-    @property
-    def pid(self) -> int:
-        """Its process id."""
-        return self._process.pid
-
+    @override
     def cause(self) -> str:
         """End the process; why it ended: its exit status, and the last that it printed."""
-        self.end()
-        status = self._process.returncode
-        cause = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
-        return ": ".join(filter(None, (cause, self.printed)))
+        cause = super().cause()
+        if self._printed.closed:
+            return cause
+        self._printed.seek(max(0, self._printed.seek(0, os.SEEK_END) - _SAID))
+        return ": ".join(filter(None, (cause, self._printed.read().decode(errors="replace").strip())))
 
-    def end(self) -> None:
-        """End the process; safe to call twice. Nothing may wait on the wire meanwhile."""
-        self.wire.close()
-        try:
-            self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        if not self._said.closed:
-            size = self._said.seek(0, 2)
-            self._said.seek(max(0, size - _SAID))
-            self.printed = self._said.read().decode(errors="replace").strip()
-            self._said.close()
+    def close(self) -> None:
+        """End the process; safe to call twice. Nothing may wait on the channel meanwhile."""
+        self.channel.close()
+        self.end()
+        self._printed.close()

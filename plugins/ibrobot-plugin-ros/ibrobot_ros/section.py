@@ -11,12 +11,11 @@ from typing import Any, override
 from ibrobot_ros2.goals import Actions, with_goals
 
 from ibrobot_core.api import DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
-from ibrobot_core.app import CONTROL, Component, ComponentFailed, GoalRun, Pulse, error_line
+from ibrobot_core.app import CONTROL, Channel, ChannelMessage, Component, ComponentFailed, GoalRun, Pulse, error_line
 from ibrobot_ros.options import RosOptions
 from ibrobot_ros.process import NodeProcess
 from ibrobot_ros.services import Services
 from ibrobot_ros.topics import Topics, ros_name
-from ibrobot_ros.wire import Wire
 
 DIAGNOSTICS = "/diagnostics"
 _NICE = 5
@@ -56,7 +55,7 @@ class RosNode(Component):
         )  # fmt: skip
         self._services = Services(options, session)
         self._node: NodeProcess | None = None
-        self._wire: Wire | None = None
+        self._channel: Channel | None = None
         self._ending = threading.Event()
         self._threads: list[threading.Thread] = []
         self._restarts = 0
@@ -94,7 +93,7 @@ class RosNode(Component):
         self._services.open()
         if not self._lockstep:
             self._actions.open()
-        self._declare(self._node.wire)
+        self._declare(self._node.channel)
         if self._lockstep:
             return
         for name, work in (("ros", self._receive), ("ros topics", self._send)):
@@ -105,14 +104,14 @@ class RosNode(Component):
 
     @override
     def step(self, now_ns: int) -> None:
-        wire = self._wire
-        if wire is None:
+        channel = self._channel
+        if channel is None:
             return
-        while self.topics.send_next(wire, 0.0):
+        while self.topics.send_next(channel, 0.0):
             pass
-        for head, payload in wire.wait(0.0):
-            self._take(wire, head, payload)
-        if not wire.flush(_STOP_S):
+        for head in channel.receive(0.0):
+            self._take(channel, head)
+        if not channel.flush(_STOP_S):
             assert self._node is not None
             raise ComponentFailed(f"the ROS node is gone: {self._node.cause()}")
 
@@ -120,81 +119,81 @@ class RosNode(Component):
     def stop(self) -> None:
         self._session.pulses.discard(self._pulse)
         self._ending.set()
-        if self._wire is not None and not self._wire.closed:
-            self._wire.wake()
+        if self._channel is not None and not self._channel.closed:
+            self._channel.wake()
         for thread in self._threads:
             thread.join(_STOP_S)
         self._threads.clear()
-        wire, self._wire = self._wire, None
-        if wire is not None:
-            self._send_rest(wire)
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            self._send_rest(channel)
         self.topics.close()
         self._services.close()
         self._actions.close()
-        if wire is not None:
-            wire.send({"op": "end"})
-            wire.flush(1.0)
+        if channel is not None:
+            channel.send({"op": "end"})
+            channel.flush(1.0)
         node, self._node = self._node, None
         if node is not None:
-            node.end()
+            node.close()
 
     def _new_node(self, given_up: threading.Event) -> NodeProcess:
         return NodeProcess(self._options, self._options.name, niceness=_NICE, given_up=given_up.is_set)
 
-    def _declare(self, wire: Wire) -> None:
+    def _declare(self, channel: Channel) -> None:
         """Tell a new node what the run has."""
         self._pinged_s = time.monotonic()
         self._heard_s = self._pinged_s + _SETUP_S
-        self.topics.declare(wire)
-        self._services.declare(wire)
+        self.topics.declare(channel)
+        self._services.declare(channel)
         if not self._lockstep:
-            self._actions.declare(wire)
-        self._wire = wire
+            self._actions.declare(channel)
+        self._channel = channel
 
     def _send(self) -> None:
         """Send messages of the bus, in a thread of its own."""
         while not self._ending.is_set():
-            wire = self._wire
-            if wire is None or wire.closed:
+            channel = self._channel
+            if channel is None or channel.closed:
                 self._ending.wait(_GLANCE_S)
             else:
-                self.topics.send_next(wire, _GLANCE_S)
+                self.topics.send_next(channel, _GLANCE_S)
 
-    def _send_rest(self, wire: Wire) -> None:
+    def _send_rest(self, channel: Channel) -> None:
         """Flush, so external recordings are complete."""
         deadline_s = time.monotonic() + _END_S
-        while not wire.closed and time.monotonic() < deadline_s and self.topics.send_next(wire, 0.0):
+        while not channel.closed and time.monotonic() < deadline_s and self.topics.send_next(channel, 0.0):
             pass
 
     def _receive(self) -> None:
         """Take what the node sends, watch it, and start it again, in a thread of its own."""
         wait_s = _FIRST_WAIT_S
         while not self._ending.is_set():
-            wire = self._wire
+            channel = self._channel
             self._pulse.beat()
-            if wire is not None and not wire.closed:
-                for head, payload in wire.wait(_GLANCE_S):
-                    self._take(wire, head, payload)
-                self._watch(wire)
+            if channel is not None and not channel.closed:
+                for head in channel.receive(_GLANCE_S):
+                    self._take(channel, head)
+                self._watch(channel)
                 if self._restarts and time.monotonic() - self._begun_s > _LONGEST_WAIT_S:
                     wait_s = _FIRST_WAIT_S
             else:
                 if self._node is not None:
-                    self._lose(self._node.cause(), wait_s)
+                    self._lose(self._node, wait_s)
                 with self._pulse.paused():  # nobody can call without a node
                     if not self._ending.wait(wait_s):
                         wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
                         self._restart()
             self._publish_status()
 
-    def _watch(self, wire: Wire) -> None:
+    def _watch(self, channel: Channel) -> None:
         """Ask the node for a sign of life, and offer services that are new."""
         now_s = time.monotonic()
         if now_s - self._pinged_s >= _PING_S:
             self._pinged_s = now_s
-            wire.send({"op": "ping"})
-            self._services.refresh(wire)
-            self._actions.refresh(wire)
+            channel.send({"op": "ping"})
+            self._services.refresh(channel)
+            self._actions.refresh(channel)
         silent_s = now_s - self._heard_s
         if silent_s > _SILENT_S and not self._trouble:
             assert self._node is not None
@@ -205,10 +204,11 @@ class RosNode(Component):
             self._trouble = ""
             self._session.log.warning("ros: the node answers again")
 
-    def _lose(self, cause: str, wait_s: float) -> None:
+    def _lose(self, node: NodeProcess, wait_s: float) -> None:
         """Report the death of the node."""
-        self._node = self._wire = None
-        self._trouble = f"the ROS node died ({cause.splitlines()[-1]})"
+        self._trouble = f"the ROS node died ({node.cause().splitlines()[-1]})"
+        node.close()
+        self._node = self._channel = None
         self._session.log.error("ros: %s; starting it again in %g s", self._trouble, wait_s)
         self._actions.abandon(self._trouble)
 
@@ -223,33 +223,35 @@ class RosNode(Component):
         self._begun_s = time.monotonic()
         self._trouble = ""
         self._session.log.warning("ros: the node was started again")
-        self._declare(self._node.wire)
+        self._declare(self._node.channel)
 
-    def _take(self, wire: Wire, head: dict[str, Any], payload: bytes) -> None:
+    def _take(self, channel: Channel, head: ChannelMessage) -> None:
         self._heard_s = time.monotonic()
         takes: dict[str, Callable[[], None]] = {
-            "message": lambda: self.topics.take(head["topic"], payload),
+            "message": lambda: self.topics.take(head["topic"], head.payload),
             "matched": lambda: self.topics.take_subscribers(head["topic"], head["subscribers"]),
             "dropped": lambda: self._note_flood(head["topic"], head["count"]),
             "trouble": lambda: self.topics.tell(f"{head['topic']}: {head['what']}"),
-            "goal": lambda: self._submit(wire, head),
-            "cancel": lambda: self._submit(wire, head),
-            "call": lambda: self._services.take_call(wire, head),
+            "goal": lambda: self._submit(channel, head),
+            "cancel": lambda: self._submit(channel, head),
+            "call": lambda: self._services.take_call(channel, head),
             "pong": lambda: None,
         }  # fmt: skip
         takes[head["op"]]()
 
-    def _submit(self, wire: Wire, head: dict[str, Any]) -> None:
+    def _submit(self, channel: Channel, head: dict[str, Any]) -> None:
         """Decide about a goal or a cancel in another thread; refuse it if there is none."""
-        if not self._services.submit(partial(self._decide, wire, head, self._session.stops)):
+        if not self._services.submit(partial(self._decide, channel, head, self._session.stops)):
             self._session.log.warning("ros: a %s is refused: too many calls wait", head["op"])
-            wire.send({"op": "decided", "goal": head["goal"], "accepted": False})
+            channel.send({"op": "decided", "goal": head["goal"], "accepted": False})
 
-    def _decide(self, wire: Wire, head: dict[str, Any], stops: int) -> None:
+    def _decide(self, channel: Channel, head: dict[str, Any], stops: int) -> None:
         """Answer a goal, or a cancel, which was received after `stops` emergency stops."""
         number, actions = head["goal"], self._actions
-        accepted = actions.cancel(wire, number) if head["op"] == "cancel" else actions.take_goal(wire, head, stops)
-        wire.send({"op": "decided", "goal": number, "accepted": accepted})
+        accepted = (
+            actions.cancel(channel, number) if head["op"] == "cancel" else actions.take_goal(channel, head, stops)
+        )
+        channel.send({"op": "decided", "goal": number, "accepted": accepted})
 
     def _note_flood(self, topic: str, count: int) -> None:
         self.topics.counts[f"dropped {topic}"] += count

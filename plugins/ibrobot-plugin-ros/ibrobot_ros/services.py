@@ -10,10 +10,9 @@ from typing import Any
 from ibrobot_ros2.offers import TRIGGER, Offer, Offers
 from ibrobot_ros2.workers import StopWay, Workers
 
-from ibrobot_core.app import CHECK_ESTOP, ESTOP, ComponentFailed, RunView
+from ibrobot_core.app import CHECK_ESTOP, ESTOP, Channel, ComponentFailed, RunView
 from ibrobot_ros.options import RosOptions
 from ibrobot_ros.topics import ros_name
-from ibrobot_ros.wire import Wire
 
 _WORKERS, _URGENT_WORKERS = 16, 2
 _MOST = 1000
@@ -67,24 +66,24 @@ class Services:
         """
         return self._workers[urgent].put(work) is None
 
-    def declare(self, wire: Wire) -> None:
+    def declare(self, channel: Channel) -> None:
         """Tell a new node which services there are."""
         self._offers.clear()
-        self.refresh(wire)
+        self.refresh(channel)
 
-    def refresh(self, wire: Wire) -> None:
+    def refresh(self, channel: Channel) -> None:
         """Tell the node which services are new."""
         for name, offer in self._found.found().items():
             if name not in self._offers:
                 self._offers[name] = offer
-                wire.send({"op": "service", "name": name, "type": offer.type, "urgent": offer.urgent})
+                channel.send({"op": "service", "name": name, "type": offer.type, "urgent": offer.urgent})
 
-    def take_call(self, wire: Wire, head: Mapping[str, Any]) -> None:
+    def take_call(self, channel: Channel, head: Mapping[str, Any]) -> None:
         """Answer a call, in another thread."""
         offer = self._offers[head["service"]]
-        if not self.submit(partial(self._answer, wire, offer, head), urgent=offer.urgent):
+        if not self.submit(partial(self._answer, channel, offer, head), urgent=offer.urgent):
             busy = {"success": False, "message": "the robot has no thread for this call: too many calls wait"}
-            wire.send({"op": "answer", "call": head["call"], **busy})
+            channel.send({"op": "answer", "call": head["call"], **busy})
 
-    def _answer(self, wire: Wire, offer: Offer, head: Mapping[str, Any]) -> None:
-        wire.send({"op": "answer", "call": head["call"], **self._found.answer(offer, head["request"])})
+    def _answer(self, channel: Channel, offer: Offer, head: Mapping[str, Any]) -> None:
+        channel.send({"op": "answer", "call": head["call"], **self._found.answer(offer, head["request"])})

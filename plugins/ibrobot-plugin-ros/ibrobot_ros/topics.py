@@ -5,15 +5,17 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Mapping
+from typing import Any
 
 from ibrobot_ros2 import decode, encode
 from ibrobot_ros2.interfaces import fields_of
 
 from ibrobot_core.api import MESSAGE_TYPES, NS_PER_S, IbrobotError, JointState
-from ibrobot_core.app import Received, RunView, Subscription
+from ibrobot_core.app import Channel, Received, RunView, Subscription
 from ibrobot_ros.options import NAME, Ros2ControlOptions, RosOptions
-from ibrobot_ros.wire import Frame, Wire
 
+type Frame = tuple[dict[str, Any], bytes]
+"""A message for the node, with the bytes of a message of ROS."""
 CLOCK = "/clock"
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 _CLOCK_CDR = struct.Struct("<4siI")
@@ -88,7 +90,7 @@ class Topics:
         if queue is not None:
             queue.close()
 
-    def declare(self, wire: Wire) -> None:
+    def declare(self, channel: Channel) -> None:
         """Tell a new node which topics it has, with the newest message of those that are latched."""
         self._subscribers.clear()
         self._declared.clear()
@@ -96,11 +98,11 @@ class Topics:
             qos = profile(topic, type_name, self._options.qos)
             name = ros_name(topic, self._options.namespace)
             head = {"op": "subscriber", "topic": name, "type": type_name, "fields": _fields(type_name), "qos": qos}
-            wire.send({**head, "rate_hz": self._options.rate_hz})
+            channel.send({**head, "rate_hz": self._options.rate_hz})
         for received in self._session.bus.latched().values():
-            wire.send_all(self._frames(received, wire.backlog))
+            channel.send_all(self._frames(received, channel.backlog))
 
-    def send_next(self, wire: Wire, timeout_s: float) -> bool:
+    def send_next(self, channel: Channel, timeout_s: float) -> bool:
         """Send the messages of the bus that wait; returns whether there was one within `timeout_s` [s]."""
         queue = self._queue
         first = queue.get(timeout_s) if queue is not None else None
@@ -110,13 +112,13 @@ class Topics:
             self._note_lost(queue)
         frames: list[Frame] = []
         for received in (first, *queue.drain()):
-            frames += self._frames(received, wire.backlog)
+            frames += self._frames(received, channel.backlog)
             if self.clock and isinstance(received.message, JointState):
                 frames += self._clock_frames(received.message.header.stamp_ns)
-        wire.send_all(frames)
+        channel.send_all(frames)
         return True
 
-    def take(self, name: str, payload: bytes) -> None:
+    def take(self, name: str, payload: memoryview) -> None:
         """Publish a message of ROS on the bus."""
         topic = self._received[name]
         try:

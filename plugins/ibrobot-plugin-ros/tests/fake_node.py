@@ -8,11 +8,13 @@ import socket
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from ibrobot_ros.wire import Frame, Wire
 
-PACKAGE = Path(sys.modules["ibrobot_ros.wire"].__file__ or "").parent
+from ibrobot_core.app import Channel
+
+type Frame = tuple[dict[str, Any], bytes]
 HELLO = {
     "op": "hello",
     "python": "python",
@@ -38,13 +40,11 @@ def write(folder: Path, behaviour: str = "") -> Path:
     path.write_text(
         textwrap.dedent(f"""\
             #!{sys.executable}
-            import sys
-            from types import ModuleType
+            import runpy, sys
             sys.path.insert(0, {str(Path(__file__).parent)!r})
-            package = sys.modules["ibrobot_ros"] = ModuleType("ibrobot_ros")  # as in run.py: without what it imports
-            package.__path__ = [{str(PACKAGE)!r}]
+            runpy.run_path(sys.argv[1])["stub"](sys.argv[2])
             from fake_node import serve
-            serve(int(sys.argv[2]), {behaviour!r}, {str(folder / "frames")!r})
+            serve(int(sys.argv[3]), {behaviour!r}, {str(folder / "frames")!r})
             """)
     )
     path.chmod(0o755)
@@ -58,50 +58,52 @@ def sends(**answers: list[Frame]) -> str:
 
 def serve(descriptor: int, behaviour: str, notes: str) -> None:
     """The other side's program."""
-    wire = Wire(socket.socket(fileno=descriptor))
+    channel = Channel(socket.socket(fileno=descriptor))
     if behaviour == "dies":
         print("a library is missing", file=sys.stderr)
         os._exit(3)
     if behaviour.startswith("controller"):
-        _control(wire, *behaviour.split()[1:])
+        _control(channel, *behaviour.split()[1:])
     answers = json.loads(behaviour) if behaviour.startswith("{") else {}
     with open(notes, "a", encoding="utf-8") as noted:
-        while not wire.closed:
-            for head, payload in wire.wait(0.1):
-                noted.write(json.dumps([head, payload.hex()]) + "\n")
+        while not channel.closed:
+            for head in channel.receive(0.1):
+                noted.write(json.dumps([head, head.payload.hex()]) + "\n")
                 noted.flush()
                 if head["op"] == "order":
-                    wire.send({"op": "missing", "what": "no rclpy", "python": "x"} if behaviour == "missing" else HELLO)
+                    channel.send(
+                        {"op": "missing", "what": "no rclpy", "python": "x"} if behaviour == "missing" else HELLO
+                    )
                 elif head["op"] == "ping" and behaviour != "silent":
-                    wire.send({"op": "pong"})
+                    channel.send({"op": "pong"})
                 elif head["op"] == "end":
-                    wire.flush(1.0)
+                    channel.flush(1.0)
                     os._exit(0)
                 for answer, body in answers.pop(head["op"], ()):
-                    wire.send(answer, bytes.fromhex(body))
+                    channel.send(answer, bytes.fromhex(body))
     os._exit(0)
 
 
-def _control(wire: Wire, state: str, offset: str, count: str) -> None:
+def _control(channel: Channel, state: str, offset: str, count: str) -> None:
     """Publish states, and follow commands at 3 rad/s."""
     text, begin, size = bytearray.fromhex(state), int(offset), 8 * int(count)
     position = np.frombuffer(text, np.float64, int(count), begin).copy()
     command, told = position.copy(), False
-    while not wire.closed:
-        for head, payload in wire.wait(0.002):
+    while not channel.closed:
+        for head in channel.receive(0.002):
             if head["op"] == "order":
-                wire.send(HELLO)
+                channel.send(HELLO)
             elif head["op"] == "subscriber":
                 told = True
-                wire.send({"op": "matched", "topic": "", "subscribers": 1})
+                channel.send({"op": "matched", "topic": "", "subscribers": 1})
             elif head["op"] == "message":
-                command = np.frombuffer(payload[-size:])
+                command = np.frombuffer(bytes(head.payload[-size:]))
             elif head["op"] == "end":
                 os._exit(0)
         position += np.clip(command - position, -0.006, 0.006)
         text[begin : begin + size] = position.tobytes()
         if told:
-            wire.send({"op": "message", "topic": "/joint_states"}, bytes(text))
+            channel.send({"op": "message", "topic": "/joint_states"}, bytes(text))
     os._exit(0)
 
 

@@ -205,7 +205,7 @@ def test_without_further_threads_stops_are_answered_and_other_calls_refused(star
     part.session.bus.unserve(ESTOP)
     part.session.bus.serve(ESTOP, lambda request: calls.append("estop"))
     answers: queue.SimpleQueue[dict[str, object]] = queue.SimpleQueue()
-    wire = SimpleNamespace(send=answers.put)
+    channel = SimpleNamespace(send=answers.put)
     services._offers = {"/estop": Offer(TRIGGER, "/estop", {}, urgent=True), "/slow": Offer(TRIGGER, "/slow", {})}
 
     def refuse(thread):
@@ -213,9 +213,9 @@ def test_without_further_threads_stops_are_answered_and_other_calls_refused(star
 
     monkeypatch.setattr(threading.Thread, "start", refuse)
     for number in range(3):
-        services.take_call(wire, {"service": "/slow", "call": number, "request": {}})
+        services.take_call(channel, {"service": "/slow", "call": number, "request": {}})
         assert "no thread for this call" in answers.get(timeout=PATIENCE_S)["message"]
-        services.take_call(wire, {"service": "/estop", "call": number, "request": {}})
+        services.take_call(channel, {"service": "/estop", "call": number, "request": {}})
         assert answers.get(timeout=PATIENCE_S)["success"] is True
     assert calls == ["estop"] * 3
     monkeypatch.undo()

@@ -11,19 +11,12 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ibrobot_core.api import Policy
-from ibrobot_core.app import (
-    Channel,
-    ComponentFailed,
-    Failure,
-    build_policy,
-    error_text,
-    from_document,
-    installed_plugins,
-    open_parent,
-)
+from ibrobot_core.app import Channel, build_policy, error_text, from_document, installed_plugins, run_child
 from ibrobot_serve.wire import WIRE_LIMITS, WireDecoder, WireEncoder, WireKind, WireMessage
 
 _GLANCE_S = 0.5
@@ -42,10 +35,12 @@ def answer_requests(policy: Policy, channel: Channel, request: memoryview, answe
         return len(encoder.encode(message, lambda size: answer[:size]))
 
     while True:
-        try:
-            order = channel.wait(None)[-1]  # the host gave up the earlier ones
-        except ComponentFailed:
+        orders = channel.receive(None)
+        if channel.closed:
             return
+        if not orders:
+            continue
+        order = orders[-1]  # the host gave up the earlier ones
         begun_ns = time.monotonic_ns()
         try:
             message = decoder.decode(request[: order["size"]])
@@ -66,17 +61,14 @@ def _end_with(host: int) -> None:
     os._exit(1)
 
 
-def main(parent: int, request: int, answer: int) -> int:
-    """Run with the host's channel and memories; returns the exit status."""
-    channel = open_parent(parent)
+def run(channel: Channel, order: Mapping[str, Any], request: int, answer: int) -> None:
+    """Run with the host's channel and memories."""
     os.nice(_NICE)
-    policy = None
+    threading.Thread(target=_end_with, args=(order["host"],), daemon=True).start()
+    registry = installed_plugins()
+    config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"], registry=registry)
+    policy = build_policy(config, registry, order["model"], order["seed"])
     try:
-        order = channel.wait(None)[0]
-        threading.Thread(target=_end_with, args=(order["host"],), daemon=True).start()
-        registry = installed_plugins()
-        config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"], registry=registry)
-        policy = build_policy(config, registry, order["model"], order["seed"])
         policy.load()
         channel.send({
             "event": "ready", "fingerprint": policy.fingerprint(), "weights": policy.weights(),
@@ -84,15 +76,9 @@ def main(parent: int, request: int, answer: int) -> int:
         })  # fmt: skip
         frames = [memoryview(mmap.mmap(descriptor, WIRE_LIMITS.size)) for descriptor in (request, answer)]
         answer_requests(policy, channel, *frames)
-    except Exception as error:  # noqa: BLE001 - the host reports it
-        channel.report(Failure(error_text(error)))
-        return 1
     finally:
-        if policy is not None:
-            policy.close()
-        channel.flush()
-    return 0
+        policy.close()
 
 
 if __name__ == "__main__":
-    sys.exit(main(*(int(argument) for argument in sys.argv[1:])))
+    sys.exit(run_child(run))

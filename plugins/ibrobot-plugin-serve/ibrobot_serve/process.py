@@ -133,7 +133,7 @@ class ProcessEngine(Engine):
             for memory in memories:
                 os.ftruncate(memory, WIRE_LIMITS.size)  # pages are allocated at their first use
             self._request, self._answer = (memoryview(mmap.mmap(memory, WIRE_LIMITS.size)) for memory in memories)
-            self._child = Child("ibrobot_serve.model_process", self._order, *memories)
+            self._child = Child("ibrobot_serve.model_process", self._order, *memories, end_s=_END_TIMEOUT_S)
         finally:
             for memory in memories:
                 os.close(memory)
@@ -144,8 +144,8 @@ class ProcessEngine(Engine):
         while True:
             try:
                 event = child.wait(min(_GLANCE_S, max(0.0, deadline_s - time.monotonic())))
-            except ComponentFailed:
-                raise self._died(child) from None
+            except ComponentFailed as death:
+                raise self._died(child, str(death)) from None
             if event is not None:
                 if event["event"] == "ready":
                     self._check(event["fingerprint"], event["weights"])
@@ -192,9 +192,8 @@ class ProcessEngine(Engine):
             self._await("ready", child, deadline_s)
         return child
 
-    def _died(self, child: Child, why: str = "") -> PolicyError:
+    def _died(self, child: Child, how: str) -> PolicyError:
         """An error with the cause of the process's death; schedules the restart."""
-        how = why or child.cause(self._patience_s)
         self._reap()
         pause_s = min(_LONGEST_PAUSE_S, 2.0 ** (self._deaths - 1)) if self._deaths else 0.0
         self._deaths += 1
@@ -210,10 +209,6 @@ class ProcessEngine(Engine):
         if self._child is not None:
             child, self._child = self._child, None
             child.channel.close()  # a healthy process then ends
-            child.end(self._patience_s)
+            child.end_s = 0.0 if self._closed.is_set() else _END_TIMEOUT_S
+            child.end()
             self._request = self._answer = memoryview(b"")
-
-    @property
-    def _patience_s(self) -> float:
-        """How long the process may take to exit [s]."""
-        return 0.0 if self._closed.is_set() else _END_TIMEOUT_S

@@ -6,10 +6,11 @@ belongs to a channel, and the newest frame of a channel replaces one that was no
 
 from __future__ import annotations
 
-import asyncio
 import socket
 import struct
 import threading
+
+from ibrobot_core.app import Channel
 
 STATE, STATUS, SAMPLES, PLAN, FIRST_PICTURE = 0, 1, 2, 3, 16
 """Channels of the stream:
@@ -28,9 +29,6 @@ JPEG, RGB, PNG = 0, 1, 2
 """Encodings of pictures."""
 ALIVE_S = 0.5
 """Period of the server's signs of life [s]."""
-_HEAD = struct.Struct("<IB")
-_LARGEST = 256 << 20
-"""Largest frame [bytes]."""
 
 
 class FrameSender:
@@ -41,10 +39,8 @@ class FrameSender:
     """
 
     def __init__(self, connection: socket.socket) -> None:
-        connection.setblocking(False)
-        self._socket = connection
+        self._channel = Channel(connection)
         self._waiting: dict[int, bytes] = {}
-        self._partial = memoryview(b"")
         self._lock = threading.Lock()
         self.replaced = 0
         """Number of frames that a newer one replaced."""
@@ -54,39 +50,16 @@ class FrameSender:
         with self._lock:
             self.replaced += channel in self._waiting
             self._waiting[channel] = payload
-            self._flush()
+        self.flush()
 
     def flush(self) -> None:
         """Send what was kept, as far as the other side reads."""
         with self._lock:
-            self._flush()
-
-    def _flush(self) -> None:
-        try:
-            while self._partial or self._waiting:
-                if not self._partial:
-                    channel = next(iter(self._waiting))
-                    payload = self._waiting.pop(channel)
-                    self._partial = memoryview(_HEAD.pack(len(payload), channel) + payload)
-                self._partial = self._partial[self._socket.send(self._partial) :]
-        except BlockingIOError:
-            return
-        except OSError:  # the other side is gone, which its channel reports
-            self._waiting.clear()
-            self._partial = memoryview(b"")
+            self._channel.receive()  # sends what is left of the last one
+            while self._waiting and not self._channel.backlog:
+                channel = next(iter(self._waiting))
+                self._channel.send({"channel": channel}, self._waiting.pop(channel))
 
     def close(self) -> None:
         """Close the socket."""
-        self._socket.close()
-
-
-async def receive_frame(reader: asyncio.StreamReader) -> tuple[int, bytes]:
-    """The next frame: channel and payload.
-
-    Raises:
-        asyncio.IncompleteReadError: at the end of the stream.
-    """
-    size, channel = _HEAD.unpack(await reader.readexactly(_HEAD.size))
-    if size > _LARGEST:
-        raise ValueError(f"a frame of {size} bytes is larger than {_LARGEST}")
-    return channel, await reader.readexactly(size)
+        self._channel.close()

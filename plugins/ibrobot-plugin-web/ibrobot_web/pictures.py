@@ -64,7 +64,7 @@ def _rgb(message: Image) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     return np.ascontiguousarray(shown, dtype=np.uint8)
 
 
-async def as_jpeg(payload: bytes) -> bytes:
+async def as_jpeg(payload: bytes | memoryview) -> bytes | memoryview:
     """A payload that browsers show: pixels are encoded in a thread."""
     return payload if PICTURE_HEAD.unpack_from(payload)[3] != RGB else await asyncio.to_thread(_encoded, payload)
 
@@ -84,7 +84,7 @@ def to_picture(message: Message) -> Picture | None:
     return Picture(payload[PICTURE_HEAD.size :], kind)
 
 
-def _encoded(payload: bytes) -> bytes:
+def _encoded(payload: bytes | memoryview) -> bytes:
     """Pixels as JPEG."""
     stamp_ns, width, height, _ = PICTURE_HEAD.unpack_from(payload)
     data = np.frombuffer(payload, np.uint8, offset=PICTURE_HEAD.size)

@@ -75,7 +75,7 @@ class WebViewer(Viewer):
         self._dead = ""
         own, far = socket.socketpair()
         with far:
-            self._child = Child(_MODULE, self._order(session), far.fileno())
+            self._child = Child(_MODULE, self._order(session), far.fileno(), end_s=_END_S)
         self._frames = FrameSender(own)
         try:
             self.url, self.watch_url = self._await_ready(self._child)
@@ -144,7 +144,7 @@ class WebViewer(Viewer):
             self._commands.close(_END_S)
         self._frames.close()
         child.channel.close()
-        child.end(_END_S)
+        child.end()
         if self.url:
             self._thread.join()
         self.url = self.watch_url = ""
@@ -165,18 +165,13 @@ class WebViewer(Viewer):
 
     @staticmethod
     def _await_ready(child: Child) -> tuple[str, str]:
-        deadline_s = time.monotonic() + _START_S
-        while time.monotonic() < deadline_s:
-            try:
-                message = child.wait(_POLL_S)
-            except ComponentFailed:
-                raise IbrobotError(child.cause(_END_S)) from None
-            if child.failure is not None:
-                raise IbrobotError(child.failure.error)
-            match message:
-                case {"url": str() as url, "watch_url": str() as watch_url}:
-                    return url, watch_url
-        raise ComponentFailed(f"the page's server was not ready after {_START_S:g} s")
+        try:
+            message = child.wait(_START_S)
+        except ComponentFailed as death:
+            raise IbrobotError(str(death)) from None
+        if message is None:
+            raise ComponentFailed(f"the page's server was not ready after {_START_S:g} s")
+        return message["url"], message["watch_url"]
 
     def _receive(self, child: Child) -> None:
         """Take messages until the server or the viewer ends. Without this thread the page's STOP would be deaf."""
@@ -192,7 +187,7 @@ class WebViewer(Viewer):
         self._session.pulses.discard(pulse)
         if self._child is child:
             self._commands.take(Sent(None, None, Release()))
-            self._dead = self._dead or f"the page's server died: {child.cause(_END_S)}"
+            self._dead = self._dead or f"the page's server died: {child.cause()}"
 
     def _take(self, child: Child) -> None:
         """Wait for messages of the server, and take them."""

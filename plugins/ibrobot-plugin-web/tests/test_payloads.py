@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_ros2.jpeg import to_jpeg
 from ibrobot_testing import make_session, stand_in
-from ibrobot_web.link import JPEG, PICTURE_HEAD, FrameSender, receive_frame
+from ibrobot_web.link import JPEG, PICTURE_HEAD, FrameSender
 from ibrobot_web.objects import SceneObjects
 from ibrobot_web.pictures import as_jpeg, to_payload
 from ibrobot_web.status import LogLines, numbers_of, plan_json, status_json
@@ -34,7 +34,7 @@ from ibrobot_core.api import (
     String,
     Vector3,
 )
-from ibrobot_core.app import PanelDescriptor, RunView
+from ibrobot_core.app import Channel, PanelDescriptor, RunView
 
 
 def gradient(encoding: str) -> Image:
@@ -79,40 +79,30 @@ def test_messages_without_pictures_have_none() -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.binary(max_size=40)), min_size=1, max_size=20))
 def test_frames_arrive_in_order_and_the_newest_of_each_channel_arrives(frames: list[tuple[int, bytes]]) -> None:
-    async def received(near: socket.socket, far: socket.socket) -> list[tuple[int, bytes]]:
-        sender = FrameSender(near)
-        for channel, payload in frames:
-            sender.send(channel, payload)
-        near.shutdown(socket.SHUT_WR)
-        reader, writer = await asyncio.open_connection(sock=far)
-        found = []
-        try:
-            while True:
-                found.append(await receive_frame(reader))
-        except asyncio.IncompleteReadError:
-            writer.close()
-            sender.close()
-            return found
-
-    assert asyncio.run(received(*socket.socketpair())) == frames
+    near, far = socket.socketpair()
+    sender, receiver = FrameSender(near), Channel(far)
+    for channel, payload in frames:
+        sender.send(channel, payload)
+    found = [(frame["channel"], bytes(frame.payload)) for frame in receiver.receive()]
+    sender.close()
+    receiver.close()
+    assert found == frames
 
 
 def test_a_reader_that_is_behind_gets_the_newest() -> None:
     near, far = socket.socketpair()
-    with far:
-        sender = FrameSender(near)
-        for i in range(100):
-            sender.send(16, bytes([i]) * 100_000)
-        assert sender.replaced > 90
-        far.settimeout(5)
-        received = bytearray()
-        for _ in range(1000):
-            received += far.recv(1 << 16)
-            sender.flush()
-            if received[-1] == 99:
-                break
-        assert received[-1] == 99
-        sender.close()
+    sender, receiver = FrameSender(near), Channel(far)
+    for i in range(100):
+        sender.send(16, bytes([i]) * 100_000)
+    assert sender.replaced > 90
+    frames = []
+    for _ in range(1000):
+        frames += receiver.receive()
+        sender.flush()
+    assert frames[-1].payload == bytes([99]) * 100_000
+    assert len(frames) < 10
+    sender.close()
+    receiver.close()
 
 
 def test_numbers_of_messages_are_paths() -> None:

@@ -1,1 +1,1 @@
-"""The ROS node, which runs in a process and an interpreter of its own; it imports nothing but rclpy and `wire`."""
+"""The ROS node, in a process and an interpreter of its own; it imports nothing but rclpy and core's `Channel`."""

@@ -10,8 +10,8 @@ from typing import Any
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 
+from ibrobot_core.app import Channel, ChannelMessage
 from ibrobot_ros.node.types import fill, find_type, plain
-from ibrobot_ros.wire import Wire
 
 _PATIENCE_S = 10.0
 """Longest wait for the run's decision about a goal [s]."""
@@ -43,19 +43,19 @@ class _Goal:
 class Actions:
     """The action servers of a run's executors and services."""
 
-    def __init__(self, node: Any, wire: Wire) -> None:
+    def __init__(self, node: Any, channel: Channel) -> None:
         self._node = node
-        self._wire = wire
+        self._channel = channel
         self._lock = threading.Lock()
         self._count = 0
         self._goals: dict[int, _Goal] = {}
 
-    def add(self, head: dict[str, Any], payload: bytes) -> None:
+    def add(self, head: ChannelMessage) -> None:
         """Offer an action."""
         try:
             kind = find_type(head["type"])
         except LookupError as error:
-            self._wire.send({"op": "trouble", "topic": head["name"], "what": f"not in ROS: {error}"})
+            self._channel.send({"op": "trouble", "topic": head["name"], "what": f"not in ROS: {error}"})
             return
         address: dict[str, Any] = {key: head[key] for key in ("executor", "service") if key in head}
         asked: list[_Goal] = []
@@ -77,19 +77,19 @@ class Actions:
             callback_group=MutuallyExclusiveCallbackGroup(),
         )  # fmt: skip
 
-    def decide(self, head: dict[str, Any], payload: bytes) -> None:
+    def decide(self, head: ChannelMessage) -> None:
         """Take the run's decision about a goal, or about a cancel."""
         goal = self._goals.get(head["goal"])
         if goal is not None:
             goal.decided.put(head)
 
-    def give_feedback(self, head: dict[str, Any], payload: bytes) -> None:
+    def give_feedback(self, head: ChannelMessage) -> None:
         """Publish how a goal goes on."""
         goal = self._goals.get(head["goal"])
         if goal is not None and goal.handle is not None and not goal.end.is_set():
             goal.handle.publish_feedback(fill(goal.type.Feedback(), head["values"]))
 
-    def end(self, head: dict[str, Any], payload: bytes) -> None:
+    def end(self, head: ChannelMessage) -> None:
         """Take the end of a goal."""
         goal = self._goals.get(head["goal"])
         if goal is not None:
@@ -101,10 +101,10 @@ class Actions:
         with self._lock:
             self._count += 1
             goal = self._goals[self._count] = _Goal(self._count, kind, address)
-        self._wire.send({"op": "goal", "goal": goal.number, **address, "fields": plain(request)})
+        self._channel.send({"op": "goal", "goal": goal.number, **address, "fields": plain(request)})
         if self._decision(goal):
             return goal
-        self._wire.send({"op": "cancel", "goal": goal.number, **address})  # should the run accept it too late
+        self._channel.send({"op": "cancel", "goal": goal.number, **address})  # should the run accept it too late
         del self._goals[goal.number]
         return None
 
@@ -118,7 +118,7 @@ class Actions:
         goal = next((each for each in list(self._goals.values()) if each.handle is handle), None)
         if goal is None or goal.end.is_set():
             return CancelResponse.REJECT
-        self._wire.send({"op": "cancel", "goal": goal.number, **goal.address})
+        self._channel.send({"op": "cancel", "goal": goal.number, **goal.address})
         return CancelResponse.ACCEPT if self._decision(goal) else CancelResponse.REJECT
 
     def _execute(self, goal: _Goal) -> Any:

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from ibrobot_ros.wire import Wire
+from ibrobot_core.app import Channel, ChannelMessage
 
 INTERFACES = ("std_srvs", "control_msgs", "tf2_msgs", "ibrobot_msgs")
 """Packages of message types that not every ROS has."""
@@ -24,15 +24,15 @@ _POOL = 64
 
 def run(descriptor: int) -> None:
     """Run the node over an inherited socket."""
-    wire = Wire(socket.socket(fileno=descriptor))
-    order = _order(wire)
+    channel = Channel(socket.socket(fileno=descriptor))
+    order = channel.next(None)
     if order is None:
         return
     try:
         rclpy = importlib.import_module("rclpy")
     except ImportError as error:
-        wire.send({"op": "missing", "what": f"{type(error).__name__}: {error}", "python": sys.executable})
-        wire.flush(1.0)
+        channel.send({"op": "missing", "what": f"{type(error).__name__}: {error}", "python": sys.executable})
+        channel.flush(1.0)
         return
     if order["niceness"]:
         os.nice(order["niceness"])
@@ -41,21 +41,14 @@ def run(descriptor: int) -> None:
     if os.environ.get("ROS_DISTRO") in OLD and os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "LOCALHOST":
         os.environ["ROS_LOCALHOST_ONLY"] = "1"
     rclpy.init(args=["--ros-args", "--log-level", "error"])
-    wire.send({"op": "hello", **_found(rclpy)})
+    channel.send({"op": "hello", **_found(rclpy)})
     if not order["probe"]:
-        serve(wire, order["name"])
-    wire.flush(1.0)
-    wire.close()
+        serve(channel, order["name"])
+    channel.flush(1.0)
+    channel.close()
     rclpy.try_shutdown()
     # Executors leave threads behind that Python would wait for.
     os._exit(0)
-
-
-def _order(wire: Wire) -> dict[str, Any] | None:
-    while not wire.closed:
-        for head, _ in wire.wait(_POLL_S):
-            return head
-    return None
 
 
 def _found(rclpy: Any) -> dict[str, Any]:
@@ -70,7 +63,7 @@ def _found(rclpy: Any) -> dict[str, Any]:
     }
 
 
-def serve(wire: Wire, name: str) -> None:
+def serve(channel: Channel, name: str) -> None:
     """Do what the run asks until it closes the socket."""
     from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 
@@ -90,9 +83,9 @@ def serve(wire: Wire, name: str) -> None:
     # Three executors: neither a flood of messages nor slow services keep an emergency stop waiting.
     calls = node("", MultiThreadedExecutor(_POOL))
     urgent = node("_stop", SingleThreadedExecutor())
-    topics = Topics(node("_topics", SingleThreadedExecutor()), wire)
-    actions, services = Actions(calls, wire), Services(calls, urgent, wire)
-    does: dict[str, Callable[[dict[str, Any], bytes], None]] = {
+    topics = Topics(node("_topics", SingleThreadedExecutor()), channel)
+    actions, services = Actions(calls, channel), Services(calls, urgent, channel)
+    does: dict[str, Callable[[ChannelMessage], None]] = {
         "publisher": topics.add_publisher,
         "message": topics.publish,
         "subscriber": topics.add_subscriber,
@@ -102,14 +95,14 @@ def serve(wire: Wire, name: str) -> None:
         "ended": actions.end,
         "service": services.add,
         "answer": services.answer,
-        "ping": lambda head, payload: wire.send({"op": "pong"}),
+        "ping": lambda head: channel.send({"op": "pong"}),
     }
     for thread in threads:
         thread.start()
-    while not wire.closed:
-        for head, payload in wire.wait(_POLL_S):
+    while not channel.closed:
+        for head in channel.receive(_POLL_S):
             if head["op"] == "end":
                 topics.finish()
                 return
-            does[head["op"]](head, payload)
+            does[head["op"]](head)
         topics.watch()

@@ -8,8 +8,8 @@ from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 
+from ibrobot_core.app import Channel, ChannelMessage
 from ibrobot_ros.node.types import fill, find_type, plain
-from ibrobot_ros.wire import Wire
 
 _PATIENCE_S = 120.0
 """Longest wait for the run's answer: some services answer when a motion has ended [s]."""
@@ -18,13 +18,13 @@ _PATIENCE_S = 120.0
 class Services:
     """Passes calls to the run, and its answers back. A service answers one call at a time."""
 
-    def __init__(self, node: Any, urgent: Any, wire: Wire) -> None:
+    def __init__(self, node: Any, urgent: Any, channel: Channel) -> None:
         self._nodes = {False: node, True: urgent}
-        self._wire = wire
+        self._channel = channel
         self._numbers = itertools.count(1)
         self._waiting: dict[int, queue.SimpleQueue[dict[str, Any]]] = {}
 
-    def add(self, head: dict[str, Any], payload: bytes) -> None:
+    def add(self, head: ChannelMessage) -> None:
         """Offer a service."""
         name = head["name"]
 
@@ -36,9 +36,9 @@ class Services:
                 find_type(head["type"]), name, call, callback_group=MutuallyExclusiveCallbackGroup()
             )
         except LookupError as error:
-            self._wire.send({"op": "trouble", "topic": name, "what": f"not in ROS: {error}"})
+            self._channel.send({"op": "trouble", "topic": name, "what": f"not in ROS: {error}"})
 
-    def answer(self, head: dict[str, Any], payload: bytes) -> None:
+    def answer(self, head: ChannelMessage) -> None:
         """Take the run's answer to a call."""
         waiting = self._waiting.get(head["call"])
         if waiting is not None:
@@ -47,7 +47,7 @@ class Services:
     def _ask(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
         number = next(self._numbers)
         waiting = self._waiting[number] = queue.SimpleQueue()
-        self._wire.send({"op": "call", "service": name, "call": number, "request": request})
+        self._channel.send({"op": "call", "service": name, "call": number, "request": request})
         try:
             return waiting.get(timeout=_PATIENCE_S)
         except queue.Empty:

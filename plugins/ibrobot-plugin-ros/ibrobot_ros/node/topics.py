@@ -11,8 +11,8 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from ibrobot_core.app import Channel, ChannelMessage
 from ibrobot_ros.node.types import find_message
-from ibrobot_ros.wire import Wire
 
 BACKLOG = 16 << 20
 """Bytes that the run may leave unread before messages for it are dropped."""
@@ -58,9 +58,9 @@ class _Input:
 class Topics:
     """Publishes messages of the run in ROS, and passes those of ROS to the run."""
 
-    def __init__(self, node: Any, wire: Wire) -> None:
+    def __init__(self, node: Any, channel: Channel) -> None:
         self._node = node
-        self._wire = wire
+        self._channel = channel
         self._publishers: dict[str, Any] = {}
         self._subscribers: dict[str, int] = {}
         """Topic -> the number of subscribers that the run knows of."""
@@ -68,7 +68,7 @@ class Topics:
         self._watched_s = 0.0
         self._reported: set[str] = set()
 
-    def add_publisher(self, head: dict[str, Any], payload: bytes) -> None:
+    def add_publisher(self, head: ChannelMessage) -> None:
         """Declare a topic of the run."""
         topic = head["topic"]
 
@@ -86,19 +86,19 @@ class Topics:
             ),
         )  # fmt: skip
 
-    def publish(self, head: dict[str, Any], payload: bytes) -> None:
+    def publish(self, head: ChannelMessage) -> None:
         """Publish a message of the run."""
         publisher = self._publishers.get(head["topic"])
         if publisher is not None:
-            publisher.publish(payload)
+            publisher.publish(bytes(head.payload))
 
-    def add_subscriber(self, head: dict[str, Any], payload: bytes) -> None:
+    def add_subscriber(self, head: ChannelMessage) -> None:
         """Subscribe to a topic for the run."""
         subscriber = _Input(head["topic"], head["type"], head["rate_hz"])
 
         def take(message: bytes) -> None:
-            if self._wire.backlog < BACKLOG and subscriber.passes():
-                self._wire.send({"op": "message", "topic": subscriber.topic}, message)
+            if self._channel.backlog < BACKLOG and subscriber.passes():
+                self._channel.send({"op": "message", "topic": subscriber.topic}, message)
             else:
                 subscriber.dropped += 1
 
@@ -134,7 +134,7 @@ class Topics:
         for each in self._inputs:
             dropped, each.dropped = each.dropped, 0
             if dropped:
-                self._wire.send({"op": "dropped", "topic": each.topic, "count": dropped})
+                self._channel.send({"op": "dropped", "topic": each.topic, "count": dropped})
             for publisher in self._node.get_publishers_info_by_topic(each.topic):
                 if publisher.topic_type != each.type_name:
                     self._report(
@@ -144,15 +144,15 @@ class Topics:
     def _tell_subscribers(self, topic: str, count: int) -> None:
         if self._subscribers.get(topic, 0) != count:
             self._subscribers[topic] = count
-            self._wire.send({"op": "matched", "topic": topic, "subscribers": count})
+            self._channel.send({"op": "matched", "topic": topic, "subscribers": count})
 
     def _report(self, topic: str, what: str) -> None:
         if f"{topic} {what}" not in self._reported:
             self._reported.add(f"{topic} {what}")
-            self._wire.send({"op": "trouble", "topic": topic, "what": what})
+            self._channel.send({"op": "trouble", "topic": topic, "what": what})
 
     def _try(self, topic: str, make: Callable[[], Any]) -> None:
         try:
             make()
         except (LookupError, InvalidTopicNameException) as error:
-            self._wire.send({"op": "trouble", "topic": topic, "what": f"not in ROS: {error}"})
+            self._channel.send({"op": "trouble", "topic": topic, "what": f"not in ROS: {error}"})

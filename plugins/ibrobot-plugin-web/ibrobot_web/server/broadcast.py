@@ -86,7 +86,7 @@ class Broadcast:
         self._kept = kept
         self._newest: dict[int, bytes] = {}
 
-    def publish(self, channel: int, payload: bytes) -> None:
+    def publish(self, channel: int, payload: bytes | memoryview) -> None:
         """Send a frame to all pages."""
         frame = bytes((channel,)) + payload
         if channel in self._kept:

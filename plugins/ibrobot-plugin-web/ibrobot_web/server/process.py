@@ -26,9 +26,8 @@ from typing import Any
 import attrs
 from ibrobot_http.server import HttpServer
 
-from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Channel, Failure, open_parent, read_options
-from ibrobot_web.link import ALIVE_S, FIRST_PICTURE, STATUS, receive_frame
+from ibrobot_core.app import Channel, read_options, run_child
+from ibrobot_web.link import ALIVE_S, FIRST_PICTURE, STATUS
 from ibrobot_web.messages import Alive, FromServer, Pages, Release, RunCommand, Sent, StopRun, to_run
 from ibrobot_web.options import WebOptions
 from ibrobot_web.pictures import as_jpeg
@@ -37,8 +36,6 @@ from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import Answer, Drive
 from ibrobot_web.server.page_guard import page_guard
 
-_STREAM_BYTES = 4 << 20
-"""Frames that wait to be broadcast [bytes]."""
 _DRAIN_S = 0.5
 """Longest time until pages have the last status [s]."""
 _log = logging.getLogger("ibrobot.web")
@@ -87,20 +84,21 @@ class RunLink:
         if self._channel.closed:
             self.ended.set()
 
-    async def relay(self, connection: socket.socket) -> None:
+    async def relay(self, stream: Channel) -> None:
         """Broadcast the states and pictures of the run."""
-        reader, writer = await asyncio.open_connection(sock=connection, limit=_STREAM_BYTES)
+        loop, arrived = asyncio.get_running_loop(), asyncio.Event()
         try:
-            while True:
-                channel, payload = await receive_frame(reader)
-                if channel >= FIRST_PICTURE:
-                    payload = await as_jpeg(payload)
-                self.broadcast.publish(channel, payload)
-        except asyncio.IncompleteReadError:
-            return
+            while not stream.closed:
+                loop.add_reader(stream.fileno(), arrived.set)
+                await arrived.wait()
+                loop.remove_reader(stream.fileno())  # until these are sent, newer ones replace each other in the run
+                arrived.clear()
+                for frame in stream.receive():
+                    picture = frame["channel"] >= FIRST_PICTURE
+                    payload = await as_jpeg(frame.payload) if picture else frame.payload
+                    self.broadcast.publish(frame["channel"], payload)
         finally:
             self.ended.set()
-            writer.close()
 
     def _execute(self, sent: Sent[RunCommand], answer: Answer) -> None:
         number = None
@@ -127,7 +125,7 @@ class RunLink:
         self._channel.send(to_run(message))
 
 
-async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any]) -> None:
+async def serve(channel: Channel, stream: Channel, order: Mapping[str, Any]) -> None:
     """Serve until the run closes the channel.
 
     Raises:
@@ -152,19 +150,11 @@ async def serve(channel: Channel, stream: socket.socket, order: Mapping[str, Any
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def main() -> None:
+def run(channel: Channel, order: Mapping[str, Any], stream: int) -> None:
     """Run the process."""
-    channel = open_parent(int(sys.argv[1]))
-    stream = socket.socket(fileno=int(sys.argv[2]))
-    stream.setblocking(False)
-    order = channel.wait(None)[0]
     sys.path[:] = [path for path in sys.path if Path(path) != Path()]
-    try:
-        asyncio.run(serve(channel, stream, order))
-    except IbrobotError as error:
-        channel.report(Failure(str(error)))
-        channel.flush()
+    asyncio.run(serve(channel, Channel(socket.socket(fileno=stream)), order))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_child(run))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import threading
 from collections.abc import Mapping
 from typing import Any
@@ -11,6 +10,7 @@ import attrs
 
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import (
+    ChannelMessage,
     Child,
     ComponentFailed,
     Question,
@@ -76,7 +76,7 @@ def _follow(lock: threading.Lock, work: Work) -> None:
     """Take the messages of a guide until it ends; kill it if it was cancelled and does not end by itself."""
     child = work.child
     done = False
-    while not work.cancelled and not done and child.failure is None:
+    while not work.cancelled and not done:
         try:
             message = child.wait(_POLL_S)
         except ComponentFailed:
@@ -86,15 +86,15 @@ def _follow(lock: threading.Lock, work: Work) -> None:
             with lock:
                 _take(work, message)
     child.channel.close()
-    error = "" if done else "cancelled; nothing more is done" if work.cancelled else child.cause(_END_S)
-    child.end(_END_S)
+    error = "" if done else "cancelled; nothing more is done" if work.cancelled else child.cause()
+    child.end()
     with lock:
         work.error = error
         work.state = "done" if done else "failed"
         work.ask = None
 
 
-def _take(work: Work, message: Mapping[str, Any]) -> None:
+def _take(work: Work, message: ChannelMessage) -> None:
     match message["event"]:
         case "say":
             work.items.append({"kind": "say", "text": message["text"], "warning": message["warning"]})
@@ -102,7 +102,7 @@ def _take(work: Work, message: Mapping[str, Any]) -> None:
             work.items.append({"kind": "show", **_table(message)})
         case "picture":
             work.items.append({"kind": "picture", "title": message["title"], "picture": len(work.pictures)})
-            work.pictures.append(base64.b64decode(message["content"]))
+            work.pictures.append(bytes(message.payload))
         case "ask":
             work.ask = {name: message[name] for name in ("ask", "kind", "text")}
         case "rows" if work.ask is not None and work.ask["ask"] == message["ask"]:
@@ -140,7 +140,8 @@ def start(ui: Ui, name: str, answers: Mapping[str, str | bool] = option(factory=
         if before is not None and before.state == "running":
             raise IbrobotError(f"{before.title} is running: end it first")
         number = before.number + 1 if before is not None else 1
-        work = Work(guide.name, guide.title, number, Child(_MODULE, {"name": guide.name, "answers": given}))
+        order = {"name": guide.name, "answers": given}
+        work = Work(guide.name, guide.title, number, Child(_MODULE, order, end_s=_END_S))
         work.thread = threading.Thread(target=_follow, args=(devices.lock, work), name="guide", daemon=True)
         work.thread.start()
         devices.work = work

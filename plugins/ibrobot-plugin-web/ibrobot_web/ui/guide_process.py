@@ -7,17 +7,15 @@ and requests `{"ask": N, "kind": "confirm" | "wait", "text": …}` with `rows` w
 
 from __future__ import annotations
 
-import base64
 import itertools
 import logging
-import select
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, override
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Channel, Failure, Guide, error_text, installed_plugins, open_parent
+from ibrobot_core.app import Channel, Guide, installed_plugins, run_child
 
 _POLL_S = 0.03
 _ROWS_S = 0.1
@@ -49,7 +47,7 @@ class PageGuide(Guide):
 
     @override
     def picture(self, title: str, content: bytes) -> None:
-        self._channel.send({"event": "picture", "title": title, "content": base64.b64encode(content).decode()})
+        self._channel.send({"event": "picture", "title": title}, content)
 
     @override
     def confirm(self, question: str, *, flag: str = "", default: bool = False) -> bool:
@@ -79,8 +77,7 @@ class PageGuide(Guide):
         self._channel.send({"event": "ask", "ask": number, "kind": kind, "text": text})
         while until_s is None or time.monotonic() < until_s:
             meanwhile(number)
-            select.select([self._channel.fileno()], [], [], _POLL_S)
-            for message in self._channel.receive():
+            for message in self._channel.receive(_POLL_S):
                 if message.get("reply") == number:
                     return message["ok"]
             if self._channel.closed:
@@ -88,22 +85,17 @@ class PageGuide(Guide):
         return True
 
 
-def main() -> None:
-    """Run the process."""
-    channel = open_parent(int(sys.argv[1]))
-    order = channel.wait(None)[0]
+def run(channel: Channel, order: Mapping[str, Any]) -> None:
+    """Run the guide."""
+    guide = next(each for each in installed_plugins().guides if each.name == order["name"])
     try:
-        guide = next(each for each in installed_plugins().guides if each.name == order["name"])
         guide.run(order["answers"], PageGuide(channel))
-    except IbrobotError as error:
-        channel.report(Failure(str(error) or type(error).__name__))
     except Exception as error:
-        logging.getLogger("ibrobot.ui").exception("the guide %s failed", order["name"])
-        channel.report(Failure(error_text(error)))
-    else:
-        channel.send({"event": "done"})
-    channel.flush()
+        if not isinstance(error, IbrobotError):
+            logging.getLogger("ibrobot.ui").exception("the guide %s failed", order["name"])
+        raise
+    channel.send({"event": "done"})
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_child(run))
