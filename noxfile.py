@@ -34,7 +34,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 PROJECT = nox.project.load_toml("pyproject.toml")
 FOLDERS = {
-    path.name.removeprefix("ibrobot-").removeprefix("plugin-"): path for path in sorted(Path("plugins").glob("*-*"))
+    path.parent.name.removeprefix("ibrobot-").removeprefix("plugin-"): path.parent
+    for path in sorted(Path("plugins").glob("*-*/pyproject.toml"))  # a folder of a package that went may be left
 }
 """Name -> folder, of every plugin, of the libraries that they share, and of what LeRobot discovers."""
 SLOW = ("feetech", "testing", "data", "mcap")
