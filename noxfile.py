@@ -354,6 +354,7 @@ def types(session: nox.Session) -> None:
         "benchmarks",
         "docs",
         "plugins/ibrobot-plugin-lerobot/tests",
+        *(str(folder / "tests") for folder in EXAMPLES.values()),
     )
     untyped = ["tests.*"]
     for module in {path.stem for each in shared for path in Path(each).iterdir() if path.suffix in (".py", "")}:

@@ -114,7 +114,8 @@ def as_step(goal: str) -> dict[str, Any]:
     return step
 
 
-def ended(trajectory: JointTrajectory) -> Answer:
+def ended(trajectory: JointTrajectory | None) -> Answer:
+    assert trajectory is not None
     last = trajectory.points[-1]
     return last.positions.tolist(), last.time_from_start_ns / 1e9
 

@@ -12,14 +12,16 @@ from ibrobot_core.launch.sources.teleop import TeleopSource
 if TYPE_CHECKING:
     from fake_runs import Runs
 
-    from ibrobot_core.launch.session import Session
+    from ibrobot_core.interfaces.run import StreamingRun
     from ibrobot_core.schema import ControlMode
 
 
 class Raise(SourceWorker):
     """Moves the first joint to 0.3 rad."""
 
-    def __init__(self, session: Session, mode: ControlMode) -> None:
+    session: StreamingRun
+
+    def __init__(self, session: StreamingRun, mode: ControlMode) -> None:
         super().__init__(session, mode, "raises the first joint")
 
     @override

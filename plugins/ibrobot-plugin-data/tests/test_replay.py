@@ -14,7 +14,7 @@ from ibrobot_data.replay_source import ReplaySource
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import Vector
-from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
+from ibrobot_core.app import LaunchRequest, Runtime, Session, StreamingRun, installed_plugins, load_config
 
 ROBOT = """\
 robot:
@@ -49,7 +49,7 @@ def replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     path.write_text(ROBOT)
 
     def make(playback: Playback = WAVE, *, speed: float = 1.0, simulated: bool = True) -> Runtime:
-        def source(session: Session, mode: Any) -> ReplaySource:
+        def source(session: StreamingRun, mode: Any) -> ReplaySource:
             return ReplaySource(session, mode, "wave", playback, speed)
 
         registry = installed_plugins()
