@@ -85,7 +85,7 @@ def option(
         names: what a text or path names: `episodes`, `dataset`, `policy`, `robot`, `calibration`, `viewer`, or the
             `options` of another program.
         suggest: a value that forms enter, e.g. `datasets/{episodes}`: a name in braces stands for the last part of the
-            path that is given for the option of this name.
+            path that is given for the option of this name. Of several choices, the one that forms tick.
         typed: what a command line calls it, if that is not made of the key: flags and value, e.g. `-o FILE`, or an
             argument, e.g. `EPISODES`. A value `[HZ=40]` may be left out.
     """

@@ -92,6 +92,8 @@ def main() -> None:
         if step == int(given.get("stop_at", 0)) and not begun:
             Path(given["stopped"]).write_text("")
             time.sleep(60)
+    if "fail" in given:
+        print("Traceback (most recent call last):", "torch.OutOfMemoryError: CUDA out of memory", sep="\n")
     sys.exit(7 * ("fail" in given))
 
 

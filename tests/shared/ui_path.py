@@ -125,7 +125,7 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
 
 
 def convert(page: Any, shot: Shot = lambda page, name: None) -> None:
-    """Play back an episode, convert both, and play back the dataset."""
+    """Play back an episode, convert the successes, and play back the dataset."""
     page.get_by_role("link", name="Judge the episodes").click()
     page.get_by_role("link", name="episode_000001").click(timeout=_WAIT_MS)
     plays(page)
@@ -137,7 +137,7 @@ def convert(page: Any, shot: Shot = lambda page, name: None) -> None:
     page.get_by_role("link", name="Open the dataset").wait_for(timeout=_WAIT_MS)
     shot(page, "convert")
     page.get_by_role("link", name="Open the dataset").click()
-    page.get_by_role("button", name="Play 1").click(timeout=_WAIT_MS)
+    page.get_by_role("button", name="Play 0").click(timeout=_WAIT_MS)
     plays(page)
     shot(page, "datasets")
 

@@ -35,7 +35,9 @@ class ConvertOptions:
         names="dataset", open=True, suggest="datasets/{episodes}", label="Dataset", help="folder of the dataset"
     )
     append: bool = option(False, label="Add to it", help="add new episodes to an existing dataset")
-    outcome: tuple[str, ...] = option(tuple(OUTCOMES), choices=OUTCOMES, label="Outcomes", help="episodes to convert")
+    outcome: tuple[str, ...] = option(
+        tuple(OUTCOMES), choices=OUTCOMES, label="Outcomes", help="episodes to convert", suggest="success"
+    )
     prompt: str = option("", label="Task", help="task of episodes that were recorded without one")
     only: str = option(
         "all", choices=ONLY, label="Rows", more=True, help="rows to keep; each stretch of them becomes an episode"

@@ -6,6 +6,7 @@ Several policies, for seeds or other settings, are the jobs of a pool.
 from __future__ import annotations
 
 import itertools
+import re
 import time
 from collections.abc import Callable, Iterable
 from contextlib import closing
@@ -26,6 +27,9 @@ _PHASES = {
     "Start offline training": "training",
 }
 """Text in the output of `lerobot-train` -> what it does from then on. Loading torch comes first."""
+_ERROR = re.compile(r"(?:\w+\.)*\w*(?:Error|Exception)\b(?::|$)")
+"""The last line of a traceback."""
+_LONGEST_CAUSE = 500
 _KEPT = "interrupted; the newest checkpoints are kept: the same command continues from there"
 
 
@@ -43,18 +47,19 @@ class Train(TrainOptions):
         if self.each or self.on:
             train_several(self, emit)
             return
-        code, newest = run_training(self, partial(_report, emit) if emit is not None else None)
+        causes: list[str] = []
+        code, newest = run_training(self, partial(_report, emit, causes) if emit is not None else None)
         if code or newest is None:
             first = self.save_every or saving_step(self.steps)
-            _tell_end(newest, first, emit, interrupted=code == INTERRUPTED)
+            what = "interrupted" if code == INTERRUPTED else ": ".join(["the training failed", *causes[-1:]])
+            _tell_end(what, newest, first, emit)
             raise Unsuccessful(exit_code=code or 1)
         trained = self.out / "checkpoints" / "last" / newest.policy.name
         tell(f"trained: {trained}", Report(str(trained)), emit)
 
 
-def _tell_end(newest: TrainingCheckpoint | None, first: int, emit: Emit, *, interrupted: bool) -> None:
-    """Tell what is kept of a training that has ended early."""
-    text = "interrupted" if interrupted else "the training failed"
+def _tell_end(text: str, newest: TrainingCheckpoint | None, first: int, emit: Emit) -> None:
+    """Tell what is kept of a training that has ended early, after why it has."""
     if newest is None:
         text += f"; nothing is kept, since the first checkpoint would have been written at step {first}"
     else:
@@ -62,8 +67,8 @@ def _tell_end(newest: TrainingCheckpoint | None, first: int, emit: Emit, *, inte
     tell(text, Failed(text.replace("the same command", "the same training")), emit, err=True)
 
 
-def _report(emit: Callable[[Event], None], output: Iterable[str], begun: int, steps: int) -> None:
-    """Print the progress as events, and all other lines as they are."""
+def _report(emit: Callable[[Event], None], causes: list[str], output: Iterable[str], begun: int, steps: int) -> None:
+    """Print the progress as events, and all other lines as they are; `causes` gets the errors among them."""
     begin, reports = time.monotonic(), 0
     first: tuple[int, float] | None = None
     """Step and time [s] of the first report, before which LeRobot loads."""
@@ -74,6 +79,7 @@ def _report(emit: Callable[[Event], None], output: Iterable[str], begun: int, st
             emit(Phase(text))
         if (event := progress(line, reports, steps, begun)) is None:
             echo(line.rstrip("\n"), err=True)
+            causes += [line.strip()[:_LONGEST_CAUSE]] * (_ERROR.match(line) is not None)
             continue
         reports += 1
         step, loss, rate = event

@@ -78,7 +78,8 @@ def test_training_reports_its_progress_as_events(dataset: Path, tmp_path: Path):
     phases = [event["text"] for event in events if event["event"] == "phase"]
     assert phases == ["loading torch and LeRobot", "opening the dataset", "training"]
     assert "WARNING no wandb" in lines
-    run(train, dataset, "--out", tmp_path / "other", "--steps", 10, "--events", "--fail=1", code=7)
+    failed = run(train, dataset, "--out", tmp_path / "other", "--steps", 10, "--events", "--fail=1", code=7)
+    assert "the training failed: torch.OutOfMemoryError: CUDA out of memory; kept: " in json.loads(failed[-1])["error"]
 
 
 def test_what_is_shown_of_a_training() -> None:

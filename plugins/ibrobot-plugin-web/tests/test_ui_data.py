@@ -245,6 +245,8 @@ def test_an_episode_is_converted_and_its_dataset_shown_and_played(tmp_path: Path
     async def test(server: UiServer) -> None:
         form = await server.get("jobs/form", command="convert")
         (episodes,) = form["known"]["episodes"]
+        assert episodes["text"] == "pick: 1 success"
+        assert [each["suggest"] for each in form["fields"] if each["name"] == "outcome"] == ["success"]
         values = {"episodes": [episodes["value"]], "out": "datasets/pick"}
         await server.post("jobs/start", command="convert", values=values)
         job, lines = await server.job(lambda job: job["state"] in ("done", "failed"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -63,4 +64,5 @@ def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
         (tmp_path / f"episodes/pick/episodes/episode_00000{number}/metadata.yaml").read_text() for number in (1, 2)
     ]
     assert ["success" in outcomes[0], "failure" in outcomes[1]] == [True, True]
-    assert (tmp_path / "datasets/pick/meta/info.json").is_file()
+    info = json.loads((tmp_path / "datasets/pick/meta/info.json").read_text())
+    assert info["total_episodes"] == 1, "the success"

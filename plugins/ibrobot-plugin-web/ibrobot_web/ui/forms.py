@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args, get_origin
@@ -25,7 +26,7 @@ from ibrobot_core.app import (
 )
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.job_runner import IBROBOT
-from ibrobot_web.ui.recordings import find_policies, find_recordings
+from ibrobot_web.ui.recordings import Episodes, find_policies, find_recordings
 from ibrobot_web.ui.robots import robot_names, robot_of
 
 _FLAG = re.compile(r"(?<![\w.])(?P<flag>--[a-z][a-z-]*)(?![\w.-])(?: (?P<value>[\w-]+))?")
@@ -178,14 +179,17 @@ def _shown(command: Command) -> dict[str, attrs.Attribute[Any]]:
 def _known(ui: Ui) -> dict[str, list[dict[str, str]]]:
     """Paths in the opened folders, by kind: the value of each, and its text."""
     recordings = find_recordings(ui.folders)
-    counts: dict[str, int] = {}
+    outcomes: dict[str, Counter[str]] = {}
     for path in recordings.episodes:
         name = ui.folders.name(_dataset_of(ui, path))
-        counts[name] = counts.get(name, 0) + 1
+        outcomes.setdefault(name, Counter())[ui.keep(Episodes).row(ui, path)["outcome"]] += 1
     return {
         "episodes": [
-            {"value": name, "text": f"{name}: {count} episode{'' if count == 1 else 's'}"}
-            for name, count in counts.items()
+            {
+                "value": name,
+                "text": f"{name}: {', '.join(f'{count} {outcome}' for outcome, count in each.most_common())}",
+            }
+            for name, each in outcomes.items()
         ],
         "dataset": [{"value": name, "text": name} for name in map(ui.folders.name, recordings.datasets)],
         "policy": [{"value": name, "text": name} for name in (ui.folders.name(path) for path, _ in find_policies(ui))],

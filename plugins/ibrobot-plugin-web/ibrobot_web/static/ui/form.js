@@ -75,9 +75,11 @@ class Field {
       return;
     }
     if (field.several) {
+      const checked = field.choices.length && field.suggest ? [field.suggest] : field.default;
+      this.suggest = "";
       const boxes = choices.map(([value, text]) => {
         const box = h("input", { type: "checkbox", value });
-        box.checked = field.default?.length ? field.default.includes(value) : choices.length === 1 && field.required;
+        box.checked = checked?.length ? checked.includes(value) : choices.length === 1 && field.required;
         return h("label", {}, box, ` ${text}`);
       });
       const group = h("div", { class: "choices", role: "group", "aria-label": field.label, "aria-describedby": help.id },
