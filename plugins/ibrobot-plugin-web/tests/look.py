@@ -300,7 +300,7 @@ def look_at_training(chromium: Any, look: Look) -> None:
             page.locator("#use-robot").select_option("picking.yaml")
             look(page, "ui-training-done")
             page.get_by_role("button", name="Show the change").click()
-            page.get_by_role("button", name="Write picking.yaml").click()
+            page.get_by_role("button", name="Write the file picking.yaml").click()
             with page.context.expect_page(timeout=120_000) as opening:
                 page.get_by_role("button", name="Launch it in simulation").click()
             run_page = opening.value

@@ -14,6 +14,7 @@ import { Thumb } from "./thumb.js";
 import { PlotsPanel } from "./panels/plots.js";
 import { HealthPanel } from "./panels/health.js";
 import { LogPanel } from "./panels/log.js";
+import { words } from "./words.js";
 
 const STALE_MS = 1500;
 const CONFIRMED_MS = 300;
@@ -133,7 +134,7 @@ function showHeader() {
   missed = loop.missed ?? 0;
   const late = performance.now() - missedAt < LATE_MS;
   say($("late"), loop.ticks ? `${Math.round(loop.rate_hz)} Hz, ${late ? "late" : "on time"}` : "");
-  $("late").title = loop.ticks ? `Lateness of the control loop: 99 % below ${Math.round(loop.lateness_p99_us)} µs; ${loop.missed} of ${loop.ticks} ticks missed` : "";
+  $("late").title = loop.ticks ? words(`Lateness of the control loop: 99 % below ${Math.round(loop.lateness_p99_us)} µs; ${loop.missed} of ${loop.ticks} ticks missed`) : "";
   $("late").classList.toggle("bad", late);
 }
 

@@ -1,20 +1,25 @@
 // Elements: h("button", {class: "primary", onclick: f}, "Text", child) makes one. Text is never markup.
 
+import { words } from "./words.js";
+
+const READ = ["aria-label", "placeholder", "title", "label"]; // properties that people read
+
 export function h(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(properties)) {
     if (value === undefined || value === null || value === false) continue;
     if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
     else if (value === true) element.setAttribute(name, "");
-    else element.setAttribute(name, value);
+    else element.setAttribute(name, READ.includes(name) ? words(value) : value);
   }
-  element.append(...children.flat().filter((child) => child !== null && child !== undefined));
+  element.append(...children.flat().filter((child) => child !== null && child !== undefined).map(words));
   return element;
 }
 
 // Sets text only if it changed, so that screen readers and the layout rest.
 export function say(element, text) {
-  if (element.textContent !== text) element.textContent = text;
+  const shown = words(text);
+  if (element.textContent !== shown) element.textContent = shown;
 }
 
 // Replaces an element's children only if the described content changed.
@@ -22,7 +27,7 @@ export function refresh(element, description, make) {
   const key = JSON.stringify(description);
   if (element.dataset.key === key) return;
   element.dataset.key = key;
-  element.replaceChildren(...[make()].flat());
+  element.replaceChildren(...[make()].flat().map(words));
 }
 
 // A table: the names of its columns, and its rows.
@@ -92,7 +97,7 @@ export function toast(text, kind = "info") {
   announced ??= (document.getElementById("stage") ?? document.body).appendChild(h("div", { class: "toasts", role: "status", "aria-live": "polite" }));
   const item = h("div", { class: `toast ${kind}` }, h("p", {}, text),
     h("button", { "aria-label": "Close", onclick: () => item.remove() }, "×"));
-  const others = [...announced.children].filter((each) => each.firstChild.textContent !== text);
+  const others = [...announced.children].filter((each) => each.firstChild.textContent !== words(text));
   announced.replaceChildren(...others.slice(-2), item);
   const leave = () => { if (item.matches(":hover, :focus-within")) setTimeout(leave, 1000); else item.remove(); };
   setTimeout(leave, SHOWN_MS[kind]);

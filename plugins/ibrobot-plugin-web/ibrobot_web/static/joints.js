@@ -1,6 +1,7 @@
 // One row for each joint: position between the limits, command, and jog by slider or buttons. Angles are in one unit.
 
 import { h, refresh, say } from "./dom.js";
+import { words } from "./words.js";
 
 const KEY = "angles";
 const DEGREES = 180 / Math.PI;
@@ -21,7 +22,7 @@ export class Joints {
     this.degrees = degrees;
     localStorage.setItem(KEY, degrees ? "deg" : "rad");
     say(this.unit, degrees ? "in degrees" : "in radians");
-    this.unit.title = degrees ? "Show radians" : "Show degrees";
+    this.unit.title = words(degrees ? "Show radians" : "Show degrees");
     if (this.page.state) this.state(this.page.state);
   }
 

@@ -1,6 +1,7 @@
 // The page without a running robot: header, navigation, and one view at a time.
 
 import { clearToasts, h, refresh, say, switchTheme, toast } from "./dom.js";
+import { words } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 
@@ -49,7 +50,7 @@ class Ui extends EventTarget {
       const ended = !started || (job && job.state !== "running");
       if (job?.facts.url) opened.location.replace(this.runAddress(job.facts.url));
       else if (ended) opened.close();
-      else opened.document.body.textContent = `The robot starts … ${job?.lines.at(-1) ?? ""}`;
+      else opened.document.body.textContent = words(`The robot starts … ${job?.lines.at(-1) ?? ""}`);
       if (ended || job?.facts.url) this.removeEventListener("job", follow);
       if (job?.state === "failed") document.querySelector(".job .problem")?.scrollIntoView({ block: "center" });
     };
@@ -127,7 +128,7 @@ async function showView() {
     }
     else link.removeAttribute("aria-current");
   }
-  document.title = `ibrobot: ${ui.session.views.find((view) => view.name === name).title}`;
+  document.title = `ibrobot: ${words(ui.session.views.find((view) => view.name === name).title)}`;
   if (current !== name) {
     clearToasts();
     current = name;

@@ -1,7 +1,7 @@
 // The 3D view: the main thread's side. Drawing happens in a worker, so that a slow graphics card delays neither the
 // deadman nor the stop.
 
-import { h, isDark } from "./dom.js";
+import { h, isDark, say } from "./dom.js";
 
 const STEP = 0.1;
 
@@ -22,16 +22,16 @@ export class View3D {
     this.slides = []; // joints whose positions are metres
     this.ages = [];
     if (!this.canvas.transferControlToOffscreen) {
-      this.note.textContent = "3D needs a newer browser.";
+      say(this.note, "3D needs a newer browser.");
       return;
     }
     this.worker = new Worker("/static/view3d.worker.js", { type: "module" });
     const offscreen = this.canvas.transferControlToOffscreen();
     this.worker.postMessage({ do: "start", canvas: offscreen, dark: isDark() }, [offscreen]);
-    this.worker.onerror = (event) => { this.note.textContent = `3D failed: ${event.message}`; };
+    this.worker.onerror = (event) => { say(this.note, `3D failed: ${event.message}`); };
     this.worker.onmessage = ({ data }) => {
       if (data.slides) this.slides = data.slides;
-      if (data.problem !== undefined) this.note.textContent = data.problem;
+      if (data.problem !== undefined) say(this.note, data.problem);
       if (data.drawn) {
         this.frames += 1;
         this.at = data.handle;
@@ -49,15 +49,15 @@ export class View3D {
   }
 
   async load(scene) {
-    this.note.textContent = "The server makes the robot's shapes …";
+    say(this.note, "The server makes the robot's shapes …");
     try {
       const response = await fetch(scene);
       if (!response.ok) throw new Error(await response.text());
-      this.note.textContent = "Loading the robot's shapes …";
+      say(this.note, "Loading the robot's shapes …");
       this.tell({ do: "scene", scene: await response.json() });
-      this.note.textContent = "Drawing the robot …";
+      say(this.note, "Drawing the robot …");
     } catch (error) {
-      this.note.textContent = `The robot's shapes cannot be loaded: ${error.message}`;
+      say(this.note, `The robot's shapes cannot be loaded: ${error.message}`);
     }
   }
 

@@ -1,6 +1,7 @@
 // The choice of a robot, its body and its mode, with what `ibrobot config check` says. Views share the choice.
 
 import { h, refresh, row, table } from "../dom.js";
+import { words } from "../words.js";
 
 const SOURCES = { folder: "In the opened folders", ibrobot: "Shipped with ibrobot", plugin: "Shipped with plugins" };
 const KEY = "robot";
@@ -85,7 +86,7 @@ export class Chooser {
     this.mode.disabled = !found.modes;
     const chosen = found.modes?.find(({ name }) => name === choice.mode);
     this.warning.textContent = [chosen?.policy && "The robot moves by itself as soon as the run has started, until you stop it.",
-      chosen && !choice.sim && "Real hardware moves. Keep a hand at the power switch."].filter(Boolean).join(" ");
+      chosen && !choice.sim && "Real hardware moves. Keep a hand at the power switch."].filter(Boolean).map(words).join(" ");
     refresh(this.report, found, () => reportOf(found));
     this.changed(found);
   }

@@ -39,7 +39,7 @@ export class View {
     const chosen = rest || this.path || found[0];
     refresh(this.choice, [found, chosen], () => found.map((path) => h("option", { value: path, selected: path === chosen }, path)));
     this.choices.hidden = !found.length;
-    this.note.replaceChildren(...(found.length ? [] : ["No datasets in the opened folders. ", h("a", { href: "#job-convert" }, "Convert episodes into one"), "."]));
+    this.note.replaceChildren(...(found.length ? [] : [h("span", {}, "No datasets in the opened folders. "), h("a", { href: "#job-convert" }, "Convert episodes into one"), "."]));
     if (chosen && found.includes(chosen)) await this.open(chosen);
     else if (rest) say(this.note, `${rest}: there is no such dataset in the opened folders`);
   }

@@ -1,6 +1,7 @@
 // View: devices. The guides of plugins: ports, cameras, motors, calibration, step by step.
 
 import { h, problem, refresh, say, table } from "../dom.js";
+import { words } from "../words.js";
 
 const POLL_MS = 150;
 
@@ -137,7 +138,7 @@ function field(guide, { name, text, default: preset, choices, open }) {
     other ? h("option", { value: other }, `${other} (not found)`) : null, h("option", { value: "" }, "another …"));
   input.id = `${id}-other`;
   input.hidden = true;
-  input.setAttribute("aria-label", `${text}, another`);
+  input.setAttribute("aria-label", words(`${text}, another`));
   select.addEventListener("change", () => { input.hidden = select.value !== ""; if (!input.hidden) { input.value = ""; input.focus(); } });
   return { name, elements: [label, h("span", {}, select, input)], value: () => select.value || input.value };
 }

@@ -62,7 +62,7 @@ export class View {
     this.outcomes = found.outcomes;
     const known = new Set(this.rows.map(({ path }) => path));
     for (const path of this.chosen) if (!known.has(path)) this.chosen.delete(path);
-    this.note.replaceChildren(...(this.rows.length ? [] : ["No episodes in the opened folders. ", h("a", { href: "#record" }, "Record some"), "."]));
+    this.note.replaceChildren(...(this.rows.length ? [] : [h("span", {}, "No episodes in the opened folders. "), h("a", { href: "#record" }, "Record some"), "."]));
     if (!found.complete) say(this.note, "There are too many folders to search. Open a smaller folder: ibrobot ui FOLDER");
     this.draw();
     this.trashes = found.trashes;

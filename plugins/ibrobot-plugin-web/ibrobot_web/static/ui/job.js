@@ -3,6 +3,7 @@
 import { h, problem, refresh, say } from "../dom.js";
 import { drawPlot } from "../plot.js";
 import { Question } from "./question.js";
+import { words } from "../words.js";
 
 // What a job has made -> the view that shows it.
 const MADE = { dataset: ["datasets", "Open the dataset"], policy: ["policies", "Use it in a robot"], episode: ["episodes", "See the episode"], episodes: ["episodes", "Judge the episodes"] };
@@ -71,7 +72,7 @@ export class JobCard {
     if (!points.length) return;
     const last = points.at(-1)[0];
     const end = progress ? Math.max(last, last / progress) : last;
-    this.plot.setAttribute("aria-label", `${axes[1]} over ${axes[0]}`);
+    this.plot.setAttribute("aria-label", words(`${axes[1]} over ${axes[0]}`));
     drawPlot(this.plot, {
       times: points.map(([x]) => x), lines: [[axes[1], points.map(([, y]) => y)]], begin: 0, end,
       labels: [`${axes[1]}, ${axes[0]} 0`, String(Math.round(end))],

@@ -74,7 +74,7 @@ export class View {
     const write = h("button", {
       class: "primary", disabled: !this.ui.drives || found.problems.length > 0 || !found.diff.length,
       onclick: () => this.write(request, found),
-    }, found.new ? `Write the new file ${found.target}` : `Write ${found.target}`);
+    }, found.new ? `Write the new file ${found.target}` : `Write the file ${found.target}`);
     this.change.replaceChildren(
       found.diff.length ? h("pre", { class: "diff", tabindex: "0", "aria-label": "Change" }, found.diff.map((line) => (
         h("span", { class: line.startsWith("+") ? "added" : line.startsWith("-") ? "removed" : "" }, `${line}\n`))))

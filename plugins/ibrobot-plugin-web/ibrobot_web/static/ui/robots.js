@@ -5,6 +5,7 @@ import { Chooser } from "./chooser.js";
 import { Copy } from "./copy.js";
 import { JobList, RUNS } from "./job.js";
 import { Overview } from "./overview.js";
+import { words } from "../words.js";
 
 export class View {
   constructor(ui) {
@@ -38,7 +39,7 @@ export class View {
     this.launch.disabled = !this.chooser.ready || !this.ui.drives;
     const { found } = this.chooser;
     this.hint.textContent = found?.modes && !found.modes.some(({ jogs }) => Object.keys(jogs).length)
-      ? "No mode of this YAML is driven from the robot's page. To jog from it, add `web: {type: web}` to `teleoperation`, and a mode with `teleop: web`." : "";
+      ? words("No mode of this YAML is driven from the robot's page. To jog from it, add `web: {type: web}` to `teleoperation`, and a mode with `teleop: web`.") : "";
   }
 
   async start() {

@@ -1,0 +1,36 @@
+// The page's words in the language of the browser: English as it stands in the code, or a table in `words/`.
+
+const LANGUAGES = ["zh"];
+const wanted = localStorage.getItem("language") ?? navigator.language;
+const language = LANGUAGES.find((each) => wanted.toLowerCase().startsWith(each));
+const table = language ? (await import(`./words/${language}.js`)).default : {};
+if (language) document.documentElement.lang = language;
+// Those that are filled in, the longest first: it says most.
+const filled = Object.entries(table).filter(([text]) => text.includes("{}")).sort(([a], [b]) => b.length - a.length)
+  .map(([text, words]) => [new RegExp(`^${text.split("{}").map((part) => part.replace(/[.*+?^${}()|[\]\\]/g, "\\$&")).join("(.+?)")}$`), words]);
+const known = new Map(Object.entries(table)); // with what was looked up before
+const MOST = 2000;
+
+// A text in the language of the browser; what no table has stays as it is.
+export function words(text) {
+  if (!language || typeof text !== "string") return text;
+  const inner = text.trim();
+  return inner ? text.replace(inner, () => lookUp(inner)) : text;
+}
+
+function lookUp(text) {
+  let found = known.get(text);
+  if (found === undefined) {
+    found = text;
+    for (const [pattern, template] of filled) {
+      const match = pattern.exec(text);
+      if (!match) continue;
+      let i = 0;
+      found = template.replaceAll("{}", () => words(match[++i]));
+      break;
+    }
+    if (known.size > MOST) known.clear();
+    known.set(text, found);
+  }
+  return found;
+}

@@ -1,0 +1,85 @@
+"""The pages in other languages: tables that fit the code, and no English sentence left on the page of `ibrobot ui`."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from ibrobot_web.server.app import STATIC
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+TABLES = sorted((STATIC / "words").glob("*.js"))
+ENTRY = re.compile(r'^  ("(?:[^"\\]|\\.)*"): ("(?:[^"\\]|\\.)*"),$', re.MULTILINE)
+
+
+def entries(table: Path) -> list[tuple[str, str]]:
+    text = table.read_text(encoding="utf-8")
+    found = [(json.loads(key), json.loads(value)) for key, value in ENTRY.findall(text)]
+    assert len(found) == sum(line.startswith('  "') for line in text.splitlines()), "each line is an entry"
+    return found
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda path: path.stem)
+def test_a_table_fits_the_code(table: Path) -> None:
+    sources = [*STATIC.rglob("*.js"), *STATIC.glob("*.html"), *STATIC.parent.rglob("*.py")]
+    sources += (STATIC.parents[3]).glob("plugins/ibrobot-plugin-*/ibrobot_*/**/*.py")
+    code = "\n".join(path.read_text(encoding="utf-8") for path in sources if path.parent.name != "words").casefold()
+    known = entries(table)
+    assert len(known) > 300
+    assert len(dict(known)) == len(known), "no text is there twice"
+    for text, words in known:
+        assert words.count("{}") == text.count("{}"), text
+        for part in text.split("{}"):
+            for word in re.findall(r"[^\W\d_]{4,}", part):
+                assert word.casefold() in code, f"{text!r} is no longer in the code"
+
+
+VIEWS = ("robots", "devices", "record", "episodes", "job-convert", "datasets", "policies", "job-eval", "jobs")
+SHOWN = """[...document.querySelectorAll('#nav, #main')].flatMap((part) => {
+  const walk = document.createTreeWalker(part, NodeFilter.SHOW_TEXT), found = [];
+  while (walk.nextNode()) {
+    const up = walk.currentNode.parentElement;
+    if (up.checkVisibility() && !up.closest("pre, td")) found.push(walk.currentNode.data);
+  }
+  return found;
+})"""
+"""The visible texts of the page of `ibrobot ui`, without output and values."""
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
+def test_no_english_sentence_is_left_in_a_chinese_browser(tmp_path: Path) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
+    from ui_path import FLAGS, own_robot, ui_process, until
+
+    own_robot(tmp_path)
+    with ui_process(tmp_path) as address, sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page(locale="zh-CN")
+        errors: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(address)
+        page.get_by_text("没有发现问题。").wait_for(timeout=60_000)
+        assert page.evaluate("document.documentElement.lang") == "zh"
+        assert page.get_by_role("link", name="数据集", exact=True).is_visible()
+        for view in (
+            "robots",
+            "devices",
+            "record",
+            "episodes",
+            "job-convert",
+            "datasets",
+            "policies",
+            "job-eval",
+            "jobs",
+        ):
+            page.evaluate(f"location.hash = {view!r}")
+            until(page, f"document.querySelector('#view-{view}')?.isConnected")
+            page.wait_for_timeout(500)
+            english = re.compile(r"[^\u4e00-\u9fff]*[A-Za-z]+ [a-z]+ [a-z]+[^\u4e00-\u9fff]*")
+            assert [text for text in page.evaluate(SHOWN) if english.fullmatch(text)] == [], view
+        browser.close()
+    assert errors == []
