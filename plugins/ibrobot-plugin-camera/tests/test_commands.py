@@ -73,11 +73,14 @@ def test_preview_shows_the_stream_to_who_has_the_token() -> None:
             assert preview.stdout is not None
             try:
                 url = preview.stdout.readline().strip()
-                page = urllib.request.urlopen(url, timeout=20).read().decode()
-                assert '<img src="/stream/camera?token=' in page
-                with pytest.raises(urllib.error.HTTPError, match="403"):
-                    urllib.request.urlopen(url.partition("?")[0], timeout=20)
-                stream = urllib.request.urlopen(url.replace("/?", "/stream/camera?"), timeout=20)
+                browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+                page = browser.open(url, timeout=20).read().decode()
+                assert '<img src="/stream/0" alt="camera">' in page
+                address = url.partition("?")[0]
+                for path in ("", "stream/0"):
+                    with pytest.raises(urllib.error.HTTPError, match="401"):
+                        urllib.request.urlopen(address + path, timeout=20)
+                stream = browser.open(f"{address}stream/0", timeout=20)
                 assert stream.headers["Content-Type"].startswith("multipart/x-mixed-replace")
                 received = stream.read(6000)
                 assert received.count(b"--picture") >= 2

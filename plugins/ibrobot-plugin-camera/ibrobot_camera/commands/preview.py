@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import html
-import secrets
 import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs, urlsplit
+from collections.abc import Mapping
+from contextlib import closing
+from typing import TYPE_CHECKING
 
 import attrs
 
@@ -15,9 +15,16 @@ from ibrobot_core.api import SensorError, option
 from ibrobot_core.app import echo, on_signals
 
 if TYPE_CHECKING:
+    from aiohttp import web
+
     from ibrobot_camera.camera import OpenCvCamera
 
 _BOUNDARY = "picture"
+_STYLE = """body { margin: 1em; background: #111; color: #eee; font-family: sans-serif }
+body { display: flex; flex-wrap: wrap; gap: 1em }
+figure { margin: 0 } img { max-width: 100%; min-width: 20em; background: #333 }"""
+_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>ibrobot cameras</title>
+<link rel="stylesheet" href="{style}">{figures}</html>"""
 
 
 class Newest:
@@ -71,22 +78,25 @@ class Preview:
     seconds: float | None = option(None, ge=0, help="stop after this many seconds")
 
     def __call__(self) -> None:
+        from ibrobot_http.addresses import host_names
+        from ibrobot_http.guard import Guard
+        from ibrobot_http.listener import listen
+        from ibrobot_http.server import ServerThread
+
         from ibrobot_camera.commands.sources import opened
 
         ended = threading.Event()
         on_signals(ended.set)
-        token = secrets.token_urlsafe(16)
+        listener = listen(self.host, self.port, host_names(self.host, ()), any_port="--port 0")
+        guard = Guard(listener, roles=("watch",), any_port=True)
         with opened(self.source) as cameras:
             views = {name: Newest(name, camera, ended) for name, camera in cameras.items()}
-            server = ThreadingHTTPServer((self.host, self.port), _handler(views, token, ended))
-            server.daemon_threads = True
-            for thread in (*(view.thread for view in views.values()), threading.Thread(target=server.serve_forever)):
-                thread.start()
-            echo(f"http://{self.host}:{server.server_address[1]}/?token={token}")
-            ended.wait(self.seconds)
-            ended.set()
-            server.shutdown()
-            server.server_close()
+            with closing(ServerThread(guard, _app(views, ended), "preview")):
+                for view in views.values():
+                    view.thread.start()
+                echo(guard.link("watch"))
+                ended.wait(self.seconds)
+                ended.set()
             for view in views.values():
                 view.thread.join()
         for view in views.values():
@@ -94,57 +104,37 @@ class Preview:
                 raise SensorError(view.problem)
 
 
-def _handler(views: dict[str, Newest], token: str, ended: threading.Event) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        """Serves the page, and a stream of images for each camera."""
+def _app(views: Mapping[str, Newest], ended: threading.Event) -> web.Application:
+    """The page, and a stream of pictures for each camera."""
+    from aiohttp import web
+    from ibrobot_http.files import STYLE
 
-        def do_GET(self) -> None:
-            """Answer a browser that knows the token."""
-            address = urlsplit(self.path)
-            given = parse_qs(address.query).get("token", [""])[0]
-            if not secrets.compare_digest(given, token):
-                self.send_error(403)
-            elif address.path == "/":
-                self._page()
-            elif (name := address.path.removeprefix("/stream/")) in views:
-                self._stream(views[name])
-            else:
-                self.send_error(404)
+    async def page(request: web.Request) -> web.StreamResponse:
+        figures = "".join(
+            f'<figure><img src="/stream/{i}" alt="{name}"><figcaption>{name}</figcaption></figure>'
+            for i, name in enumerate(map(html.escape, views))
+        )
+        return web.Response(text=_PAGE.format(style=STYLE, figures=figures), content_type="text/html")
 
-        def log_message(self, format: str, *arguments: Any) -> None:
-            """Print nothing: the terminal shows the address."""
+    async def style(request: web.Request) -> web.StreamResponse:
+        return web.Response(text=_STYLE, content_type="text/css")
 
-        def _page(self) -> None:
-            figures = "".join(
-                f'<figure><img src="/stream/{name}?token={token}" alt="{html.escape(name)}">'
-                f"<figcaption>{html.escape(name)}</figcaption></figure>"
-                for name in views
-            )
-            body = (
-                '<!doctype html><html lang="en"><meta charset="utf-8"><title>ibrobot cameras</title><style>'
-                "body{margin:1em;background:#111;color:#eee;font-family:sans-serif;display:flex;flex-wrap:wrap;gap:1em}"
-                "figure{margin:0}img{max-width:100%;min-width:20em;background:#333}</style>" + figures
-            ).encode()
-            self.send_response(200)
-            self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
+    async def stream(request: web.Request) -> web.StreamResponse:
+        number = int(request.match_info["number"])
+        if number >= len(views):
+            raise web.HTTPNotFound
+        view, seen = list(views.values())[number], 0
+        response = web.StreamResponse(headers={"Content-Type": f"multipart/x-mixed-replace; boundary={_BOUNDARY}"})
+        await response.prepare(request)
+        while not ended.is_set():
+            seen, jpeg = await asyncio.to_thread(view.after, seen, 0.5)
+            if jpeg:
+                head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                await response.write(head.encode() + jpeg + b"\r\n")
+        return response
 
-        def _stream(self, view: Newest) -> None:
-            self.send_response(200)
-            self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            number = 0
-            try:
-                while not ended.is_set():
-                    number, jpeg = view.after(number, 0.5)
-                    if not jpeg:
-                        continue
-                    head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n"
-                    self.wfile.write(f"{head}\r\n".encode() + jpeg + b"\r\n")
-            except OSError:
-                return  # the browser has gone
-
-    return Handler
+    app = web.Application()
+    app.router.add_get("/", page)
+    app.router.add_get(STYLE, style)
+    app.router.add_get(r"/stream/{number:\d+}", stream)
+    return app
