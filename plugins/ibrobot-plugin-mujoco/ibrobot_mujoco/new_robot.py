@@ -20,6 +20,7 @@ from ibrobot_mujoco.mjcf_model import complete_model
 from ibrobot_mujoco.urdf_model import DrivenJoint, RobotModel, make_model
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
+_LIMITS_OF_ARM = "Write those of its datasheet, or begin with a tenth."
 
 
 @attrs.frozen(kw_only=True)
@@ -95,6 +96,8 @@ class NewRobot:
         for doubt in model.doubts:
             echo(f"check: {doubt}")
         echo(f"try it: ibrobot launch {self.out} --sim --mode web --web")
+        fastest = max(joint.max_acceleration for joint in model.joints)
+        echo(f"BEFORE A REAL ARM MOVES: its limits, e.g. max_acceleration {fastest:.3g}, are guesses. {_LIMITS_OF_ARM}")
 
 
 @contextmanager
@@ -242,6 +245,7 @@ def robot_yaml(model: RobotModel, source: Path, folder: str) -> str:
 # What that file does not say is a guess:
 {notes}
 # A real arm needs a section `hardware` with a plugin for it.
+# BEFORE A REAL ARM MOVES: max_velocity and max_acceleration are for the simulation. {_LIMITS_OF_ARM}
 robot:
   name: {_word(model.name)}
   joints:                                 # order here = order in every vector
