@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING
 import pytest
 from blinded_arm import ARM, NAMES
 from command_line import run_here
+from ibrobot_testing.command import command_line
 
 from ibrobot_core.config import find_config
 from ibrobot_core.plugins import installed_plugins
 
 if TYPE_CHECKING:
-    from ibrobot_testing.command import command_line
-from ibrobot_testing.site import Site
+    from ibrobot_testing.site import Site
 
 pytestmark = pytest.mark.integration
 PATIENCE_S = 240.0

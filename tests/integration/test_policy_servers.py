@@ -18,14 +18,15 @@ from ibrobot_policy_servers.options import ActionMap, ObservationMap, OpenpiOpti
 from ibrobot_policy_servers.served import ServedPolicy
 from ibrobot_serve.service import InferenceService
 from ibrobot_testing import host_context
+from ibrobot_testing.command import command_line
 from ibrobot_testing.fakes import FakeTransport
 from openpi_server import OpenpiServer, towards_a_goal
 
 if TYPE_CHECKING:
     from fake_runs import Runs
-    from ibrobot_testing.command import command_line
     from ibrobot_testing.site import Site
-from ibrobot_core.launch.runtime import Runtime
+
+    from ibrobot_core.launch.runtime import Runtime
 
 episodes = command_line("episodes")
 

@@ -40,7 +40,7 @@ class _Part:
         """
         try:
             settings = read_settings(folder / SETTINGS)
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             raise DatasetError(f"{folder}: is not an evaluation: it has no {SETTINGS}") from None
         asked = settings.pop(ASKED, None)
         if settings.get("trials") or settings.get("until_decided") or asked is None:

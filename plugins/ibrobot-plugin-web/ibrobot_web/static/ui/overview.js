@@ -39,7 +39,7 @@ export class Overview {
 }
 
 function record({ episodes, unjudged, newest }) {
-  if (!episodes) return ["No episode yet.", link("record", "Record episodes")];
+  if (!episodes) return ["No episode yet.", link("record", "Record some")];
   const last = newest[0];
   return [`${count(episodes, "episode")}, ${unjudged} not judged.`,
     `The newest: ${[last.task && `“${last.task}”`, last.outcome, last.began_s && when(last.began_s)].filter(Boolean).join(", ")}.`,
