@@ -44,7 +44,7 @@ class Commands(click.Group):
 
     def __init__(self, words: str = "", **settings: Any) -> None:
         self._prefix = f"{words} " if words else ""
-        if (command := installed_plugins().commands.get(words)) is not None:
+        if words and (command := installed_plugins().commands.get(words)) is not None:  # the top is made at import
             settings = {"help": f"{command.summary}\n\n{command.about}"}
             if command.does is not None:
                 own = _click_command(command)

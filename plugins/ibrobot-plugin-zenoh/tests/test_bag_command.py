@@ -246,7 +246,7 @@ def test_episode_is_played_into_the_network_without_its_commands(network: tuple[
     [
         (["--start-offset", "9"], "taught: --start-offset 9 is after its end; it lasts 0.0 s"),
         (["--remap", "/lamp"], "expected OLD:=NEW, got '/lamp'"),
-        (["--rate", "0"], "0.0 is not in the range"),
+        (["--rate", "0"], "0.0 is too small, must be at least 0.001"),
         (["--topics", "/x"], "has no topic '/x'"),
     ],
 )

@@ -114,7 +114,7 @@ def arguments(options: Any) -> list[str]:
         value = values[field.name]
         items = value if isinstance(value, tuple) else (value,)
         if (flag := flag_of(name, field))[0] != "-":
-            operands += map(str, items)
+            operands += [str(item) for item in items if item is not None]
         elif value != default_of(field):
             flags += [flag if item is True else f"{flag}={item}" for item in items]
     return [*flags, "--", *operands]
