@@ -25,9 +25,9 @@ def command_line(command: str | Command) -> click.Command:
 
     if isinstance(command, Command):
         return click_command(command)
-    found: click.Command | None = cli
+    current: click.Command | None = cli
     for word in command.split():
-        assert isinstance(found, click.Group), command
-        found = found.get_command(click.Context(found), word)
-    assert found is not None, command
-    return found
+        assert isinstance(current, click.Group), command
+        current = current.get_command(click.Context(current), word)
+    assert current is not None, command
+    return current
