@@ -87,9 +87,9 @@ class Preview:
 
         ended = threading.Event()
         on_signals(ended.set)
-        listener = listen(self.host, self.port, host_names(self.host, ()), any_port="--port 0")
-        guard = Guard(listener, roles=("watch",), any_port=True)
         with opened(self.source) as cameras:
+            listener = listen(self.host, self.port, host_names(self.host, ()), any_port="--port 0")
+            guard = Guard(listener, roles=("watch",), any_port=True)
             views = {name: Newest(name, camera, ended) for name, camera in cameras.items()}
             with closing(ServerThread(guard, _app(views, ended), "preview")):
                 for view in views.values():
