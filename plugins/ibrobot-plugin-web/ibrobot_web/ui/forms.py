@@ -34,6 +34,8 @@ _COMMAND = re.compile(r"`ibrobot ([a-z]+(?: [a-z]+)?)[^`]*`")
 _COMMAND_S = 600.0
 _TITLES = {"eval": "Evaluate"}
 """Command -> what the page calls it, where that is not its last word."""
+_KINDS = {"episodes", "dataset", "policy", "robot"}
+"""What forms offer of the opened folders."""
 WITH_ROBOT = frozenset({"record"})
 """Commands that run a robot, with a view of their own in which it is chosen."""
 
@@ -64,7 +66,7 @@ def form_of(ui: Ui, command: str) -> dict[str, Any]:
     shown = _shown(declared)
     wanted = {field.metadata["names"] for field in shown.values()}
     form["summary"] = declared.summary
-    form["known"] = {names: values for names, values in _known(ui).items() if names in wanted}
+    form["known"] = {names: _known(ui, names) for names in sorted(wanted & _KINDS)}
     form["fields"] = [_field_json(name, field) for name, field in shown.items()]
     try:
         declared.check()
@@ -176,25 +178,22 @@ def _shown(command: Command) -> dict[str, attrs.Attribute[Any]]:
     return {name: each for name, each in fields(command.options).items() if each.metadata["label"] is not None}
 
 
-def _known(ui: Ui) -> dict[str, list[dict[str, str]]]:
-    """Paths in the opened folders, by kind: the value of each, and its text."""
-    recordings = find_recordings(ui.folders)
-    outcomes: dict[str, Counter[str]] = {}
-    for path in recordings.episodes:
-        name = ui.folders.name(_dataset_of(ui, path))
-        outcomes.setdefault(name, Counter())[ui.keep(Episodes).row(ui, path)["outcome"]] += 1
-    return {
-        "episodes": [
-            {
-                "value": name,
-                "text": f"{name}: {', '.join(f'{count} {outcome}' for outcome, count in each.most_common())}",
-            }
-            for name, each in outcomes.items()
-        ],
-        "dataset": [{"value": name, "text": name} for name in map(ui.folders.name, recordings.datasets)],
-        "policy": [{"value": name, "text": name} for name in (ui.folders.name(path) for path, _ in find_policies(ui))],
-        "robot": [{"value": name, "text": name} for name in robot_names(ui)],
-    }
+def _known(ui: Ui, names: str) -> list[dict[str, str]]:
+    """Paths of a kind in the opened folders: the value of each, and its text."""
+    if names == "episodes":
+        outcomes: dict[str, Counter[str]] = {}
+        for path in find_recordings(ui.folders).episodes:
+            name = ui.folders.name(_dataset_of(ui, path))
+            outcomes.setdefault(name, Counter())[ui.keep(Episodes).row(ui, path)["outcome"]] += 1
+        words = {name: ", ".join(f"{n} {each}" for each, n in of.most_common()) for name, of in outcomes.items()}
+        return [{"value": name, "text": f"{name}: {text}"} for name, text in words.items()]
+    if names == "dataset":
+        known = [ui.folders.name(path) for path in find_recordings(ui.folders).datasets]
+    elif names == "policy":
+        known = [ui.folders.name(path) for path, _ in find_policies(ui)]
+    else:
+        known = robot_names(ui)
+    return [{"value": name, "text": name} for name in known]
 
 
 def _dataset_of(ui: Ui, episode: Path) -> Path:
