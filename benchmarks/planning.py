@@ -24,6 +24,7 @@ import mujoco
 import numpy as np
 from figures import report
 from ibrobot_kinematics.poses import matrix
+from ibrobot_planning.planner import JointGoal, PlanRequest, PlanResult
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.planners.search import Pace, Space, connect, shortened
@@ -32,7 +33,6 @@ from ibrobot_planning.world.objects import Box, Cylinder, World
 from planning_scenes import ARM_JOINTS, KINDS, MAX_ACCELERATION, MAX_VELOCITY, MJCF, PADDING_M, Maker, Problem, so101
 
 from ibrobot_core.api import Context, PlanningError, SteppedClock, Vector
-from ibrobot_core.app import JointGoal, PlanRequest, PlanResult
 
 PROOFS = Path(__file__).with_name("planning_proofs.json")
 """Kind -> seed -> a path that solves the problem [mrad]."""

@@ -49,7 +49,7 @@ python_maximum_signature_line_length = 140
 python_use_unqualified_type_names = True
 autodoc_default_options = {"members": True, "show-inheritance": True}
 # Names of other projects, of type parameters, and of what has no page of its own.
-nitpick_ignore = [("py:class", "ibrobot_core.interfaces.planner.Goal")]  # a type alias, which autodoc leaves out
+nitpick_ignore = [("py:class", "ibrobot_planning.planner.Goal")]  # a type alias, which autodoc leaves out
 nitpick_ignore_regex = [("py:.*", r"(?!ibrobot_core\.interfaces\.(?!run\b|run_state\b)\w+\.[A-Z]).*")]
 
 

@@ -14,7 +14,7 @@ from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config.describe import described, type_name
 from ibrobot_core.convert import is_mapping, is_sequence
 from ibrobot_core.options import fields
-from ibrobot_core.plugins import KINDS, installed_plugins
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.schema import SECTIONS
 
 
@@ -64,7 +64,7 @@ def options_of_kinds() -> dict[str, Iterator[str]]:
 
 def _kinds() -> list[str]:
     """The kinds of which a type is installed."""
-    return [kind for kind in KINDS if installed_plugins().types(kind)]
+    return [kind for kind in installed_plugins().all_kinds if installed_plugins().types(kind)]
 
 
 def _kind_page(kind: str) -> Iterator[str]:

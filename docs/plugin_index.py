@@ -9,7 +9,7 @@ from typing import Any
 
 import pluggy
 
-from ibrobot_core.plugins import KINDS, installed_plugins
+from ibrobot_core.plugins import installed_plugins
 
 CORE = "ibrobot-core"
 
@@ -48,7 +48,7 @@ def _needs(plugins: list[str]) -> Iterator[str]:
 
 def _offers(manager: pluggy.PluginManager) -> Iterator[tuple[str, str, str]]:
     """Kind, name and summary of everything that one plugin registers."""
-    for kind, hook in KINDS.items():
+    for kind, hook in installed_plugins().all_kinds.items():
         for descriptor in _yielded(manager, hook):
             yield kind, f"[`{descriptor.type}`](#options-{kind}-{descriptor.type})", descriptor.summary
     for reader in _yielded(manager, "ibrobot_readers"):

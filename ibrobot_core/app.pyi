@@ -4,6 +4,7 @@
 from ibrobot_core.descriptors import (
     Command as Command,
     SectionDescriptor as SectionDescriptor,
+    Kind as Kind,
     SourceDescriptor as SourceDescriptor,
     PanelDescriptor as PanelDescriptor,
     GuideDescriptor as GuideDescriptor,
@@ -93,20 +94,6 @@ from ibrobot_core.deadman import HOLD_S as HOLD_S
 from ibrobot_core.control.spline import Spline as Spline
 
 # Planning
-from ibrobot_core.descriptors import PlannerDescriptor as PlannerDescriptor
-from ibrobot_core.interfaces.planner import (
-    Planner as Planner,
-    PlanRequest as PlanRequest,
-    PlanResult as PlanResult,
-    AnyGoal as AnyGoal,
-    Goal as Goal,
-    JointGoal as JointGoal,
-    NamedGoal as NamedGoal,
-    PoseGoal as PoseGoal,
-    PositionGoal as PositionGoal,
-    LinearGoal as LinearGoal,
-    OrientationPolicy as OrientationPolicy,
-)
 from ibrobot_core.errors import PlanCode as PlanCode
 
 # Topics and services

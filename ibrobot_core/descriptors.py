@@ -239,14 +239,6 @@ class ExecutorDescriptor(Descriptor["interfaces.Executor"]):
 
 
 @attrs.frozen
-class PlannerDescriptor(Descriptor["interfaces.Planner"]):
-    """A motion planner."""
-
-    tool_goals: bool = True
-    """Whether it takes every goal; otherwise only `JointGoal`."""
-
-
-@attrs.frozen
 class SourceDescriptor(Descriptor["SourceWorker"]):
     """The command source of the control modes that have a key, its `type`: `planner`, or `intervene` of `inference`."""
 
@@ -324,6 +316,21 @@ class PoolDescriptor(Descriptor["interfaces.Pool"]):
         RequestError: e.g. for an address that the pool does not have.
         ComponentFailed: if its machines cannot be reached.
     """
+
+
+@attrs.frozen
+class Kind:
+    """A kind that a plugin defines. Its types can be named in the robot YAML, as those of core's kinds.
+
+    A plugin that offers types of it, but does not need the package that defines it, marks the hook with
+    `@hookimpl(optionalhook=True)`.
+    """
+
+    name: str
+    hook: str
+    """Name of the hook, e.g. `ibrobot_planners`."""
+    descriptor: builtins.type[Descriptor[Any]]
+    """The class of what the hook yields."""
 
 
 @attrs.frozen

@@ -65,11 +65,6 @@ def ibrobot_executors() -> Iterable[descriptors.ExecutorDescriptor]:  # type: ig
 
 
 @hookspec
-def ibrobot_planners() -> Iterable[descriptors.PlannerDescriptor]:  # type: ignore[empty-body]
-    """Motion planners."""
-
-
-@hookspec
 def ibrobot_sources() -> Iterable[descriptors.SourceDescriptor]:  # type: ignore[empty-body]
     """Command sources of control modes."""
 
@@ -132,6 +127,11 @@ def ibrobot_guides() -> Iterable[descriptors.GuideDescriptor]:  # type: ignore[e
 @hookspec
 def ibrobot_reports() -> Iterable[descriptors.ReportDescriptor]:  # type: ignore[empty-body]
     """Folders with results, which pages list and show."""
+
+
+@hookspec
+def ibrobot_kinds() -> Iterable[descriptors.Kind]:  # type: ignore[empty-body]
+    """Kinds that this plugin defines, each with a hook by which others offer theirs."""
 
 
 @hookspec

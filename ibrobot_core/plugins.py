@@ -44,7 +44,6 @@ KINDS: Mapping[str, str] = {
     "policy": "ibrobot_policies",
     "engine": "ibrobot_engines",
     "executor": "ibrobot_executors",
-    "planner": "ibrobot_planners",
     "source": "ibrobot_sources",
     "transport": "ibrobot_transports",
     "recorder": "ibrobot_recorders",
@@ -114,10 +113,17 @@ class Registry:
     reports: list[descriptors.ReportDescriptor] = attrs.field(factory=list)
     decoders: list[descriptors.DecoderDescriptor] = attrs.field(factory=list)
     features: dict[str, descriptors.FeatureDescriptor] = attrs.field(factory=dict)
+    kinds: dict[str, descriptors.Kind] = attrs.field(factory=dict)
+    """The kinds that plugins define; `KINDS` has those of core."""
     commands: dict[str, descriptors.Command] = attrs.field(factory=dict)
     command_packages: dict[str, str] = attrs.field(factory=dict)
     """Command -> the package that offers it."""
     managers: dict[str, pluggy.PluginManager] = attrs.field(factory=dict)
+
+    @property
+    def all_kinds(self) -> dict[str, str]:
+        """Kind -> its hook, of core and of plugins."""
+        return {**KINDS, **{kind.name: kind.hook for kind in self.kinds.values()}}
 
     def types(self, kind: str) -> list[str]:
         """The available types of a kind, sorted."""
@@ -340,19 +346,21 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
-def _check_names(plugin: Any) -> None:
+def _check_names(plugin: Any, kinds: Iterable[descriptors.Kind]) -> None:
     """Refuse functions with the name prefix of hooks that are not hooks, so that typos do not go unnoticed."""
-    known = {name for name in vars(hookspecs) if name.startswith("ibrobot_")}
+    known = {name for name in vars(hookspecs) if name.startswith("ibrobot_")} | {kind.hook for kind in kinds}
     for name in vars(plugin) if isinstance(plugin, ModuleType) else dir(plugin):
-        if name.startswith("ibrobot_") and name not in known and hasattr(getattr(plugin, name), "ibrobot_impl"):
+        hook: Any = getattr(plugin, name) if name.startswith("ibrobot_") and name not in known else None
+        if hasattr(hook, "ibrobot_impl") and not hook.ibrobot_impl["optionalhook"]:
             close = get_close_matches(name, known, 1)
             raise ValueError(f"unknown hook {name!r}" + (f", did you mean {close[0]!r}?" if close else ""))
 
 
-def _offered(manager: pluggy.PluginManager, hook: str) -> list[Any]:
-    """Objects that a plugin yields for a hook; their class is in the hook's annotation, their names are texts."""
-    names = {"Iterable": list, "descriptors": descriptors}
-    (expected,) = get_args(get_type_hints(getattr(hookspecs, hook), names)["return"])
+def _offered(manager: pluggy.PluginManager, hook: str, expected: type[Any] | None = None) -> list[Any]:
+    """Objects that a plugin yields for a hook; core's hooks have their class as annotation. Their names are texts."""
+    if expected is None:
+        names = {"Iterable": list, "descriptors": descriptors}
+        (expected,) = get_args(get_type_hints(getattr(hookspecs, hook), names)["return"])
     offers = [each for result in getattr(manager.hook, hook)() for each in result]
     for each in offers:
         if not isinstance(each, expected):
@@ -380,38 +388,75 @@ def _contained(offer: Any, message: str) -> dict[str, Callable[..., Any]]:
     return {name: partial(ask, name) for name in asked if name in attrs.fields_dict(type(offer))}
 
 
-def _add(registry: Registry, plugin: str, package: str, version: str, load: Callable[[], Any]) -> None:
-    """Load a plugin and call its registration hooks; a plugin that raises is registered as a failure."""
-    manager = pluggy.PluginManager("ibrobot")
-    manager.add_hookspecs(hookspecs)
-    offers: dict[str, list[Any]] = {}
-    stage = "import"
-    try:
-        loaded = load()
-        stage = "hooks"
-        _check_names(loaded)
-        manager.register(loaded, plugin)
-        manager.check_pending()
-        for stage in (*KINDS.values(), *_UNTYPED):
-            offers[stage] = _offered(manager, stage)
-    except BaseException as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
-        registry.failures.append(Failure(plugin, package, stage, _reason(error)))
-        return
-    for kind, each in ((kind, each) for kind, hook in KINDS.items() for each in offers[hook]):
-        entry = Entry(kind, each, plugin, package, version)
-        if (other := registry.entries.setdefault((kind, each.type), entry)) is not entry:
-            reason = f"{kind} type {each.type!r} is offered by {other.package} already"
-            registry.failures.append(Failure(plugin, package, KINDS[kind], reason))
-    for name in ("readers", "decoders", "configs", "panels", "guides", "reports"):
-        getattr(registry, name).extend(offers[f"ibrobot_{name}"])
-    for each in offers["ibrobot_commands"]:
-        if registry.commands.setdefault(each.name, each) is each:
-            registry.command_packages[each.name] = package
-        else:
-            reason = f"command {each.name!r} is offered by {registry.command_packages[each.name]} already"
-            registry.failures.append(Failure(plugin, package, "ibrobot_commands", reason))
-    registry.features |= {each.name: each for each in offers["ibrobot_features"]}
-    registry.managers[plugin] = manager
+@attrs.define
+class _Plugin:
+    """A plugin on its way into a registry."""
+
+    name: str
+    package: str
+    version: str
+    entry: EntryPoint
+    manager: pluggy.PluginManager
+    stage: str = "import"
+
+    @classmethod
+    def of(cls, entry: EntryPoint) -> _Plugin:
+        manager = pluggy.PluginManager("ibrobot")
+        manager.add_hookspecs(hookspecs)
+        package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("?", "?")
+        return cls(entry.name, package, version, entry, manager)
+
+    def succeeds(self, step: Callable[[Registry], None], registry: Registry) -> bool:
+        """Take a step; if it raises, the plugin is registered as a failure."""
+        try:
+            step(registry)
+        except BaseException as error:  # noqa: BLE001 - contained: reported where the plugin is asked for
+            registry.failures.append(Failure(self.name, self.package, self.stage, _reason(error)))
+            return False
+        return True
+
+    def load(self, registry: Registry) -> None:
+        """Import it, and register its kinds."""
+        loaded = self.entry.load()
+        self.stage = "hooks"
+        self.manager.register(loaded, self.name)
+        self.stage = "ibrobot_kinds"
+        for kind in _offered(self.manager, self.stage):
+            if kind.name in KINDS or registry.kinds.setdefault(kind.name, kind) is not kind:
+                self.refuse(registry, f"kind {kind.name!r} is defined by another package already")
+
+    def offer(self, registry: Registry) -> None:
+        """Register what it offers; nothing of it if one of its hooks raises."""
+        kinds = list(registry.kinds.values())
+        self.stage = "hooks"
+        for kind in kinds:
+            self.manager.add_hookspecs(type(kind.name, (), {kind.hook: hookspecs.hookspec(lambda: ())}))
+        ((_, loaded),) = self.manager.list_name_plugin()
+        _check_names(loaded, kinds)
+        self.manager.check_pending()
+        classes = {kind.hook: kind.descriptor for kind in kinds}
+        offers: dict[str, list[Any]] = {}
+        for self.stage in (*registry.all_kinds.values(), *_UNTYPED):
+            offers[self.stage] = _offered(self.manager, self.stage, classes.get(self.stage))
+        for name, hook in registry.all_kinds.items():
+            for each in offers[hook]:
+                entry = Entry(name, each, self.name, self.package, self.version)
+                if (other := registry.entries.setdefault((name, each.type), entry)) is not entry:
+                    self.refuse(registry, f"{name} type {each.type!r} is offered by {other.package} already", hook)
+        for name in ("readers", "decoders", "configs", "panels", "guides", "reports"):
+            getattr(registry, name).extend(offers[f"ibrobot_{name}"])
+        for each in offers["ibrobot_commands"]:
+            if registry.commands.setdefault(each.name, each) is each:
+                registry.command_packages[each.name] = self.package
+            else:
+                owner = registry.command_packages[each.name]
+                self.refuse(registry, f"command {each.name!r} is offered by {owner} already", "ibrobot_commands")
+        registry.features |= {each.name: each for each in offers["ibrobot_features"]}
+        registry.managers[self.name] = self.manager
+
+    def refuse(self, registry: Registry, reason: str, stage: str = "ibrobot_kinds") -> None:
+        """Register that one of its offers is not used."""
+        registry.failures.append(Failure(self.name, self.package, stage, reason))
 
 
 def discover(points: Iterable[EntryPoint] | None = None) -> Registry:
@@ -431,9 +476,10 @@ def discover(points: Iterable[EntryPoint] | None = None) -> Registry:
         )
     others = [entry for entry in (installed if points is None else points) if entry not in own]
     registry = Registry()
-    for entry in (*own, *sorted(others, key=lambda entry: entry.name)):
-        package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("?", "?")
-        _add(registry, entry.name, package, version, entry.load)
+    plugins = [_Plugin.of(entry) for entry in (*own, *sorted(others, key=lambda entry: entry.name))]
+    for plugin in [plugin for plugin in plugins if plugin.succeeds(plugin.load, registry)]:
+        plugin.succeeds(plugin.offer, registry)
+    registry.failures.sort(key=lambda failure: failure.plugin)
     return registry
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import subprocess
 import sys
@@ -92,6 +93,42 @@ def test_two_commands_of_one_name_are_a_failure_of_the_later_plugin(site: Site) 
     shown = _ibrobot("plugins")
     assert f"broken: {registry.failures[2]}\n" in shown.stdout
     assert _ibrobot("juggle", "--help").returncode == 0
+
+
+def test_a_plugin_defines_a_kind_that_others_offer(site: Site) -> None:
+    site.add("fake-aaa", "offers_judges.py")  # discovered before the kind is known
+    site.add("fake-defining", "defines_a_kind.py")
+    registry = discover(site.entry_points())
+
+    assert registry.failures == []
+    assert registry.find("judge", "strict").summary == "never pleased"
+    assert {*registry.all_kinds} - {*KINDS} == {"judge"}
+    with pytest.raises(PluginError, match="unknown judge type 'strct', did you mean 'strict'"):
+        registry.find("judge", "strct")
+
+
+def test_an_optional_hook_needs_no_kind(site: Site) -> None:
+    site.add("fake-aaa", "offers_judges.py")
+    registry = discover(site.entry_points())
+
+    assert registry.failures == []
+    assert registry.types("hardware") == ["plain_arm"]
+
+
+def test_two_definitions_of_a_kind_and_wrong_offers_are_failures(site: Site) -> None:
+    for name in ("fake-defining", "fake-other"):
+        site.add(name, "defines_a_kind.py")
+    site.add("fake-wrong", "misspelt_kind.py")
+    site.add("fake-zzz", "offers_judges.py")
+    vars(importlib.import_module("fake_zzz"))["ibrobot_judges"].__code__ = (lambda: iter(["strict"])).__code__
+    registry = discover(site.entry_points())
+
+    assert [str(failure) for failure in registry.failures] == [
+        "plugin 'fake_other' (fake-other) failed in ibrobot_kinds: kind 'judge' is defined by another package already",
+        "plugin 'fake_wrong' (fake-wrong) has a wrong hook: "
+        "ValueError: unknown hook 'ibrobot_jugdes', did you mean 'ibrobot_judges'?",
+        "plugin 'fake_zzz' (fake-zzz) failed in ibrobot_judges: TypeError: expected a JudgeDescriptor, got 'strict'",
+    ]
 
 
 def test_core_without_its_entry_point_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,13 +14,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from ibrobot_kinematics.poses import matrix
+from ibrobot_planning.planner import JointGoal, PlanRequest
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.world.objects import Box, Cylinder, World
 from PIL import Image
 
 from ibrobot_core.api import Context, SteppedClock, Vector
-from ibrobot_core.app import JointGoal, PlanRequest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from planning import motion_of

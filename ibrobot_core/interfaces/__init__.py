@@ -14,7 +14,6 @@ from ibrobot_core.interfaces.hardware import (
     SimulatedHardware,
     Torque,
 )
-from ibrobot_core.interfaces.planner import Planner
 from ibrobot_core.interfaces.policy import Frame, PictureCodec, Policy, PolicySpec, Tensors
 from ibrobot_core.interfaces.pool import Pool
 from ibrobot_core.interfaces.reader import EpisodeAddress, EpisodeReader

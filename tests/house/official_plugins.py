@@ -16,7 +16,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from ibrobot_core.descriptors import SectionDescriptor
-from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, RECORDS, discover
+from ibrobot_core.plugins import EXTRAS, OFFICIAL, RECORDS, discover
 
 PLUGINS = Path(__file__).parents[2] / "plugins"
 DISTRIBUTION = PLUGINS / "ibrobot" / "pyproject.toml"
@@ -35,7 +35,7 @@ def offers() -> dict[str, dict[str, list[str]]]:
         registry = discover([entry])
         assert not registry.failures, registry.failures
         kinds: dict[str, list[str]] = {}
-        for kind in KINDS:
+        for kind in registry.all_kinds:
             mine = [each for each in registry.entries.values() if (each.kind, each.package) == (kind, package)]
             if mine:
                 kinds[kind] = sorted(each.descriptor.type for each in mine)

@@ -32,7 +32,7 @@ ALLOWED = {
     "hasattr(os, 'sched_getaffinity')",
     "hasattr(os, 'posix_fadvise')",
     # Functions with pluggy's mark on them.
-    "hasattr(getattr(plugin, name), 'ibrobot_impl')",
+    "hasattr(hook, 'ibrobot_impl')",
     # LeRobot's own policies, and torch's functions: some have these.
     "getattr(self.network, '_queues', {})",
     "getattr(func, '__name__', '')",

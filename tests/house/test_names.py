@@ -14,6 +14,7 @@ CORE = OFFICIAL.parent
 ORDINARY = {"gripper", "imu", "joint", "keyboard", "process", "processes", "trajectory", "twist"}
 ORDINARY |= {"drawer", "empty", "handover", "push", "sort", "stack"}
 """Types that are words of the language too: they count where a YAML would name them, as in `type: WORD`."""
+TYPED = {*KINDS, "planner"} - {"section", "source"}
 
 
 def patterns() -> Iterator[str]:
@@ -23,7 +24,7 @@ def patterns() -> Iterator[str]:
         yield rf"\b(ibrobot-plugin-{name}|ibrobot_{name})\b"
         yield from (rf"\bibrobot {command}\b" for command in offers.get("command", ()))
         yield from (rf"\b{section}: \{{|plugin_sections\[.{section}.\]" for section in offers.get("section", ()))
-        for type_ in (type_ for kind in KINDS if kind not in {"section", "source"} for type_ in offers.get(kind, ())):
+        for type_ in (type_ for kind in offers if kind in TYPED for type_ in offers[kind]):
             yield rf"\b(type|execution_mode): {type_}\b" if type_ in ORDINARY else rf"\b{type_}\b"
 
 

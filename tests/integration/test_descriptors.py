@@ -10,14 +10,13 @@ from ibrobot_testing import check_descriptor
 
 from ibrobot_core.api import Descriptor
 from ibrobot_core.app import installed_plugins
-from ibrobot_core.plugins import KINDS
 
 pytestmark = pytest.mark.integration
 
 KNOWN = installed_plugins()
 TYPES = [
     pytest.param(found, id=f"{kind}-{type_}")
-    for kind in KINDS
+    for kind in KNOWN.all_kinds
     for type_ in KNOWN.types(kind)
     if isinstance(found := KNOWN.find(kind, type_), Descriptor)
     if type_ != "zenoh"  # whom to connect to has no default

@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from ibrobot_core.api import ExecutorDescriptor, Late, OptionFault, did_you_mean, hookimpl
-from ibrobot_core.app import Command, PlannerDescriptor, SectionDescriptor, SourceDescriptor
+from ibrobot_core.app import Command, Kind, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
+from ibrobot_planning.planner import PlannerDescriptor
 from ibrobot_planning.planners.options import GoalCheckOptions, JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
 from ibrobot_planning.world.options import WorldOptions
@@ -15,6 +16,12 @@ from ibrobot_planning.world.options import WorldOptions
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
     from ibrobot_core.app import Component, RunView
+
+
+@hookimpl
+def ibrobot_kinds() -> Iterable[Kind]:
+    """Planners."""
+    yield Kind("planner", "ibrobot_planners", PlannerDescriptor)
 
 
 @hookimpl

@@ -11,6 +11,17 @@ from typing import override
 import attrs
 import numpy as np
 from ibrobot_kinematics import KinematicsError, Target, robot_model, solve_all
+from ibrobot_planning.planner import (
+    AnyGoal,
+    JointGoal,
+    NamedGoal,
+    Planner,
+    PlannerDescriptor,
+    PlanRequest,
+    PlanResult,
+    PoseGoal,
+    PositionGoal,
+)
 from ibrobot_planning.world.objects import Box, Sphere, World
 
 from ibrobot_core.api import (
@@ -26,18 +37,7 @@ from ibrobot_core.api import (
     ns,
     option,
 )
-from ibrobot_core.app import (
-    AnyGoal,
-    JointGoal,
-    NamedGoal,
-    PlanCode,
-    Planner,
-    PlannerDescriptor,
-    PlanRequest,
-    PlanResult,
-    PoseGoal,
-    PositionGoal,
-)
+from ibrobot_core.app import PlanCode
 
 DT = 0.02
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from ibrobot_planning.planner import PlannerDescriptor
+from ibrobot_planning.suite import FakePlanner
 from ibrobot_testing.fakes import (
     FakeHardware,
-    FakePlanner,
     FakePolicy,
     FakeRealHardware,
     FakeRecorder,
@@ -25,7 +26,6 @@ from ibrobot_core.api import (
     Vector3,
     hookimpl,
 )
-from ibrobot_core.app import PlannerDescriptor
 
 POSES = "/scene/poses"
 SCENE = (

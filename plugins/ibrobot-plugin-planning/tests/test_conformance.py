@@ -7,17 +7,17 @@ from typing import override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_planning.planner import JointGoal, PlanRequest
 from ibrobot_planning.planners.joint import JointPlanner
 from ibrobot_planning.planners.options import JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
+from ibrobot_planning.suite import PlannerSuite
 from ibrobot_planning.world.arm import robot_arm
 from ibrobot_planning.world.collision import Collisions, unchecked_pairs
 from ibrobot_planning.world.engines import find_engines
 from ibrobot_planning.world.objects import World
-from ibrobot_testing import PlannerSuite
 
 from ibrobot_core.api import Context, MissingDependency
-from ibrobot_core.app import JointGoal, PlanRequest
 
 from .table_arm import make_robot
 

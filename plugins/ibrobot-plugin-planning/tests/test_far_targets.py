@@ -16,11 +16,12 @@ from ibrobot_planning.execution.requests import GoTo, MoveToPose
 from ibrobot_planning.execution.services import CARTESIAN, COMPUTE_IK, PLAN, PLAN_GOAL
 from ibrobot_planning.execution.source import CMD_POSE, GO_TO, MOVE_ACTION, MOVE_TO_POSE
 from ibrobot_planning.goals.tool import Tool
+from ibrobot_planning.planner import PoseGoal, PositionGoal
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.tasks.runner import RUN
 
 from ibrobot_core.api import IbrobotError, PlanningError, Pose, Quaternion, Vector3
-from ibrobot_core.app import ConfigError, PlanCode, PoseGoal, PositionGoal, Runtime
+from ibrobot_core.app import ConfigError, PlanCode, Runtime
 
 from .conftest import Make
 from .table_arm import make_robot

@@ -16,12 +16,13 @@ from ibrobot_planning.execution.requests import Execute, GoTo
 from ibrobot_planning.execution.results import MoveResult
 from ibrobot_planning.execution.source import EXECUTE, GO_TO
 from ibrobot_planning.goals.text import Target
+from ibrobot_planning.planner import PlanRequest, PlanResult
 from ibrobot_planning.planners.completion import MOST_POINTS, Start, completed
 from ibrobot_planning.planners.timing import LONGEST_S
-from ibrobot_testing.fakes import FakePlanner
+from ibrobot_planning.suite import FakePlanner
 
 from ibrobot_core.api import Header, Joint, JointTrajectory, JointTrajectoryPoint, PlanningError, Robot, Vector, ns
-from ibrobot_core.app import PlanCode, PlanRequest, PlanResult, Runtime, Spline
+from ibrobot_core.app import PlanCode, Runtime, Spline
 
 from .conftest import Make
 from .table_arm import ARM, WALL, make_planner

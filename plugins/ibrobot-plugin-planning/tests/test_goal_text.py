@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 from ibrobot_planning.goals.text import target
+from ibrobot_planning.planner import AnyGoal, JointGoal, NamedGoal, PoseGoal, PositionGoal
 
 from ibrobot_core.api import PlanningError, Quaternion, Vector3
-from ibrobot_core.app import AnyGoal, JointGoal, NamedGoal, PlanCode, PoseGoal, PositionGoal
+from ibrobot_core.app import PlanCode
 
 from .table_arm import JOINTS, make_robot
 

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_planning import ibrobot_planners
+from ibrobot_planning.planner import JointGoal, PlanRequest, PoseGoal
 from ibrobot_planning.planners.joint import JointPlanner
 from ibrobot_planning.planners.options import JointPlannerOptions
 
 from ibrobot_core.api import Context, Joint, JointTrajectory, PlanningError, Pose, Robot, SteppedClock
-from ibrobot_core.app import JointGoal, PlanRequest, PoseGoal
 
 ROBOT = Robot(
     name="three",

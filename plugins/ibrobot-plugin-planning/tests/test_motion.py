@@ -25,6 +25,7 @@ from ibrobot_planning.execution.source import (
     MOVE_TO_POSE,
     RESULT,
 )
+from ibrobot_planning.planner import PositionGoal
 
 from ibrobot_core.api import (
     Header,
@@ -39,7 +40,7 @@ from ibrobot_core.api import (
     Vector,
     Vector3,
 )
-from ibrobot_core.app import PlanCode, PositionGoal, RequestError, Runtime
+from ibrobot_core.app import PlanCode, RequestError, Runtime
 
 from .conftest import Make
 from .table_arm import JOINTS, make_robot

@@ -15,21 +15,13 @@ from ibrobot_planning import ibrobot_planners
 from ibrobot_planning.client import Client
 from ibrobot_planning.execution.requests import GoTo
 from ibrobot_planning.execution.source import GO_TO
-from ibrobot_testing import PlannerSuite
+from ibrobot_planning.planner import Planner
+from ibrobot_planning.suite import PlannerSuite
 from ibrobot_testing.command import command_line
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import Context, PlanningError
-from ibrobot_core.app import (
-    ConfigError,
-    LaunchRequest,
-    PlanCode,
-    Planner,
-    Runtime,
-    Session,
-    installed_plugins,
-    load_config,
-)
+from ibrobot_core.app import ConfigError, LaunchRequest, PlanCode, Runtime, Session, installed_plugins, load_config
 
 from .other_planners import BatchOptions, BatchPlanner
 from .table_arm import ARM, make_robot

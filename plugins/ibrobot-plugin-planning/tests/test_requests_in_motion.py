@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from ibrobot_kinematics.clearance import CLEARANCE
 from ibrobot_planning.execution.motions import Execution
 from ibrobot_planning.execution.source import GO_TO, MOVE_TO_CONFIGURATION, MOVE_TO_POSE, RESULT
+from ibrobot_planning.suite import FakePlanner
 from ibrobot_planning.world.objects import SNAPSHOT, World
-from ibrobot_testing.fakes import FakePlanner
 
 from ibrobot_core.api import HardwareError, IbrobotError, PlanningError
 from ibrobot_core.app import ConfigError, PlanCode, RequestError, Runtime, Service

@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 from ibrobot_kinematics import robot_model
 from ibrobot_planning.goals.tool import Tool
-from ibrobot_planning.planners.rrt import RrtConnectPlanner
-from ibrobot_planning.planners.timing import Motion
-from ibrobot_planning.world.collision import Collisions
-from ibrobot_planning.world.objects import Sphere, World, WorldObject
-
-from ibrobot_core.api import PlanningError, Pose, Quaternion, Robot, Vector3
-from ibrobot_core.app import (
+from ibrobot_planning.planner import (
     AnyGoal,
     JointGoal,
     LinearGoal,
     NamedGoal,
-    PlanCode,
     Planner,
     PlanRequest,
     PlanResult,
     PoseGoal,
     PositionGoal,
 )
+from ibrobot_planning.planners.rrt import RrtConnectPlanner
+from ibrobot_planning.planners.timing import Motion
+from ibrobot_planning.world.collision import Collisions
+from ibrobot_planning.world.objects import Sphere, World, WorldObject
+
+from ibrobot_core.api import PlanningError, Pose, Quaternion, Robot, Vector3
+from ibrobot_core.app import PlanCode
 
 from .table_arm import ARM, WALL, box, make_planner, make_robot, write_arm
 

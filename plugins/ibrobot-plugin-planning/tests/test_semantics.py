@@ -12,6 +12,7 @@ from ibrobot_kinematics.urdf import read_urdf
 from ibrobot_planning.commands.description import srdf_of as srdf
 from ibrobot_planning.goals.joints import named_pose, pose_names
 from ibrobot_planning.goals.text import target
+from ibrobot_planning.planner import NamedGoal, PlanRequest
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.tasks.format import MoveStep
@@ -21,7 +22,6 @@ from ibrobot_planning.world.collision import unchecked_pairs
 from ibrobot_planning.world.objects import World
 
 from ibrobot_core.api import Context, PlanningError, SteppedClock
-from ibrobot_core.app import NamedGoal, PlanRequest
 
 from .table_arm import ARM, make_robot
 

@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from ibrobot_kinematics import world_clearance
 from ibrobot_planning import ibrobot_sections
+from ibrobot_planning.planner import JointGoal, PlanRequest
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.world.clouds import CLEAR
@@ -43,7 +44,7 @@ from ibrobot_core.api import (
     Vector3,
     ns,
 )
-from ibrobot_core.app import ConfigError, JointGoal, PlanCode, PlanRequest, Session, single_options
+from ibrobot_core.app import ConfigError, PlanCode, Session, single_options
 
 from .table_arm import ARM, make_robot
 from .test_clouds import CLOUD, FIELDS, INFO, MOUNTS, cloud, depth_image

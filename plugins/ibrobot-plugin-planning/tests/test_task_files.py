@@ -11,6 +11,7 @@ import pytest
 from ibrobot_kinematics.poses import orientation, pose_at
 from ibrobot_kinematics.rotations import from_rpy
 from ibrobot_planning.goals.grammar import upright
+from ibrobot_planning.planner import PoseGoal, PositionGoal
 from ibrobot_planning.tasks.checks import CheckedTask, Situation, check_task
 from ibrobot_planning.tasks.format import MoveStep
 from ibrobot_planning.tasks.reading import EXAMPLES, find_task, read_task
@@ -18,7 +19,7 @@ from ibrobot_planning.world.objects import Sphere, World, WorldObject
 from ibrobot_planning.world.section import first_world, scene_objects
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.app import ConfigError, PoseGoal, PositionGoal, Registry, RobotConfig, installed_plugins, load_config
+from ibrobot_core.app import ConfigError, Registry, RobotConfig, installed_plugins, load_config
 
 from .table_arm import ARM, make_robot
 from .test_tasks import task_robot

@@ -12,6 +12,7 @@ import pytest
 from ibrobot_kinematics.clearance import CLEARANCE
 from ibrobot_kinematics.poses import matrix
 from ibrobot_planning import ibrobot_sections
+from ibrobot_planning.planner import JointGoal, PlanRequest
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.world.objects import SNAPSHOT, Box, Capsule, Cylinder, Mesh, Plane, Sphere, read_mesh
@@ -30,7 +31,7 @@ from ibrobot_planning.world.section import (
 from ibrobot_testing import SectionSuite, make_session
 
 from ibrobot_core.api import Context, Float64MultiArray, PlanningError, SteppedClock
-from ibrobot_core.app import ConfigError, JointGoal, PlanRequest, RequestError, single_options
+from ibrobot_core.app import ConfigError, RequestError, single_options
 
 from .parts import POSES
 from .table_arm import ARM, make_robot

@@ -15,7 +15,6 @@ from ibrobot_testing.engine import EngineSuite
 from ibrobot_testing.executor import ExecutorSuite
 from ibrobot_testing.hardware import HardwareSuite, SimulatedHardwareSuite
 from ibrobot_testing.leaks import LeakCheck
-from ibrobot_testing.planner import PlannerSuite
 from ibrobot_testing.policy import PolicySuite
 from ibrobot_testing.pool import PoolSuite
 from ibrobot_testing.recorder import RecorderSuite
@@ -34,7 +33,6 @@ __all__ = [
     "ExecutorSuite",
     "HardwareSuite",
     "LeakCheck",
-    "PlannerSuite",
     "PolicySuite",
     "PoolSuite",
     "RecorderSuite",

@@ -8,7 +8,6 @@ from typing import Never
 import attrs
 from ibrobot_testing.fakes import (
     FakeHardware,
-    FakePlanner,
     FakePolicy,
     FakeRealHardware,
     FakeSource,
@@ -18,10 +17,11 @@ from ibrobot_testing.fakes import (
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import (
+    Descriptor,
     EngineDescriptor,
     ExecutorDescriptor,
     HardwareDescriptor,
-    PlannerDescriptor,
+    Kind,
     PolicyDescriptor,
     RecorderDescriptor,
     SensorDescriptor,
@@ -31,6 +31,16 @@ from ibrobot_core.descriptors import (
 )
 from ibrobot_core.errors import HardwareError, MissingDependency, TeleopError
 from ibrobot_core.interfaces.hardware import Holding
+
+try:
+    from ibrobot_planning.planner import PlannerDescriptor
+except ImportError:  # then this plugin defines the kind
+
+    @hookimpl
+    def ibrobot_kinds():
+        yield Kind("planner", "ibrobot_planners", Descriptor)
+
+    PlannerDescriptor = Descriptor  # type: ignore[assignment, misc]
 
 
 class Scene(FakeHardware):
@@ -151,7 +161,7 @@ def ibrobot_sources():
 
 @hookimpl
 def ibrobot_planners():
-    yield PlannerDescriptor("cubic", lambda options, ctx: FakePlanner(ctx), "cubics")
+    yield PlannerDescriptor("cubic", lambda options, ctx: None, "cubics")
 
 
 @hookimpl

@@ -9,7 +9,6 @@ import attrs
 from ibrobot_testing.fakes import (
     FakeEngine,
     FakeHardware,
-    FakePlanner,
     FakePolicy,
     FakeRealHardware,
     FakeRecorder,
@@ -21,10 +20,11 @@ from ibrobot_testing.fakes import (
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import (
+    Descriptor,
     EngineDescriptor,
     ExecutorDescriptor,
     HardwareDescriptor,
-    PlannerDescriptor,
+    Kind,
     PolicyDescriptor,
     RecorderDescriptor,
     SensorDescriptor,
@@ -39,6 +39,16 @@ EVENTS: list[tuple[Any, ...]] = []
 CALLS: list[str] = []
 MADE: dict[str, Any] = {}
 TROUBLE: dict[str, str] = {}
+
+try:
+    from ibrobot_planning.planner import PlannerDescriptor
+except ImportError:  # then this plugin defines the kind
+
+    @hookimpl
+    def ibrobot_kinds():
+        yield Kind("planner", "ibrobot_planners", Descriptor)
+
+    PlannerDescriptor = Descriptor  # type: ignore[assignment, misc]
 
 
 class Scene(FakeHardware):
@@ -236,7 +246,7 @@ def ibrobot_sources():
 
 @hookimpl
 def ibrobot_planners():
-    yield PlannerDescriptor("cubic", make(FakePlanner), "cubics")
+    yield PlannerDescriptor("cubic", lambda options, ctx: None, "cubics")
 
 
 @hookimpl

@@ -27,8 +27,6 @@ from ibrobot_core.app import (
     ControlMode,
     LaunchRequest,
     PlanCode,
-    PoseGoal,
-    PositionGoal,
     RobotConfig,
     Session,
     Unsuccessful,
@@ -38,6 +36,7 @@ from ibrobot_core.app import (
 )
 from ibrobot_planning.execution.plans import GoalPlans, arm_joints
 from ibrobot_planning.goals.text import Target, target
+from ibrobot_planning.planner import PoseGoal, PositionGoal
 from ibrobot_planning.planners.search import length
 from ibrobot_planning.planners.timing import motion_of
 from ibrobot_planning.world.objects import world_of

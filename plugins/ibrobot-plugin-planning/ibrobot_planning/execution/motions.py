@@ -20,8 +20,9 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_core.app import GoalRun, Planner, RunView
+from ibrobot_core.app import GoalRun, RunView
 from ibrobot_planning.execution.door import GoalDoor
+from ibrobot_planning.planner import Planner
 from ibrobot_planning.planners.blend import Limits, braking, cut, joined
 from ibrobot_planning.planners.timing import Motion, motion_of, trajectory_of
 

@@ -11,26 +11,14 @@ import numpy as np
 from ibrobot_kinematics import robot_model
 
 from ibrobot_core.api import IbrobotError, JointTrajectory, PlanningError, Vector, ns
-from ibrobot_core.app import (
-    AnyGoal,
-    ControlMode,
-    Goal,
-    JointGoal,
-    PlanCode,
-    Planner,
-    PlannerDescriptor,
-    PlanRequest,
-    PlanResult,
-    Plugins,
-    RobotConfig,
-    RunView,
-)
+from ibrobot_core.app import ControlMode, PlanCode, Plugins, RobotConfig, RunView
 from ibrobot_planning.execution.motions import ExecutorGoal, commanded
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import GoalOptions
 from ibrobot_planning.goals.joints import without_names
 from ibrobot_planning.goals.text import Target
 from ibrobot_planning.goals.tool import Tool
+from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, Planner, PlannerDescriptor, PlanRequest, PlanResult
 from ibrobot_planning.planners.completion import Start, check_size, completed
 from ibrobot_planning.world.objects import World, world_of
 

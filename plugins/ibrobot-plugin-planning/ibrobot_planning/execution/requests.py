@@ -18,9 +18,10 @@ from ibrobot_core.api import (
     documented,
     option,
 )
-from ibrobot_core.app import Goal, PlanCode
+from ibrobot_core.app import PlanCode
 from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions
 from ibrobot_planning.goals.text import Target
+from ibrobot_planning.planner import Goal
 from ibrobot_planning.world.ages import AgeSummary
 
 

@@ -11,7 +11,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import Header, IbrobotError, JointState, PlanningError, PoseStamped, Vector
-from ibrobot_core.app import ControlMode, Goal, NoRequest, PlanCode, PlanRequest, PlanResult, RunView, Service
+from ibrobot_core.app import ControlMode, NoRequest, PlanCode, RunView, Service
 from ibrobot_planning.execution.motions import commanded
 from ibrobot_planning.execution.plans import GoalPlans, arm_joints
 from ibrobot_planning.execution.requests import (
@@ -30,6 +30,7 @@ from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import line_goal
 from ibrobot_planning.goals.text import target
 from ibrobot_planning.goals.tool import Candidate
+from ibrobot_planning.planner import Goal, PlanRequest, PlanResult
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
 from ibrobot_planning.world.objects import observed_world, world_of

@@ -14,17 +14,11 @@ import numpy as np
 
 from ibrobot_core.api import HardwareError, NotSupported, PlanningError, Pose, PoseStamped, String, ns, seconds
 from ibrobot_core.app import (
-    AnyGoal,
     ControlMode,
     ControlState,
-    Goal,
     GoalRun,
-    JointGoal,
     NoRequest,
-    OrientationPolicy,
     PlanCode,
-    PlanResult,
-    PoseGoal,
     RequestLimits,
     Service,
     SourceWorker,
@@ -39,6 +33,7 @@ from ibrobot_planning.execution.services import PlanningServices
 from ibrobot_planning.goals.grammar import check_frame
 from ibrobot_planning.goals.text import Target, target
 from ibrobot_planning.goals.tool import pose_matrix
+from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, OrientationPolicy, PlanResult, PoseGoal
 from ibrobot_planning.world.objects import observed_world
 
 GO_TO = Service(

@@ -12,8 +12,9 @@ from ibrobot_kinematics.poses import homogeneous, matrix, pose
 from ibrobot_kinematics.rotations import from_quaternion, from_rpy
 
 from ibrobot_core.api import PlanningError, Pose, Vector, Vector3, documented, option
-from ibrobot_core.app import JointGoal, LinearGoal, NamedGoal, OrientationPolicy, PlanCode, PoseGoal, PositionGoal
+from ibrobot_core.app import PlanCode
 from ibrobot_planning.goals.errors import invalid_goal
+from ibrobot_planning.planner import JointGoal, LinearGoal, NamedGoal, OrientationPolicy, PoseGoal, PositionGoal
 from ibrobot_planning.world.objects import BASE_FRAMES, World
 from ibrobot_planning.world.options import FURTHEST
 

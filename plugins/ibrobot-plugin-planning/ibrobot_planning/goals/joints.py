@@ -10,9 +10,10 @@ from ibrobot_kinematics.srdf import GroupState, read_srdf
 from ibrobot_kinematics.urdf import read_urdf
 
 from ibrobot_core.api import PlanningError, Robot, Vector
-from ibrobot_core.app import AnyGoal, Goal, JointGoal, NamedGoal, PlanCode, PlanRequest
+from ibrobot_core.app import PlanCode
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import scaling_fault
+from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, NamedGoal, PlanRequest
 
 
 def pose_names(robot: Robot) -> list[str]:

@@ -8,10 +8,10 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import JointTrajectory, PlanningError, Pose, Robot
-from ibrobot_core.app import AnyGoal, Goal, JointGoal, LinearGoal, NamedGoal, PoseGoal, PositionGoal
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import DIRECTIONS, POLICIES, GoalOptions, scaling_fault
 from ibrobot_planning.goals.joints import named_pose
+from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, LinearGoal, NamedGoal, PoseGoal, PositionGoal
 from ibrobot_planning.world.objects import World
 
 _SIZES = {"xyz": 3, "axis": 3, "rpy": 3, "quaternion": 4}

@@ -14,8 +14,8 @@ from ibrobot_kinematics.rotations import between, cross, log
 from ibrobot_kinematics.search import search
 
 from ibrobot_core.api import Vector, Vector3
-from ibrobot_core.app import PoseGoal, PositionGoal
 from ibrobot_planning.goals.errors import invalid_goal, unreachable
+from ibrobot_planning.planner import PoseGoal, PositionGoal
 
 _PITCHES = np.linspace(-np.pi / 2, np.pi / 2, 7)
 """Directions of the tool that are tried if a goal has none: from straight down to straight up."""

@@ -10,8 +10,9 @@ from typing import override
 import numpy as np
 
 from ibrobot_core.api import Context, Header, JointTrajectory, JointTrajectoryPoint, PlanningError, ns, seconds
-from ibrobot_core.app import JointGoal, NamedGoal, PlanCode, Planner, PlanRequest, PlanResult
+from ibrobot_core.app import PlanCode
 from ibrobot_planning.goals.joints import checked_start, joint_target
+from ibrobot_planning.planner import JointGoal, NamedGoal, Planner, PlanRequest, PlanResult
 from ibrobot_planning.planners.options import JointPlannerOptions
 from ibrobot_planning.planners.timing import check_duration
 

@@ -10,9 +10,9 @@ from ibrobot_kinematics import KinematicModel, Target, UnreachableError, solve
 from ibrobot_kinematics.rotations import between, cross, exp, log
 
 from ibrobot_core.api import Vector
-from ibrobot_core.app import PoseGoal, PositionGoal
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.tool import Tool, pose_matrix, turned, unit, vector
+from ibrobot_planning.planner import PoseGoal, PositionGoal
 
 _STEP_M = 0.004
 _STEP_RAD = 0.05

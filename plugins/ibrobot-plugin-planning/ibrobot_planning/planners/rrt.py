@@ -12,22 +12,22 @@ import numpy as np
 from ibrobot_kinematics import robot_model
 
 from ibrobot_core.api import Context, JointTrajectory, PlanningError, Vector
-from ibrobot_core.app import (
+from ibrobot_core.app import PlanCode
+from ibrobot_planning.goals.errors import invalid_goal
+from ibrobot_planning.goals.joints import checked_start, joint_target
+from ibrobot_planning.goals.tool import Candidate, Tool
+from ibrobot_planning.planner import (
     AnyGoal,
     Goal,
     JointGoal,
     LinearGoal,
     NamedGoal,
-    PlanCode,
     Planner,
     PlanRequest,
     PlanResult,
     PoseGoal,
     PositionGoal,
 )
-from ibrobot_planning.goals.errors import invalid_goal
-from ibrobot_planning.goals.joints import checked_start, joint_target
-from ibrobot_planning.goals.tool import Candidate, Tool
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.paths import CHECK_S, FreePaths, collisions, outwards, sentence

@@ -10,20 +10,11 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import IbrobotError, PlanningError, Vector
-from ibrobot_core.app import (
-    AnyGoal,
-    ControlMode,
-    Goal,
-    LinearGoal,
-    Plugins,
-    PoseGoal,
-    PositionGoal,
-    RobotConfig,
-    check_models,
-)
+from ibrobot_core.app import ControlMode, Plugins, RobotConfig, check_models
 from ibrobot_planning.execution.plans import tool_planners
 from ibrobot_planning.goals.grammar import GoalOptions
 from ibrobot_planning.goals.joints import named_pose, pose_names
+from ibrobot_planning.planner import AnyGoal, Goal, LinearGoal, PoseGoal, PositionGoal
 from ibrobot_planning.tasks.format import (
     Alternatives,
     GripperStep,

@@ -3,7 +3,6 @@
 from ibrobot_testing.fakes.control import FakeExecutor, FakeHardware, FakeRealHardware, FakeTrajectoryExecutor
 from ibrobot_testing.fakes.host import (
     FakeEngine,
-    FakePlanner,
     FakePolicy,
     FakeSensor,
     FakeSource,
@@ -19,7 +18,6 @@ __all__ = [
     "FakeEngine",
     "FakeExecutor",
     "FakeHardware",
-    "FakePlanner",
     "FakePolicy",
     "FakeRealHardware",
     "FakeRecorder",

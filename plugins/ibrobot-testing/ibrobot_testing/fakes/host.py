@@ -1,4 +1,4 @@
-"""Fakes of components in the host: sensor, teleoperation device, policy, engine, planner, source, viewer."""
+"""Fakes of components in the host: sensor, teleoperation device, policy, engine, source, viewer."""
 
 from __future__ import annotations
 
@@ -14,11 +14,8 @@ from ibrobot_core.api import (
     Header,
     Image,
     JointReading,
-    JointTrajectory,
-    JointTrajectoryPoint,
     Message,
     OperatorEvent,
-    PlanningError,
     Policy,
     PolicySpec,
     Sensor,
@@ -27,22 +24,10 @@ from ibrobot_core.api import (
     TeleopCommand,
     TeleopError,
     Tensors,
-    Vector,
     Viewer,
-    ns,
     seconds,
 )
-from ibrobot_core.app import (
-    ControlMode,
-    JointGoal,
-    PlanCode,
-    Planner,
-    PlanRequest,
-    PlanResult,
-    SourceWorker,
-    StreamingRun,
-    Subscription,
-)
+from ibrobot_core.app import ControlMode, SourceWorker, StreamingRun, Subscription
 
 
 class FakeSensor(Sensor):
@@ -197,45 +182,6 @@ class FakeSource(SourceWorker):
     @override
     def work(self, timeout_s: float) -> None:
         self.pause(timeout_s)
-
-
-class FakePlanner(Planner):
-    """A cubic from start to goal for all joints together, slow enough for the slowest."""
-
-    def __init__(self, ctx: Context) -> None:
-        self._robot = ctx.robot
-
-    @override
-    def plan(self, request: PlanRequest) -> PlanResult:
-        if not isinstance(request.goal, JointGoal):
-            raise PlanningError(
-                f"the fake planner knows joint goals only, not {type(request.goal).__name__}",
-                PlanCode.UNRECOGNIZED_GOAL_TYPE,
-            )
-        unknown = set(request.goal.joints) - set(request.joints)
-        if unknown:
-            raise PlanningError(f"no joint {min(unknown)!r} in the request; it has: {', '.join(request.joints)}")
-        end = request.start.copy()
-        end[[request.joints.index(joint) for joint in request.goal.joints]] = request.goal.positions
-        order = self._robot.indices(request.joints)
-        for joint, position, lower, upper in zip(
-            request.joints, end, self._robot.lower[order], self._robot.upper[order], strict=True
-        ):
-            if not lower <= position <= upper:
-                raise PlanningError(f"{joint}: {position} rad is outside {lower} to {upper} rad")
-        way = np.abs(end - request.start)
-        velocity = self._robot.max_velocity[order] * request.velocity_scaling
-        acceleration = self._robot.max_acceleration[order] * request.acceleration_scaling
-        # Peaks of a cubic over time T: velocity 1.5 distance / T, acceleration 6 distance / T^2.
-        duration = max((1.5 * way / velocity).max(), np.sqrt(6 * way / acceleration).max(), 0.01)
-        points = tuple(_cubic_point(request.start, end, duration, share) for share in np.linspace(0.0, 1.0, 50))
-        return PlanResult(JointTrajectory(Header(), request.joints, points))
-
-
-def _cubic_point(start: Vector, end: Vector, duration: float, share: float) -> JointTrajectoryPoint:
-    position = start + (end - start) * (3 * share**2 - 2 * share**3)
-    velocity = (end - start) * (6 * share - 6 * share**2) / duration
-    return JointTrajectoryPoint(ns(duration * share), position, velocity)
 
 
 class FakeViewer(Viewer):

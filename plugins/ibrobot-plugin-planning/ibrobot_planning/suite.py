@@ -1,17 +1,18 @@
-"""The conformance suite of planners."""
+"""The conformance suite of planners, and a planner for tests; both need `ibrobot-testing`."""
 
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from typing import ClassVar
+from typing import ClassVar, override
 
 import attrs
 import numpy as np
 import pytest
-
-from ibrobot_core.api import Context, JointTrajectory, PlanningError, Vector, seconds
-from ibrobot_core.app import JointGoal, Planner, PlanRequest
 from ibrobot_testing.suite import Suite
+
+from ibrobot_core.api import Context, Header, JointTrajectory, JointTrajectoryPoint, PlanningError, Vector, ns, seconds
+from ibrobot_core.app import PlanCode
+from ibrobot_planning.planner import JointGoal, Planner, PlanRequest, PlanResult
 
 
 class PlannerSuite(Suite[Planner]):
@@ -177,3 +178,42 @@ def _spline(p0: Vector, p1: Vector, v0: Vector, v1: Vector, duration: float) -> 
         return [p0, p1 - p0]
     d0, d1 = v0 * duration, v1 * duration
     return [p0, d0, 3 * (p1 - p0) - 2 * d0 - d1, 2 * (p0 - p1) + d0 + d1]
+
+
+class FakePlanner(Planner):
+    """A cubic from start to goal for all joints together, slow enough for the slowest."""
+
+    def __init__(self, ctx: Context) -> None:
+        self._robot = ctx.robot
+
+    @override
+    def plan(self, request: PlanRequest) -> PlanResult:
+        if not isinstance(request.goal, JointGoal):
+            raise PlanningError(
+                f"the fake planner knows joint goals only, not {type(request.goal).__name__}",
+                PlanCode.UNRECOGNIZED_GOAL_TYPE,
+            )
+        unknown = set(request.goal.joints) - set(request.joints)
+        if unknown:
+            raise PlanningError(f"no joint {min(unknown)!r} in the request; it has: {', '.join(request.joints)}")
+        end = request.start.copy()
+        end[[request.joints.index(joint) for joint in request.goal.joints]] = request.goal.positions
+        order = self._robot.indices(request.joints)
+        for joint, position, lower, upper in zip(
+            request.joints, end, self._robot.lower[order], self._robot.upper[order], strict=True
+        ):
+            if not lower <= position <= upper:
+                raise PlanningError(f"{joint}: {position} rad is outside {lower} to {upper} rad")
+        way = np.abs(end - request.start)
+        velocity = self._robot.max_velocity[order] * request.velocity_scaling
+        acceleration = self._robot.max_acceleration[order] * request.acceleration_scaling
+        # Peaks of a cubic over time T: velocity 1.5 distance / T, acceleration 6 distance / T^2.
+        duration = max((1.5 * way / velocity).max(), np.sqrt(6 * way / acceleration).max(), 0.01)
+        points = tuple(_cubic_point(request.start, end, duration, share) for share in np.linspace(0.0, 1.0, 50))
+        return PlanResult(JointTrajectory(Header(), request.joints, points))
+
+
+def _cubic_point(start: Vector, end: Vector, duration: float, share: float) -> JointTrajectoryPoint:
+    position = start + (end - start) * (3 * share**2 - 2 * share**3)
+    velocity = (end - start) * (6 * share - 6 * share**2) / duration
+    return JointTrajectoryPoint(ns(duration * share), position, velocity)

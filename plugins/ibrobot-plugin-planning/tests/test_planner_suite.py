@@ -7,11 +7,11 @@ from typing import override
 import attrs
 import numpy as np
 import pytest
-from ibrobot_testing import PlannerSuite, checks, failed_checks
-from ibrobot_testing.fakes import FakePlanner
+from ibrobot_planning.planner import JointGoal, PlanResult
+from ibrobot_planning.suite import FakePlanner, PlannerSuite
+from ibrobot_testing import checks, failed_checks
 
 from ibrobot_core.api import PlanningError
-from ibrobot_core.app import JointGoal, PlanResult
 
 
 class TestPlanner(PlannerSuite):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import attrs
 
-from ibrobot_core.messages import JointTrajectory, Pose, Vector3
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Descriptor
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import JointTrajectory, Pose, Vector, Vector3
 
 OrientationPolicy = Literal["refuse", "nearest", "keep_axis", "arm_plane", "current", "free"]
 
@@ -142,3 +144,11 @@ class Planner(ABC):
 
     def close(self) -> None:
         """Release resources of `load`. Safe to call twice."""
+
+
+@attrs.frozen
+class PlannerDescriptor(Descriptor[Planner]):
+    """A motion planner."""
+
+    tool_goals: bool = True
+    """Whether it takes every goal; otherwise only `JointGoal`."""
