@@ -5,7 +5,6 @@ from ibrobot_core.hookspecs import hookimpl as hookimpl
 from ibrobot_core.descriptors import (
     Descriptor as Descriptor,
     HardwareDescriptor as HardwareDescriptor,
-    SceneDescriptor as SceneDescriptor,
     SensorDescriptor as SensorDescriptor,
     TeleopDescriptor as TeleopDescriptor,
     PolicyDescriptor as PolicyDescriptor,
@@ -24,13 +23,14 @@ from ibrobot_core.descriptors import (
 # Options
 from ibrobot_core.options import (
     option as option,
+    not_a_key as not_a_key,
     documented as documented,
     not_empty as not_empty,
     NoOptions as NoOptions,
     OptionFault as OptionFault,
     did_you_mean as did_you_mean,
 )
-from ibrobot_core.descriptors import StreamOptions as StreamOptions, SceneConfig as SceneConfig
+from ibrobot_core.descriptors import StreamOptions as StreamOptions
 
 # The robot
 from ibrobot_core.robot import Robot as Robot, Joint as Joint, Description as Description, Vector as Vector
@@ -49,7 +49,6 @@ from ibrobot_core.interfaces import (
     Torque as Torque,
     Signal as Signal,
     EpisodeSetup as EpisodeSetup,
-    Scene as Scene,
     SceneObject as SceneObject,
     Sensor as Sensor,
     Teleop as Teleop,

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
-from ibrobot_core.component_config import ComponentConfig
-from ibrobot_core.options import NoOptions, OptionFault, OptionName, documented, not_a_key, option
+from ibrobot_core.options import NoOptions, OptionFault, OptionName, documented, option
 
 if TYPE_CHECKING:
     from ibrobot_core import interfaces
     from ibrobot_core.component import Component, SourceWorker, TransportLink
+    from ibrobot_core.component_config import ComponentConfig
     from ibrobot_core.events import Event
     from ibrobot_core.interfaces.run import RunAccess, RunView
     from ibrobot_core.messages import CompressedImage, Image
@@ -121,31 +121,6 @@ class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
     def kept(self, options: Any) -> Mapping[str, Any]:
         """Its calibration and its anchored joints."""
         return {"calibration": self.calibration(options), "anchored": self.anchored(options)}
-
-
-@attrs.frozen
-class SceneDescriptor(Descriptor["interfaces.Scene[Any, Any]"]):
-    """A scene of a simulation, whose options have a field of type `SceneConfig`; the simulation makes it."""
-
-    make: Callable[[Any, Robot], interfaces.Scene[Any, Any]] = attrs.field(kw_only=True)  # type: ignore[assignment]
-    """Options and robot -> the scene."""
-
-    def kept(self, options: Any) -> Mapping[str, Any]:
-        """Itself, with which the simulation makes the scene."""
-        return {"descriptor": self}
-
-
-@attrs.frozen
-class SceneConfig(ComponentConfig):
-    """The scene in the options of a simulation."""
-
-    plugin_kind = "scene"
-
-    descriptor: SceneDescriptor = not_a_key()
-
-    def make(self, robot: Robot) -> interfaces.Scene[Any, Any]:
-        """The scene, around a robot."""
-        return self.descriptor.make(self.options, robot)
 
 
 @attrs.frozen

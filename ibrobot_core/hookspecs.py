@@ -35,11 +35,6 @@ def ibrobot_hardware() -> Iterable[descriptors.HardwareDescriptor]:  # type: ign
 
 
 @hookspec
-def ibrobot_scenes() -> Iterable[descriptors.SceneDescriptor]:  # type: ignore[empty-body]
-    """Scenes of simulations."""
-
-
-@hookspec
 def ibrobot_sensors() -> Iterable[descriptors.SensorDescriptor]:  # type: ignore[empty-body]
     """Cameras and other sensors."""
 

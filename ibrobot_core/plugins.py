@@ -38,7 +38,6 @@ CORE = "ibrobot-core"
 
 KINDS: Mapping[str, str] = {
     "hardware": "ibrobot_hardware",
-    "scene": "ibrobot_scenes",
     "sensor": "ibrobot_sensors",
     "teleop": "ibrobot_teleop",
     "policy": "ibrobot_policies",

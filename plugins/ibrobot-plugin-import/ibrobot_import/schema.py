@@ -9,7 +9,6 @@ from typing import Any, get_args
 
 import attrs
 
-from ibrobot_core.api import SceneConfig
 from ibrobot_core.app import (
     SECTIONS,
     ComponentConfig,
@@ -112,9 +111,12 @@ class _Schemas:
         return several
 
     def _of_component(self, kind: type[ComponentConfig]) -> Schema:
-        """The schema of a section with a `type`, which determines its further keys; a scene may be its type alone."""
+        """The schema of a section with a `type`, which determines its further keys.
+
+        Where a plugin defines the kind, the type may stand alone.
+        """
         schema = self._of_typed(kind)
-        if not issubclass(kind, SceneConfig):
+        if kind.plugin_kind not in self.registry.kinds:
             return schema
         return {"anyOf": [{"type": "string", "enum": schema["properties"][kind.type_key()]["enum"]}, schema]}
 

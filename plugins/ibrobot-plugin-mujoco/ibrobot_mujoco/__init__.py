@@ -9,16 +9,16 @@ from ibrobot_core.api import (
     HardwareDescriptor,
     Late,
     PolicyDescriptor,
-    SceneDescriptor,
     SensorDescriptor,
     ViewerDescriptor,
     hookimpl,
 )
-from ibrobot_core.app import Command
+from ibrobot_core.app import Command, Kind
 from ibrobot_mujoco.check import check_world
 from ibrobot_mujoco.experts import EXPERTS
 from ibrobot_mujoco.gl import choose, from_module
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions, picture_size
+from ibrobot_mujoco.scene import SceneDescriptor
 from ibrobot_mujoco.scenes import SCENES
 
 
@@ -41,6 +41,12 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
         film={"type": "mujoco", "camera": "front", "width": 320, "height": 240, "fps": 10},
         summary="the robot's MJCF in MuJoCo, with the objects of a scene",
     )
+
+
+@hookimpl
+def ibrobot_kinds() -> Iterable[Kind]:
+    """Scenes."""
+    yield Kind("scene", "ibrobot_scenes", SceneDescriptor)
 
 
 @hookimpl

@@ -14,9 +14,10 @@ from ibrobot_kinematics.mjcf import mesh_name, read_mjcf, several_arms
 from ibrobot_kinematics.rotations import quaternion
 from numpy.typing import NDArray
 
-from ibrobot_core.api import NS_PER_S, HardwareError, Robot, Scene, ns
+from ibrobot_core.api import NS_PER_S, HardwareError, Robot, ns
 from ibrobot_mujoco.lowpoly import GRID_M, low_poly
 from ibrobot_mujoco.options import MujocoOptions, SceneCamera, SceneThing
+from ibrobot_mujoco.scene import Scene
 from ibrobot_mujoco.scenes.solids import FRICTION
 from ibrobot_mujoco.scenes.table import TABLE
 from ibrobot_mujoco.world import World

@@ -7,7 +7,8 @@ from typing import Literal
 
 import attrs
 
-from ibrobot_core.api import SceneConfig, documented, option
+from ibrobot_core.api import documented, option
+from ibrobot_mujoco.scene import SceneConfig
 from ibrobot_mujoco.scenes import scene
 
 Vec3 = tuple[float, float, float]

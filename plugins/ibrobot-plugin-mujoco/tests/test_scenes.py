@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from ibrobot_mujoco.model import build_spec
 from ibrobot_mujoco.options import MujocoOptions
+from ibrobot_mujoco.scene import Scene, SceneConfig
+from ibrobot_mujoco.scene_suite import SceneSuite
 from ibrobot_mujoco.scenes import scene
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.spans import ends
 from ibrobot_mujoco.world import World
-from ibrobot_testing import SceneSuite
 
-from ibrobot_core.api import Context, HardwareError, Robot, Scene, SceneConfig, Vector
+from ibrobot_core.api import Context, HardwareError, Robot, Vector
 from ibrobot_core.app import ConfigError, find_config, installed_plugins, load_config
 
 LOOKS: Mapping[str, Any] = {

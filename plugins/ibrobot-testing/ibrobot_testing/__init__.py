@@ -18,7 +18,6 @@ from ibrobot_testing.leaks import LeakCheck
 from ibrobot_testing.policy import PolicySuite
 from ibrobot_testing.pool import PoolSuite
 from ibrobot_testing.recorder import RecorderSuite
-from ibrobot_testing.scene import SceneSuite
 from ibrobot_testing.section import SectionSuite, make_session
 from ibrobot_testing.sensor import SensorSuite
 from ibrobot_testing.service import declared_services, stand_in
@@ -36,7 +35,6 @@ __all__ = [
     "PolicySuite",
     "PoolSuite",
     "RecorderSuite",
-    "SceneSuite",
     "SectionSuite",
     "SensorSuite",
     "SimulatedHardwareSuite",

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ibrobot_core.api import SceneConfig, SceneDescriptor
 from ibrobot_mujoco.gl import from_module
+from ibrobot_mujoco.scene import SceneConfig, SceneDescriptor
 from ibrobot_mujoco.scenes.options import (
     DrawerOptions,
     HandoverOptions,

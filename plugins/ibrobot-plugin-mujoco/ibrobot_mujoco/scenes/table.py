@@ -11,7 +11,8 @@ from typing import ClassVar, override
 import mujoco
 import numpy as np
 
-from ibrobot_core.api import HardwareError, Robot, Scene, Vector
+from ibrobot_core.api import HardwareError, Robot, Vector
+from ibrobot_mujoco.scene import Scene
 from ibrobot_mujoco.scenes.options import SceneOptions
 from ibrobot_mujoco.scenes.solids import FRICTION, add_cube, hue, resize_cube
 from ibrobot_mujoco.spans import Span, ends

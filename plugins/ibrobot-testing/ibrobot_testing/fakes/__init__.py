@@ -9,7 +9,6 @@ from ibrobot_testing.fakes.host import (
     FakeTeleop,
     FakeViewer,
 )
-from ibrobot_testing.fakes.scene import FakeScene, FakeWorld
 from ibrobot_testing.fakes.storage import FakeDataset, FakeRecorder
 from ibrobot_testing.fakes.transport import FakeTransport
 
@@ -21,12 +20,10 @@ __all__ = [
     "FakePolicy",
     "FakeRealHardware",
     "FakeRecorder",
-    "FakeScene",
     "FakeSensor",
     "FakeSource",
     "FakeTeleop",
     "FakeTrajectoryExecutor",
     "FakeTransport",
     "FakeViewer",
-    "FakeWorld",
 ]

@@ -6,8 +6,8 @@ from typing import Any, override
 
 import numpy as np
 import pytest
-from ibrobot_testing import SceneSuite, checks, failed_checks
-from ibrobot_testing.fakes import FakeScene, FakeWorld
+from ibrobot_mujoco.scene_suite import FakeScene, FakeWorld, SceneSuite
+from ibrobot_testing import checks, failed_checks
 
 
 class Subject(SceneSuite[Any, Any]):

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+import attrs
 
-from ibrobot_core.robot import Vector
+from ibrobot_core.api import Descriptor, not_a_key
+from ibrobot_core.app import ComponentConfig
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ibrobot_core.api import Robot, Vector
 
 
 class Scene[Spec, World](ABC):
-    """The objects and the task of a simulation. Core knows neither `Spec` nor `World`: the simulation defines them.
+    """The objects and the task of a simulation. The simulation defines `Spec` and `World`.
 
     Attributes:
         values: names of the values that `observe` writes, e.g. `cube.x`.
@@ -52,3 +59,28 @@ class Scene[Spec, World](ABC):
     @abstractmethod
     def success(self, world: World) -> bool | None:
         """Whether the task is done; None for a scene without a task."""
+
+
+@attrs.frozen
+class SceneDescriptor(Descriptor[Scene[Any, Any]]):
+    """A scene of a simulation, whose options have a field of type `SceneConfig`; the simulation makes it."""
+
+    make: Callable[[Any, Robot], Scene[Any, Any]] = attrs.field(kw_only=True)  # type: ignore[assignment]
+    """Options and robot -> the scene."""
+
+    def kept(self, options: Any) -> Mapping[str, Any]:
+        """Itself, with which the simulation makes the scene."""
+        return {"descriptor": self}
+
+
+@attrs.frozen
+class SceneConfig(ComponentConfig):
+    """The scene in the options of a simulation."""
+
+    plugin_kind = "scene"
+
+    descriptor: SceneDescriptor = not_a_key()
+
+    def make(self, robot: Robot) -> Scene[Any, Any]:
+        """The scene, around a robot."""
+        return self.descriptor.make(self.options, robot)
