@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.lerobot
+pytestmark = [pytest.mark.lerobot, pytest.mark.long]  # other tests show each stage
 
 PROGRAM = Path(__file__).parents[2] / "benchmarks/gpu.py"
 

@@ -35,7 +35,8 @@ function isSoftware() {
 
 export class Canvas3D {
   constructor(canvas) {
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: !isSoftware(), powerPreference: "high-performance" });
+    this.slow = isSoftware();
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: !this.slow, powerPreference: "high-performance" });
     if (!gl) throw new Error("this browser offers no WebGL 2 here");
     this.gl = gl;
     this.canvas = canvas;

@@ -14,6 +14,7 @@ const WIDE = 1.3; // width by height of a picture below which it counts as narro
 const FRUSTUM_M = 0.05;
 const OBJECT = [0.55, 0.6, 0.66, 0.75];
 const FRAME_MS = 40; // 25 frames a second leave a small machine time for the rest
+const SLOW_FRAME_MS = 100; // without a graphics card, each costs processor time that control may need
 const COMMANDED = [0.18, 0.5, 0.83, 0.3], PLANNED = [0.12, 0.62, 0.33, 0.3];
 
 let screen, bodies = [], joints = [], tips = {}, tip = null, extras = [], dark = false;
@@ -150,7 +151,7 @@ function look() {
 
 function draw(now = 0) {
   requestAnimationFrame(draw);
-  if (!dirty || size[0] < 2 || now - begun < FRAME_MS - 5) return;
+  if (!dirty || size[0] < 2 || now - begun < (screen.slow ? SLOW_FRAME_MS : FRAME_MS) - 5) return;
   begun = now;
   dirty = false;
   look();
