@@ -21,7 +21,7 @@ def ibrobot_commands() -> Iterable[Command]:
     summary = "Make a dataset for training from episodes."
     yield Command("convert", Late("ibrobot_data.command:Convert"), summary, EVENTS)
     summary = "Run a robot and record its episodes."
-    yield Command("record", Late("ibrobot_data.record:Record"), summary, (SessionEvent,))
+    yield Command("record", Late("ibrobot_data.record:Record"), summary, (SessionEvent, *EVENTS))
     yield Command("replay", Late("ibrobot_data.replay:Replay"), "Play a recorded episode on a robot, and compare.")
 
 

@@ -141,15 +141,17 @@ class Convert(ConvertOptions):
         return (*overrides, *self.sets)
 
 
-def _to_dataset(options: Convert, progress: _Progress) -> Report:
-    from ibrobot_data.run import convert as run
-    from ibrobot_data.run import find_episodes
+def conversion_request(options: Convert) -> ConversionRequest:
+    """The request for a dataset that the options make.
 
+    Raises:
+        IbrobotError: for options that do not fit, or what they need is not installed.
+    """
     installed_plugins().check_pool(options.on)
     type_ = options.type_ or installed_plugins().default("dataset")
     writer_options = _options("dataset", type_, options.writer_overrides())
     robot, calibration = _stated(options)
-    request = ConversionRequest(
+    return ConversionRequest(
         options.out, writer_options, type_, append=options.append, outcomes=options.outcome,
         jobs=options.jobs, on=options.on, norm_mode=options.norm_mode or NORM_MODES[0], missing=options.missing,
         prompt=options.prompt, success=options.success, only=options.only, context=options.context,
@@ -158,6 +160,13 @@ def _to_dataset(options: Convert, progress: _Progress) -> Report:
         contract=Contract.from_config(robot) if robot is not None else None,
         document=json.loads(json.dumps(robot.document, default=str)) if robot is not None else None,
     )  # fmt: skip
+
+
+def _to_dataset(options: Convert, progress: _Progress) -> Report:
+    from ibrobot_data.run import convert as run
+    from ibrobot_data.run import find_episodes
+
+    request = conversion_request(options)
     episodes = find_episodes(options.episodes)
     episodes = [episodes[number] for number in shard_of(options.shard, len(episodes))]
     with progress(len(episodes)) as watch:

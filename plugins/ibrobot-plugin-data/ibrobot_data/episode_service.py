@@ -19,6 +19,8 @@ from ibrobot_data.episode_start import is_kept
 from ibrobot_data.prompt import check_prompt
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ibrobot_data.recording_worker import RecordingWorker
     from ibrobot_data.written import WrittenEpisode
 
@@ -225,6 +227,11 @@ class EpisodeService(Episodes):
     def written(self) -> Sequence[WrittenEpisode]:
         """The episodes that have ended, as they are on the disk, without discarded and replaced ones."""
         return self._recording.written
+
+    @property
+    def replaced(self) -> Path | None:
+        """The folder of the episode that is being recorded again; None without one."""
+        return self._recording.replaced
 
     def play(self, cue: Cue) -> None:
         """Let the operator hear a cue, unless the mode begins and ends the episodes."""

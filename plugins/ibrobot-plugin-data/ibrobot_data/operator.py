@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import inf
-from typing import override
+from typing import TYPE_CHECKING, override
 
 from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, ViewerDescriptor, seconds
 from ibrobot_core.app import DiskFull, Event, RecordedRun, RunHooks
@@ -14,6 +14,9 @@ from ibrobot_data.options import has_button
 from ibrobot_data.plural import plural
 from ibrobot_data.recording_session import Session as SessionEvent
 from ibrobot_data.written import lost_text, rows
+
+if TYPE_CHECKING:
+    from ibrobot_data.beside import ConversionBeside
 
 _MIB = 1 << 20
 _REDO_S = 8.0
@@ -37,6 +40,7 @@ class Operator(RunHooks):
         continuous: one episode, from the first complete set of messages to the end of the run.
         keys: whether the run has a terminal for the operator's keys.
         cues: plays cues; by default none.
+        beside: converts episodes that have ended; by default nothing does.
         report: receives the state of the session when it changes.
 
     Raises:
@@ -46,7 +50,7 @@ class Operator(RunHooks):
     def __init__(
         self, run: RecordedRun, service: EpisodeService, count: int | None, reset_time_s: float, prompt: str | None, *,
         auto: bool, keys: bool, continuous: bool = False, report: Callable[[Event], None] | None = None,
-        cues: Cues | None = None,
+        cues: Cues | None = None, beside: ConversionBeside | None = None,
     ) -> None:  # fmt: skip
         if service.by_mode and continuous:
             raise NotSupported(f"--continuous: mode {run.mode} begins and ends its episodes itself")
@@ -59,6 +63,7 @@ class Operator(RunHooks):
         self._service = service
         self._cues = cues or Cues("none", None)
         service.on_cue.append(self._cues.play)
+        self._beside = beside
         self._warned_of = 0
         """Number of the episode whose end was announced."""
         self._count = service.wanted = count
@@ -87,6 +92,8 @@ class Operator(RunHooks):
         """Begin or end an episode when it is due; called a few times a second."""
         self._tell()
         self._cues.step()
+        if self._beside is not None:
+            self._beside.step()
         while not self._run.operator_events.empty():
             self._press(self._run.operator_events.get())
         if self._service.by_mode:
@@ -196,6 +203,7 @@ class Operator(RunHooks):
             ("record", self._state()),
             *([("", self._complaint)] if self._complaint else []),
             ("saved", f"{self._saved()} into {self._service.folder}"),
+            *([("dataset", self._beside.row())] if self._beside is not None else []),
             ("lost", f"{lost_text(status.lost) if status.lost else 'nothing'}{earlier}"),
             (
                 "disk",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import attrs
 
@@ -17,10 +18,14 @@ from ibrobot_core.app import (
     RequestError,
     RobotConfig,
     Runtime,
+    default_of,
     echo,
+    fields,
+    flag_of,
     installed_plugins,
     run_robot,
 )
+from ibrobot_data.conversion import ConvertOptions
 from ibrobot_data.cues import Cues
 from ibrobot_data.episode_dataset import EpisodeDataset, count_complete
 from ibrobot_data.episode_service import EpisodeService
@@ -28,11 +33,30 @@ from ibrobot_data.operator import Operator
 from ibrobot_data.plural import plural
 from ibrobot_data.prompt import check_prompt
 
+if TYPE_CHECKING:
+    from ibrobot_data.beside import ConversionBeside
+    from ibrobot_data.command import Convert
+
 CUES = ("beep", "speech", "none")
 """Kinds of cues; see `Cues`."""
 
 
+_OF_CONVERSION = ("outcome", "only", "context", "missing", "norm_mode", "success", "any_robot")
+"""Options of `ibrobot convert` that this command has, too, as `--convert-OPTION`."""
+
+
+def _with_conversion[C](kind: type[C]) -> type[C]:
+    """Class decorator: add the options of the conversion."""
+    for name in _OF_CONVERSION:
+        known = attrs.fields_dict(ConvertOptions)[name]
+        own = attrs.field(default=known.default, metadata={**known.metadata, "more": True}, validator=known.validator)
+        setattr(kind, f"convert_{name}", own)
+        kind.__annotations__[f"convert_{name}"] = known.type
+    return kind
+
+
 @attrs.frozen(kw_only=True)
+@_with_conversion
 class Record(ModeOptions):
     """Run a robot and record its episodes as bags.
 
@@ -42,7 +66,10 @@ class Record(ModeOptions):
     --auto, or --continuous for one episode without a break; recording.split_size and recording.split_duration divide
     it into files.
 
-    Exits as `ibrobot launch` does.
+    With --convert, episodes that have ended are converted while the session goes on, and added to the dataset when it
+    ends, as `ibrobot convert --append` would. After an interruption, that command continues.
+
+    Exits as `ibrobot launch` does; with --convert, with 1 if an episode cannot be converted.
     """
 
     prompt: str | None = option(
@@ -79,6 +106,17 @@ class Record(ModeOptions):
         False, label="Without a break", more=True, help="record one episode, from the start of the run to its end"
     )
     reset_time: float = option(0.0, ge=0, unit="s", label="Pause", more=True, help="pause between episodes")
+    convert: bool = option(
+        False, label="Convert", help="convert episodes beside the recording, so that the dataset is there at the end"
+    )
+    convert_out: Path | None = option(
+        None, names="dataset", open=True, suggest="datasets/{dataset}", label="Converted into", more=True,
+        help="folder of the converted dataset, to which episodes are added; by default datasets/DATASET",
+    )  # fmt: skip
+    convert_type: str | None = option(None, label=None, help="dataset writer; by default that of an installed plugin")
+    convert_sets: tuple[str, ...] = option(
+        (), typed="--convert-set OPTION=VALUE", label=None, help="any option of the dataset writer"
+    )
 
     def __call__(self, emit: Emit) -> None:
         if self.continuous and (self.auto or self.episodes is not None or self.reset_time):
@@ -90,29 +128,68 @@ class Record(ModeOptions):
         if self.resume:
             earlier = count_complete(folder)
             prompt = prompt or EpisodeDataset(folder).prompt or None
+        conversion = self._conversion(folder)
         if self.episodes is not None and earlier >= self.episodes:
             echo(f"{folder}: has {earlier} {plural(earlier, 'episode')} already")
+            if conversion is not None:
+                conversion(emit)
             return
         live = sys.stdin.isatty() and sys.stdout.isatty() and not self.headless
         cues = Cues(self.cues, sys.stdout.fileno() if live else None)
+        beside: list[ConversionBeside] = []
 
         def operator(runtime: Runtime) -> Operator:
             service = runtime.session.episodes
             assert isinstance(service, EpisodeService)
             service.earlier = earlier
+            if conversion is not None:
+                from ibrobot_data.beside import ConversionBeside
+
+                beside.append(ConversionBeside(conversion, service, runtime.session.log))
             return Operator(
                 runtime.session, service, self.episodes, self.reset_time, prompt, auto=self.auto,
                 continuous=self.continuous, keys=live, report=emit,
-                cues=cues,
+                cues=cues, beside=beside[0] if beside else None,
             )  # fmt: skip
 
         request = LaunchRequest(
             self.lockstep, self.seed, self.duration, self.episodes and self.episodes - earlier, self.goals,
             prompt=prompt or "", by_operator=True,
         )  # fmt: skip
-        run_robot(
-            robot, request, headless=self.headless, dry_run=self.dry_run, as_json=self.as_json, make_hooks=operator
+        try:
+            run_robot(
+                robot, request, headless=self.headless, dry_run=self.dry_run, as_json=self.as_json, make_hooks=operator
+            )  # fmt: skip
+        finally:
+            if conversion is not None and beside:
+                beside[0].finish()
+                if count_complete(folder):
+                    conversion(emit)
+
+    def _conversion(self, folder: Path) -> Convert | None:
+        """The conversion at the end of the session; None without `--convert`.
+
+        Raises:
+            RequestError: for options of it without `--convert`, or that do not fit.
+        """
+        known, values = fields(type(self)), attrs.asdict(self, recurse=False)
+        given = {name: value for name, value in values.items() if name.startswith("convert_")}
+        if not self.convert:
+            for name, value in given.items():
+                if value != default_of(known[name]):
+                    raise RequestError(f"{flag_of(name, known[name])} needs --convert")
+            return None
+        from ibrobot_data.command import Convert, conversion_request
+        from ibrobot_data.run import check_out
+
+        out = self.convert_out or Path("datasets") / folder.name
+        settings: dict[str, Any] = {name: given[f"convert_{name}"] for name in _OF_CONVERSION}
+        conversion = Convert(
+            episodes=(folder,), out=out, append=True, type_=self.convert_type, sets=self.convert_sets,
+            as_json=self.as_json, **settings,
         )  # fmt: skip
+        check_out(conversion_request(conversion))
+        return conversion
 
     def _recorded(self) -> RobotConfig:
         """The robot of the YAML, with a section `recording` added if the YAML has none."""

@@ -125,6 +125,8 @@ class RecordingWorker(SessionWorker):
         """Whether the present episode replaces the one kept last."""
         self.kept: Path | None = None
         """The folder of the episode kept last."""
+        self.replaced: Path | None = None
+        """The folder of the kept episode that the present one replaces."""
         self.written: list[WrittenEpisode] = []
         """The episodes that have ended, as they are on the disk, without discarded and replaced ones."""
         self._handled = 0
@@ -213,7 +215,7 @@ class RecordingWorker(SessionWorker):
         with self._pending_lock:
             start, owned = self._start_of(number, prompt, session.bus.snapshot_ns())
             latched = tuple(i for i in session.bus.latched().values() if i.received_ns <= start.stamp_ns)
-            begin = partial(self._open_episode, start, owned, latched, self._incoming.lost.copy())
+            begin = partial(self._open_episode, start, owned, latched, self._incoming.lost.copy(), again=again)
             self._pending.append((start.stamp_ns, begin))
             self._again = again
 
@@ -340,10 +342,12 @@ class RecordingWorker(SessionWorker):
             self._seen.setdefault(item.topic, deque(maxlen=_RATE_WINDOW)).append(item.received_ns)
 
     def _open_episode(
-        self, start: EpisodeStart, owned: Ownership, latched: Iterable[Received], lost: Mapping[str, int]
-    ) -> None:
+        self, start: EpisodeStart, owned: Ownership, latched: Iterable[Received], lost: Mapping[str, int], *,
+        again: bool = False,
+    ) -> None:  # fmt: skip
         """Open an episode; `latched` and `lost` are the latched messages and the lost ones counted when it began."""
         self.failure = None
+        self.replaced = self.kept if again else None
         self._lost, self._lost_before, self._told_of_loss = lost, {}, False
         self._give_up()
         self._owned = owned
@@ -365,6 +369,7 @@ class RecordingWorker(SessionWorker):
         with self._pending_lock:
             self._provisional -= provisional and not again
             self._whole += kept and not replaced
+        self.replaced = None
         if kept:
             self.kept = folder
             self.episodes.play("saved")

@@ -89,11 +89,8 @@ def convert(
         PluginError: when the dataset writer is not installed.
     """
     begin = time.monotonic()
-    with _staging(request) as (staging, old):
-        if old is not None:
-            request = attrs.evolve(request, labels=INTERVENTION in old.features)
-            _check_old(request, old)
-        plan = _Plan(request, staging, old, episodes)
+    with _staging(request) as (whole, staging, old):
+        plan = _Plan(whole, staging, old, episodes)
         request = plan.request
         # Without --append nothing may be added, unless the same command was killed after the merge.
         if old is not None and not request.append and plan.adds(old):
@@ -109,6 +106,38 @@ def convert(
         clear_staging(staging)
     ordered = tuple(reports[source] for source in plan.sources)
     return Report(request.out, ordered, size_of(request.out), time.monotonic() - begin, plan.resumed)
+
+
+def stage(request: ConversionRequest, episode: Path, progress: Callable[[int], None]) -> EpisodeReport | None:
+    """Convert an episode in this process, and keep it for the call of `convert` that adds it to the dataset.
+
+    Returns None if the dataset has the episode, or a finished unit of it is kept already.
+
+    Args:
+        request: the request of that call.
+        episode: the episode's folder.
+        progress: called with the number of frames done since the last call.
+
+    Raises:
+        DatasetError: as `convert`.
+        DiskFull: as `convert`.
+        InUse: if another conversion into the dataset is running.
+    """
+    set_malloc(_MAP_FROM, _KEEP)
+    with _staging(request) as (whole, staging, old):
+        plan = _Plan(whole, staging, old, [episode])
+        return next((convert_episode(job, progress) for job in plan.unfinished(plan.todo)), None)
+
+
+def check_out(request: ConversionRequest) -> None:
+    """Check that episodes can be added to the dataset at `request.out`, or that it does not exist yet.
+
+    Raises:
+        DatasetError: as `convert`.
+        InUse: if another conversion into the dataset is running.
+    """
+    with _staging(request):
+        pass
 
 
 def plan_conversion(request: ConversionRequest, episodes: Sequence[Path]) -> tuple[str, ...]:
@@ -147,8 +176,8 @@ def _remove_unfinished(staging: Path) -> None:
 
 
 @contextmanager
-def _staging(request: ConversionRequest) -> Iterator[tuple[Path, DatasetSummary | None]]:
-    """The staging folder, owned by this conversion, and the existing dataset."""
+def _staging(request: ConversionRequest) -> Iterator[tuple[ConversionRequest, Path, DatasetSummary | None]]:
+    """The staging folder, owned by this conversion, and the existing dataset, with labels requested if it has them."""
     out, staging = request.out, request.out / STAGING
     try:
         with own_staging(out):
@@ -156,8 +185,11 @@ def _staging(request: ConversionRequest) -> Iterator[tuple[Path, DatasetSummary 
             others = [path for path in out.iterdir() if path != staging]
             if old is None and others and all(path.name == _LOCK for path in staging.iterdir()):
                 raise DatasetError(f"{out} is not empty and has no dataset of writer {request.type!r}")
+            if old is not None:
+                request = attrs.evolve(request, labels=INTERVENTION in old.features)
+                _check_old(request, old)
             _remove_unfinished(staging)
-            yield staging, old
+            yield request, staging, old
     except OSError as error:
         raise DatasetError(f"{out}: cannot be written: {error.strerror}") from error
 
@@ -306,7 +338,8 @@ class _Plan:
                 self._reports[source] = attrs.evolve(self._reports[source], passed_over=f"is a copy of {original}")
         return self._reports
 
-    def _convert(self, sources: Sequence[str], watch: Watch) -> None:
+    def unfinished(self, sources: Sequence[str]) -> list[Job]:
+        """The jobs of these episodes that no earlier run has finished."""
         todo = []
         for job in (self._jobs[source] for source in sources):
             unit = read_unit(job.unit)
@@ -316,7 +349,10 @@ class _Plan:
             else:
                 shutil.rmtree(job.unit, ignore_errors=True)
                 todo.append(job)
-        if not todo:
+        return todo
+
+    def _convert(self, sources: Sequence[str], watch: Watch) -> None:
+        if not (todo := self.unfinished(sources)):
             return
         total = sum(self._expected[job.source] for job in todo)
         try:

@@ -143,6 +143,14 @@ def test_a_session_is_started_with_the_values_of_its_form(folder: Path) -> None:
         job, _ = await server.job(lambda job: job["state"] == "failed")
         assert f"--root={folder / 'episodes'} --dataset=a b --prompt=--pick --episodes=3" in job["command"]
         assert "nope" in job["facts"]["error"]
+        values = {"convert": False, "convert_outcome": ["success"], "convert_out": "datasets/a"}
+        await server.post("record/start", robot="arms/pan.yaml", sim=False, mode="nope", values=values)
+        job, _ = await server.job(lambda job: job["number"] == 2 and job["state"] == "failed")
+        assert "convert" not in job["command"], "what the form suggests asks for no conversion"
+        values["convert"] = True
+        await server.post("record/start", robot="arms/pan.yaml", sim=False, mode="nope", values=values)
+        job, _ = await server.job(lambda job: job["number"] == 3 and job["state"] == "failed")
+        assert f"--convert --convert-out={folder / 'datasets/a'} --convert-outcome=success" in job["command"]
 
     run_ui([folder], test)
 

@@ -40,7 +40,8 @@ def place(ui: Ui, dataset: str = "default") -> dict[str, Any]:
 def start(ui: Ui, robot: str, values: Mapping[str, Any], sim: bool = False, mode: str = "") -> dict[str, int]:
     """Begin a session: `ibrobot record`, which ends by itself after the last episode."""
     command = installed_plugins().command(_COMMAND)
-    given = dict(values)
+    # Options of the conversion are suggested whether or not one is asked for.
+    given = {name: value for name, value in values.items() if values.get("convert") or not name.startswith("convert_")}
     folder = _folder(ui, str(given.pop("dataset", None) or "default"))
     root = ui.folders.find(_ROOT)
     options = read_form(ui, command, given)

@@ -176,6 +176,8 @@ export default {
   "Devices": "设备",
   "Episodes": "回合",
   "Convert": "转换",
+  "Convert episodes beside the recording, so that the dataset is there at the end": "录制的同时转换回合，结束时数据集就已经可用",
+  "Converted into": "转换到",
   "Datasets": "数据集",
   "Train": "训练",
   "Policies": "策略",
