@@ -1,0 +1,465 @@
+"""The card of a model's data, or of a rig: what was usual there, small enough to lie beside a checkpoint."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.api import DatasetError, replace_file
+from ibrobot_diagnose.course import begins_to_move, delay_of
+from ibrobot_diagnose.pictures import SMALL, Grey, background, descriptors, grey, nearest, png, read_png, shift_of
+from ibrobot_diagnose.window import Camera, Floats, Window
+
+FILE = "reference.json"
+"""Name of the card in the folder of a checkpoint or a dataset."""
+SCHEMA, VERSION = "ibrobot card", 1
+LEVELS = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
+_OF_EPISODE, _IN_ALL, _POSES = 24, 480, 200
+"""Most thumbnails of an episode and of a camera, and most start and end poses."""
+_LARGEST = 64 << 20
+"""Largest file that is read [bytes]."""
+
+
+@attrs.frozen(eq=False)
+class CameraCard:
+    """The pictures of a camera in the data."""
+
+    topic: str
+    size: tuple[int, int]
+    numbers: Mapping[str, tuple[float, ...]]
+    """brightness, contrast, sharpness, clipped, red, blue (in relation to green) -> values at `LEVELS`."""
+    thumbnails: NDArray[np.uint8]
+    """Shape (N, 24, 32, 3)."""
+    places: tuple[tuple[str, float], ...]
+    """Episode and time [s] of each thumbnail."""
+    poses: Floats
+    """Positions of the joints at each thumbnail [rad], shape (N, J)."""
+    usual_distance: float
+    """Distance of nearly all thumbnails to the nearest one of another episode."""
+    background: NDArray[np.uint8]
+    """Median picture in grey, three equal channels, some 160 pixels wide."""
+    moving: NDArray[np.uint8]
+    """How much each pixel changes, likewise."""
+    usual_shift: float
+    """How far the backgrounds of its episodes are apart [pixels of 640]."""
+    repeated_s: float
+    """Longest time with equal pictures while the arm moved [s]."""
+
+    @cached_property
+    def vectors(self) -> NDArray[np.float32]:
+        """Descriptors of the thumbnails."""
+        return descriptors(self.thumbnails)
+
+    def at(self, name: str, level: float) -> float:
+        """A quantile of a number."""
+        return self.numbers[name][LEVELS.index(level)]
+
+
+@attrs.frozen(eq=False)
+class Card:
+    """What was usual in a model's data."""
+
+    rate_hz: float
+    joints: tuple[str, ...]
+    contract: Mapping[str, Any]
+    """`Contract.canonical`."""
+    episodes: int
+    frames: int
+    prompts: Mapping[str, int]
+    """Prompt -> number of episodes."""
+    state: Floats
+    """Positions [rad] at `LEVELS`, shape (9, J)."""
+    action: Floats
+    speed: Floats
+    """Measured speeds [rad/s], likewise."""
+    lead: Floats
+    """How far actions are from the positions of their tick [rad], likewise."""
+    starts: Floats
+    """Positions at the beginning of episodes [rad], shape (N, J)."""
+    ends: Floats
+    following: tuple[float | None, ...]
+    """What is left of the error of each joint without its delay [rad rms]; None if unknown."""
+    series: Mapping[str, tuple[float, ...]]
+    """seconds, idle_start_s, moving_speed [rad/s] -> values over the episodes at `LEVELS`."""
+    ages_ms: Mapping[str, float]
+    """Stream -> median age of its samples on receipt [ms]; empty for data without stamps of their own."""
+    cameras: Mapping[str, CameraCard] = attrs.field(factory=dict)
+    """Key of an observation -> its camera."""
+    norm_mode: str | None = None
+    """Unit of the joints in training; None if unknown."""
+    trained: Mapping[str, Any] | None = None
+    """What `ibrobot train` did: policy, steps; None if the card is not of a training."""
+    statistics: Mapping[str, Any] | None = None
+    """Mean and deviation of state and action in the unit of the training; None if unknown."""
+
+    def quantile(self, name: str, level: float) -> float:
+        """A quantile over the episodes, of `series`."""
+        return self.series[name][LEVELS.index(level)]
+
+    def row(self, values: Floats, level: float) -> Floats:
+        """The row of `state`, `action` or `speed` at a level, shape (J,)."""
+        result: Floats = values[LEVELS.index(level)]
+        return result
+
+    def write(self, path: Path) -> None:
+        """Write the card to a file."""
+        replace_file(path, json.dumps(self.facts(), separators=(",", ":")) + "\n")
+
+    def facts(self) -> dict[str, Any]:
+        """The card as a JSON object."""
+        return {
+            "schema": SCHEMA, "version": VERSION, "levels": list(LEVELS), "rate_hz": self.rate_hz,
+            "joints": list(self.joints), "contract": self.contract, "episodes": self.episodes, "frames": self.frames,
+            "prompts": dict(self.prompts), "state": _rounded(self.state), "action": _rounded(self.action),
+            "speed": _rounded(self.speed), "lead": _rounded(self.lead),
+            "starts": _rounded(self.starts), "ends": _rounded(self.ends),
+            "following": list(self.following), "series": {name: list(each) for name, each in self.series.items()},
+            "ages_ms": dict(self.ages_ms), "norm_mode": self.norm_mode, "trained": self.trained,
+            "statistics": self.statistics,
+            "cameras": {key: _camera_facts(each) for key, each in self.cameras.items()},
+        }  # fmt: skip
+
+    @classmethod
+    def read(cls, path: Path) -> Card:
+        """Read a card from a file, which may come from anywhere.
+
+        Raises:
+            DatasetError: if it cannot be read, or is no card of this version.
+        """
+        try:
+            if path.stat().st_size > _LARGEST:
+                raise ValueError(f"it is larger than {_LARGEST >> 20} MiB")
+            facts = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
+                raise ValueError("it is no card")
+            if facts.get("version") != VERSION:
+                raise ValueError(f"it has version {facts.get('version')!r}; this ibrobot reads version {VERSION}")
+            return cls._of(facts)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise DatasetError(f"{path}: cannot be read as a card of data: {error}") from None
+
+    @classmethod
+    def _of(cls, facts: Mapping[str, Any]) -> Card:
+        joints = tuple(str(each) for each in facts["joints"])
+        tables = {name: _table(facts[name], len(LEVELS), len(joints), name) for name in _QUANTILES}
+        poses = {name: _table(facts[name], None, len(joints), name) for name in ("starts", "ends")}
+        following = tuple(None if each is None else _finite(each, "following") for each in facts["following"])
+        if len(following) != len(joints):
+            raise ValueError("following has not a number for each joint")
+        rate = _finite(facts["rate_hz"], "rate_hz")
+        if rate <= 0:
+            raise ValueError("rate_hz must be above 0")
+        return cls(
+            rate, joints, dict(facts["contract"]), int(facts["episodes"]), int(facts["frames"]),
+            {str(text): int(count) for text, count in facts["prompts"].items()}, **tables, **poses,
+            following=following, series={str(name): _levels(each, name) for name, each in facts["series"].items()},
+            ages_ms={str(name): _finite(each, name) for name, each in facts["ages_ms"].items()},
+            cameras={str(key): _read_camera(each, len(joints)) for key, each in facts["cameras"].items()},
+            norm_mode=facts["norm_mode"], trained=facts["trained"], statistics=facts["statistics"],
+        )  # fmt: skip
+
+
+_QUANTILES = ("state", "action", "speed", "lead")
+
+
+def _rounded(values: Floats) -> list[list[float]]:
+    return [[float(f"{each:.6g}") for each in row] for row in values.tolist()]
+
+
+def _finite(value: Any, name: str) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"{name}: {value!r} is not a finite number")
+    return number
+
+
+def _levels(values: Any, name: str) -> tuple[float, ...]:
+    numbers = tuple(_finite(each, name) for each in values)
+    if len(numbers) != len(LEVELS):
+        raise ValueError(f"{name} must have {len(LEVELS)} values")
+    return numbers
+
+
+def _table(values: Any, rows: int | None, columns: int, name: str) -> Floats:
+    table = np.array(values, np.float64).reshape(-1, columns)
+    if (rows is not None and len(table) != rows) or not np.isfinite(table).all():
+        raise ValueError(f"{name} must have {rows or 'some'} rows of {columns} finite numbers")
+    return table
+
+
+def _camera_facts(camera: CameraCard) -> dict[str, Any]:
+    count = len(camera.thumbnails)
+    mosaic = camera.thumbnails.reshape(count * SMALL[0], SMALL[1], 3)
+    return {
+        "topic": camera.topic, "size": list(camera.size), "numbers": {n: list(v) for n, v in camera.numbers.items()},
+        "thumbnails": _text(mosaic), "places": [list(each) for each in camera.places],
+        "poses": _rounded(camera.poses), "usual_distance": camera.usual_distance,
+        "background": _text(camera.background),
+        "moving": _text(camera.moving), "usual_shift": camera.usual_shift, "repeated_s": camera.repeated_s,
+    }  # fmt: skip
+
+
+def _text(picture: NDArray[np.uint8]) -> str:
+    return base64.b64encode(png(picture)).decode()
+
+
+def _picture(text: str) -> NDArray[np.uint8]:
+    return read_png(base64.b64decode(text, validate=True))
+
+
+def _read_camera(facts: Mapping[str, Any], joints: int) -> CameraCard:
+    mosaic = _picture(facts["thumbnails"])
+    if mosaic.shape[1] != SMALL[1] or len(mosaic) % SMALL[0]:
+        raise ValueError(f"thumbnails must be pictures of {SMALL[1]} x {SMALL[0]} pixels")
+    thumbnails = mosaic.reshape(-1, *SMALL, 3)
+    places = tuple((str(name), _finite(at, "places")) for name, at in facts["places"])
+    middle, moving = _picture(facts["background"]), _picture(facts["moving"])
+    if len(places) != len(thumbnails) or middle.shape != moving.shape:
+        raise ValueError("its thumbnails and backgrounds do not belong together")
+    numbers = {str(name): _levels(each, name) for name, each in facts["numbers"].items()}
+    missing = [name for name in _NUMBERS if name not in numbers]
+    if missing:
+        raise ValueError(f"it lacks {missing[0]} of the pictures")
+    height, width = (int(each) for each in facts["size"])
+    others = (_finite(facts[name], name) for name in ("usual_distance", "usual_shift", "repeated_s"))
+    distance, shift, repeated = others
+    poses = _table(facts["poses"], len(thumbnails), joints, "poses")
+    return CameraCard(
+        str(facts["topic"]),
+        (height, width),
+        numbers,
+        thumbnails,
+        places,
+        poses,
+        distance,
+        middle,
+        moving,
+        shift,
+        repeated,
+    )
+
+
+_NUMBERS = ("brightness", "contrast", "sharpness", "clipped", "red", "blue")
+
+
+def numbers_of(camera: Camera) -> dict[str, NDArray[np.float64]]:
+    """What is known of each picture of a camera, by the names of `CameraCard.numbers`."""
+    pictures, small = camera.pictures, camera.small
+    means = small.mean((1, 2)) + 1.0
+    return {
+        **{name: np.array([getattr(each, name) for each in pictures]) for name in _NUMBERS[:4]},
+        "red": means[:, 0] / means[:, 1], "blue": means[:, 2] / means[:, 1],
+    }  # fmt: skip
+
+
+def repeated_of(window: Window, camera: Camera) -> tuple[float, float | None]:
+    """Longest time in which pictures came but were equal while the arm moved [s], and when it began [s]."""
+    best: tuple[float, float | None] = (0.0, None)
+    moving = window.speeds.max(axis=1, initial=0.0) > 0.1
+    begin = 0
+    for i in range(1, len(camera.pictures) + 1):
+        if i < len(camera.pictures) and camera.pictures[i].digest == camera.pictures[begin].digest:
+            continue
+        since, until = camera.times_ns[begin], camera.times_ns[i - 1]
+        inside = (window.ticks_ns > since) & (window.ticks_ns <= until)
+        seconds = float((moving & inside).sum()) / window.contract.rate_hz
+        best = max(best, (seconds, window.since(since)), key=lambda each: each[0])
+        begin = i
+    return best
+
+
+def moving_speed(window: Window) -> float:
+    """Mean speed of the commands, or of the arm without commands, over the joints while it moves [rad/s]."""
+    values = window.commands if "commands" in window.streams else window.states
+    speed = np.nan_to_num(np.abs(np.diff(values, axis=0)).sum(axis=1)) * window.contract.rate_hz
+    moving = speed > 0.1
+    return float(speed[moving].mean()) if moving.any() else 0.0
+
+
+def background_of(camera: Camera) -> tuple[Grey, Grey] | None:
+    """Median of a camera's pictures, and what moves in them; None for fewer than three."""
+    kept = [each for each in camera.kept.values() if each.shape == next(iter(camera.kept.values())).shape]
+    return background(kept) if len(kept) >= 3 else None
+
+
+class Maker:
+    """Makes a card of episodes, one after the other, so that they need not fit into memory."""
+
+    def __init__(self) -> None:
+        self._first: Window | None = None
+        self._tables: dict[str, list[Floats]] = {name: [] for name in (*_QUANTILES, "starts", "ends")}
+        self._prompts: Counter[str] = Counter()
+        self._rests: list[Floats] = []
+        self._series: dict[str, list[float]] = {"seconds": [], "idle_start_s": [], "moving_speed": []}
+        self._ages: dict[str, list[float]] = {}
+        self._cameras: dict[str, _CameraMaker] = {}
+
+    def add(self, window: Window) -> None:
+        """Add an episode.
+
+        Raises:
+            DatasetError: if it has other joints than the first one, or none.
+        """
+        self._first = first = self._first or window
+        if window.joints != first.joints or not window.joints:
+            raise DatasetError(
+                f"{window.name}: its joints are {', '.join(window.joints)}, not {', '.join(first.joints)}"
+            )
+        known = np.isfinite(window.states).all(axis=1)
+        if not known.any():
+            return
+        states = window.states[known]
+        self._tables["state"].append(states)
+        self._tables["speed"].append(window.speeds[known])
+        commands = window.commands[np.isfinite(window.commands).all(axis=1)]
+        if len(commands):
+            lead = np.abs(window.commands - window.states)
+            self._tables["lead"].append(lead[np.isfinite(lead).all(axis=1)])
+            self._tables["action"].append(commands)
+            self._rests.append(delay_of(window)[1])
+            self._series["idle_start_s"].append(begins_to_move(window))
+        self._tables["starts"].append(states[:1])
+        self._tables["ends"].append(states[-1:])
+        self._prompts[window.prompt] += 1
+        self._series["seconds"].append(window.seconds)
+        self._series["moving_speed"].append(moving_speed(window))
+        if not window.sampled and len(window.state.times_ns):
+            age = float(np.median(window.state.times_ns - window.state.stamps_ns)) / 1e6
+            self._ages.setdefault("joint positions", []).append(age)
+        for key, camera in window.cameras.items():
+            if camera.pictures:
+                self._cameras.setdefault(key, _CameraMaker(camera)).add(window, camera)
+                if not window.sampled:
+                    ages = np.array(camera.times_ns) - np.array(camera.stamps_ns)
+                    name = f"pictures of {camera.name}"
+                    self._ages.setdefault(name, []).append(float(np.median(ages)) / 1e6)
+
+    def card(self, **more: Any) -> Card:
+        """The card.
+
+        Raises:
+            DatasetError: without an episode.
+        """
+        first, tables = self._first, self._tables
+        if first is None or not tables["state"]:
+            raise DatasetError("there is no episode with joint positions to make a card of")
+        joined = {name: np.concatenate(each) for name, each in tables.items() if each}
+        joined.setdefault("action", joined["state"])
+        quantiles: dict[str, Any] = {name: np.quantile(joined[name], LEVELS, axis=0) for name in _QUANTILES}
+        poses: dict[str, Any] = {name: joined[name][_thinned(len(joined[name]), _POSES)] for name in ("starts", "ends")}
+        series = {n: tuple(np.quantile(each or [0.0], LEVELS).tolist()) for n, each in self._series.items()}
+        following: list[float | None] = [None] * len(first.joints)
+        for j in range(len(first.joints)):
+            known = [float(rests[j]) for rests in self._rests if np.isfinite(rests[j])]
+            following[j] = float(np.quantile(known, 0.95)) if known else None
+        return Card(
+            first.contract.rate_hz, first.joints, first.contract.canonical(), len(self._series["seconds"]),
+            len(joined["state"]), dict(self._prompts), **quantiles, **poses, following=tuple(following), series=series,
+            ages_ms={name: float(np.median(each)) for name, each in self._ages.items()},
+            cameras={key: each.card() for key, each in self._cameras.items()}, **more,
+        )  # fmt: skip
+
+
+def _thinned(count: int, most: int) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))
+
+
+class _CameraMaker:
+    def __init__(self, camera: Camera) -> None:
+        self._topic, self._size = camera.topic, camera.size
+        self._numbers: dict[str, list[NDArray[np.float64]]] = {name: [] for name in _NUMBERS}
+        self._thumbnails: list[NDArray[np.uint8]] = []
+        self._places: list[tuple[str, float]] = []
+        self._owners: list[int] = []
+        self._poses: list[Floats] = []
+        self._kept: list[list[NDArray[np.uint8]]] = []
+        self._repeated: list[float] = []
+
+    def add(self, window: Window, camera: Camera) -> None:
+        for name, values in numbers_of(camera).items():
+            self._numbers[name].append(values)
+        chosen = _thinned(len(camera.pictures), _OF_EPISODE)
+        poses = window.state.at(np.array(camera.times_ns, np.int64)[chosen])
+        if np.isfinite(poses).any():
+            poses = np.where(np.isfinite(poses), poses, np.nanmedian(poses, axis=0))  # the first picture may come first
+        self._poses.append(np.nan_to_num(poses))
+        for i in chosen.tolist():
+            self._thumbnails.append(camera.pictures[i].small)
+            self._places.append((window.name, round(window.since(camera.times_ns[i]), 3)))
+            self._owners.append(len(self._kept))
+        kept = list(camera.kept.values())
+        self._kept.append([kept[i] for i in _thinned(len(kept), 8)])
+        self._repeated.append(repeated_of(window, camera)[0])
+
+    def card(self) -> CameraCard:
+        chosen = _thinned(len(self._thumbnails), _IN_ALL)
+        thumbnails = np.stack([self._thumbnails[i] for i in chosen])
+        owners = np.array([self._owners[i] for i in chosen])
+        vectors, far = descriptors(thumbnails), []
+        for owner in np.unique(owners).tolist():
+            others = vectors[owners != owner]
+            if len(others):
+                far.append(nearest(vectors[owners == owner], others)[0])
+        usual = float(np.quantile(np.concatenate(far), 0.99)) if far else 0.5
+        shape = self._kept[0][0].shape
+        kept = [[each for each in of if each.shape == shape] for of in self._kept]
+        chosen_episodes = [kept[i] for i in _thinned(len(kept), 12) if kept[i]]
+        middle, moving = background([each for of in chosen_episodes for each in of])
+        shifts = [0.0]
+        for of in chosen_episodes:
+            if len(of) >= 3 and len(chosen_episodes) > 1:
+                shift = shift_of(middle, background(of)[0], still(moving))
+                shifts += [shift.pixels] if shift is not None and shift.after > 0.3 else []
+        return CameraCard(
+            self._topic, self._size,
+            {n: tuple(np.quantile(np.concatenate(each), LEVELS).tolist()) for n, each in self._numbers.items()},
+            thumbnails, tuple(self._places[i] for i in chosen), np.concatenate(self._poses)[chosen], usual,
+            _coloured(middle), _coloured(moving),
+            float(np.quantile(shifts, 0.9)), max(self._repeated),
+        )  # fmt: skip
+
+
+def still(moving: Grey) -> Grey:
+    """Weight of each pixel: small where the pictures change."""
+    result: Grey = (1.0 / (1.0 + (moving / 6.0) ** 2)).astype(np.float32)
+    return result
+
+
+def _coloured(values: Grey) -> NDArray[np.uint8]:
+    return np.repeat(np.clip(np.rint(values), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def in_grey(picture: NDArray[np.uint8]) -> Grey:
+    """A stored background in grey values."""
+    return grey(picture)
+
+
+def make_card(windows: Iterable[Window], **more: Any) -> Card:
+    """The card of episodes.
+
+    Args:
+        windows: the episodes.
+        more: further fields of the card: norm_mode, trained, statistics.
+
+    Raises:
+        DatasetError: if there is none, or they have different joints.
+    """
+    maker = Maker()
+    for window in windows:
+        maker.add(window)
+    return maker.card(**more)
+
+
+def with_card(folders: Sequence[Path]) -> Path | None:
+    """The first card in these folders; None if none has one."""
+    return next((folder / FILE for folder in folders if (folder / FILE).is_file()), None)

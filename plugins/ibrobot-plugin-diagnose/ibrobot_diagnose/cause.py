@@ -1,0 +1,225 @@
+"""Causes: what they need, what they find, and how findings are ranked."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_core.api import IbrobotError
+
+if TYPE_CHECKING:
+    from ibrobot_diagnose.card import Card
+    from ibrobot_diagnose.window import Window
+
+GROUP = "ibrobot_causes"
+"""Group of entry points, each a cause's class: `CLASS = "package.module:Class"`."""
+ACCUSED = 0.5
+"""Likelihood from which a cause is named."""
+
+
+@attrs.frozen(eq=False)
+class Shown:
+    """A picture of a finding."""
+
+    title: str
+    picture: NDArray[np.uint8]
+    """Shape (H, W, 3)."""
+
+
+@attrs.frozen(eq=False)
+class Evidence:
+    """What a cause found."""
+
+    text: str
+    """One sentence with the number; it begins the report if the cause is the most probable one."""
+    number: float
+    unit: str
+    threshold: float
+    """The cause is accused if the number is on the wrong side of it."""
+    likelihood: float
+    """0 to 1; from 0.5 on the cause is named."""
+    since_s: float | None = None
+    """From when on [s], since the beginning of the window; None if it applies throughout."""
+    details: tuple[str, ...] = ()
+    """Further evidence, a line each."""
+    pictures: tuple[Shown, ...] = ()
+
+
+@attrs.frozen(eq=False)
+class Reference:
+    """What a window is compared with."""
+
+    card: Card | None = None
+    """The card of the model's data, or of the other episodes of a dataset."""
+    model: Any = None
+    """The model, to ask it again; see `ask_again.Model`."""
+
+    @property
+    def streams(self) -> frozenset[str]:
+        """Names of what it has, as in `Cause.needs`."""
+        card = self.card
+        has = {
+            "card": card is not None, "card pictures": card is not None and bool(card.cameras),
+            "training card": card is not None and card.trained is not None, "model": self.model is not None,
+        }  # fmt: skip
+        return frozenset(name for name, there in has.items() if there)
+
+
+class Cause(ABC):
+    """A reason why a run goes wrong, or an episode is bad.
+
+    It does not know whether the window is a live rig, a recording or an episode of a dataset.
+    """
+
+    name: ClassVar[str]
+    """Its name in JSON, e.g. `camera_moved`."""
+    title: ClassVar[str]
+    """The condition in which nothing is wrong, for the list of what is healthy, e.g. `cameras stand as in training`."""
+    needs: ClassVar[frozenset[str]] = frozenset()
+    """The streams of the window and the reference that it needs: `state`, `commands`, `answers`, `chunks` (used ones),
+    `pictures`, `outcome`, `demonstration`; `card`, `card pictures`, `training card`; `model`."""
+    explains: ClassVar[frozenset[str]] = frozenset()
+    """Names of causes that this one brings about: those are consequences if this one is found."""
+    remedy: ClassVar[str]
+    """What to do, in the imperative."""
+
+    @abstractmethod
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        """Evidence for this cause; None if nothing points to it."""
+
+
+@attrs.frozen(eq=False)
+class Finding:
+    """A cause with its evidence."""
+
+    cause: Cause
+    evidence: Evidence
+
+    @property
+    def name(self) -> str:
+        """Name of the cause."""
+        return self.cause.name
+
+
+@attrs.frozen(eq=False)
+class Diagnosis:
+    """The result for a window."""
+
+    findings: tuple[Finding, ...]
+    """The accused causes, most probable first."""
+    healthy: tuple[tuple[str, str], ...]
+    """Name and title of the causes that were tested and not accused."""
+    untested: tuple[tuple[str, str], ...]
+    """Name of the causes that could not be tested, and why."""
+
+    @property
+    def first(self) -> str:
+        """Name of the most probable cause; empty if none is accused."""
+        return self.findings[0].name if self.findings else ""
+
+
+_LACKS = {
+    "state": "no joint positions were recorded", "commands": "no commands were recorded",
+    "answers": "no answers of a model were recorded", "chunks": "no answer of the model was used",
+    "pictures": "no pictures were recorded", "outcome": "nobody judged the outcome",
+    "demonstration": "a model acted, nobody demonstrated", "card": "there is no card of the model's data: --data",
+    "card pictures": "there is no card of the model's pictures: --data",
+    "training card": "there is no card from a training", "model": "the model was not asked: --model",
+}  # fmt: skip
+
+
+_SLOPE = math.log(0.95 / 0.05)
+
+
+def likelihood(number: float, threshold: float, certain: float) -> float:
+    """Likelihood of a number: 0.5 at the threshold, 0.95 where it is `certain`, logistic in their logarithms.
+
+    `certain` below the threshold means that small numbers are suspicious.
+    """
+    if not math.isfinite(number):
+        return 0.0
+    tiny = 1e-9
+    place = math.log(max(number, tiny) / threshold) / math.log(certain / threshold)
+    return 1 / (1 + math.exp(-_SLOPE * max(-20.0, min(20.0, place))))
+
+
+def own_causes() -> tuple[Cause, ...]:
+    """The causes of this package."""
+    from ibrobot_diagnose import causes
+
+    return causes.all_causes()
+
+
+@cache
+def installed_causes() -> tuple[Cause, ...]:
+    """The causes of this package and of others.
+
+    Raises:
+        IbrobotError: if one of another package cannot be loaded, or has the name of another cause.
+    """
+    known = {each.name: each for each in own_causes()}
+    for point in sorted(entry_points(group=GROUP), key=lambda each: each.name):
+        where = f"entry point {point.name!r} of {point.dist.name if point.dist else 'a package'} ({GROUP})"
+        try:
+            cause = point.load()()
+        except Exception as error:
+            raise IbrobotError(f"{where}: {point.value} cannot be loaded: {type(error).__name__}: {error}") from error
+        if not isinstance(cause, Cause):
+            raise IbrobotError(f"{where}: {point.value} is no subclass of ibrobot_diagnose.cause.Cause")
+        if cause.name in known:
+            raise IbrobotError(f"{where}: there is a cause {cause.name!r} already; choose another name")
+        known[cause.name] = cause
+    return tuple(known.values())
+
+
+def diagnose(
+    window: Window, reference: Reference, causes: Iterable[Cause] | None = None,
+    tested: Callable[[str], None] = lambda name: None,
+) -> Diagnosis:  # fmt: skip
+    """Test all causes, and rank those that are accused.
+
+    Args:
+        window: what happened.
+        reference: what it is compared with.
+        causes: by default all installed ones.
+        tested: called with the name of each cause after its test.
+    """
+    there = window.streams | reference.streams
+    findings: list[Finding] = []
+    healthy, untested = [], []
+    for cause in installed_causes() if causes is None else causes:
+        if lacking := sorted(cause.needs - there):
+            untested.append((cause.name, _LACKS.get(lacking[0], lacking[0])))
+            continue
+        evidence = cause.test(window, reference)
+        if evidence is not None and evidence.likelihood >= ACCUSED:
+            findings.append(Finding(cause, evidence))
+        else:
+            healthy.append((cause.name, cause.title))
+        tested(cause.name)
+    return Diagnosis(ranked(findings), tuple(healthy), tuple(untested))
+
+
+def ranked(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Findings by likelihood, each after those that explain it; what explains another is at least as likely."""
+    own = {each.name: each.evidence.likelihood for each in findings}
+    likely = {
+        each.name: max(own[name] for name in {each.name, *(each.cause.explains & own.keys())}) for each in findings
+    }
+    rest = sorted(findings, key=lambda each: (-likely[each.name], each.name))
+    ordered: list[Finding] = []
+    while rest:
+        free = [each for each in rest if not any(each.name in other.cause.explains for other in rest)]
+        # Two that explain each other: the one that explains more.
+        chosen = free[0] if free else max(rest, key=lambda each: len(each.cause.explains & own.keys()))
+        ordered.append(chosen)
+        rest.remove(chosen)
+    return tuple(ordered)

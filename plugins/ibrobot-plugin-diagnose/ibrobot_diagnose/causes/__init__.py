@@ -1,0 +1,13 @@
+"""The causes of this package, a family in a file."""
+
+from __future__ import annotations
+
+from ibrobot_diagnose.cause import Cause
+from ibrobot_diagnose.causes import data, joints, limits, motion, pictures, timing
+
+_FAMILIES = (timing, limits, motion, pictures, joints, data)
+
+
+def all_causes() -> tuple[Cause, ...]:
+    """A cause of each class."""
+    return tuple(each() for family in _FAMILIES for each in family.CAUSES)

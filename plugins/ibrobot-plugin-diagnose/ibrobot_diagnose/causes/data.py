@@ -1,0 +1,289 @@
+"""Causes in the model's data and training: prompt, starts, speeds, statistics, idle beginnings, a success not seen."""
+
+from __future__ import annotations
+
+from typing import override
+
+import numpy as np
+
+from ibrobot_diagnose.card import moving_speed
+from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
+from ibrobot_diagnose.causes.pictures import pairs
+from ibrobot_diagnose.course import begins_to_move
+from ibrobot_diagnose.window import Window
+
+
+class OtherPrompt(Cause):
+    """The model was given a task that is not in its data."""
+
+    name = "other_prompt"
+    title = "the task is one of the data's"
+    needs = frozenset({"card"})
+    explains = frozenset({"stands_still"})
+    remedy = "Give the model a task of its data, in the same words: `inference: {prompt: …}`."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        known = [text for text in card.prompts if text]
+        if not window.prompt or not known or window.prompt in known:
+            return None
+        asked = any(each.answer.prompt for each in window.asked)
+        shown = "; ".join(repr(text) for text in known[:3])
+        text = (
+            f"The model was given the task {window.prompt!r}, which is none of the {len(known)} of its data: {shown}."
+        )
+        like = {_plain(text) for text in known}
+        return Evidence(text, 1.0, "tasks", 0.5, 0.6 if not asked or _plain(window.prompt) in like else 0.9)
+
+
+def _plain(text: str) -> str:
+    return " ".join(text.lower().replace(".", " ").split())
+
+
+class UnseenStart(Cause):
+    """The run begins where no demonstration begins."""
+
+    name = "unseen_start"
+    title = "the run begins where demonstrations begin"
+    needs = frozenset({"state", "card"})
+    explains = frozenset({"unseen_states", "stands_still"})
+    remedy = "Bring the arm to the start of the demonstrations before each run, or record episodes that begin here."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        known = np.flatnonzero(np.isfinite(window.states).all(axis=1))
+        if window.joints != card.joints or not len(known):
+            return None
+        start = window.states[known[0]]
+        low, high = card.starts.min(axis=0), card.starts.max(axis=0)
+        room = 0.25 * (high - low)
+        off = np.maximum(np.maximum(low - room - start, start - high - room), 0.0)
+        j = int(np.argmax(off))
+        text = (
+            f"{window.joints[j]} begins at {start[j]:.2f} rad, {off[j]:.2f} rad outside of the {card.episodes} "
+            "demonstrations, "
+            f"which begin from {low[j]:.2f} to {high[j]:.2f} rad."
+        )
+        return Evidence(text, float(off[j]), "rad", 0.1, likelihood(float(off[j]), 0.1, 0.25), 0.0)
+
+
+class UnseenStates(Cause):
+    """The run leaves what the data shows."""
+
+    name = "unseen_states"
+    title = "the arm stays where the data was"
+    needs = frozenset({"state", "card"})
+    remedy = (
+        "See what led the arm there, at the time that is given. If nothing else is wrong, record episodes that begin "
+        "there "
+        "and end well: `ibrobot record` with corrections."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        if window.joints != card.joints:
+            return None
+        low, high = card.row(card.state, 0.0), card.row(card.state, 1.0)
+        room = np.maximum(0.15 * (high - low), 0.05)
+        states = np.nan_to_num(window.states, nan=float(low.mean()))
+        known = np.isfinite(window.states).all(axis=1)
+        outside = ((states < low - room) | (states > high + room)) & known[:, None]
+        share = float(outside.any(axis=1).mean())
+        if not outside.any():
+            return None
+        j = int(outside.sum(axis=0).argmax())
+        since = window.since(int(window.ticks_ns[outside.any(axis=1).argmax()]))
+        text = (
+            f"{window.joints[j]} left the range of the data ({low[j]:.2f} to {high[j]:.2f} rad) from {since:.1f} s on; "
+            "the arm "
+            f"was outside in {100 * share:.0f} % of the run."
+        )
+        return Evidence(text, 100 * share, "%", 15.0, likelihood(share, 0.15, 0.6), since)
+
+
+class OtherSpeed(Cause):
+    """The arm moves faster or slower than in the data."""
+
+    name = "other_speed"
+    title = "the arm moves as fast as in the data"
+    needs = frozenset({"commands", "card"})
+    explains = frozenset({"limits_low"})
+    remedy = (
+        "Execute chunks at the rate of the data: `contract: {rate_hz: …}` of the robot and of the recordings must "
+        "agree; look "
+        "for a policy that was trained on data that was sampled at another rate."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        speed = moving_speed(window)
+        low, high = (card.quantile("moving_speed", level) for level in (0.05, 0.95))
+        if window.joints != card.joints or speed <= 0 or low <= 0:
+            return None
+        factor = max(speed / high, low / speed)
+        how = "fast" if speed > high else "slow"
+        text = f"The arm moves too {how}: {speed:.2f} rad/s over all joints, in the data {low:.2f} to {high:.2f}."
+        return Evidence(text, factor, "times", 1.45, likelihood(factor, 1.45, 2.2))
+
+
+class Statistics(Cause):
+    """The model's actions are not in the range of its data."""
+
+    name = "statistics"
+    title = "the model's actions are in the range of its data"
+    needs = frozenset({"chunks", "state", "card"})
+    explains = frozenset({
+        "unseen_states", "limits_low", "arm_not_following", "other_speed", "joint_zero", "gripper_scaled",
+        "smoothing_averages",
+    })  # fmt: skip
+    remedy = (
+        "Use the statistics that lie beside the checkpoint: a model whose inputs and outputs are normalised with those "
+        "of "
+        "another dataset, or not at all, acts like this. Export or download the checkpoint again, whole."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        used = [each for each in window.asked if each.used and each.answer.joint_names == card.joints]
+        if not used or window.joints != card.joints:
+            return None
+        chunks = np.concatenate([each.chunk for each in used])
+        low, high = card.row(card.action, 0.0), card.row(card.action, 1.0)
+        room = np.maximum(0.25 * (high - low), 0.1)
+        outside = ((chunks < low - room) | (chunks > high + room)).mean(axis=0)
+        first = used[0]
+        state = window.state.at(np.array([first.answer.observed_ns]))[0]
+        jump = np.abs(first.chunk[0] - state)
+        usual = np.maximum(2.0 * card.row(card.lead, 0.99), 0.15)
+        ratio = np.nan_to_num(jump / usual)
+        begins_inside = bool(((state > low - room) & (state < high + room)).all())
+        j = int(np.argmax(ratio))
+        text = (
+            f"The model's first answer begins {jump[j]:.2f} rad away from where {window.joints[j]} is; in its data "
+            "actions are "
+            f"up to {card.row(card.lead, 0.99)[j]:.2f} rad away. {100 * outside.max():.0f} % of its actions are "
+            "outside of "
+            "those of the data."
+        )
+        details = tuple(
+            f"{joint}: answers {a:.2f} to {b:.2f} rad, in the data {c:.2f} to {d:.2f}"
+            for joint, a, b, c, d in zip(
+                window.joints, chunks.min(axis=0), chunks.max(axis=0), low.tolist(), high.tolist(), strict=True
+            )
+        )
+        number = float(ratio[j]) if begins_inside else 0.0
+        return Evidence(text, number, "times", 1.5, likelihood(number, 1.5, 3.0), 0.0, details)
+
+
+class IdleData(Cause):
+    """Demonstrations begin with time in which nothing moves, and the policy has learned to stand still."""
+
+    name = "idle_data"
+    title = "demonstrations begin to move soon"
+    needs = frozenset({"card", "commands", "chunks"})
+    explains = frozenset({"stands_still"})
+    remedy = (
+        "Cut the idle beginnings of the demonstrations (`ibrobot episodes trim`, or `ibrobot datasets check` for a "
+        "list), and "
+        "train again."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        idle, still = card.quantile("idle_start_s", 0.5), begins_to_move(window)
+        text = (
+            f"Demonstrations stand still for {idle:.1f} s at their beginning, and the policy did for {still:.1f} s: "
+            "from a "
+            "picture in which nothing happens it has learned to wait."
+        )
+        both = min(likelihood(idle, 1.2, 2.5), likelihood(still, 2.0, 5.0))
+        return Evidence(text, idle, "s", 1.2, both, 0.0)
+
+
+class CheckpointEarly(Cause):
+    """The model has seen its data too few times."""
+
+    name = "checkpoint_early"
+    title = "the model has been trained long enough"
+    needs = frozenset({"training card"})
+    explains = frozenset({"smoothing_averages", "stands_still"})
+    remedy = "Train on: the same `ibrobot train` with more --steps continues from the newest checkpoint."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        assert card.trained is not None
+        try:
+            step, steps, batch = (float(card.trained[name]) for name in ("step", "steps", "batch_size"))
+        except (KeyError, TypeError, ValueError):
+            return None
+        passes = step * batch / max(card.frames, 1)
+        text = (
+            f"The checkpoint is of step {step:.0f} of {steps:.0f}: the model has seen each frame of its data "
+            f"{passes:.1f} times; "
+            "below 2 is too early."
+        )
+        return Evidence(text, passes, "times", 2.0, likelihood(passes, 2.0, 0.7))
+
+
+class UnseenSuccess(Cause):
+    """The run looks like a success, but was judged a failure."""
+
+    name = "unseen_success"
+    title = "the judgement agrees with the pictures"
+    needs = frozenset({"outcome", "pictures", "card pictures"})
+    remedy = (
+        "Look at the last pictures: if the task was done, the judge is wrong (a threshold of the scene, an operator's "
+        "key): "
+        "`ibrobot episodes mark EPISODE success`."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        if window.outcome != "failure":
+            return None
+        best: tuple[float, str] | None = None
+        for pair in pairs(window, reference):
+            owners = [name for name, _ in pair.card.places]
+            firsts = [i for i, name in enumerate(owners) if not i or owners[i - 1] != name]
+            lasts = [i for i, name in enumerate(owners) if i + 1 == len(owners) or owners[i + 1] != name]
+            values = pair.card.thumbnails.astype(np.float32).reshape(len(owners), -1)
+            begin, end = values[firsts], values[lasts]
+            way = np.median(end, axis=0) - np.median(begin, axis=0)
+            way[np.abs(way) < 12.0] = 0.0
+            size = float((way**2).sum())
+            if size < 400.0 or len(firsts) < 5:
+                continue
+            scores = [(each - np.median(begin, axis=0)) @ way / size for each in (begin, end)]
+            apart = (scores[1].mean() - scores[0].mean()) / (scores[0].std() + scores[1].std() + 1e-3)
+            shown = pair.camera.small[-5:].reshape(min(5, len(pair.camera.small)), -1)
+            score = float(np.median((shown - np.median(begin, axis=0)) @ way / size))
+            if apart > 3.0 and (best is None or score > best[0]):
+                best = score, pair.camera.name
+        if best is None:
+            return None
+        score, name = best
+        text = (
+            f"The last pictures of {name} look like the ends of successful episodes ({100 * score:.0f} % of the way "
+            "from their "
+            "beginnings), but the run was judged a failure."
+        )
+        return Evidence(text, 100 * score, "%", 80.0, likelihood(max(score, 0.0), 0.8, 0.95))
+
+
+CAUSES: tuple[type[Cause], ...] = (
+    OtherPrompt, UnseenStart, UnseenStates, OtherSpeed, Statistics, IdleData, CheckpointEarly, UnseenSuccess,
+)  # fmt: skip

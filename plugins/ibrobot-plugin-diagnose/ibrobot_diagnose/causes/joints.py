@@ -1,0 +1,279 @@
+"""Causes in the joints: units, zeros, their order, and the gripper, in comparison with the model's data."""
+
+from __future__ import annotations
+
+import itertools
+from typing import override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_diagnose.card import LEVELS, Card
+from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
+from ibrobot_diagnose.causes.pictures import pairs
+from ibrobot_diagnose.pictures import descriptors, nearest
+from ibrobot_diagnose.window import Floats, Window
+
+_MIDDLE = slice(1, -1)
+"""Levels of the quantiles that are compared."""
+_CONSEQUENCES = frozenset({
+    "unseen_start", "unseen_states", "other_speed", "statistics", "limits_low", "stands_still", "arm_not_following",
+})  # fmt: skip
+
+
+def _known(window: Window) -> Floats:
+    result: Floats = window.states[np.isfinite(window.states).all(axis=1)]
+    return result
+
+
+def _same(window: Window, card: Card) -> bool:
+    return window.joints == card.joints and len(_known(window)) > 1
+
+
+def _span(card: Card) -> Floats:
+    result: Floats = np.maximum(card.row(card.state, 1.0) - card.row(card.state, 0.0), 0.1)
+    return result
+
+
+def _costs(states: Floats, card: Card) -> NDArray[np.float64]:
+    """How far the quantiles of each joint of the window, by row, are from those of each joint of the card."""
+    own = np.quantile(states, LEVELS, axis=0)[_MIDDLE]
+    differences = np.abs(own[:, :, None] - card.state[_MIDDLE][:, None, :]).mean(axis=0)
+    result: NDArray[np.float64] = differences / _span(card)[None]
+    return result
+
+
+def nearest_poses(window: Window, reference: Reference) -> tuple[Floats, Floats]:
+    """Positions of the joints in the window, and those of the data at pictures that look the same; shape (N, J)."""
+    own, theirs = [], []
+    for pair in pairs(window, reference):
+        times = np.array(pair.camera.times_ns, np.int64)
+        index = np.unique(np.linspace(0, len(times) - 1, min(120, len(times))).round().astype(int))
+        distance, near = nearest(descriptors(pair.camera.small[index]), pair.card.vectors)
+        states = window.state.at(times[index])
+        good = (distance < 1.5 * pair.card.usual_distance) & np.isfinite(states).all(axis=1)
+        own.append(states[good])
+        theirs.append(pair.card.poses[near[good]])
+    size = len(window.joints)
+    return (np.concatenate(own), np.concatenate(theirs)) if own else (np.empty((0, size)), np.empty((0, size)))
+
+
+class OtherUnits(Cause):
+    """Positions are in another unit."""
+
+    name = "other_units"
+    title = "joint positions are in the unit of the data"
+    needs = frozenset({"state", "card"})
+    explains = _CONSEQUENCES | {"joint_order", "joint_zero", "gripper_scaled", "gripper_reversed"}
+    remedy = (
+        "Deliver the joints in radians, as every driver here does (LeRobot's deliver degrees or -100 to 100), and give "
+        "the "
+        "model the unit of its training: `models: {…: {norm_mode: …}}`."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        if not _same(window, card):
+            return None
+        states, usual = _known(window), np.abs(card.state).max()
+        largest = float(np.quantile(np.abs(states), 0.99))
+        ratio = max(largest / usual, 0.33 * usual / max(largest, 1e-6))
+        plain = float(np.diag(_costs(states, card)).mean())
+        unit, rest = "no unit that is known", plain
+        for name, factor in (("degrees", np.pi / 180), ("radians, the data in degrees", 180 / np.pi)):
+            cost = float(np.diag(_costs(states * factor, card)).mean())
+            if cost < 0.3 * plain and cost < rest:
+                unit, rest = name, cost
+        if unit.startswith("no") and 20.0 < largest <= 101.0:
+            unit = "-100 to 100"
+        text = (
+            f"The joint positions reach {largest:.3g}, where those of the data reach {usual:.3g} rad: they are in "
+            f"{unit}."
+        )
+        return Evidence(text, ratio, "times", 4.0, likelihood(ratio, 4.0, 8.0))
+
+
+class OtherNormMode(Cause):
+    """The model is given another unit than that of its training."""
+
+    name = "other_norm_mode"
+    title = "the model gets the unit of its training"
+    needs = frozenset({"card"})
+    explains = _CONSEQUENCES
+    remedy = "Set `norm_mode` of the model in the robot YAML to the unit of its training."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        model = (window.document.get("models") or {}).get(window.policy.get("model", ""), {})
+        given = model.get("norm_mode") if isinstance(model, dict) else None
+        if given is None or card.norm_mode is None or given == card.norm_mode:
+            return None
+        text = f"The robot YAML gives the model its joints in {given}, but it was trained on {card.norm_mode}."
+        return Evidence(text, 1.0, "difference", 0.5, 0.98)
+
+
+class JointOrder(Cause):
+    """Joints have each other's place."""
+
+    name = "joint_order"
+    title = "the joints are in the order of the data"
+    needs = frozenset({"state", "card"})
+    explains = _CONSEQUENCES | {"joint_zero", "gripper_scaled", "gripper_reversed", "arm_not_following"}
+    remedy = (
+        "Compare the order of `joints` in the robot YAML with that of the data (`ibrobot datasets info`), and the "
+        "motors' "
+        "numbers with their joints: move one by hand, and see which number changes."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        size = len(window.joints)
+        if not _same(window, card) or size > 16:
+            return None
+        costs = _costs(_known(window), card)
+        starts = _known(window)[:1].T - np.median(card.starts, axis=0)[None]
+        costs = costs + 0.5 * np.abs(starts) / _span(card)[None]
+        order = _assignment(costs)
+        plain, best = float(np.trace(costs)), float(costs[np.arange(size), order].sum())
+        ratio = (plain + 0.1) / (best + 0.1 * size**0.5)
+        pairs_of = [f"{window.joints[i]} behaves as {card.joints[j]}" for i, j in enumerate(order) if i != j]
+        if not pairs_of or len(pairs_of) < 2:
+            return None
+        text = f"Joints are exchanged: {', '.join(pairs_of)} in the data; so they fit {ratio:.1f} times as well."
+        return Evidence(text, ratio, "times", 1.8, likelihood(ratio, 1.8, 3.0))
+
+
+def _assignment(costs: NDArray[np.float64]) -> NDArray[np.intp]:
+    """The joint of the card for each joint of the window with the smallest sum of costs, by exchanging pairs."""
+    size = len(costs)
+    order = np.arange(size)
+    if size <= 6:
+        rows = np.arange(size)
+        return np.array(min(itertools.permutations(range(size)), key=lambda each: costs[rows, each].sum()))
+    improved = True
+    while improved:
+        improved = False
+        for a, b in itertools.combinations(range(size), 2):
+            gain = costs[a, order[a]] + costs[b, order[b]] - costs[a, order[b]] - costs[b, order[a]]
+            if gain > 1e-9:
+                order[[a, b]], improved = order[[b, a]], True
+    return order
+
+
+class JointZero(Cause):
+    """The zero of a joint is shifted."""
+
+    name = "joint_zero"
+    title = "the zeros of the joints are those of the data"
+    needs = frozenset({"state", "card pictures", "pictures"})
+    explains = frozenset({"unseen_start", "unseen_states"})
+    remedy = (
+        "Calibrate the arm again, or choose its own calibration (`hardware: {calibration: …}`): put it into the pose "
+        "of the "
+        "two pictures, and compare the numbers."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        if not _same(window, card):
+            return None
+        own, theirs = nearest_poses(window, reference)
+        if len(own) < 10:
+            return None
+        differences = own - theirs
+        middle = np.median(differences, axis=0)
+        spread = 1.4826 * np.median(np.abs(differences - middle), axis=0)
+        sure = np.abs(middle) / (0.04 + 0.5 * spread)
+        j = int(np.argmax(sure))
+        others = np.delete(sure, j)
+        text = (
+            f"The zero of {window.joints[j]} is shifted by {middle[j]:+.2f} rad ({np.degrees(middle[j]):+.0f}°): at "
+            "pictures "
+            "that look the same, the data has other positions of this joint."
+        )
+        details = tuple(
+            f"{joint}: {off:+.3f} rad, scattered by {width:.3f}"
+            for joint, off, width in zip(window.joints, middle.tolist(), spread.tolist(), strict=True)
+        )
+        number = float(sure[j]) * (1.0 if not len(others) or others.max() < 0.7 * sure[j] else 0.7)
+        start = float(_known(window)[0, j] - np.median(card.starts[:, j]))
+        if abs(start - middle[j]) < 0.5 * abs(middle[j]):  # an arm that begins in its rest pose is off by as much
+            number *= 1.5
+        return Evidence(text, number, "times", 2.0, likelihood(number, 2.0, 3.5), details=details)
+
+
+def _gripper(window: Window) -> int | None:
+    names = [i for i, joint in enumerate(window.joints) if "grip" in joint or "jaw" in joint]
+    return names[0] if len(names) == 1 else None
+
+
+class GripperScaled(Cause):
+    """The gripper has another range."""
+
+    name = "gripper_scaled"
+    title = "the gripper has the range of the data"
+    needs = frozenset({"state", "card"})
+    explains = frozenset({"unseen_states", "unseen_start", "arm_not_following"})
+    remedy = "Calibrate the gripper from shut to open; a percentage is no angle, and another jaw has another range."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card, j = reference.card, _gripper(window)
+        assert card is not None
+        if j is None or not _same(window, card):
+            return None
+        own = _known(window)[:, j]
+        low, high = float(card.row(card.state, 0.01)[j]), float(card.row(card.state, 0.99)[j])
+        begin, end = np.quantile(own, (0.01, 0.99)).tolist()
+        factor = (end - begin) / max(high - low, 0.05)
+        # Only a range that is too large is sure: a gripper that never opens is one of a policy that does not act.
+        reach = max(factor, abs(end) / max(abs(high), 0.05)) if factor > 1 else 1.0
+        text = f"The gripper reaches from {begin:.2f} to {end:.2f}; in the data from {low:.2f} to {high:.2f} rad."
+        return Evidence(text, reach, "times", 1.5, likelihood(reach, 1.5, 2.2))
+
+
+class GripperReversed(Cause):
+    """Open is shut."""
+
+    name = "gripper_reversed"
+    title = "open is open, and shut is shut"
+    needs = frozenset({"state", "card"})
+    explains = _CONSEQUENCES | {"joint_zero", "joint_order"}
+    remedy = "Reverse the gripper: its sign in the calibration, or its two ends, are exchanged."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card, j = reference.card, _gripper(window)
+        assert card is not None
+        if j is None or not _same(window, card):
+            return None
+        own = _known(window)[:, j : j + 1]
+        mirrored = card.row(card.state, 0.0)[j] + card.row(card.state, 1.0)[j] - own
+        levels = card.state[_MIDDLE, j]
+        span = float(_span(card)[j])
+        costs = [
+            float(np.abs(np.quantile(each[:, 0], LEVELS)[_MIDDLE] - levels).mean()) / span for each in (own, mirrored)
+        ]
+        start = float(np.median(card.starts[:, j]))
+        first = [abs(float(each[0, 0]) - start) / span for each in (own, mirrored)]
+        plain, other = (cost + begin for cost, begin in zip(costs, first, strict=True))
+        ratio = (plain + 0.08) / (other + 0.08) if plain > 0.35 else 0.5
+        text = (
+            f"The gripper is reversed: it begins at {own[0, 0]:.2f} rad where the data begins at {start:.2f}, and the "
+            "mirror "
+            f"image of its way is {ratio:.1f} times as close to the data."
+        )
+        return Evidence(text, ratio, "times", 2.0, likelihood(ratio, 2.0, 3.5))
+
+
+CAUSES: tuple[type[Cause], ...] = (
+    OtherUnits, OtherNormMode, JointOrder, JointZero, GripperScaled, GripperReversed,
+)  # fmt: skip

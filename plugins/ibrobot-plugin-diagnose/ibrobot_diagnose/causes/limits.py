@@ -1,0 +1,71 @@
+"""Causes between the plan and the command: limits that are too low, and an operator who took over."""
+
+from __future__ import annotations
+
+from typing import override
+
+import numpy as np
+
+from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
+from ibrobot_diagnose.course import course_of, operated_share
+from ibrobot_diagnose.window import Window
+
+
+class LimitsLow(Cause):
+    """A limit keeps the arm from what the model says."""
+
+    name = "limits_low"
+    title = "limits leave the model's actions as they are"
+    needs = frozenset({"chunks", "commands", "state"})
+    remedy = (
+        "Raise the limit of this joint in the robot YAML (`robot: {joints: …}`) to what the arm and its surroundings "
+        "bear, at least to that of the recording; or train on demonstrations that stay below it."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        course = course_of(window)
+        if course is None or not course.acting.any():
+            return None
+        limited = course.at_velocity | course.at_position
+        off = np.nan_to_num(np.abs(course.command - course.planned)) * course.acting[:, None]
+        touched = limited & (off > 0.02) & course.acting[:, None]
+        if not touched.any():
+            return None
+        share = float(touched.any(axis=1).sum() / course.acting.sum())
+        joint = int(np.argmax((touched * off).sum(axis=0)))
+        kind = "position" if course.at_position[:, joint].sum() > course.at_velocity[:, joint].sum() else "velocity"
+        furthest = float((off * touched)[:, joint].max())
+        limits = window.limits[joint]
+        stated = (
+            f"{limits.velocity:.3g} rad/s" if kind == "velocity" else f"{limits.lower:.3g} to {limits.upper:.3g} rad"
+        )
+        text = (
+            f"The {kind} limit of {window.joints[joint]} ({stated}) held the arm back in {100 * share:.0f} % of the "
+            f"run, by up to {furthest:.2f} rad from what the model said."
+        )
+        since = window.since(int(course.times_ns[touched.any(axis=1).argmax()]))
+        return Evidence(text, 100 * share, "%", 8.0, likelihood(share * min(1.0, furthest / 0.05), 0.08, 0.3), since)
+
+
+class Takeover(Cause):
+    """An operator had the arm."""
+
+    name = "takeover"
+    title = "the policy had the arm all the time"
+    needs = frozenset({"chunks"})
+    remedy = (
+        "Judge the policy by the parts that it commanded; `ibrobot convert --only interventions` keeps the others for "
+        "training."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        share, since = operated_share(window)
+        if since is None:
+            return None
+        text = f"An operator commanded {100 * share:.0f} % of the run, from {since:.1f} s on."
+        return Evidence(text, 100 * share, "%", 20.0, likelihood(share, 0.2, 0.8), since)
+
+
+CAUSES: tuple[type[Cause], ...] = (LimitsLow, Takeover)

@@ -1,0 +1,393 @@
+"""Causes in the pictures, in comparison with those of the model's data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar, override
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_diagnose.card import (
+    CameraCard,
+    background_of,
+    in_grey,
+    numbers_of,
+    repeated_of,
+    still,
+)
+from ibrobot_diagnose.cause import Cause, Evidence, Reference, Shown, likelihood
+from ibrobot_diagnose.pictures import Shift, descriptors, nearest, resized, shift_of
+from ibrobot_diagnose.window import Camera, Window
+
+_MOST = 60
+"""Pictures of a camera that are compared."""
+UNSEEN = frozenset({"unseen_pictures", "camera_ignored"})
+
+
+@attrs.frozen(eq=False)
+class Pair:
+    """A camera of the window, and that of the model's data."""
+
+    camera: Camera
+    card: CameraCard
+
+    @property
+    def sample(self) -> NDArray[np.float32]:
+        """Some thumbnails of the window, evenly over it, shape (N, 24, 32, 3)."""
+        small = self.camera.small
+        result: NDArray[np.float32] = small[
+            np.unique(np.linspace(0, len(small) - 1, min(_MOST, len(small))).round().astype(int))
+        ]
+        return result
+
+    def distance(self, changed: Callable[[Any], Any] = lambda small: small) -> float:
+        """Median distance to the nearest thumbnail of the data, of pictures that are changed first."""
+        return float(np.median(nearest(descriptors(changed(self.sample)), self.card.vectors)[0]))
+
+    def beside(self) -> tuple[Shown, ...]:
+        """A picture of the run, and the nearest one of the data."""
+        index = len(self.camera.pictures) // 2
+        kept = min(self.camera.kept, key=lambda i: abs(i - index))
+        _, near = nearest(descriptors(self.camera.small[kept : kept + 1]), self.card.vectors)
+        episode, at_s = self.card.places[int(near[0])]
+        name = self.camera.name
+        return (
+            Shown(f"{name} in this run", self.camera.kept[kept]),
+            Shown(f"{name} in the data: {episode}, {at_s:.1f} s", self.card.thumbnails[int(near[0])]),
+        )
+
+
+def pairs(window: Window, reference: Reference) -> Iterator[Pair]:
+    """The cameras that both have."""
+    assert reference.card is not None
+    for key, card in reference.card.cameras.items():
+        camera = window.cameras.get(key)
+        if camera is not None and camera.pictures:
+            yield Pair(camera, card)
+
+
+class PictureCause(Cause):
+    """A cause that looks at each camera alone; the worst one counts."""
+
+    needs = frozenset({"pictures", "card pictures"})
+    explains = UNSEEN
+    unit: ClassVar[str] = "times"
+    threshold: ClassVar[float]
+    certain: ClassVar[float]
+
+    def measure(self, pair: Pair) -> tuple[float, str] | None:
+        """How strong it is, by `threshold` and `certain`, and a sentence; None if it cannot be told."""
+        raise NotImplementedError
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        measured = [(result, pair) for pair in pairs(window, reference) if (result := self.measure(pair)) is not None]
+        if not measured:
+            return None
+        (number, text), pair = max(measured, key=lambda each: each[0][0])
+        likely = likelihood(number, self.threshold, self.certain)
+        return Evidence(text, number, self.unit, self.threshold, likely, pictures=pair.beside() if likely > 0.4 else ())
+
+
+class CamerasExchanged(Cause):
+    """Two cameras have each other's place."""
+
+    name = "cameras_exchanged"
+    title = "each camera has its own place"
+    needs = frozenset({"pictures", "card pictures"})
+    explains = frozenset({
+        "camera_moved", "picture_dark", "picture_bright", "picture_blurred", "picture_covered", "white_balance", "bgr",
+        "picture_flipped", "joint_zero", "gripper_reversed", *UNSEEN,
+    })  # fmt: skip
+    remedy = (
+        "Exchange the devices of these cameras in the robot YAML (`peripherals: …`); `ibrobot camera preview` shows "
+        "which "
+        "is which. A path below /dev/v4l/by-path stays with the USB port."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        each = list(pairs(window, reference))
+        best: tuple[float, Pair, Pair] | None = None
+        for a in range(len(each)):
+            for b in range(a + 1, len(each)):
+                one, other = each[a], each[b]
+                own = one.distance() + other.distance()
+                crossed = Pair(one.camera, other.card).distance() + Pair(other.camera, one.card).distance()
+                ratio = own / max(crossed, 1e-3)
+                if best is None or ratio > best[0]:
+                    best = ratio, one, other
+        if best is None:
+            return None
+        ratio, one, other = best
+        text = (
+            f"The cameras {one.camera.name} and {other.camera.name} are exchanged: the pictures of each are "
+            f"{ratio:.1f} times as close to the other's in the data as to its own."
+        )
+        return Evidence(text, ratio, "times", 1.4, likelihood(ratio, 1.4, 2.2), pictures=one.beside() + other.beside())
+
+
+class CameraMoved(PictureCause):
+    """A camera does not stand where it stood."""
+
+    name = "camera_moved"
+    title = "the cameras stand as in the data"
+    explains = UNSEEN | {"joint_zero", "gripper_reversed"}
+    unit, threshold, certain = "pixels", 1.0, 2.0
+    remedy = (
+        "Put the camera back: the two pictures of the report show where it was. `ibrobot preflight` shows it live. If "
+        "it "
+        "must stay there, record some episodes from its new place and train again."
+    )
+
+    @override
+    def measure(self, pair: Pair) -> tuple[float, str] | None:
+        shift = shift_between(pair)
+        name = pair.camera.name
+        if shift is None:
+            return None
+        usual = max(4.0, 3.0 * pair.card.usual_shift)
+        if shift.after > 0.45 and shift.after > shift.before + 0.02:
+            turned = f", turned by {np.degrees(abs(shift.angle)):.1f}°" if abs(shift.angle) > 0.01 else ""
+            text = (
+                f"The camera {name} has moved: its picture is shifted by {shift.pixels:.0f} of 640 pixels{turned}; up "
+                "to "
+                f"{usual:.0f} are usual."
+            )
+            return shift.pixels / usual, text
+        if shift.after < 0.3 and shift.before < 0.3:
+            distance = pair.distance()
+            text = (
+                f"The camera {name} shows another view than in the data: what stands still agrees to "
+                f"{shift.before:.2f} "
+                "only (1 is equal), wherever one looks for it."
+            )
+            return min(1.6, 0.8 * distance / pair.card.usual_distance), text
+        return 0.0, f"The camera {name} stands as in the data."
+
+
+def shift_between(pair: Pair) -> Shift | None:
+    """How far a camera's background has moved from that of the data; None if it cannot be told."""
+    own = background_of(pair.camera)
+    if own is None:
+        return None
+    reference, weight = in_grey(pair.card.background), still(in_grey(pair.card.moving))
+    middle, moving = own
+    if middle.shape != reference.shape:
+        size = reference.shape[0], reference.shape[1]
+        middle, moving = resized(middle, size), resized(moving, size)
+    return shift_of(reference, middle, weight * still(moving))
+
+
+class _Level(PictureCause):
+    """A number of the pictures lies outside that of the data."""
+
+    number: ClassVar[str]
+    above: ClassVar[bool] = False
+    words: ClassVar[str]
+
+    @override
+    def measure(self, pair: Pair) -> tuple[float, str] | None:
+        value = float(np.median(numbers_of(pair.camera)[self.number]))
+        low, high = (pair.card.at(self.number, level) for level in (0.01, 0.99))
+        usual = high if self.above else low
+        ratio = (value + 1e-3) / (usual + 1e-3) if self.above else (usual + 1e-3) / (value + 1e-3)
+        text = (
+            f"The pictures of {pair.camera.name} are too {self.words}: their {self.number} is {value:.3g}; in the data "
+            f"it is {low:.3g} to {high:.3g}."
+        )
+        return ratio, text
+
+
+class PictureDark(_Level):
+    """Pictures are darker."""
+
+    name, title, number, words = "picture_dark", "pictures are as bright as in the data", "brightness", "dark"
+    threshold, certain = 1.3, 1.9
+    explains = UNSEEN | {"white_balance", "picture_blurred"}
+    remedy = (
+        "Light the scene as in the recordings, and fix the exposure and gain of the camera in place of automatic ones."
+    )
+
+
+class PictureBright(_Level):
+    """Pictures are brighter."""
+
+    name, title, number, words = "picture_bright", "pictures are not brighter than in the data", "brightness", "bright"
+    above, threshold, certain = True, 1.25, 1.7
+    explains = UNSEEN | {"white_balance", "picture_blurred", "picture_covered"}
+    remedy = PictureDark.remedy
+
+
+class PictureBlurred(_Level):
+    """Pictures are blurred."""
+
+    name, title, number, words = "picture_blurred", "pictures are as sharp as in the data", "sharpness", "blurred"
+    threshold, certain = 1.35, 2.2
+    remedy = "Clean the lens and focus it (switch the automatic focus off); a long exposure in dim light blurs, too."
+
+
+class PictureCovered(PictureCause):
+    """A part of the picture is hidden."""
+
+    name, title = "picture_covered", "nothing covers the cameras"
+    explains = UNSEEN | {
+        "camera_moved", "picture_blurred", "picture_dark", "picture_frozen", "white_balance", "joint_zero",
+    }  # fmt: skip
+    unit, threshold, certain = "%", 15.0, 35.0
+    remedy = "Take away what hangs before the lens: a cable, tape, a hand; or move what stands in the camera's view."
+
+    @override
+    def measure(self, pair: Pair) -> tuple[float, str] | None:
+        middles = [np.median(each, axis=0).mean(axis=2) for each in (pair.sample, pair.card.thumbnails)]
+        own, known = (_texture(each) for each in middles)
+        rich = known > max(6.0, 0.4 * float(np.median(known)))
+        if rich.sum() < 6:
+            return None
+        lost = rich & (own < 0.3 * known)
+        share = 100 * float(lost[rich].mean())
+        rest = np.repeat(np.repeat(rich & ~lost, 4, axis=0), 4, axis=1)
+        other = share < 80 and rest.any() and np.corrcoef(middles[0][rest], middles[1][rest])[0, 1] < 0.5
+        shift = shift_between(pair) if share > 10 else None
+        if other or (shift is not None and shift.after > 0.45 and shift.after > shift.before + 0.1):
+            return 0.0, ""  # another view, not this one with something before it
+        text = f"Something covers {share:.0f} % of the picture of {pair.camera.name}: there is nothing to see there."
+        return share, text
+
+
+def _texture(middle: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Contrast of 6 x 8 areas of a picture in grey, for a usual brightness."""
+    blocks = middle.reshape(6, 4, 8, 4).std(axis=(1, 3))
+    return (blocks * 100.0 / (float(middle.mean()) + 5.0)).astype(np.float32)
+
+
+class PictureFrozen(Cause):
+    """Pictures repeat while the arm moves."""
+
+    name = "picture_frozen"
+    title = "pictures go on while the arm moves"
+    needs = frozenset({"pictures", "state"})
+    explains = UNSEEN | {"joint_zero"}
+    remedy = (
+        "The camera or its driver hangs: look at its cable and USB port, and at `ibrobot doctor`; do not use a hub for "
+        "several cameras."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        cards = reference.card.cameras if reference.card is not None else {}
+        worst: tuple[float, float, Camera, float | None] | None = None
+        for key, camera in window.cameras.items():
+            seconds, since = repeated_of(window, camera)
+            usual = max(0.5, 2.0 * cards[key].repeated_s if key in cards else 0.0)
+            if worst is None or seconds / usual > worst[0] / worst[1]:
+                worst = seconds, usual, camera, since
+        if worst is None:
+            return None
+        seconds, usual, camera, since = worst
+        text = (
+            f"The picture of {camera.name} froze: the same one came for {seconds:.1f} s while the arm moved; up to "
+            f"{usual:.1f} s are usual."
+        )
+        return Evidence(text, seconds, "s", usual, likelihood(seconds, usual, 3.0 * usual), since)
+
+
+class WhiteBalance(PictureCause):
+    """Colours are others."""
+
+    name, title = "white_balance", "colours are those of the data"
+    unit, threshold, certain = "%", 8.0, 22.0
+    remedy = "Fix the white balance of the camera in place of the automatic one, and use the lamps of the recordings."
+
+    @override
+    def measure(self, pair: Pair) -> tuple[float, str] | None:
+        numbers, worst = numbers_of(pair.camera), (0.0, "red")
+        for colour in ("red", "blue"):
+            value = float(np.median(numbers[colour]))
+            low, high = pair.card.at(colour, 0.0), pair.card.at(colour, 1.0)
+            off = max(value / high, low / max(value, 1e-3)) - 1
+            worst = max(worst, (100 * off, colour))
+        percent, colour = worst
+        text = f"The colours of {pair.camera.name} are off: {colour} differs by {percent:.0f} % from that of the data."
+        return percent, text
+
+
+class Bgr(PictureCause):
+    """Red and blue are exchanged."""
+
+    name, title = "bgr", "red is red, and blue is blue"
+    explains = UNSEEN | {"white_balance", "picture_covered"}
+    threshold, certain = 1.25, 2.0
+    remedy = (
+        "Exchange red and blue: the camera delivers BGR as RGB. Set its `encoding`, or that of the contract's image, "
+        "as it "
+        "was in the recordings."
+    )
+
+    @override
+    def measure(self, pair: Pair) -> tuple[float, str] | None:
+        ratio = pair.distance() / max(pair.distance(lambda small: small[..., ::-1]), 1e-3)
+        text = (
+            f"Red and blue of {pair.camera.name} are exchanged: with them back, the pictures are {ratio:.1f} times as "
+            "close "
+            "to those of the data."
+        )
+        return ratio, text
+
+
+_FLIPS: dict[str, Callable[[Any], Any]] = {
+    "upside down": lambda small: small[:, ::-1, ::-1],
+    "mirrored": lambda small: small[:, :, ::-1],
+    "mirrored upside down": lambda small: small[:, ::-1],
+}
+
+
+class PictureFlipped(PictureCause):
+    """The picture is upside down, or mirrored."""
+
+    name, title = "picture_flipped", "pictures are the right way up"
+    explains = UNSEEN | {"camera_moved", "joint_zero", "gripper_reversed", "picture_covered"}
+    threshold, certain = 1.3, 2.0
+    remedy = "Turn the camera, or its picture in the camera's options, as it was in the recordings."
+
+    @override
+    def measure(self, pair: Pair) -> tuple[float, str] | None:
+        own = pair.distance()
+        how, distance = min(((how, pair.distance(flip)) for how, flip in _FLIPS.items()), key=lambda each: each[1])
+        ratio = own / max(distance, 1e-3)
+        text = (
+            f"The picture of {pair.camera.name} is {how}: turned back, it is {ratio:.1f} times as close to those of "
+            "the "
+            "data."
+        )
+        return ratio, text
+
+
+class UnseenPictures(PictureCause):
+    """The scene does not look as in the data."""
+
+    name, title = "unseen_pictures", "the pictures look like those of the data"
+    explains = frozenset()
+    unit, threshold, certain = "times", 2.0, 4.0
+    remedy = (
+        "Make the scene look as in the recordings (background, objects, people in view), or record episodes of this "
+        "one."
+    )
+
+    @override
+    def measure(self, pair: Pair) -> tuple[float, str] | None:
+        ratio = pair.distance() / max(pair.card.usual_distance, 0.05)
+        text = (
+            f"The pictures of {pair.camera.name} look like none of the data: {ratio:.1f} times as far from the nearest "
+            "as "
+            "those are from each other."
+        )
+        return ratio, text
+
+
+CAUSES: tuple[type[Cause], ...] = (
+    CamerasExchanged, CameraMoved, PictureDark, PictureBright, PictureBlurred, PictureCovered, PictureFrozen,
+    WhiteBalance, Bgr, PictureFlipped, UnseenPictures,
+)  # fmt: skip

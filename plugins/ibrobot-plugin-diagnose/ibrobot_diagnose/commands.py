@@ -1,0 +1,94 @@
+"""`ibrobot explain`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import attrs
+
+from ibrobot_core.api import RecorderError
+from ibrobot_core.app import Emit, Job, Unsuccessful, echo, installed_plugins, wrong_input
+from ibrobot_diagnose.options import ExplainOptions, Progress, Report
+from ibrobot_diagnose.references import card_of, find_episodes, read_episode
+
+if TYPE_CHECKING:
+    from ibrobot_diagnose.card import Card
+
+
+@attrs.frozen(kw_only=True)
+class Explain(ExplainOptions):
+    """Say why a recorded run of a policy failed.
+
+    The first line of each explanation is the most probable cause, with its number. Its evidence and what to do about
+    it follow, then the other causes in their order, what happened between the model's answers and the arm, and what
+    was tested and found healthy.
+    """
+
+    @wrong_input()
+    def __call__(self, emit: Emit) -> list[dict[str, Any]] | None:
+        episodes = find_episodes(self.episodes)
+        card = card_of(self.data) if self.data is not None else None
+        results: dict[Path, dict[str, Any]] = {}
+        failed = []
+        for number, (episode, result, error) in enumerate(_explained(self, episodes, card), 1):
+            if error:
+                failed.append(error)
+                echo(error, err=True)
+            else:
+                results[episode] = result
+            if emit is not None:
+                first = str(result.get("first", ""))
+                emit(Progress(done=number, of=len(episodes), episode=str(episode), first=first, error=error))
+        listed = [results[each] for each in episodes if each in results]
+        if failed:
+            raise Unsuccessful(None if emit is not None else listed)
+        if emit is not None:
+            emit(Report(lines=tuple(f"{each['episode']}: {each['first']}" for each in listed)))
+            return None
+        return listed
+
+    def show(self, listed: list[dict[str, Any]]) -> None:
+        """Print the explanations."""
+        for number, each in enumerate(listed):
+            if len(listed) > 1:
+                echo(f"{'' if not number else chr(10)}{each['episode']} ({each['outcome']})")
+            for line in each["lines"]:
+                echo(line)
+
+
+def _explained(
+    options: ExplainOptions, episodes: Sequence[Path], card: Card | None
+) -> Iterator[tuple[Path, dict[str, Any], str]]:
+    """Each episode with its explanation, or why there is none."""
+    if len(episodes) == 1 and not options.on:
+        try:
+            yield episodes[0], explain_episode((episodes[0], options, card)), ""
+        except RecorderError as error:
+            yield episodes[0], {}, str(error)
+        return
+    work = [Job(explain_episode, (episode, options, card)) for episode in episodes]
+    with closing(installed_plugins().pool(options.on, options.jobs)) as pool, closing(pool.run(work)) as finished:
+        for done in finished:
+            episode = done.job.argument[0]
+            yield episode, {} if done.error else done.result(), str(done.error or "")
+
+
+def explain_episode(
+    order: tuple[Path, ExplainOptions, Card | None], progress: Callable[[int], None] = lambda more: None
+) -> dict[str, Any]:
+    """Explain an episode; its facts and lines.
+
+    Raises:
+        RecorderError: if it cannot be read.
+    """
+    from ibrobot_diagnose.cause import Reference, diagnose
+    from ibrobot_diagnose.report import Explanation
+
+    episode, options, card = order
+    window = read_episode(episode)
+    reference = Reference(card)
+    explanation = Explanation.of(window, reference, diagnose(window, reference, tested=lambda name: progress(1)))
+    return {**explanation.facts(ticks=options.ticks), "lines": explanation.lines()}

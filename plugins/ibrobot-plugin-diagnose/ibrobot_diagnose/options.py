@@ -1,0 +1,65 @@
+"""Options of `ibrobot explain`, and the events that it prints. Its command line and forms derive from these."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import override
+
+import attrs
+from ibrobot_provenance.work_options import on_option
+
+from ibrobot_core.api import option
+from ibrobot_core.app import Event, Shown
+
+
+def _some(instance: object, attribute: object, paths: tuple[Path, ...]) -> None:
+    if not paths:
+        raise ValueError("choose at least one")
+
+
+@attrs.frozen(kw_only=True)
+class ExplainOptions:
+    """Which runs are explained, and what they are compared with."""
+
+    episodes: tuple[Path, ...] = option(
+        typed="EPISODES", names="episodes", validator=_some, help="recorded runs of a policy, or folders of them"
+    )
+    data: Path | None = option(
+        None, names="dataset", label="Data",
+        help="the data that the model was trained on: a dataset, its episodes, or a folder or file with their card",
+    )  # fmt: skip
+    ticks: bool = option(False, label=None, help="with --json, add what happened at each tick")
+    jobs: int | None = option(
+        None, ge=1, label="Episodes at once", more=True, help="episodes in parallel; by default one for each CPU core"
+    )
+    on: str = on_option()
+
+
+@attrs.frozen(kw_only=True)
+class Progress(Event):
+    """An episode is explained."""
+
+    done: int = option(help="finished episodes")
+    of: int = option(help="number of episodes")
+    episode: str = option(help="the episode")
+    first: str = option(help="the most probable cause in a sentence, or that there is none")
+    error: str = option("", help="why it could not be explained; empty if it was")
+
+    @override
+    def shown(self) -> Shown:
+        problem = f"{self.episode}: {self.error}" if self.error else ""
+        return Shown(f"{self.done} of {self.of}; {self.episode}: {self.first}", self.done / max(1, self.of), problem)
+
+
+@attrs.frozen(kw_only=True)
+class Report(Event):
+    """The result."""
+
+    lines: tuple[str, ...] = option(help="the most probable cause of each episode")
+
+    @override
+    def shown(self) -> Shown:
+        return Shown("; ".join(self.lines), 1.0)
+
+
+EVENTS = (Progress, Report)

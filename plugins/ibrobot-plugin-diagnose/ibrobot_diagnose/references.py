@@ -1,0 +1,168 @@
+"""Episodes, datasets and cards by their paths."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import attrs
+
+from ibrobot_core.api import DatasetError, Image, JointState, RecorderError
+from ibrobot_core.app import find_episode, installed_plugins
+
+if TYPE_CHECKING:
+    from ibrobot_diagnose.card import Card
+    from ibrobot_diagnose.window import Window
+
+_INFO = Path("meta") / "info.json"
+_NO_ANGLE = 10.0
+"""Positions beyond it are no radians."""
+
+
+def find_episodes(paths: Sequence[Path]) -> list[Path]:
+    """Episodes of all paths: recordings, folders of them, and LeRobot datasets.
+
+    Raises:
+        DatasetError: for a LeRobot dataset whose description cannot be read.
+    """
+    listed: list[Path] = []
+    for path in paths:
+        episode = find_episode(path)
+        if (info := dataset_info(episode)) is not None:
+            listed += [episode.with_name(f"{episode.name}:{number}") for number in range(info["total_episodes"])]
+            continue
+        below = sorted(episode.glob("episodes/episode_*")) or sorted(episode.glob("*/episodes/episode_*"))
+        if not below and episode.name == "episodes":
+            below = sorted(episode.glob("episode_*"))
+        listed += below or [episode]
+    return list(dict.fromkeys(listed))
+
+
+def dataset_info(path: Path) -> dict[str, Any] | None:
+    """The description of a LeRobot dataset; None for anything else.
+
+    Raises:
+        DatasetError: if it cannot be read.
+    """
+    file = path / _INFO
+    if not file.is_file():
+        return None
+    try:
+        info = json.loads(file.read_text(encoding="utf-8"))
+        info["total_episodes"], info["fps"] = int(info["total_episodes"]), float(info["fps"])
+        if not isinstance(info["features"], dict) or not 0 <= info["total_episodes"] <= 10_000_000:
+            raise ValueError("features or total_episodes are implausible")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{file}: cannot be read: {error!r}") from None
+    return dict(info)
+
+
+def read_episode(path: Path) -> Window:
+    """Read an episode by its address.
+
+    Raises:
+        RecorderError: if it cannot be read.
+    """
+    from ibrobot_diagnose.window import read_window
+
+    dataset = path.with_name(path.name.rpartition(":")[0]) if ":" in path.name else path
+    info = dataset_info(dataset) if dataset != path and not path.exists() else None
+    given = None if info is None or _is_own(dataset) else _given(dataset, info)
+    with closing(installed_plugins().open_episode(path, given)) as reader:
+        window = read_window(reader, str(path))
+    if not len(window.ticks_ns):
+        raise RecorderError(f"{path}: has no messages")
+    return window if given is None else _in_radians(window)
+
+
+def _is_own(dataset: Path) -> bool:
+    """Whether `ibrobot convert` has made a dataset, so that it describes itself."""
+    try:
+        return "ibrobot" in json.dumps(json.loads((dataset / _INFO).read_text(encoding="utf-8"))) or any(
+            dataset.glob("meta/ibrobot*")
+        )
+    except (OSError, ValueError):
+        return False
+
+
+def _given(dataset: Path, info: Mapping[str, Any]) -> dict[str, str]:
+    """What a dataset of another program does not say: a contract of its own features, in whatever unit they are."""
+    features = info["features"]
+    joints = _names(features.get("action"))
+    state = _names(features.get("observation.state"))
+    if not joints or not state:
+        raise RecorderError(
+            f"{dataset}: has no features action and observation.state with names, so joints are unknown"
+        )
+    align = {"strategy": "hold", "stamp": "header", "tol_ms": None}
+    observations: dict[str, Any] = {
+        "observation.state": [{
+            "topic": "/joint_states", "type": JointState.ros_type, "select": [f"position.{each}" for each in state],
+            "encoding": None, "shape": [len(state)], "align": align,
+        }]
+    }  # fmt: skip
+    for key, feature in features.items():
+        if feature.get("dtype") in ("video", "image"):
+            shape = _shape(feature)
+            observations[key] = [{
+                "topic": f"/{key}", "type": Image.ros_type, "select": [], "encoding": "rgb8", "shape": shape,
+                "align": {"strategy": "asof", "stamp": "header", "tol_ms": 200.0},
+            }]  # fmt: skip
+    action = [{"topic": "/commands", "type": "std_msgs/msg/Float64MultiArray", "joints": joints}]
+    contract = {"version": 1, "units": "SI", "rate_hz": info["fps"], "observations": observations, "action": action}
+    return {"contract": json.dumps(contract), "norm_mode": "radians"}
+
+
+def _names(feature: Any) -> list[str]:
+    names = feature.get("names") if isinstance(feature, dict) else None
+    if isinstance(names, dict):
+        names = next(iter(names.values()), None)
+    return [str(each).removesuffix(".pos") for each in names] if isinstance(names, list) else []
+
+
+def _shape(feature: Mapping[str, Any]) -> list[int]:
+    shape, names = [int(each) for each in feature["shape"]], feature.get("names")
+    if (isinstance(names, list) and names[:1] == ["channels"]) or (shape[0] == 3 and shape[-1] != 3):
+        shape = [*shape[1:], shape[0]]
+    return shape
+
+
+def _in_radians(window: Window) -> Window:
+    """The window with joints in radians, as far as this can be guessed: what is too large for radians is degrees."""
+    import numpy as np
+
+    largest = max(float(np.nanmax(np.abs(track.values), initial=0.0)) for track in (window.state, window.command))
+    if largest <= _NO_ANGLE:
+        return window
+    scaled = [attrs.evolve(track, values=track.values * np.pi / 180) for track in (window.state, window.command)]
+    return attrs.evolve(window, state=scaled[0], command=scaled[1])
+
+
+def windows_of(path: Path) -> Iterator[Window]:
+    """The episodes of a dataset.
+
+    Raises:
+        RecorderError: if one cannot be read.
+    """
+    for episode in find_episodes([path]):
+        yield read_episode(episode)
+
+
+def card_of(path: Path) -> Card:
+    """The card of data: stored in a file or folder, or made of the episodes in it.
+
+    Raises:
+        DatasetError: if there is neither a card nor an episode, or the card cannot be read.
+        RecorderError: if an episode cannot be read.
+    """
+    from ibrobot_diagnose.card import Card, make_card, with_card
+
+    if path.is_file():
+        return Card.read(path)
+    folders = (path, path / "pretrained_model", path / "checkpoints" / "last" / "pretrained_model", path / "meta")
+    if (stored := with_card(folders)) is not None:
+        return Card.read(stored)
+    return make_card(windows_of(path))

@@ -1,0 +1,147 @@
+"""A diagnosis in words, and as JSON."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import attrs
+import numpy as np
+
+from ibrobot_diagnose.cause import Diagnosis, Finding, Reference
+from ibrobot_diagnose.course import Course, course_of
+from ibrobot_diagnose.window import Window
+
+
+@attrs.frozen(eq=False)
+class Explanation:
+    """A window with its diagnosis."""
+
+    window: Window
+    reference: Reference
+    diagnosis: Diagnosis
+    course: Course | None
+
+    @classmethod
+    def of(cls, window: Window, reference: Reference, diagnosis: Diagnosis) -> Explanation:
+        """An explanation."""
+        return cls(window, reference, diagnosis, course_of(window))
+
+    @property
+    def first(self) -> str:
+        """The first line: the most probable cause, or that there is none, and why that is to be believed."""
+        diagnosis = self.diagnosis
+        if diagnosis.findings:
+            return diagnosis.findings[0].evidence.text
+        tested, outcome = len(diagnosis.healthy), self.window.outcome
+        lacking = sum("--data" in why for _, why in diagnosis.untested)
+        if outcome == "success":
+            return f"Nothing is wrong: the run is a success, and none of the {tested} causes tested was found."
+        if lacking:
+            return (
+                f"None of the {tested} causes that could be tested was found; {lacking} more can be with "
+                "--data DATASET, the data that the model was trained on."
+            )
+        return (
+            f"Nothing is wrong with the set-up; more or better data is what helps: none of the {tested} causes tested "
+            "was found, so the model got what it was trained on and the arm did what it said."
+        )
+
+    def facts(self, *, ticks: bool = False) -> dict[str, Any]:
+        """The explanation as a JSON object."""
+        diagnosis, window = self.diagnosis, self.window
+        return {
+            "episode": window.name, "outcome": window.outcome, "seconds": round(window.seconds, 3), "first": self.first,
+            "causes": [_finding(each) for each in diagnosis.findings],
+            "healthy": [{"name": name, "text": title} for name, title in diagnosis.healthy],
+            "untested": [{"name": name, "why": why} for name, why in diagnosis.untested],
+            "between": between(window, self.course),
+            **({"ticks": self.course.table()} if ticks and self.course is not None else {}),
+        }  # fmt: skip
+
+    def lines(self) -> list[str]:
+        """The explanation for a terminal."""
+        diagnosis, lines = self.diagnosis, [self.first]
+        for number, each in enumerate(diagnosis.findings):
+            evidence = each.evidence
+            if number:
+                lines += ["", f"{number + 1}. {evidence.text}"]
+            since = f", from {evidence.since_s:.1f} s on" if evidence.since_s is not None else ""
+            lines += [f"   likelihood {100 * evidence.likelihood:.0f} %{since} ({each.name})"]
+            lines += [f"   {detail}" for detail in evidence.details]
+            lines += [f"   What to do: {each.cause.remedy}"]
+        lines += ["", *between_lines(self.window, self.course)]
+        if diagnosis.healthy:
+            lines += [f"Tested and healthy: {'; '.join(title for _, title in diagnosis.healthy)}."]
+        reasons = Counter(why for _, why in diagnosis.untested)
+        names: dict[str, list[str]] = {}
+        for name, why in diagnosis.untested:
+            names.setdefault(why, []).append(name)
+        lines += [f"Not tested, since {why}: {', '.join(names[why])}." for why in reasons]
+        return lines
+
+
+def _finding(each: Finding) -> dict[str, Any]:
+    evidence = each.evidence
+    return {
+        "name": each.name, "text": evidence.text, "number": _plain(evidence.number), "unit": evidence.unit,
+        "threshold": _plain(evidence.threshold), "likelihood": round(evidence.likelihood, 4),
+        "since_s": None if evidence.since_s is None else round(evidence.since_s, 3), "details": list(evidence.details),
+        "remedy": each.cause.remedy,
+    }  # fmt: skip
+
+
+def _plain(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+def between(window: Window, course: Course | None) -> Mapping[str, Any]:
+    """What happened between the model's answers and the arm, over the run."""
+    used = [each for each in window.asked if each.used]
+    facts: dict[str, Any] = {
+        "requests": len(window.asked), "used": len(used),
+        "failed": sum(bool(each.answer.error) for each in window.asked),
+        "late": sum(each.answer.outcome == "late" for each in window.asked),
+    }  # fmt: skip
+    if used:
+        facts["latency_ms"] = round(float(np.median([each.answer.latency_ms for each in used])), 2)
+        facts["past_actions"] = round(float(np.mean([each.past for each in used])), 2)
+        facts["chunk_actions"] = round(float(np.mean([len(each.chunk) for each in used])), 2)
+        facts["step_ms"] = round(float(np.median([each.answer.step_ns for each in used])) / 1e6, 3)
+    if course is not None:
+        at_limit = (course.at_velocity | course.at_position).any(axis=1)
+        facts |= {
+            "share_held": round(float((course.dry & ~course.operated).mean()), 4),
+            "share_operated": round(float(course.operated.mean()), 4),
+            "share_at_limit": round(float(at_limit.mean()), 4),
+            "mean_difference_rad": {name: round(value, 5) for name, value in course.shares.items()},
+        }
+    gaps = np.diff(window.command.times_ns) / 1e6
+    if len(gaps):
+        facts["command_period_ms"] = round(float(np.median(gaps)), 3)
+        facts["longest_pause_ms"] = round(float(gaps.max()), 2)
+    return facts
+
+
+def between_lines(window: Window, course: Course | None) -> list[str]:
+    """The same in words."""
+    facts = between(window, course)
+    if not facts["used"]:
+        return ["No answer of a model was used in this recording."] if window.asked else []
+    lines = [
+        f"Between answer and arm: {facts['requests']} requests, {facts['used']} used, {facts['late']} late, "
+        f"{facts['failed']} failed; {facts['latency_ms']:.0f} ms for an answer, {facts['past_actions']:.1f} of "
+        f"{facts['chunk_actions']:.0f} actions past when it came."
+    ]
+    if course is not None:
+        shares = facts["mean_difference_rad"]
+        total = sum(shares.values()) or 1.0
+        parts = ", ".join(f"{name} {value:.4f} rad ({100 * value / total:.0f} %)" for name, value in shares.items())
+        lines.append(
+            f"Mean difference from the newest answer to the arm: {parts}. Held without a plan "
+            f"{100 * facts['share_held']:.1f} % of the time, operated {100 * facts['share_operated']:.1f} %, at a "
+            "limit "
+            f"{100 * facts['share_at_limit']:.1f} %."
+        )
+    return lines
