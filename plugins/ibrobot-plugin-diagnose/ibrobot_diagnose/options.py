@@ -42,7 +42,7 @@ class Progress(Event):
     done: int = option(help="finished episodes")
     of: int = option(help="number of episodes")
     episode: str = option(help="the episode")
-    first: str = option(help="the most probable cause in a sentence, or that there is none")
+    first: str = option(help="the most probable cause in a sentence, or that none was found")
     error: str = option("", help="why it could not be explained; empty if it was")
 
     @override

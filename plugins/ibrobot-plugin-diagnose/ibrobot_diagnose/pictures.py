@@ -134,10 +134,10 @@ class Shift:
 
 
 def shift_of(reference: Grey, picture: Grey, weight: Grey | None = None) -> Shift | None:
-    """How far a picture has moved against a reference of the same size; None if it cannot be told.
+    """How far a picture has moved against a reference of the same size; None if it is uncertain.
 
     A similarity (shift, turn and scale) is fitted to the gradients, from coarse to fine. Gradients do not depend on
-    brightness. It cannot be told if the reference has too little texture, or nothing fits.
+    brightness. It is uncertain if the reference has too little texture, or nothing fits.
 
     Args:
         reference: grey values, shape (H, W).

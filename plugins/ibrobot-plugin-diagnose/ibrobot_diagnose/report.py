@@ -30,7 +30,7 @@ class Explanation:
 
     @property
     def first(self) -> str:
-        """The first line: the most probable cause, or that there is none, and why that is to be believed."""
+        """The first line: the most probable cause, or that none was found, and why."""
         diagnosis = self.diagnosis
         if diagnosis.findings:
             return diagnosis.findings[0].evidence.text

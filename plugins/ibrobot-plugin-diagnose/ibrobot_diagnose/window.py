@@ -156,7 +156,7 @@ class Window:
     cameras: Mapping[str, Camera] = attrs.field(factory=dict)
     """Key of an observation -> its camera."""
     commanders: tuple[tuple[int, str], ...] = ()
-    """Time from which [ns] somebody commands, and who: policy, operator or handover."""
+    """Time from which [ns] the commander changes, and who: policy, operator or handover."""
     metadata: Mapping[str, str] = attrs.field(factory=dict)
     outcome: str = "unknown"
     sampled: bool = False

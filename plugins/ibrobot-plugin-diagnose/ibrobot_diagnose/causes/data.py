@@ -145,9 +145,8 @@ class Statistics(Cause):
         "smoothing_averages",
     })  # fmt: skip
     remedy = (
-        "Use the statistics that lie beside the checkpoint: a model whose inputs and outputs are normalised with those "
-        "of "
-        "another dataset, or not at all, acts like this. Export or download the checkpoint again, whole."
+        "Use the statistics that lie beside the checkpoint: a model that is normalised with the ones of another "
+        "dataset, or not at all, acts like this. Export or download the checkpoint again, whole."
     )
 
     @override

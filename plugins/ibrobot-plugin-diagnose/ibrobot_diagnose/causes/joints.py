@@ -140,7 +140,7 @@ class JointOrder(Cause):
         starts = _known(window)[:1].T - np.median(card.starts, axis=0)[None]
         costs = costs + 0.5 * np.abs(starts) / _span(card)[None]
         order = _assignment(costs)
-        plain, best = float(np.trace(costs)), float(costs[np.arange(size), order].sum())
+        plain, best = float(costs.diagonal().sum()), float(costs[np.arange(size), order].sum())
         ratio = (plain + 0.1) / (best + 0.1 * size**0.5)
         pairs_of = [f"{window.joints[i]} behaves as {card.joints[j]}" for i, j in enumerate(order) if i != j]
         if not pairs_of or len(pairs_of) < 2:

@@ -12,7 +12,7 @@ from ibrobot_diagnose.window import Window
 
 
 class ArmNotFollowing(Cause):
-    """The arm does not go where it is told."""
+    """The arm does not go where its commands say."""
 
     name = "arm_not_following"
     title = "the arm follows its commands"

@@ -1,4 +1,4 @@
-"""Causes in the pictures, in comparison with those of the model's data."""
+"""Causes in the pictures, compared with the pictures of the model's data."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class PictureCause(Cause):
     certain: ClassVar[float]
 
     def measure(self, pair: Pair) -> tuple[float, str] | None:
-        """How strong it is, by `threshold` and `certain`, and a sentence; None if it cannot be told."""
+        """How strong it is, by `threshold` and `certain`, and a sentence; None if it is uncertain."""
         raise NotImplementedError
 
     @override
@@ -169,7 +169,7 @@ class CameraMoved(PictureCause):
 
 
 def shift_between(pair: Pair) -> Shift | None:
-    """How far a camera's background has moved from that of the data; None if it cannot be told."""
+    """How far a camera's background has moved from that of the data; None if it is uncertain."""
     own = background_of(pair.camera)
     if own is None:
         return None
