@@ -10,7 +10,6 @@ from ibrobot_core.descriptors import (
     GuideDescriptor as GuideDescriptor,
     ReportDescriptor as ReportDescriptor,
     ConfigFile as ConfigFile,
-    PoolDescriptor as PoolDescriptor,
     FeatureDescriptor as FeatureDescriptor,
 )
 
@@ -162,7 +161,6 @@ from ibrobot_core.terminal import KeyReader as KeyReader, check_key as check_key
 from ibrobot_core.signals import on_signals as on_signals, end_signals as end_signals
 
 # Jobs
-from ibrobot_core.interfaces.pool import Job as Job, Done as Done, Pool as Pool
 
 # Guides
 from ibrobot_core.interfaces import Guide as Guide, Question as Question

@@ -280,20 +280,6 @@ class SectionDescriptor(Descriptor["Component"]):
 
 
 @attrs.frozen
-class PoolDescriptor(Descriptor["interfaces.Pool"]):
-    """A pool, where jobs run. Its type and its address are those of the option `--on` of commands."""
-
-    make: Callable[[str, int | None], interfaces.Pool] = attrs.field(kw_only=True)  # type: ignore[assignment]
-    """Address and number of jobs at a time -> the pool. The address is what follows `TYPE://`, or empty; the number is
-    None for as many as there is room for. Imports what it needs when it is called.
-
-    Raises:
-        RequestError: e.g. for an address that the pool does not have.
-        ComponentFailed: if its machines cannot be reached.
-    """
-
-
-@attrs.frozen
 class Kind:
     """A kind that a plugin defines. Its types can be named in the robot YAML, as those of core's kinds.
 

@@ -105,11 +105,6 @@ def ibrobot_sections() -> Iterable[descriptors.SectionDescriptor]:  # type: igno
 
 
 @hookspec
-def ibrobot_pools() -> Iterable[descriptors.PoolDescriptor]:  # type: ignore[empty-body]
-    """Pools, where jobs run."""
-
-
-@hookspec
 def ibrobot_panels() -> Iterable[descriptors.PanelDescriptor]:  # type: ignore[empty-body]
     """Tables about a run that viewers show."""
 

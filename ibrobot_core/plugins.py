@@ -28,7 +28,7 @@ from ibrobot_core.errors import (
 from ibrobot_core.options import did_you_mean
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import EpisodeReader, Pool
+    from ibrobot_core.interfaces import EpisodeReader
     from ibrobot_core.messages import CompressedImage, Image
     from ibrobot_core.schema import RobotConfig
 
@@ -49,7 +49,6 @@ KINDS: Mapping[str, str] = {
     "dataset": "ibrobot_datasets",
     "viewer": "ibrobot_viewers",
     "section": "ibrobot_sections",
-    "pool": "ibrobot_pools",
 }
 """Plugin kind -> its registration hook."""
 _UNTYPED = tuple(
@@ -234,35 +233,6 @@ class Registry:
         packages = " or ".join(name for name, offers in official_plugins().items() if "reader" in offers)
         hint = "" if formats else f"; {how_to_install(packages)}"
         raise RecorderError(f"{path}: not an episode of a known format; installed: {formats or 'none'}{hint}")
-
-    def pool(self, where: str, jobs: int | None = None) -> Pool:
-        """A new pool, which the caller closes.
-
-        Args:
-            where: type, or `TYPE://ADDRESS`; empty for the default.
-            jobs: number of jobs at a time; None for as many as there is room for.
-
-        Raises:
-            IbrobotError: e.g. if its package is not installed, which the error names, or it cannot be reached.
-        """
-        descriptor, address = self._pool_type(where)
-        return descriptor.make(address, jobs)
-
-    def check_pool(self, where: str) -> None:
-        """Check, before long work is planned, that a pool's package is installed.
-
-        Raises:
-            IbrobotError: if it is not.
-        """
-        self._pool_type(where)
-
-    def _pool_type(self, where: str) -> tuple[descriptors.PoolDescriptor, str]:
-        """The descriptor and the address of a pool."""
-        type_, _, address = (where or self.default("pool")).partition("://")
-        descriptor = self.find("pool", type_)
-        assert isinstance(descriptor, descriptors.PoolDescriptor)
-        descriptor.check()
-        return descriptor, address
 
     def decode(self, picture: CompressedImage) -> Image:
         """Decode a compressed image.

@@ -28,12 +28,13 @@ def offers() -> dict[str, dict[str, list[str]]]:
     `default`: kinds with a default type; `RECORDS`: the section that records episodes.
     """
     found: dict[str, dict[str, list[str]]] = {}
+    registry = discover()
+    assert not registry.failures, registry.failures
     for entry in entry_points(group="ibrobot"):
         package = entry.dist.name if entry.dist is not None else ""
         if not (PLUGINS / package).is_dir():
             continue  # core, an example, or a plugin of others
-        registry = discover([entry])
-        assert not registry.failures, registry.failures
+        hooks = registry.managers[entry.name].hook
         kinds: dict[str, list[str]] = {}
         for kind in registry.all_kinds:
             mine = [each for each in registry.entries.values() if (each.kind, each.package) == (kind, package)]
@@ -47,18 +48,19 @@ def offers() -> dict[str, dict[str, list[str]]]:
                 isinstance(each.descriptor, SectionDescriptor) and each.descriptor.records_episodes for each in mine
             ):
                 kinds[RECORDS] = kinds[kind]
-        if registry.readers:
-            kinds["reader"] = sorted(reader.type for reader in registry.readers)
-        if registry.features:
-            kinds["feature"] = sorted(registry.features)
-        if registry.guides:
-            kinds["guide"] = sorted(guide.name for guide in registry.guides)
+        if readers := sorted(each.type for offered in hooks.ibrobot_readers() for each in offered):
+            kinds["reader"] = readers
+        if features := sorted(each.name for offered in hooks.ibrobot_features() for each in offered):
+            kinds["feature"] = features
+        if guides := sorted(each.name for offered in hooks.ibrobot_guides() for each in offered):
+            kinds["guide"] = guides
         own = {name for name, owner in registry.command_packages.items() if owner == package}
         if commands := sorted(name for name in own if " " not in name or name.partition(" ")[0] not in own):
             kinds["command"] = commands
         if jobs := [name for name in commands if registry.commands[name].events]:
             kinds["job"] = jobs
-        found[package] = kinds
+        if kinds:
+            found[package] = kinds
     return dict(sorted(found.items()))
 
 

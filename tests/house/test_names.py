@@ -14,7 +14,7 @@ CORE = OFFICIAL.parent
 ORDINARY = {"gripper", "imu", "joint", "keyboard", "process", "processes", "trajectory", "twist"}
 ORDINARY |= {"drawer", "empty", "handover", "push", "sort", "stack"}
 """Types that are words of the language too: they count where a YAML would name them, as in `type: WORD`."""
-TYPED = {*KINDS, "planner", "scene"} - {"section", "source"}
+TYPED = {*KINDS, "planner", "pool", "scene"} - {"section", "source"}
 
 
 def patterns() -> Iterator[str]:

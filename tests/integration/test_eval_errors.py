@@ -14,9 +14,10 @@ from typing import Any, override
 
 import pytest
 from command_line import run_here
+from ibrobot_provenance.jobs import Done, Job, Pool
 from ibrobot_testing.site import Site, made_up_site
 
-from ibrobot_core.app import Done, Job, Pool, Registry, installed_plugins
+from ibrobot_core.app import installed_plugins
 
 pytestmark = pytest.mark.integration
 
@@ -76,7 +77,7 @@ class Here(Pool):
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(Registry, "pool", lambda *_: Here())
+    monkeypatch.setattr("ibrobot_eval.evaluation.open_pool", lambda *_: Here())
     log, requests = logging.getLogger("ibrobot"), logging.getLogger("ibrobot.inference")
     level, filters = log.level, [*requests.filters]
     yield
@@ -234,7 +235,7 @@ def test_code_that_changes_during_an_evaluation_ends_it(
                 code[package] = "1.1"
                 yield done
 
-    monkeypatch.setattr(Registry, "pool", lambda *_: Changing())
+    monkeypatch.setattr("ibrobot_eval.evaluation.open_pool", lambda *_: Changing())
     ended, _, text = evaluate("good", episodes=2)
     assert ended not in (0, 2)
     assert f"the installed code changed during the evaluation: {package} 1.1, not 1.0" in text

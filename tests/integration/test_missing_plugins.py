@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
 
 import pytest
+from ibrobot_provenance.jobs import check_pool
 
 from ibrobot_core import plugins
 from ibrobot_core.cli.main import main
@@ -187,4 +188,4 @@ def test_show_needs_every_plugin(only: Only, ibrobot: Run) -> None:
 def test_pool_whose_package_is_not_installed_names_it(only: Only) -> None:
     only("processes")
     with pytest.raises(PluginError, match=r"pool type 'ray' needs .* pip install ibrobot-plugin-ray$"):
-        installed_plugins().check_pool("ray://head:10001")
+        check_pool("ray://head:10001")

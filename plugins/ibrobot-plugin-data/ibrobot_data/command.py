@@ -13,6 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import attrs
+from ibrobot_provenance.jobs import check_pool
 from ibrobot_provenance.work_options import shard_of
 
 from ibrobot_core.api import Contract, DatasetDescriptor, DatasetError, option
@@ -147,7 +148,7 @@ def conversion_request(options: Convert) -> ConversionRequest:
     Raises:
         IbrobotError: for options that do not fit, or what they need is not installed.
     """
-    installed_plugins().check_pool(options.on)
+    check_pool(options.on)
     type_ = options.type_ or installed_plugins().default("dataset")
     writer_options = _options("dataset", type_, options.writer_overrides())
     robot, calibration = _stated(options)

@@ -54,7 +54,7 @@ class ConversionRequest:
     jobs: int | None = option(1, ge=1)
     """Episodes converted in parallel, each in its own process; None for as many as the pool has room for."""
     on: str = ""
-    """The pool; see `Registry.pool`."""
+    """The pool; see `open_pool`."""
 
 
 def _pairs(lists: Iterable[Iterable[int]]) -> tuple[tuple[int, int], ...]:

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_provenance.jobs import Job as PoolJob
+from ibrobot_provenance.jobs import Pool, open_pool
 from ibrobot_provenance.ownership import Ownership
 
 from ibrobot_core.api import Contract, DatasetError, DatasetSummary, EpisodeAddress, IbrobotError, seconds
-from ibrobot_core.app import DiskFull, Pool, installed_plugins, set_malloc
-from ibrobot_core.app import Job as PoolJob
+from ibrobot_core.app import DiskFull, installed_plugins, set_malloc
 from ibrobot_data.commanders import is_labelled
 from ibrobot_data.episode import (
     INTERVENTION,
@@ -356,7 +357,7 @@ class _Plan:
             return
         total = sum(self._expected[job.source] for job in todo)
         try:
-            with closing(installed_plugins().pool(self.request.on, self.request.jobs)) as pool:
+            with closing(open_pool(self.request.on, self.request.jobs)) as pool:
                 for report in _run_in_pool(todo, pool, lambda done, report: watch(done, total, report)):
                     self._reports[report.source] = report
         except DiskFull as error:

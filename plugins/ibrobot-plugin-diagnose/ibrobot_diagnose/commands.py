@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import attrs
+from ibrobot_provenance.jobs import Job, open_pool
 
 from ibrobot_core.api import RecorderError
-from ibrobot_core.app import Emit, Job, Unsuccessful, echo, installed_plugins, wrong_input
+from ibrobot_core.app import Emit, Unsuccessful, echo, wrong_input
 from ibrobot_diagnose.options import ExplainOptions, Progress, Report
 from ibrobot_diagnose.references import card_of, find_episodes, read_episode
 
@@ -70,7 +71,7 @@ def _explained(
             yield episodes[0], {}, str(error)
         return
     work = [Job(explain_episode, (episode, options, card)) for episode in episodes]
-    with closing(installed_plugins().pool(options.on, options.jobs)) as pool, closing(pool.run(work)) as finished:
+    with closing(open_pool(options.on, options.jobs)) as pool, closing(pool.run(work)) as finished:
         for done in finished:
             episode = done.job.argument[0]
             yield episode, {} if done.error else done.result(), str(done.error or "")

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import attrs
+from ibrobot_provenance.jobs import check_pool
 
 from ibrobot_core.api import option
 from ibrobot_core.app import (
@@ -19,7 +20,6 @@ from ibrobot_core.app import (
     RequestError,
     Unsuccessful,
     echo,
-    installed_plugins,
     wrong_input,
 )
 from ibrobot_eval.blinded import Blinded, reset_of
@@ -61,7 +61,7 @@ class Evaluate(EvalOptions):
         with wrong_input():
             policies = find_policies(self.config, self.mode, self.model, self.overrides, self.vary, sim=self.sim)
             options = attrs.evolve(self, trials=_checked(self, policies))
-            installed_plugins().check_pool(options.on)
+            check_pool(options.on)
             reset = reset_of(options)
             try:
                 with opened(options, policies) as evaluation:

@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_provenance.jobs import Done, Job, open_pool
 from ibrobot_provenance.ownership import owned
 
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import ComponentFailed, Done, Job, installed_plugins
+from ibrobot_core.app import ComponentFailed, installed_plugins
 from ibrobot_eval.comparison import Decision
 from ibrobot_eval.episodes import SCRATCH, EpisodeJob, Place, Result, code_here, hide_messages, run_episode, write
 from ibrobot_eval.film import can_film, film
@@ -167,7 +168,7 @@ class Evaluation:
         """Run jobs in the pool. Yields an iterator over the finished ones."""
         jobs = (Job(function, order) for order in orders)
         with (
-            closing(installed_plugins().pool(self.options.on, self.options.jobs)) as pool,
+            closing(open_pool(self.options.on, self.options.jobs)) as pool,
             closing(pool.run(jobs)) as finished,
         ):
             yield finished

@@ -14,9 +14,10 @@ from functools import partial
 from pathlib import Path
 
 import attrs
+from ibrobot_provenance.jobs import Job, open_pool
 
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import Emit, Event, Failed, Job, Unsuccessful, echo, installed_plugins, wrong_input
+from ibrobot_core.app import Emit, Event, Failed, Unsuccessful, echo, wrong_input
 from ibrobot_lerobot.trainer import INTERRUPTED, progress, run_training, saving_step
 from ibrobot_lerobot.training import Begin, Phase, Progress, Report, TrainOptions
 from ibrobot_lerobot.training_checkpoints import TrainingCheckpoint
@@ -110,7 +111,7 @@ def train_several(options: TrainOptions, emit: Emit) -> None:
     failed = 0
     limit = options.jobs or (None if options.on else 1)
     try:
-        with closing(installed_plugins().pool(options.on, limit)) as pool, closing(pool.run(jobs)) as finished:
+        with closing(open_pool(options.on, limit)) as pool, closing(pool.run(jobs)) as finished:
             for number, done in enumerate(finished, 1):
                 failed += done.error is not None
                 text = f"{done.job.argument.out}: {done.error or 'trained'} ({number} of {len(jobs)})"

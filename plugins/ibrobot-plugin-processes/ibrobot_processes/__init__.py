@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from ibrobot_provenance.jobs import PoolDescriptor
+
 from ibrobot_core.api import hookimpl
-from ibrobot_core.app import PoolDescriptor, RequestError
+from ibrobot_core.app import RequestError
 
 if TYPE_CHECKING:
-    from ibrobot_core.app import Pool
+    from ibrobot_provenance.jobs import Pool
 
 
 def _make(address: str, jobs: int | None) -> Pool:

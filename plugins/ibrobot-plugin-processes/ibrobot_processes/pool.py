@@ -16,8 +16,9 @@ from multiprocessing.context import ForkServerContext
 from typing import Any, override
 
 import attrs
+from ibrobot_provenance.jobs import Done, Job, Pool
 
-from ibrobot_core.app import ComponentFailed, Done, Job, Pool, end_signals
+from ibrobot_core.app import ComponentFailed, end_signals
 
 TRIES = 3
 """Number of processes that may die with the same job."""

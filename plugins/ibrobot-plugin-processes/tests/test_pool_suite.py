@@ -11,15 +11,16 @@ from typing import Any, ClassVar
 
 import ibrobot_processes.pool
 import pytest
-from ibrobot_testing import PoolSuite
+from ibrobot_provenance.jobs import Done, Job, Pool, open_pool
+from ibrobot_provenance.pool_suite import PoolSuite
 from ibrobot_testing.pool_jobs import Order, wait
 
-from ibrobot_core.app import ComponentFailed, Done, Job, Pool, RequestError, installed_plugins
+from ibrobot_core.app import ComponentFailed, RequestError
 
 
 def process_pool(jobs: int) -> Pool:
     """The default pool."""
-    return installed_plugins().pool("", jobs)
+    return open_pool("", jobs)
 
 
 class TestProcessPool(PoolSuite):
@@ -143,7 +144,7 @@ def test_wrong_processes_fail(kind: Any, tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_processes_have_no_address() -> None:
     with pytest.raises(RequestError, match="processes://here: processes run on this machine"):
-        installed_plugins().pool("processes://here")
+        open_pool("processes://here")
 
 
 def test_pool_uses_every_core_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,6 +155,6 @@ def test_pool_uses_every_core_by_default(tmp_path: Path, monkeypatch: pytest.Mon
         if len(list(tmp_path.glob("began_*"))) == 3:
             (tmp_path / "go").touch()
 
-    with closing(installed_plugins().pool("")) as pool:
+    with closing(open_pool("")) as pool:
         done = list(pool.run([Job(wait, Order(number, str(tmp_path))) for number in range(3)], watch))
     assert sorted(each.result() for each in done) == [0, 1, 2]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from ibrobot_provenance.jobs import PoolDescriptor
+
 from ibrobot_core.api import Late, hookimpl
-from ibrobot_core.app import PoolDescriptor
 
 
 @hookimpl

@@ -19,9 +19,10 @@ os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")  # `uv run` would ma
 
 import ray
 from ibrobot_provenance.code import differing_code, installed_code
+from ibrobot_provenance.jobs import Done, Job, Pool
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import ComponentFailed, Done, Job, Pool, installed_plugins
+from ibrobot_core.app import ComponentFailed, installed_plugins
 
 RETRIES = 4
 """Maximum number of retries of a job whose process or machine was lost."""

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ibrobot_provenance.jobs import Job, open_pool
+from ibrobot_provenance.pool_suite import PoolSuite
 from ibrobot_ray.pool import RayPool
-from ibrobot_testing import LeakCheck, PoolSuite
+from ibrobot_testing import LeakCheck
 from ibrobot_testing.pool_jobs import Order, square, wait
 from ray.cluster_utils import Cluster
 
-from ibrobot_core.app import ComponentFailed, Job, installed_plugins
+from ibrobot_core.app import ComponentFailed
 
 pytestmark = pytest.mark.long
 NODES = 3
@@ -63,7 +65,7 @@ class TestRayPool(PoolSuite):
 def test_jobs_of_a_removed_node_are_run_again(cluster: Any, tmp_path: Path) -> None:
     """All nodes have a job; the one of a node that is removed begins again on another."""
     orders = [Order(number, str(tmp_path)) for number in range(NODES)]
-    with closing(installed_plugins().pool("ray")) as pool:
+    with closing(open_pool("ray")) as pool:
         running = pool.run([Job(wait, order) for order in orders] + [Job(square, Order(5))], lambda count: step())
 
         def step() -> None:
@@ -79,4 +81,4 @@ def test_jobs_of_a_removed_node_are_run_again(cluster: Any, tmp_path: Path) -> N
 @pytest.mark.filterwarnings("ignore:Ray Client connection timed out")
 def test_cluster_that_cannot_be_reached_is_an_error() -> None:
     with pytest.raises(ComponentFailed, match=r"the Ray cluster 127\.0\.0\.1:1 cannot be used"):
-        installed_plugins().pool("ray://127.0.0.1:1")
+        open_pool("ray://127.0.0.1:1")

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ibrobot_provenance.jobs import Job
 from ibrobot_ray import pool
 from ibrobot_testing.pool_jobs import Order, divide, fail_if_odd, process, square
-
-from ibrobot_core.app import Job
 
 
 class Counts:

@@ -1,1 +1,1 @@
-"""The installed code that results depend on (`code`), and folders of results with one owner at a time (`ownership`)."""
+"""Jobs and pools (`jobs`), the code that results depend on (`code`), and folders with one owner (`ownership`)."""

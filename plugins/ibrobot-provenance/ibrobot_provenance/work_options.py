@@ -9,7 +9,7 @@ from ibrobot_core.api import option
 
 
 def on_option() -> Any:
-    """The option `on` of a command that runs jobs; see `Registry.pool`."""
+    """The option `on` of a command that runs jobs; see `open_pool`."""
     return option(
         "", label=None, unit="type[://address]",
         help="where the work is done: a type of pool, with an address if it needs one; by default on this machine",

@@ -16,7 +16,6 @@ from ibrobot_testing.executor import ExecutorSuite
 from ibrobot_testing.hardware import HardwareSuite, SimulatedHardwareSuite
 from ibrobot_testing.leaks import LeakCheck
 from ibrobot_testing.policy import PolicySuite
-from ibrobot_testing.pool import PoolSuite
 from ibrobot_testing.recorder import RecorderSuite
 from ibrobot_testing.section import SectionSuite, make_session
 from ibrobot_testing.sensor import SensorSuite
@@ -33,7 +32,6 @@ __all__ = [
     "HardwareSuite",
     "LeakCheck",
     "PolicySuite",
-    "PoolSuite",
     "RecorderSuite",
     "SectionSuite",
     "SensorSuite",

@@ -7,9 +7,10 @@ from contextlib import closing
 from pathlib import Path
 
 import attrs
+from ibrobot_provenance.jobs import Job, open_pool
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Job, Unsuccessful, echo, installed_plugins, wrong_input
+from ibrobot_core.app import Unsuccessful, echo, wrong_input
 
 
 @attrs.frozen(kw_only=True)
@@ -65,7 +66,7 @@ def _in_pool(episodes: Sequence[Path], gap: float, on: str, jobs: int | None) ->
     """The result of `check` for each episode, in their order."""
     early: dict[Path, tuple[list[str], str]] = {}
     work = (Job(check, (episode, gap)) for episode in episodes)
-    with closing(installed_plugins().pool(on, jobs)) as pool, closing(pool.run(work)) as finished:
+    with closing(open_pool(on, jobs)) as pool, closing(pool.run(work)) as finished:
         for episode in episodes:
             while episode not in early:
                 done = next(finished)

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-
-from ibrobot_core.app import Job, Pool
 from ibrobot_testing.pool_jobs import Order, die_if_odd, die_once, divide, fail_if_odd, process, square, wait
 from ibrobot_testing.suite import Suite, wait_until
+
+from ibrobot_provenance.jobs import Job, Pool
 
 
 class PoolSuite(Suite[Pool]):

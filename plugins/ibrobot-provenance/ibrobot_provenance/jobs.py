@@ -1,4 +1,4 @@
-"""Pools: where jobs run, in processes of this machine or of others."""
+"""Jobs, and pools: where they run, in processes of this machine or of others."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.bug_reports import error_text
-from ibrobot_core.errors import ComponentFailed, IbrobotError
+from ibrobot_core.api import Descriptor, IbrobotError
+from ibrobot_core.app import ComponentFailed, error_text, installed_plugins
 
 
 @attrs.frozen(eq=False)
@@ -89,3 +89,50 @@ class Pool(ABC):
 
     def close(self) -> None:
         """Leave the machines of the pool; does nothing by default."""
+
+
+@attrs.frozen
+class PoolDescriptor(Descriptor[Pool]):
+    """A pool, where jobs run. Its type and its address are those of the option `--on` of commands."""
+
+    make: Callable[[str, int | None], Pool] = attrs.field(kw_only=True)  # type: ignore[assignment]
+    """Address and number of jobs at a time -> the pool. The address is what follows `TYPE://`, or empty; the number is
+    None for as many as there is room for. Imports what it needs when it is called.
+
+    Raises:
+        RequestError: e.g. for an address that the pool does not have.
+        ComponentFailed: if its machines cannot be reached.
+    """
+
+
+def open_pool(where: str, jobs: int | None = None) -> Pool:
+    """A new pool, which the caller closes.
+
+    Args:
+        where: type, or `TYPE://ADDRESS`; empty for the default.
+        jobs: number of jobs at a time; None for as many as there is room for.
+
+    Raises:
+        IbrobotError: e.g. if its package is not installed, which the error names, or it cannot be reached.
+    """
+    descriptor, address = _pool_type(where)
+    return descriptor.make(address, jobs)
+
+
+def check_pool(where: str) -> None:
+    """Check, before long work is planned, that a pool's package is installed.
+
+    Raises:
+        IbrobotError: if it is not.
+    """
+    _pool_type(where)
+
+
+def _pool_type(where: str) -> tuple[PoolDescriptor, str]:
+    """The descriptor and the address of a pool."""
+    registry = installed_plugins()
+    type_, _, address = (where or registry.default("pool")).partition("://")
+    descriptor = registry.find("pool", type_)
+    assert isinstance(descriptor, PoolDescriptor)
+    descriptor.check()
+    return descriptor, address
