@@ -34,8 +34,20 @@ from ibrobot_ros2.goals import Actions
 from planning import Referee
 from planning_scenes import ARM_JOINTS
 
-from ibrobot_core.api import Header, IbrobotError, JointTrajectory, JointTrajectoryPoint, Pose, Vector, Vector3, ns
+from ibrobot_core.api import (
+    FollowTrajectory,
+    Header,
+    IbrobotError,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    Pose,
+    SlowDown,
+    Vector,
+    Vector3,
+    ns,
+)
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
+from ibrobot_core.control.commands import SendGoal
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101_blind.yaml"
 MODE, ARM = "moveit_planning", "arm_trajectory"
@@ -257,26 +269,17 @@ class Robot:
     def drop(self) -> None:
         """Stop what moves."""
         self.session.bus.call("/planning/cancel")
-        self.session.control.call("goal", executor=ARM, goal_id="drop", goal={"stop": True})
+        self.session.control.call(SendGoal(executor=ARM, goal_id="drop", goal=SlowDown()))
         self.rest()
 
     def bring(self, positions: Vector) -> None:
         """Move a little way back to where a goal began, past all checks."""
         if np.abs(self.command - positions).max() < 1e-9:
             return
-        rest = [0.0] * len(ARM_JOINTS)
-        point = {
-            "time_from_start_ns": ns(_RETURN_S),
-            "positions": positions.tolist(),
-            "velocities": rest,
-            "accelerations": rest,
-        }
-        goal = {
-            "trajectory": {"joint_names": list(ARM_JOINTS), "points": [point]},
-            "path_tolerance": -1,
-            "goal_tolerance": -1,
-        }
-        self.session.control.call("goal", executor=ARM, goal_id="back", goal=goal)
+        rest = np.zeros(len(ARM_JOINTS))
+        point = JointTrajectoryPoint(ns(_RETURN_S), positions, rest, rest)
+        goal = FollowTrajectory(JointTrajectory(Header(), ARM_JOINTS, (point,)), path_tolerance=-1, goal_tolerance=-1)
+        self.session.control.call(SendGoal(executor=ARM, goal_id="back", goal=goal))
         for _ in range(round(_RETURN_S * 100) + 2):
             self.step()
         self.rest()

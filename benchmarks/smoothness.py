@@ -27,6 +27,7 @@ from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, load_config
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.control.commands import GetCounters
 from ibrobot_core.control.host import InlineControl
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient, run_policy
@@ -126,7 +127,7 @@ class Arm:
     def run(self, duration_s: float) -> None:
         """So many seconds."""
         self.control.start()
-        self._generation = int(self.control.call("counters")["generation"])
+        self._generation = int(self.control.call(GetCounters())["generation"])
         self.dispatcher.begin(self._seed)
         period_ns = ns(1 / self.config.control.rate_hz)
         next_ns = begin_ns = self.clock.now_ns()

@@ -95,7 +95,12 @@ from ibrobot_core.interfaces import (
     Plan as Plan,
     GoalState as GoalState,
     GoalStatus as GoalStatus,
-    trajectory_goal as trajectory_goal,
+)
+from ibrobot_core.interfaces.executor import (
+    ExecutorGoal as ExecutorGoal,
+    FollowTrajectory as FollowTrajectory,
+    MoveJoint as MoveJoint,
+    SlowDown as SlowDown,
 )
 
 # Episodes and datasets

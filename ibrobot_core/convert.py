@@ -6,6 +6,7 @@ import math
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -56,10 +57,13 @@ class Faults(ValueError):
         """Add the faults raised in the block as faults of the item `part`."""
         try:
             yield
-        except Faults as inner:
-            self.found += [((part, *key), message) for key, message in inner.found]
         except (ValueError, TypeError) as error:
-            self.found.append(((part,), error_message(error)))
+            self.take(part, error)
+
+    def take(self, part: str | int, error: Exception) -> None:
+        """Add the faults of an error as faults of the item `part`."""
+        inner = error.found if isinstance(error, Faults) else [((), error_message(error))]
+        self.found += [((part, *key), message) for key, message in inner]
 
     def raise_any(self) -> None:
         """Raise this error if it has faults."""
@@ -142,6 +146,26 @@ def no_files(text: str) -> Path:
     raise ValueError(f"{shown(text)}: no file can be named here")
 
 
+@cache
+def _method(kind: Any) -> str:
+    """The method of `Converter` for types other than scalars; long lists have the same type many times."""
+    methods: dict[Any, str] = {
+        is_union: "_union", is_literal: "_literal", is_sequence: "_sequence", is_mapping: "_mapping",
+        is_array: "_array", attrs.has: "_attrs",
+    }  # fmt: skip
+    for fits, name in methods.items():
+        if fits(kind):
+            return name
+    raise TypeError(f"options of type {kind} are not supported")
+
+
+@cache
+def _dtype(kind: Any) -> np.dtype[Any]:
+    scalar_type = get_args(kind)[-1]
+    dtype: np.dtype[Any] = np.dtype(scalar_type if get_origin(kind) is not np.ndarray else get_args(scalar_type)[0])
+    return dtype
+
+
 @attrs.frozen
 class Converter:
     """Converts plain values to the types of annotations."""
@@ -165,17 +189,7 @@ class Converter:
             return _scalar(value, kind)
         if kind is Path:
             return self._path(_scalar(value, str))
-        for fits, structure in (
-            (is_union, self._union),
-            (is_literal, self._literal),
-            (is_sequence, self._sequence),
-            (is_mapping, self._mapping),
-            (is_array, self._array),
-            (attrs.has, self._attrs),
-        ):
-            if fits(kind):
-                return structure(value, kind)
-        raise TypeError(f"options of type {kind} are not supported")
+        return getattr(self, _method(kind))(value, kind)
 
     def arguments(
         self, known: Mapping[str, attrs.Attribute[Any]], value: Mapping[str, Any], faults: Faults
@@ -184,8 +198,10 @@ class Converter:
         arguments: dict[str, Any] = {}
         for name, field in known.items():
             if name in value:
-                with faults.at(name):
+                try:
                     arguments[name] = self._field(field, value[name])
+                except (ValueError, TypeError) as error:
+                    faults.take(name, error)
             elif field.default is attrs.NOTHING:
                 faults.add((name,), "required key is missing")
         return arguments
@@ -243,10 +259,9 @@ class Converter:
         """A list of numbers as an array, shape (N,)."""
         if not isinstance(value, list | tuple):
             raise _wrong("a list of numbers", value)
-        scalar_type = get_args(kind)[-1]
-        dtype = np.dtype(scalar_type if get_origin(kind) is not np.ndarray else get_args(scalar_type)[0])
+        dtype = _dtype(kind)
         scalar = float if dtype.kind == "f" else int
-        if all(type(item) is scalar for item in value):
+        if set(map(type, value)) <= {scalar}:
             numbers = list(value)
         else:
             numbers = self._items((i, item, scalar) for i, item in enumerate(value))
@@ -260,8 +275,10 @@ class Converter:
         """Convert items, given as key, value and kind."""
         faults, values = Faults(), []
         for key, item, kind in items:
-            with faults.at(key):
+            try:
                 values.append(self.structure(item, kind))
+            except (ValueError, TypeError) as error:
+                faults.take(key, error)
             if len(faults.found) >= self.most:
                 break
         faults.raise_any()
@@ -271,6 +288,9 @@ class Converter:
         members = [member for member in get_args(kind) if member is not type(None)]
         if value is None and len(members) < len(get_args(kind)):
             return None
+        if isinstance(value, Mapping) and (classes := [member for member in members if attrs.has(member)]):
+            # The faults of the class that the keys are of.
+            return self.structure(value, max(classes, key=lambda each: len(fields(each).keys() & value.keys())))
         reasons = []
         for member in members:
             try:
@@ -287,7 +307,7 @@ class Converter:
             else reason.removeprefix("expected ").partition(", got")[0]
             for member, reason in zip(members, reasons, strict=True)
         ]
-        raise _wrong(" or ".join(expected), value)
+        raise _wrong(" or ".join(dict.fromkeys(expected)), value)
 
     def _literal(self, value: Any, kind: Any) -> Any:
         choices = get_args(kind)

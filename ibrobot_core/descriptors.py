@@ -204,9 +204,8 @@ class ExecutorDescriptor(Descriptor["interfaces.Executor"]):
 
     streams: bool = False
     goals: Literal["trajectory", "position"] = "trajectory"
-    """The goals of an executor that does not stream: `trajectory`, made by `trajectory_goal`, or `position`,
-    `{"position": q}`, with the position of its first joint [rad]. The result of an aborted trajectory has the key
-    `exceeded` if a tolerance was: `path` or `goal`."""
+    """The goals of an executor that does not stream: `trajectory` (`FollowTrajectory`) or `position` (`MoveJoint`).
+    The result of an aborted trajectory has the key `exceeded` if a tolerance was: `path` or `goal`."""
 
     def kept(self, options: Any) -> Mapping[str, Any]:
         """The kind of goals that it takes."""

@@ -138,14 +138,19 @@ def not_a_key(default: Any = attrs.NOTHING, *, factory: Any = None, repr: bool =
     return attrs.field(default=default, metadata={"key": False}, repr=repr, eq=eq)
 
 
+_FIELDS: dict[type[Any], Mapping[str, attrs.Attribute[Any]]] = {}
+
+
 def fields(kind: type[Any]) -> Mapping[str, attrs.Attribute[Any]]:
     """The keys of an options class, with resolved types."""
-    attrs.resolve_types(kind)
-    keys = (field for field in attrs.fields(kind) if field.init and field.metadata.get("key", True))
-    return {
-        str(field.alias): field.evolve(type=field.metadata["plain"]) if field.metadata.get("plain") else field
-        for field in keys
-    }
+    if kind not in _FIELDS:
+        attrs.resolve_types(kind)
+        keys = (field for field in attrs.fields(kind) if field.init and field.metadata.get("key", True))
+        _FIELDS[kind] = {
+            str(field.alias): field.evolve(type=field.metadata["plain"]) if field.metadata.get("plain") else field
+            for field in keys
+        }
+    return _FIELDS[kind]
 
 
 def default_of(field: attrs.Attribute[Any]) -> Any:

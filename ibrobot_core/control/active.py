@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.errors import GoalRejected
 from ibrobot_core.interfaces import Executor, JointReading, Plan
+from ibrobot_core.interfaces.executor import ExecutorGoal
 from ibrobot_core.interfaces.run_state import PlanRecord
 from ibrobot_core.robot import Robot, Vector
 
@@ -92,7 +93,7 @@ class ActiveExecutors:
             self._report_goals(owned)
         return setpoints
 
-    def set_goal(self, executor: str, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
+    def set_goal(self, executor: str, goal_id: str, goal: ExecutorGoal, measured: JointReading) -> None:
         """Pass a goal to an executor.
 
         Raises:

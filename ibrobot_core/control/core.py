@@ -12,8 +12,8 @@ import numpy as np
 
 from ibrobot_core.clock import Clock
 from ibrobot_core.config import RobotConfig
+from ibrobot_core.control import commands
 from ibrobot_core.control.active import ActiveExecutors
-from ibrobot_core.control.commands import Act, permitted
 from ibrobot_core.control.following import FollowingError
 from ibrobot_core.control.hardware_group import HardwareGroup
 from ibrobot_core.control.health import Health
@@ -24,6 +24,7 @@ from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.control.timing import Pace
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
 from ibrobot_core.interfaces import EpisodeSetup, Executor, JointReading, Signal, Torque
+from ibrobot_core.interfaces.executor import ExecutorGoal
 from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S, ns
@@ -82,18 +83,19 @@ class ControlCore:
         """The fault, if a joint's condition caused it; otherwise empty."""
         self._tick = 0
         self._due_ns = clock.now_ns()
-        self._commands: dict[str, Act] = {
-            "switch_mode": self._switch_mode,
-            "reset_episode": self._reset_episode,
-            "estop": self.emergency_stop,
-            "fault": self._raise_fault,
-            "reset": self._reset,
-            "goal": self._goal,
-            "cancel": self._cancel,
-            "counters": self.counters,
-            "halt": self._halt,
-            "begin_startup": self.begin_startup,
+        self._acts: Mapping[type[commands.Command], Callable[..., Mapping[str, Any] | None]] = {
+            commands.SwitchMode: self._switch_mode,
+            commands.ResetEpisode: self._reset_episode,
+            commands.EmergencyStop: self.emergency_stop,
+            commands.RaiseFault: self._raise_fault,
+            commands.ClearFaults: self._reset,
+            commands.SendGoal: self._goal,
+            commands.CancelGoals: self._cancel,
+            commands.GetCounters: self.counters,
+            commands.Halt: self._halt,
+            commands.BeginStartup: self.begin_startup,
         }
+        """What executes a command, with its fields as arguments."""
         self.take_stops: Callable[[], None] = lambda: None
         self.stops = 0
         self.phase = Phase.RUNNING
@@ -226,19 +228,16 @@ class ControlCore:
         if silent_s + braking_s >= longest_s:
             self._raise_fault(f"{fault} for {silent_s * 1e3:.0f} ms")
 
-    def handle(self, command: Mapping[str, Any]) -> dict[str, Any]:
-        """Execute a command of the host and return the reply; the reply to a refused command has the key `error`.
-
-        Commands come from another process: one that does not exist, or whose arguments are others, is refused, too.
-        """
-        reply = {"reply": command.get("id")}
-        arguments = {key: value for key, value in command.items() if key not in ("do", "id")}
+    def handle(self, command: commands.Command) -> dict[str, Any]:
+        """Execute a command of the host and return the answer; that to a refused command has the key `error`."""
         try:
-            act = permitted(self._commands, command.get("do"), arguments, self.phase, self.fault)
-            result = act(**arguments) or {}
+            if self.phase not in commands.PERMITTED.get(type(command), (self.phase,)):
+                cause = f": {self.fault}" if self.phase is Phase.FAULTED else ""
+                raise HardwareError(f"refused {self.phase.value}{cause}")
+            result = self._acts[type(command)](**attrs.asdict(command, recurse=False)) or {}
         except IbrobotError as error:
-            return {**reply, "stops": self.stops, "error": str(error)}
-        return {**reply, "stops": self.stops, "generation": self.generation, **result}
+            return {"stops": self.stops, "error": str(error)}
+        return {"stops": self.stops, "generation": self.generation, **result}
 
     def counters(self) -> dict[str, Any]:
         """Counts of all interventions and refusals by the safety layer, the executors, the hardware and the loop."""
@@ -505,12 +504,12 @@ class ControlCore:
         self._advance(Cause.EMERGENCY_STOP)
         self._raise_fault(EMERGENCY_STOP)
 
-    def _halt(self, *, unmoved: bool) -> dict[str, Any]:
+    def _halt(self, *, unmoved: bool, ends: bool) -> dict[str, Any]:
         """Begin the stop behaviour; `halted` says whether it has finished."""
         self.begin_stop(unmoved=unmoved)
         return {"halted": self.stopped}
 
-    def _reset(self, stops: int | None = None) -> dict[str, Any]:
+    def _reset(self, stops: int | None) -> dict[str, Any]:
         """Clear faults and the emergency stop, and enter the mode again at the measured positions.
 
         Args:
@@ -558,14 +557,12 @@ class ControlCore:
         self._advance(Cause.RESET)
         self._enter()
 
-    def _goal(
-        self, executor: str, goal_id: str, goal: Mapping[str, Any], stops: int = -1, generation: int = -1
-    ) -> None:
+    def _goal(self, executor: str, goal_id: str, goal: ExecutorGoal, stops: int | None, generation: int | None) -> None:
         """Pass a goal to an executor; one requested before an emergency stop, or in another generation, is refused."""
-        if generation not in (-1, self.generation) or self.stops > stops >= 0:
+        if generation not in (None, self.generation) or (stops is not None and self.stops > stops):
             raise HardwareError(f"goal {goal_id}: refused, a stop, a reset or another mode came after it was requested")
         self._executors.set_goal(executor, goal_id, goal, self._at_tick)
         self._commanded_ns = self._clock.now_ns()
 
-    def _cancel(self, executor: str = "") -> None:
+    def _cancel(self, executor: str) -> None:
         self._executors.cancel(self._at_tick, executor)

@@ -17,6 +17,7 @@ from ibrobot_core.child import Child, is_stopped
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.component import raise_thread_priority
 from ibrobot_core.config import RobotConfig
+from ibrobot_core.control import commands
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.link import LinkLayout, SharedMemory, raise_error
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
@@ -36,9 +37,9 @@ _REPLY_TIMEOUT_S = 5.0
 _STOP_TIMEOUT_S = 15.0
 """Time after which a control process that has not ended is killed; moving to a stop pose takes up to 10 s."""
 _GONE = "the control process is gone"
-_STOPS = ("estop", "fault")
+_STOPS = (commands.EmergencyStop, commands.RaiseFault)
 """Commands sent to a control process that does not run at present, since they still matter once it runs again."""
-_SLOW = ("reset", "reset_episode", "switch_mode")
+_SLOW = (commands.ClearFaults, commands.ResetEpisode, commands.SwitchMode)
 """Commands during which control may be silent, e.g. while hardware is set up again."""
 
 _LOG = logging.getLogger("ibrobot")
@@ -83,7 +84,7 @@ class ControlHost(ABC):
         """
 
     @abstractmethod
-    def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
+    def call(self, command: commands.Command) -> Mapping[str, Any]:
         """Execute a command and return its answer, with the `generation` valid from now on.
 
         Raises:
@@ -172,8 +173,8 @@ class InlineControl(ControlHost):
             self._on_event(self._core.events.popleft())
 
     @override
-    def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
-        reply = self._core.handle({"do": do, "id": 0, **arguments})
+    def call(self, command: commands.Command) -> Mapping[str, Any]:
+        reply = self._core.handle(command)
         self.stops = reply["stops"]
         return raise_error(reply)
 
@@ -307,16 +308,16 @@ class ControlClient(ControlHost):
                 self._take(message)
 
     @override
-    def call(self, do: str, **arguments: Any) -> Mapping[str, Any]:
-        if self._child is None or (self._silence and do not in _STOPS):
+    def call(self, command: commands.Command) -> Mapping[str, Any]:
+        if self._child is None or (self._silence and not isinstance(command, _STOPS)):
             raise ComponentFailed(self._silence or _GONE)
         channel = self._child.channel
         number = next(self._ids)
         answer: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
         self._replies[number] = answer
-        self._slow |= {number} if do in _SLOW else set()
+        self._slow |= {number} if isinstance(command, _SLOW) else set()
         try:
-            channel.send({"do": do, "id": number, **arguments})
+            channel.send(commands.encode(command, number))
             if channel.closed or self._silence:
                 raise ComponentFailed(self._silence or _GONE)
             reply = answer.get(timeout=_REPLY_TIMEOUT_S)
@@ -324,7 +325,8 @@ class ControlClient(ControlHost):
                 raise ComponentFailed(reply["gone"])
             return raise_error(reply)
         except queue.Empty:
-            raise ComponentFailed(f"control did not answer {do!r} within {_REPLY_TIMEOUT_S:.0f} s") from None
+            name = type(command).__name__
+            raise ComponentFailed(f"control did not answer {name} within {_REPLY_TIMEOUT_S:.0f} s") from None
         finally:
             del self._replies[number]
             self._slow.discard(number)
@@ -332,11 +334,11 @@ class ControlClient(ControlHost):
     def raise_fault(self, fault: str) -> None:
         """Have control brake and hold because of a fault, without waiting for its answer."""
         if self._child is not None:
-            self._child.channel.send({"do": "fault", "id": 0, "fault": fault})
+            self._child.channel.send(commands.encode(commands.RaiseFault(fault), 0))
 
     @override
     def arrive(self) -> None:
-        self.call("begin_startup")
+        self.call(commands.BeginStartup())
         while not self._arrived.wait(_GLANCE_S):
             if self._given_up.is_set():
                 raise ComponentFailed("given up while the robot moved to its startup pose")
@@ -344,7 +346,7 @@ class ControlClient(ControlHost):
     @override
     def halt(self, *, unmoved: bool = False) -> None:
         deadline_s = time.monotonic() + _STOP_TIMEOUT_S
-        while self.running and not self.call("halt", unmoved=unmoved)["halted"]:
+        while self.running and not self.call(commands.Halt(unmoved))["halted"]:
             if time.monotonic() >= deadline_s:
                 return
             time.sleep(_HALT_GLANCE_S)
@@ -359,7 +361,7 @@ class ControlClient(ControlHost):
         if self._child is None:
             return
         self._stopping = True
-        self._child.channel.send({"do": "stop", "id": 0, "unmoved": unmoved})
+        self._child.channel.send(commands.encode(commands.Halt(unmoved, ends=True), 0))
         self._child.resume()
         self._end(self._child)
 

@@ -1,4 +1,4 @@
-"""The phases of the control loop, what leads from one to another, and which commands each accepts."""
+"""The phases of the control loop, and what leads from one to another."""
 
 from __future__ import annotations
 
@@ -49,17 +49,3 @@ TRANSITIONS: Mapping[Phase, Mapping[Cause, Phase]] = {
     Phase.STOPPING: {},
 }  # fmt: skip
 """The phase after each cause; a cause that is missing leaves the phase as it is."""
-
-_ALWAYS = frozenset({"estop", "fault", "cancel", "counters", "halt", "begin_startup"})
-"""Commands that stop the robot or change nothing, and one that only `ARRIVING` heeds."""
-_RESETS = frozenset({"reset", "reset_episode"})
-PERMITTED: Mapping[Phase, frozenset[str]] = {
-    Phase.ARRIVING: _ALWAYS,
-    Phase.FAILED: _ALWAYS,
-    Phase.RUNNING: _ALWAYS | _RESETS | {"switch_mode", "goal"},
-    Phase.FAULTED: _ALWAYS | _RESETS,
-    Phase.SHEDDING: _ALWAYS | _RESETS,
-    Phase.SHED: _ALWAYS | _RESETS,
-    Phase.STOPPING: _ALWAYS,
-}
-"""The commands of the host that each phase accepts."""

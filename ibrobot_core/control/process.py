@@ -21,11 +21,13 @@ from ibrobot_core.child import is_stopped, run_child
 from ibrobot_core.clock import RealClock
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
+from ibrobot_core.control.commands import Command, EmergencyStop, Halt, decode
 from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.link import LinkLayout, SharedMemory
 from ibrobot_core.control.phase import Phase
 from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
+from ibrobot_core.errors import HardwareError
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.safe_output import echo
 from ibrobot_core.units import NS_PER_S
@@ -49,8 +51,8 @@ class ControlProcess:
         self._host = host
         self._ready = ready
         self._arrived = False
-        self._waiting: deque[Mapping[str, Any]] = deque()
-        """Commands of the host that were received and not executed yet."""
+        self._waiting: deque[tuple[Any, Command]] = deque()
+        """Commands of the host that were received and not executed yet, with their numbers."""
         self._punctuality = Punctuality()
         self._beats = 0
         self._heard_ns = 0
@@ -106,11 +108,15 @@ class ControlProcess:
 
     def _receive(self) -> None:
         """Receive commands; emergency stops overtake all others."""
-        for command in self._channel.receive():
-            if command.get("do") == "estop":
-                self._channel.send(self._core.handle({"do": "estop", "id": command.get("id")}))
-            else:
-                self._waiting.append(command)
+        for message in self._channel.receive():
+            number = message.get("id")
+            if message.get("do") == EmergencyStop.__name__:  # whatever else it says
+                self._channel.send({"reply": number, **self._core.handle(EmergencyStop())})
+                continue
+            try:
+                self._waiting.append((number, decode(message)))
+            except HardwareError as error:
+                self._channel.send({"reply": number, "error": str(error)})
 
     def _note_silences(self, late: int) -> None:
         """Have the robot brake if the host, or this process, has been stopped or blocked."""
@@ -128,12 +134,9 @@ class ControlProcess:
         begun_ns = self._clock.now_ns()
         self._receive()
         while self._waiting:
-            command = self._waiting.popleft()
-            if command.get("do") == "stop":
-                self._ends = True
-                self._core.begin_stop(unmoved=command.get("unmoved") is True)
-            else:
-                self._channel.send(self._core.handle(command))
+            number, command = self._waiting.popleft()
+            self._channel.send({"reply": number, **self._core.handle(command)})
+            self._ends = self._ends or (isinstance(command, Halt) and command.ends)
         return self._clock.now_ns() - begun_ns > self._core.period_ns
 
     def _report_to_host(self) -> None:

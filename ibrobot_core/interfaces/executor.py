@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import attrs
 
@@ -42,6 +42,43 @@ class GoalStatus:
     state: GoalState
     message: str = ""
     result: Mapping[str, Any] = attrs.field(factory=dict)
+
+
+@attrs.frozen
+class FollowTrajectory:
+    """A goal for executors with `goals="trajectory"` in their descriptor; the stamp of the trajectory is ignored."""
+
+    trajectory: JointTrajectory
+    """Without efforts: positions do not follow them."""
+    path_tolerance: float | Mapping[str, float] = 0.0
+    """[rad], of all joints or by joint; 0: as the executor's options say, -1: none."""
+    goal_tolerance: float | Mapping[str, float] = 0.0
+    """As `path_tolerance`, at the end."""
+    goal_time: float = 0.0
+    """Longest time to reach the end after its time [s]; 0: as the executor's options say, -1: any."""
+    takes_over: str | None = None
+    """Name of the running goal that it takes over from; it then begins at `at_ns`, and else when it is accepted."""
+    at_ns: int = 0
+    """Time along the running trajectory [ns]."""
+
+
+@attrs.frozen
+class MoveJoint:
+    """A goal for executors with `goals="position"` in their descriptor: the position of their joint [rad]."""
+
+    position: float
+    max_effort: float = 0.0
+    """[Nm]; 0: no limit."""
+
+
+@attrs.frozen
+class SlowDown:
+    """Slow down along the present goal, and hold; a goal for executors with any goals."""
+
+    stop: Literal[True] = True
+
+
+ExecutorGoal = FollowTrajectory | MoveJoint | SlowDown
 
 
 class Executor(ABC):
@@ -87,11 +124,11 @@ class Executor(ABC):
         """Replace the plan; only if `accepts_plans`. An invalid plan is counted, and the old one is kept."""
         raise NotImplementedError(f"{type(self).__name__} accepts no plans")
 
-    def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
+    def set_goal(self, goal_id: str, goal: ExecutorGoal, measured: JointReading) -> None:
         """Begin a goal; it replaces a present one without a step in the setpoint.
 
         Raises:
-            GoalRejected: if it is malformed or this executor accepts no goals; the old goal continues.
+            GoalRejected: if it is wrong or this executor accepts no goals; the old goal continues.
         """
         raise GoalRejected(f"{type(self).__name__} accepts no goals")
 
@@ -105,23 +142,3 @@ class Executor(ABC):
     def counters(self) -> Mapping[str, int]:
         """Counts of refused or missing input since construction, by name; e.g. `stale`, `refused_nonfinite`."""
         return {}
-
-
-def trajectory_goal(message: JointTrajectory) -> dict[str, Any]:
-    """Convert a message to a goal for executors with `goals="trajectory"` in their descriptor.
-
-    The goal is `{"trajectory": {"joint_names": […], "points": […]}}`. Each point has `time_from_start_ns` and, if the
-    message has them, `positions` [rad], `velocities` [rad/s] and `accelerations` [rad/s^2], in the order of the names.
-    It starts when it is accepted; the stamp of the message is ignored.
-
-    Raises:
-        GoalRejected: if a point has efforts, which cannot be followed by positions.
-    """
-    points = []
-    for index, point in enumerate(message.points):
-        if point.effort.size:
-            raise GoalRejected(f"point {index} has efforts; only positions, velocities and accelerations are followed")
-        motion = {"positions": point.positions, "velocities": point.velocities, "accelerations": point.accelerations}
-        given = {name: values.tolist() for name, values in motion.items() if values.size}
-        points.append({"time_from_start_ns": point.time_from_start_ns, **given})
-    return {"trajectory": {"joint_names": list(message.joint_names), "points": points}}

@@ -19,6 +19,7 @@ from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock
 from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.interfaces import run_state
+from ibrobot_core.interfaces.executor import ExecutorGoal
 from ibrobot_core.interfaces.hardware import JointReading
 from ibrobot_core.interfaces.teleop import OperatorEvent
 from ibrobot_core.pulses import Pulse
@@ -199,14 +200,14 @@ class StreamingRun(RunView, Protocol):
 class GoalRun(RunView, Protocol):
     """A run, for clients with goals: they send them through the door, and cancel them."""
 
-    def send_goal(self, executor: str, goal_id: str, goal: Mapping[str, Any], stops: int | None = None) -> None: ...
+    def send_goal(self, executor: str, goal_id: str, goal: ExecutorGoal, stops: int | None = None) -> None: ...
     def cancel_goals(self, executor: str = "") -> None: ...
 
 
 class GuardedRun(GoalRun, Protocol):
     """A run, for the door that checks the goals of all clients."""
 
-    goal_door: Callable[..., None] | None
+    goal_door: Callable[[str, str, ExecutorGoal, Callable[[ExecutorGoal], None]], None] | None
 
 
 class RecordedRun(RunView, Protocol):

@@ -15,6 +15,7 @@ from ibrobot_core.clock import SteppedClock
 from ibrobot_core.component import Component
 from ibrobot_core.config.missing import absent_models, unavailable_modes
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.control.commands import ClearFaults, SwitchMode
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, NotSupported, PluginError
 from ibrobot_core.launch.control import ControlComponent
 from ibrobot_core.launch.plan import LaunchPlan, build_plan, mode_components
@@ -224,7 +225,7 @@ class Runtime:
             session.command_source.recover()
             session.end_source()
             try:
-                stopped = bool(session.command("reset", stops=stops)["cleared"])
+                stopped = bool(session.command(ClearFaults(stops))["cleared"])
             except BaseException:
                 if not session.faults:  # the robot was not stopped, and its mode goes on
                     session.begin_source()
@@ -257,7 +258,7 @@ class Runtime:
     def _go_on(self) -> None:
         """Enter the present mode again after a reset made the robot hold."""
         session = self.session
-        session.command("switch_mode", mode=session.mode)
+        session.command(SwitchMode(session.mode))
         session.held = False
         between_episodes = self.plan.episodes_worker in self._started and not session.episodes.running
         if not between_episodes:
@@ -367,7 +368,7 @@ class Runtime:
             worker.stop()
         session.end_source()
         try:
-            session.command("switch_mode", mode=mode)
+            session.command(SwitchMode(mode))
         except BaseException:
             session.begin_source()
             if worker is not None:

@@ -18,9 +18,11 @@ from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock, RealClock, SteppedClock
 from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config import RobotConfig
+from ibrobot_core.control import commands
 from ibrobot_core.control.host import ControlHost
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, MissingDependency
-from ibrobot_core.interfaces import Context, JointReading, OperatorEvent, run_state, trajectory_goal
+from ibrobot_core.interfaces import Context, JointReading, OperatorEvent, run_state
+from ibrobot_core.interfaces.executor import ExecutorGoal
 from ibrobot_core.interfaces.run import CommandSource, LaunchRequest
 from ibrobot_core.launch.absence import absent_sensors, by_cause
 from ibrobot_core.launch.episodes import Episodes
@@ -92,7 +94,7 @@ class Session:
         self.state: run_state.ControlState | None = None
         self.on_state: list[Callable[[run_state.ControlState], None]] = []
         self.on_goal: list[Callable[[Mapping[str, Any]], None]] = []
-        self.goal_door: Callable[..., None] | None = None
+        self.goal_door: Callable[[str, str, ExecutorGoal, Callable[[ExecutorGoal], None]], None] | None = None
         self.plan: run_state.PlanRecord | None = None
         self.acting: run_state.ActingPolicy | None = None
         self.sensors: dict[str, run_state.SensorFigures] = {}
@@ -210,13 +212,13 @@ class Session:
         self.plan = run_state.PlanRecord(self.generation, start_ns, step_ns, mask, full)
         self.control.write_plan(self.plan)
 
-    def send_goal(self, executor: str, goal_id: str, goal: Mapping[str, Any], stops: int | None = None) -> None:
+    def send_goal(self, executor: str, goal_id: str, goal: ExecutorGoal, stops: int | None = None) -> None:
         """Send a goal to an executor of the present mode: the one door for the goals of every client.
 
         Args:
             executor: its name.
             goal_id: names the goal in events.
-            goal: as for `Executor.set_goal`, but a `trajectory` is a `JointTrajectory`.
+            goal: as for `Executor.set_goal`.
             stops: number of emergency stops when it was requested; control refuses it after a newer one.
 
         Raises:
@@ -226,11 +228,10 @@ class Session:
         if self.faults or self.held:
             raise HardwareError(f"refused before a reset: {(*self.faults, f'holding: {self.to_go_on()}')[0]}")
 
-        requested = {"stops": -1 if stops is None else stops, "generation": self.generation}
+        generation = self.generation
 
-        def send(checked: Mapping[str, Any]) -> None:
-            plain = trajectory_goal(checked["trajectory"]) if "trajectory" in checked else {}
-            self.control.call("goal", executor=executor, goal_id=goal_id, goal={**checked, **plain}, **requested)
+        def send(checked: ExecutorGoal) -> None:
+            self.control.call(commands.SendGoal(executor, goal_id, checked, stops, generation))
 
         send(goal) if self.goal_door is None else self.goal_door(executor, goal_id, goal, send)
 
@@ -240,7 +241,7 @@ class Session:
         Raises:
             ComponentFailed: if control has died.
         """
-        self.control.call("cancel", executor=executor)
+        self.control.call(commands.CancelGoals(executor))
 
     def raise_fault(self, fault: str) -> None:
         """Have control brake all joints and hold until a reset.
@@ -248,11 +249,11 @@ class Session:
         Raises:
             ComponentFailed: if control has died.
         """
-        self.control.call("fault", fault=fault)
+        self.control.call(commands.RaiseFault(fault))
 
     def reset_episode(self, seed: int) -> bool:
         """Set up the simulated scene again; False if an emergency stop is latched, so that nothing has changed."""
-        return bool(self.command("reset_episode", seed=seed)["begun"])
+        return bool(self.command(commands.ResetEpisode(seed))["begun"])
 
     @property
     def stops(self) -> int:
@@ -270,13 +271,13 @@ class Session:
             self.log.error("emergency stop while nothing commands the robot: the run ends")
             return
         try:
-            self._control.call("estop")
+            self._control.call(commands.EmergencyStop())
         except IbrobotError:
             raise
         except BaseException as error:  # e.g. no memory: it may not have been sent, and the next one would not be
             self.fail("emergency stop", as_failure(error))
             with suppress(Exception):
-                self._control.call("fault", fault="an emergency stop could not be sent")
+                self._control.call(commands.RaiseFault("an emergency stop could not be sent"))
             raise
 
     def check_stop(self) -> None:
@@ -286,12 +287,12 @@ class Session:
             IbrobotError: if control does not answer.
         """
         if self._control is not None and self._control.running:
-            self._control.call("counters")
+            self._control.call(commands.GetCounters())
 
-    def command(self, do: str, **arguments: Any) -> Mapping[str, Any]:
+    def command(self, command: commands.SwitchMode | commands.ClearFaults | commands.ResetEpisode) -> Mapping[str, Any]:
         """Execute a command that begins a new generation, e.g. a mode switch, and return control's answer."""
         with self._commanding:  # keep the generation of the last command
-            answer = self.control.call(do, **arguments)
+            answer = self.control.call(command)
             self.generation = int(answer["generation"])
             self.factors = answer.get("factors", self.factors)
             return answer

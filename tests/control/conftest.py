@@ -16,6 +16,7 @@ from ibrobot_testing.fakes import FakeHardware, FakeRealHardware, FakeTrajectory
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, from_document
 from ibrobot_core.control.build import build_core
+from ibrobot_core.control.commands import Command
 from ibrobot_core.control.core import ControlCore
 from ibrobot_core.descriptors import ExecutorDescriptor, HardwareDescriptor
 from ibrobot_core.errors import HardwareError
@@ -190,9 +191,9 @@ class Rig:
         record = PlanRecord(self.core.generation, now_ns, self.core.period_ns, np.array(joints), positions)
         self.core.set_plan(record)
 
-    def call(self, do: str, **arguments: Any) -> dict[str, Any]:
+    def call(self, command: Command) -> dict[str, Any]:
         """Have a command carried out; returns the answer."""
-        return self.core.handle({"do": do, "id": 7, **arguments})
+        return self.core.handle(command)
 
     def stop(self, longest: int = 1000) -> int:
         """Stop; returns after how many ticks the robot had stopped."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import attrs
 import numpy as np
 import pytest
 
 from ibrobot_core.control import core
+from ibrobot_core.control.commands import CancelGoals, SendGoal, SwitchMode
 from ibrobot_core.errors import ConfigError, HardwareError, NotSupported
+from ibrobot_core.interfaces.executor import FollowTrajectory, SlowDown
 from ibrobot_core.interfaces.run_state import PlanRecord
+from ibrobot_core.messages import Header, JointTrajectory, JointTrajectoryPoint
 
-POINTS = {"joint_names": ["pan", "lift"], "points": [{"time_from_start_ns": 400_000_000, "positions": [0.3, 0.2]}]}
-GOAL = {"executor": "arm_trajectory", "goal_id": "one", "goal": {"trajectory": POINTS}}
+TRAJECTORY = JointTrajectory(Header(), ("pan", "lift"), (JointTrajectoryPoint(400_000_000, np.array([0.3, 0.2])),))
+GOAL = SendGoal("arm_trajectory", "one", FollowTrajectory(TRAJECTORY))
 
 
 class TestStart:
@@ -56,7 +60,7 @@ class TestModes:
         rig.tick(100)
         rig.hardware._position[1] -= 0.05  # it sags
         rig.tick()
-        answer = rig.call("switch_mode", mode="plan")
+        answer = rig.call(SwitchMode(mode="plan"))
 
         assert answer["generation"] == rig.core.generation
         rig.tick(60)
@@ -68,7 +72,7 @@ class TestModes:
         rig = make_rig({}).start()
         rig.plan([0.9, 1.0, 0.9], 0.4)
         rig.tick(20)
-        rig.call("switch_mode", mode="plan")
+        rig.call(SwitchMode(mode="plan"))
         rig.tick(50)
 
         rig.assert_within_limits()
@@ -78,8 +82,8 @@ class TestModes:
         rig = make_rig({}).start()
         before = rig.tick().command
         generation = rig.core.generation
-        rig.call("switch_mode", mode="plan")
-        rig.call("switch_mode", mode="stream")
+        rig.call(SwitchMode(mode="plan"))
+        rig.call(SwitchMode(mode="stream"))
         old = PlanRecord(generation, rig.clock.now_ns(), rig.core.period_ns, np.ones(3, bool), np.full((50, 3), 0.9))
         rig.core.set_plan(old)
 
@@ -90,7 +94,7 @@ class TestModes:
         rig = make_rig({}).start()
         rig.plan([0.2, 0.2, 0.5])
 
-        assert rig.call("switch_mode", mode="dance")["error"] == "no mode 'dance'; the modes are: stream, plan"
+        assert rig.call(SwitchMode(mode="dance"))["error"] == "no mode 'dance'; the modes are: stream, plan"
         np.testing.assert_allclose(rig.tick(70).command, [0.2, 0.2, 0.5], atol=1e-9)
 
     def test_a_plan_for_some_joints_moves_no_others(self, make_rig):
@@ -127,7 +131,7 @@ class TestLateTicks:
 class TestGoals:
     def test_reach_their_executor_and_report(self, make_rig):
         rig = make_rig({}).start("plan")
-        assert "error" not in rig.call("goal", **GOAL)
+        assert "error" not in rig.call(GOAL)
         rig.tick(150)
 
         goals = rig.events("goal")
@@ -141,21 +145,21 @@ class TestGoals:
         rig = make_rig({}).start("stream")
 
         refused = "executor 'arm_trajectory' is not active; active: arm_position, gripper_position"
-        assert rig.call("goal", **GOAL)["error"] == refused
+        assert rig.call(GOAL)["error"] == refused
 
     def test_that_are_malformed_are_refused(self, make_rig):
         rig = make_rig({}).start("plan")
-        assert "error" in rig.call("goal", **GOAL | {"goal": {"trajectory": {"joint_names": ["nose"], "points": []}}})
+        assert "error" in rig.call(attrs.evolve(GOAL, goal=SlowDown()))
         assert rig.events("goal") == []
 
     def test_end_with_the_mode_or_a_cancel(self, make_rig):
         rig = make_rig({}).start("plan")
-        for end, arguments in (("cancel", {}), ("switch_mode", {"mode": "stream"})):
-            rig.call("switch_mode", mode="plan")
+        for end in (CancelGoals(), SwitchMode("stream")):
+            rig.call(SwitchMode(mode="plan"))
             rig.events("goal")
-            rig.call("goal", **GOAL)
+            rig.call(GOAL)
             rig.tick(10)
-            rig.call(end, **arguments)
+            rig.call(end)
             rig.tick()
 
             assert [goal["state"] for goal in rig.events("goal")] == ["executing", "canceled"]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ibrobot_core.api import SlowDown
+from ibrobot_core.control.commands import BeginStartup, EmergencyStop, SendGoal
 from ibrobot_core.errors import HardwareError
 
 REST = [-0.8, 1.0, 0.1]
@@ -14,7 +16,7 @@ def start(make_rig, **control: str | float):
     """Start, without a tick."""
     rig = make_rig({"control": {"startup": "pose rest", **control}})
     rig.core.start("stream")
-    assert "error" not in rig.call("begin_startup")
+    assert "error" not in rig.call(BeginStartup())
     rig.hardware.written.append(rig.hardware.read().position)
     return rig
 
@@ -55,7 +57,7 @@ def test_it_waits_until_everything_is_there_that_may_stop_it(make_rig):
     rig.core.begin_startup()
     arrive(rig)
     held = rig.tick(50).command
-    rig.call("begin_startup")  # too late to mean anything
+    rig.call(BeginStartup())  # too late to mean anything
     np.testing.assert_array_equal(rig.tick(20).command, held)
 
 
@@ -91,8 +93,8 @@ def test_a_joint_that_is_blocked_is_named(rig):
         HardwareError, match=r"control.startup: pose rest: joint lift does not follow: it is \d\.\d\d rad"
     ):
         arrive(rig)
-    refused = rig.call("goal", executor="arm_position", goal_id="1", goal={})["error"]
-    assert refused == "goal: refused after the start has failed"
+    refused = rig.call(SendGoal(executor="arm_position", goal_id="1", goal=SlowDown()))["error"]
+    assert refused == "refused after the start has failed"
 
 
 def test_a_joint_that_hangs_too_far_from_the_pose_is_named(rig):
@@ -155,7 +157,7 @@ def test_a_stop_on_the_way_brakes_before_the_start_fails(make_rig, stop):
     rig = start(make_rig, stop=stop)
     rig.tick(20)
     assert np.abs(rig.hardware.written[-1] - rig.hardware.written[-2]).max() > 0.004
-    assert rig.call("estop")["stops"] == 1
+    assert rig.call(EmergencyStop())["stops"] == 1
     with pytest.raises(HardwareError, match=r"control\.startup: pose rest: emergency stop"):
         arrive(rig, 20)
 

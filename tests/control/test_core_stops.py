@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ibrobot_core.control.commands import ClearFaults, EmergencyStop, ResetEpisode, SwitchMode
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces import Torque
 
@@ -58,10 +59,10 @@ class TestFailures:
         rig.hardware.write_error = ""
         rig.tick()
 
-        assert "before a reset: the port is gone" in rig.call("switch_mode", mode="plan")["error"]
+        assert "before a reset: the port is gone" in rig.call(SwitchMode(mode="plan"))["error"]
         rig.plan([0.3, 0.3, 0.3])
         assert rig.core.counters()["loop"]["old_plans"] == 1
-        assert "error" not in rig.call("reset")
+        assert "error" not in rig.call(ClearFaults())
         rig.plan([0.3, 0.3, 0.3])
         np.testing.assert_allclose(rig.tick(70).command, 0.3)
 
@@ -71,10 +72,10 @@ class TestFailures:
         rig.tick(20)
         rig.hardware.reset_faults = lambda: None
 
-        assert rig.call("reset")["error"] == "the bus is silent"
+        assert rig.call(ClearFaults())["error"] == "the bus is silent"
         assert rig.core.fault
         rig.hardware.silent = False
-        assert "error" not in rig.call("reset")
+        assert "error" not in rig.call(ClearFaults())
         assert not rig.core.fault
 
     def test_signals_that_fail_are_missing_and_stop_nothing(self, make_rig):
@@ -108,7 +109,7 @@ class TestEmergencyStop:
         rig = make_rig({}).start()
         rig.plan([0.9, 1.0, 0.9], 0.5)
         rig.tick(20)
-        rig.call("estop")
+        rig.call(EmergencyStop())
         state = rig.tick(8)
         assert state.estop
         rig.plan([0.0, 0.0, 0.0])
@@ -116,7 +117,7 @@ class TestEmergencyStop:
         rig.assert_within_limits()
         assert [event["fault"] for event in rig.events("fault")] == ["emergency stop"]
 
-        assert "error" not in rig.call("reset")
+        assert "error" not in rig.call(ClearFaults())
         assert not rig.tick().estop
         rig.plan([0.0, 0.0, 0.0])
         np.testing.assert_allclose(rig.tick(80).command, 0.0)
@@ -125,17 +126,17 @@ class TestEmergencyStop:
         rig = make_rig({}).start()
         rig.plan([0.9, 1.0, 0.9], 0.5)
         rig.tick(20)
-        rig.call("estop")
+        rig.call(EmergencyStop())
         rig.tick()
 
-        assert "still braking" in rig.call("reset")["error"]
+        assert "still braking" in rig.call(ClearFaults())["error"]
         assert rig.tick().estop
 
     def test_a_reset_on_the_move_makes_no_step(self, make_rig):
         rig = make_rig({}).start()
         rig.plan([0.9, 1.0, 0.9], 0.5)
         rig.tick(20)
-        assert "error" not in rig.call("reset")
+        assert "error" not in rig.call(ClearFaults())
         rig.tick(50)
 
         rig.assert_within_limits()
@@ -194,7 +195,7 @@ class TestStop:
 
     def test_relax_is_what_a_fault_does_too(self, make_rig):
         rig = make_rig({"control": {"stop": "relax"}}).start()
-        rig.call("estop")
+        rig.call(EmergencyStop())
         count = len(rig.hardware.written)
         rig.tick(20)
 
@@ -225,7 +226,7 @@ class TestStop:
             rig.plan([0.9, 1.0, 0.9], 0.5)
             rig.tick(20)
             rig.hardware.relax_outcome = outcome
-            rig.call("estop")
+            rig.call(EmergencyStop())
             count = len(rig.hardware.written)
             rig.tick(20)
 
@@ -242,7 +243,7 @@ class TestStop:
         rig.tick(20)
         hand, base = rig.parts["hand"], rig.parts["base"]
         base.relax_outcome = HardwareError("servo 1 keeps it")
-        rig.call("estop")
+        rig.call(EmergencyStop())
         counts = len(hand.written), len(base.written)
         rig.tick(20)
         assert hand.relaxed
@@ -250,7 +251,7 @@ class TestStop:
         assert len(base.written) == counts[1] + 20
         assert rig.core.counters()["loop"]["write_errors"] == 0
 
-        assert "error" not in rig.call("reset")
+        assert "error" not in rig.call(ClearFaults())
         rig.tick()
         rig.core.close()
         assert not hand.relaxed
@@ -260,7 +261,7 @@ class TestStop:
         rig = make_rig({"control": {"stop": stop}}).start()
         rig.core.begin_stop()
 
-        assert rig.call("reset")["error"] == "reset: refused while the robot is stopping"
+        assert rig.call(ClearFaults())["error"] == "refused while the robot is stopping"
         rig.plan([0.9, 0.9, 0.9])
         assert rig.core.counters()["executors"]["arm_position"]["stale"] == 0
 
@@ -295,7 +296,7 @@ class TestSimulation:
         starts = []
         for seed in (3, 4, 3):
             generation = rig.core.generation
-            assert rig.call("reset_episode", seed=seed)["generation"] > generation
+            assert rig.call(ResetEpisode(seed=seed))["generation"] > generation
             starts.append(rig.tick().command)
 
         np.testing.assert_array_equal(starts[0], starts[2])

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_testing.contexts import make_robot
 
+from ibrobot_core.control.commands import ClearFaults, EmergencyStop
 from ibrobot_core.control.following import FollowingError
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.schema import Following
@@ -130,7 +131,7 @@ class TestControl:
         assert rig.core.fault
         rig.hardware.blocked[0] = False
 
-        assert "error" not in rig.call("reset")
+        assert "error" not in rig.call(ClearFaults())
         rig.tick(300)
         assert rig.core.fault == ""
 
@@ -156,7 +157,7 @@ class TestControl:
 
     def test_an_arm_without_torque_is_not_watched(self, make_rig):
         rig = make_rig({"control": {"stop": "relax"}}).start()
-        rig.call("estop")
+        rig.call(EmergencyStop())
         rig.hardware._position[0] -= 0.9
         rig.tick(400)
 

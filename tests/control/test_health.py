@@ -9,6 +9,7 @@ import attrs
 import numpy as np
 import pytest
 
+from ibrobot_core.control.commands import ClearFaults, EmergencyStop
 from ibrobot_core.errors import ConfigError, HardwareError
 from ibrobot_core.interfaces.hardware import Condition, Severity
 
@@ -83,12 +84,12 @@ class TestFaults:
         assert [event["fault"] for event in rig.events("fault")] == [WEAK.message]
         rig.assert_within_limits()
 
-        rig.call("reset")
+        rig.call(ClearFaults())
         rig.tick()
         assert rig.core.fault == WEAK.message  # it lasts
         rig.hardware.conditions = ()
         rig.tick()
-        assert "error" not in rig.call("reset")
+        assert "error" not in rig.call(ClearFaults())
         rig.tick()
         assert rig.core.fault == ""
 
@@ -121,7 +122,7 @@ class TestShedding:
     def test_without_a_pose_or_after_an_emergency_stop_it_relaxes_at_once(self, make_rig, pose):
         rig = make_rig({"control": {"load_shedding": {"after": 1.0, "pose": pose}}}).start()
         if pose:
-            rig.call("estop")
+            rig.call(EmergencyStop())
         before = rig.tick().command
         rig.hardware.conditions = (HOT,)
         rig.tick(102)
@@ -157,7 +158,7 @@ class TestShedding:
         rig.tick(110)
         assert rig.hardware.relaxed
 
-        assert "error" not in rig.call("reset")
+        assert "error" not in rig.call(ClearFaults())
         rig.tick(90)
         assert not rig.hardware.relaxed
         rig.tick(20)
@@ -199,7 +200,7 @@ class TestShedding:
         rig.hardware.conditions = (HOT,)
         rig.tick(120)
         assert np.abs(rig.hardware.written[-1] - rig.hardware.written[-2]).max() > 0.004
-        rig.call("estop")
+        rig.call(EmergencyStop())
         rig.tick(95)
         assert not rig.hardware.relaxed
         assert np.abs(rig.hardware.written[-1] - REST).max() > 0.1

@@ -22,6 +22,7 @@ from logged_run import wait_for
 
 from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.config import from_document
+from ibrobot_core.control.commands import BeginStartup, ClearFaults, EmergencyStop, GetCounters, RaiseFault, SwitchMode
 from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
 from ibrobot_core.errors import ComponentFailed, HardwareError
 from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
@@ -171,7 +172,7 @@ class TestBoth:
         host = make(kind, startup="pose out")
         host.start()
         host.arrive()
-        assert host.call("counters")["generation"] == host.generation
+        assert host.call(GetCounters())["generation"] == host.generation
         if isinstance(host, InlineControl):
             host.step()
         np.testing.assert_allclose(
@@ -181,11 +182,11 @@ class TestBoth:
     def test_commands_are_answered_with_the_generation_and_refused_with_the_reason(self, make, kind):
         host = make(kind)
         host.start()
-        first = host.call("switch_mode", mode="plan")["generation"]
+        first = host.call(SwitchMode(mode="plan"))["generation"]
 
-        assert host.call("switch_mode", mode="stream")["generation"] > first
+        assert host.call(SwitchMode(mode="stream"))["generation"] > first
         with pytest.raises(HardwareError, match="no mode 'dance'; the modes are: stream, plan"):
-            host.call("switch_mode", mode="dance")
+            host.call(SwitchMode(mode="dance"))
 
 
 @pytest.mark.integration
@@ -229,7 +230,7 @@ class TestProcess:
 
         def call() -> None:
             with suppress(ComponentFailed):  # it may end before it answers
-                host.call("estop")
+                host.call(EmergencyStop())
 
         calling = threading.Thread(target=call)
 
@@ -252,9 +253,9 @@ class TestProcess:
     def test_an_emergency_stop_on_the_way_to_the_startup_pose_brakes_and_ends_it(self, make, reports):
         host = make(startup="pose out")
         host.start()
-        host.call("begin_startup")
+        host.call(BeginStartup())
         reports.state(lambda state: abs(state.command - state.position).max() > 1e-3)
-        host.call("estop")
+        host.call(EmergencyStop())
 
         assert str(reports.deaths.get(timeout=PATIENCE_S)) == "control.startup: pose out: emergency stop"
         commands = [state.command for state in list_of(reports.states)]
@@ -275,7 +276,7 @@ class TestProcess:
         halting.start()
         reports.state(lambda state: abs(state.command - state.position).max() > 1e-3)
         if how == "command":
-            assert host.call("estop")["stops"] == 1
+            assert host.call(EmergencyStop())["stops"] == 1
         elif how == "SIGTERM":
             os.kill(host.pid, signal.SIGTERM)
         else:
@@ -293,18 +294,18 @@ class TestProcess:
     def test_a_stop_during_a_slow_reset_wins(self, make, reports, tmp_path):
         host = make(resetting=str(file := tmp_path / "resetting"))
         host.start()
-        host.call("fault", fault="a cable is loose")
+        host.call(RaiseFault(fault="a cable is loose"))
         answers: queue.SimpleQueue[str] = queue.SimpleQueue()
 
         def reset() -> None:
             with pytest.raises(HardwareError) as refused:
-                host.call("reset", stops=0)
+                host.call(ClearFaults(stops=0))
             answers.put(str(refused.value))
 
         resetting = threading.Thread(target=reset)
         resetting.start()
         wait_for(file.exists, "the hardware clears its faults")
-        host._child.channel.send({"id": 0, "do": "estop"})
+        host._child.channel.send({"id": 0, "do": "EmergencyStop"})
         file.unlink()
         resetting.join()
 
@@ -317,17 +318,21 @@ class TestProcess:
         host.start()
         tick = reports.state(lambda state: True).tick
         os.kill(host.pid, signal.SIGSTOP)
-        goal = {"executor": "trajectory", "goal_id": "1", "goal": {}}
+        goal = {"executor": "trajectory", "goal_id": "1", "goal": {"stop": True}}
         waiting = [host._replies.setdefault(number, queue.SimpleQueue()) for number in (101, 102)]
-        for command in ({"id": 101, "do": "goal", **goal}, {"id": 102, "do": "reset", "stops": 0}, {"do": "estop"}):
+        for command in (
+            {"id": 101, "do": "SendGoal", **goal},
+            {"id": 102, "do": "ClearFaults", "stops": 0},
+            {"do": "EmergencyStop"},
+        ):
             host._child.channel.send(command)
         os.kill(host.pid, signal.SIGCONT)
 
         refused = [each.get(timeout=PATIENCE_S)["error"] for each in waiting]
-        assert refused[0].startswith("goal: refused before a reset: emergency stop")
+        assert refused[0].startswith("refused before a reset: emergency stop")
         assert refused[1] == "reset: refused, an emergency stop came after it was requested"
         reports.state(lambda state: state.stops == 1)
-        host.call("counters")
+        host.call(GetCounters())
         reports.state(lambda state: state.tick > tick + 20)
         assert reports.state(lambda state: True).estop
         assert [event["event"] for event in list_of(reports.events)] == ["fault"]
@@ -335,21 +340,27 @@ class TestProcess:
     def test_messages_that_are_no_commands_end_nothing_and_stop_works(self, make, reports):
         host = make()
         host.start()
-        for message in ({}, {"do": 1}, {"do": "stop it"}, {"do": "goal", "id": []}, {"do": "reset", "id": 1, "x": 2}):
+        for message in (
+            {},
+            {"do": 1},
+            {"do": "stop it"},
+            {"do": "SendGoal", "id": []},
+            {"do": "ClearFaults", "id": 1, "x": 2},
+        ):
             host._child.channel.send(message)
-        host._child.channel.send({"do": "estop", "id": {}, "event": "log"})
+        host._child.channel.send({"do": "EmergencyStop", "id": {}, "event": "log"})
         assert reports.state(lambda state: state.stops == 1).estop
-        assert host.call("estop")["stops"] == 2
+        assert host.call(EmergencyStop())["stops"] == 2
 
     def test_a_fault_is_reported_and_reset(self, make, reports):
         host = make()
         host.start()
-        host.call("estop")
+        host.call(EmergencyStop())
         assert reports.events.get(timeout=PATIENCE_S)["fault"] == "emergency stop"
         assert reports.state(lambda state: state.estop)
 
         resting = reports.state(lambda state: state.estop)
-        assert host.call("reset")["generation"] > resting.generation
+        assert host.call(ClearFaults())["generation"] > resting.generation
         assert reports.state(lambda state: not state.estop)
 
     def test_its_report_has_the_whole_run_at_the_end(self, make, reports):
@@ -368,7 +379,7 @@ class TestProcess:
 
         assert str(reports.deaths.get(timeout=PATIENCE_S)) == "the control process died (killed by SIGKILL)"
         with pytest.raises(ComponentFailed, match="control process is gone"):
-            host.call("estop")
+            host.call(EmergencyStop())
 
     def test_one_that_ignores_its_end_is_killed_and_reported(self, make, reports, monkeypatch, caplog):
         monkeypatch.setattr("ibrobot_core.control.host._STOP_TIMEOUT_S", 0.2)
@@ -405,7 +416,7 @@ class TestProcess:
         )
 
         assert reports.events.get(timeout=PATIENCE_S)["fault"] == named
-        for command in ("estop", "reset"):
+        for command in (EmergencyStop(), ClearFaults()):
             with pytest.raises(ComponentFailed, match=f"^{re.escape(named)}$"):
                 host.call(command)
 
@@ -425,7 +436,7 @@ class TestProcess:
         while len(held) < 50:
             held.append(reports.state(lambda state: True).command)
         np.testing.assert_array_equal(held[-1], held[-2])
-        assert host.call("reset")["cleared"] == fault["fault"]
+        assert host.call(ClearFaults())["cleared"] == fault["fault"]
 
     def test_one_that_is_stopped_ends_in_order_when_the_run_ends(self, make, reports, tmp_path):
         host = make(closed=str(tmp_path / "closed"))
@@ -442,7 +453,7 @@ class TestProcess:
         os.kill(host.pid, signal.SIGSTOP)
 
         with pytest.raises(ComponentFailed, match=r"is stopped, and STOP does not reach the robot"):
-            host.call("estop")
+            host.call(EmergencyStop())
 
     def test_without_the_hosts_signs_of_life_it_holds(self, make, reports, monkeypatch):
         beats: Any

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ibrobot_core.api import SlowDown
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.control.position import PositionExecutor
 from ibrobot_core.descriptors import StreamOptions
@@ -268,4 +269,4 @@ def test_it_takes_plans_and_no_goals() -> None:
     assert executor.accepts_plans
     assert executor.joints == ("roll", "pan")
     with pytest.raises(GoalRejected, match="accepts no goals"):
-        executor.set_goal("1", {}, reading(0))
+        executor.set_goal("1", SlowDown(), reading(0))

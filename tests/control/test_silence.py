@@ -6,6 +6,8 @@ import attrs
 import numpy as np
 import pytest
 
+from ibrobot_core.api import FollowTrajectory, Header, JointTrajectory, JointTrajectoryPoint
+from ibrobot_core.control.commands import ClearFaults, SendGoal
 from ibrobot_core.schema import InferenceConfig
 
 PEER_TIMEOUT_S = 0.3
@@ -70,7 +72,7 @@ def test_after_it_nothing_moves_before_a_reset(moving):
     moving.tick(50)
     np.testing.assert_array_equal(moving.core.state.command, held)
 
-    assert moving.call("reset")["cleared"].startswith("the host has been silent")
+    assert moving.call(ClearFaults())["cleared"].startswith("the host has been silent")
     np.testing.assert_array_equal(moving.tick(20).command, moving.core.state.position)
 
 
@@ -108,8 +110,7 @@ def test_a_policy_may_go_on_by_itself_however_long_it_has_waited(make_rig):
 
 def test_a_goal_counts_as_a_command(make_rig):
     rig = make_rig({}).start("plan")
-    points = [{"positions": [0.0, 0.0], "time_from_start_ns": 0}]
-    goal = {"trajectory": {"joint_names": ["pan", "lift"], "points": points}}
-    assert "error" not in rig.call("goal", executor="arm_trajectory", goal_id="1", goal=goal)
+    trajectory = JointTrajectory(Header(), ("pan", "lift"), (JointTrajectoryPoint(0, np.zeros(2)),))
+    assert "error" not in rig.call(SendGoal("arm_trajectory", "1", FollowTrajectory(trajectory)))
 
     assert silent(rig, PEER_TIMEOUT_S)

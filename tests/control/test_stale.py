@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ibrobot_core.control.commands import ClearFaults
 from ibrobot_core.interfaces.run_state import PlanRecord
 from ibrobot_core.units import ns, seconds
 from tests.control.conftest import PERIOD_S, Rig
@@ -108,7 +109,7 @@ class TestMeasuredNowhere:
         np.testing.assert_array_equal(rig.tick(50).command, held)
         send(rig, np.full((1, 3), 1.0), 0.0, PERIOD_S)
         np.testing.assert_array_equal(rig.tick(50).command, held)  # a reset is needed
-        assert rig.call("reset")["cleared"]
+        assert rig.call(ClearFaults())["cleared"]
 
     def test_a_reading_that_is_missing_once_is_no_fault(self, make_rig):
         rig = make_rig(EDITS).start()

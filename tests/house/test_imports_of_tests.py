@@ -19,6 +19,7 @@ ALLOWED = {
     ): "every encoding that contracts know",
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.config"): DRIVE,
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.control.build"): DRIVE,
+    ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.control.commands"): DRIVE,
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.interfaces.run_state"): DRIVE,
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.plugins"): DRIVE,
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.control.safety"): LOOP,

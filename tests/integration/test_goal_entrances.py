@@ -285,7 +285,7 @@ def test_goal_under_check_is_not_followed_after_a_fault_and_its_reset(robot: Rob
     assert take is not None
 
     def slowly(*arguments: Any) -> None:
-        robot.session.control.call("fault", fault="a leader was lost")
+        robot.session.raise_fault("a leader was lost")
         for _ in range(100):
             robot.runtime.step()
         robot.session.bus.call("/reset", {"stops": robot.session.stops})

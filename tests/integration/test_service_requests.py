@@ -15,6 +15,7 @@ from ibrobot_planning.execution.plans import GoalPlans
 from ibrobot_ros2.services import Answer, Call, decode_answer, decode_call, encode_answer, encode_call
 from plain_requests import SECRET, Offered, Requests, declared, everything, offered
 
+from ibrobot_core.api import FollowTrajectory
 from ibrobot_core.errors import IbrobotError, TransportError
 from ibrobot_core.launch.runtime import Runtime
 
@@ -112,10 +113,10 @@ def note_motions(monkeypatch: pytest.MonkeyPatch) -> tuple[list[Any], list[Any]]
         checked.append(check(self, *arguments))
         return checked[-1]
 
-    def note_begun(self: Execution, name: str, goal_id: str, goal: Any, takes_over: Any = None) -> None:
-        if takes_over is None and not isinstance(goal, float):  # others are parts of the running one, or its blend
-            begun.append(goal)
-        send(self, name, goal_id, goal, takes_over)
+    def note_begun(self: Execution, name: str, goal_id: str, goal: Any) -> None:
+        if isinstance(goal, FollowTrajectory) and goal.takes_over is None:  # others are parts of the running one
+            begun.append(goal.trajectory)
+        send(self, name, goal_id, goal)
 
     monkeypatch.setattr(GoalPlans, "_checked", note_checked)
     monkeypatch.setattr(Execution, "_send", note_begun)

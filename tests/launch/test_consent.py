@@ -35,7 +35,7 @@ def moves(run: Runtime, ticks: int = 30) -> bool:
 
 
 def reset_after_a_stop(run: Runtime, runs: Runs) -> None:
-    run.session.control.call("estop")
+    run.session.emergency_stop()
     moves(run, 15)  # it brakes
     assert not moves(run)
     run.reset()
@@ -88,7 +88,7 @@ def test_a_deadman_pressed_before_does_not_count_after(run: Runtime, runs: Runs,
 
 
 def press_the_emergency_stop(run: Runtime, runs: Runs) -> None:
-    run.session.control.call("estop")
+    run.session.emergency_stop()
 
 
 def silence_the_hardware(run: Runtime, runs: Runs) -> None:

@@ -66,7 +66,7 @@ def test_the_next_episode_waits_for_the_reset_of_an_emergency_stop(runs: Runs):
 
 def test_a_success_after_a_fault_is_a_failure(runs: Runs):
     runtime = runs.start(mode="teleop")
-    runtime.session.control.call("fault", fault="the gripper is stuck")
+    runtime.session.raise_fault("the gripper is stuck")
     seconds(runtime, 0.1)
     runtime.session.bus.call(RESET, None)
     runtime.session.episodes.end("success")

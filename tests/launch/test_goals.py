@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from ibrobot_core.api import HardwareError, Header, JointTrajectory, JointTrajectoryPoint
+from ibrobot_core.api import FollowTrajectory, HardwareError, Header, JointTrajectory, JointTrajectoryPoint
 
 if TYPE_CHECKING:
     from fake_runs import Runs
 
-GOAL = {"trajectory": JointTrajectory(Header(), ("pan",), (JointTrajectoryPoint(10**9, np.array([0.1])),))}
+GOAL = FollowTrajectory(JointTrajectory(Header(), ("pan",), (JointTrajectoryPoint(10**9, np.array([0.1])),)))
 
 
 @pytest.fixture

@@ -86,7 +86,7 @@ def test_a_robot_is_ready_unless_it_is_stopped_or_its_model_is_gone(runtime: Run
     assert stats is not None
     stats.alive = False
     assert get(runtime, "/readyz") == (503, "the model is gone\n")
-    runtime.session.control.call("estop")
+    runtime.session.emergency_stop()
     runtime.step()
     assert get(runtime, "/readyz") == (503, "the emergency stop is latched\n")
     assert get(runtime, "/healthz") == (200, "ok\n")

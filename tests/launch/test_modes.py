@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from ibrobot_core.control.commands import Command, SwitchMode
 from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported
 from ibrobot_core.launch.runtime import SET_MODE, Runtime
 
@@ -56,16 +57,16 @@ def test_new_parts_are_ready_before_ownership_changes_and_old_ones_go_after(
     control = runtime.session.control
     real = control.call
 
-    def call(do: str, **arguments: Any) -> Any:
-        calls.append(do)
-        return real(do, **arguments)
+    def call(command: Command) -> Any:
+        calls.append(type(command).__name__)
+        return real(command)
 
     monkeypatch.setattr(control, "call", call)
     runtime.switch_mode("policy")
-    assert calls == ["load net", "switch_mode", "disconnect stick"]
+    assert calls == ["load net", "SwitchMode", "disconnect stick"]
     calls.clear()
     runtime.switch_mode("teleop")
-    assert calls == ["connect stick", "switch_mode", "close net"]
+    assert calls == ["connect stick", "SwitchMode", "close net"]
 
 
 def test_what_runs_is_what_the_mode_needs(runs: Runs):
@@ -109,7 +110,7 @@ def test_control_that_refuses_leaves_the_old_mode_which_a_reset_revives(runs: Ru
     runtime = runs.start(mode="teleop")
     seconds(runtime, 0.2)
     running = names(runtime)
-    runtime.session.control.call("estop")
+    runtime.session.emergency_stop()
     with pytest.raises(HardwareError, match="refused before a reset: emergency stop"):
         runtime.switch_mode("policy")
     assert (runtime.session.mode, names(runtime)) == ("teleop", running)
@@ -127,10 +128,10 @@ def test_the_old_mode_goes_on_when_control_refuses_the_new_one(runs: Runs, monke
     control = runtime.session.control
     real = control.call
 
-    def call(do: str, **arguments: Any) -> Any:
-        if do == "switch_mode":
+    def call(command: Command) -> Any:
+        if isinstance(command, SwitchMode):
             raise HardwareError("not now")
-        return real(do, **arguments)
+        return real(command)
 
     monkeypatch.setattr(control, "call", call)
     with pytest.raises(HardwareError, match="not now"):

@@ -69,7 +69,7 @@ def terminal(runs: Runs, request: pytest.FixtureRequest) -> Terminal:
 
 
 def estop(run: Runtime) -> None:
-    run.session.control.call("estop")
+    run.session.emergency_stop()
     for _ in range(20):
         run.step()
 
@@ -93,7 +93,7 @@ def test_keys_come_first_and_nothing_scrolls_away(terminal: Terminal):
 
 
 def test_a_fault_is_shown_in_full_above_the_messages_and_the_mode_until_its_reset(terminal: Terminal):
-    terminal.run.session.control.call("fault", fault=FAULT)
+    terminal.run.session.raise_fault(FAULT)
     for _ in range(20):
         terminal.run.step()
     shown = terminal.words("the newest message")
@@ -128,7 +128,7 @@ def test_help_on_a_device_is_not_shown_while_the_robot_holds(runs: Runs, monkeyp
     terminal = Terminal(runs.start(mode="teleop"), 120, 40, help="Tab start")
     monkeypatch.setattr(terminal.run.session.command_source, "help", lambda: "following the leader arm")
     assert "following the leader arm Tab start" in terminal.words()
-    terminal.run.session.control.call("fault", fault=FAULT)
+    terminal.run.session.raise_fault(FAULT)
     for _ in range(20):
         terminal.run.step()
     shown = terminal.words()
@@ -148,7 +148,7 @@ def test_an_emergency_stop_is_shown_with_its_key_until_its_reset(terminal: Termi
 
 
 def test_a_fault_during_another_is_shown_too(terminal: Terminal):
-    terminal.run.session.control.call("fault", fault="the first")
+    terminal.run.session.raise_fault("the first")
     terminal.run.step()
     terminal.run.session.add_fault("recording ended: the disk is full; make room")
     shown = terminal.words()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from ibrobot_core.cli.run import _listen, _Panel
+from ibrobot_core.control.commands import Command, EmergencyStop, ResetEpisode
 from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, TeleopError, TransportError
 from ibrobot_core.launch.runtime import CHECK_ESTOP, ESTOP, RESET, SET_MODE, Runtime
 from ibrobot_core.run_hooks import RunHooks
@@ -101,10 +102,10 @@ class TestSending:
     def test_a_stop_that_cannot_be_sent_makes_the_robot_hold_and_ends_the_run(self, teleop: Runtime, monkeypatch):
         call = teleop.session.control.call
 
-        def short_of_memory(do: str, **arguments: Any) -> Any:
-            if do == "estop":
+        def short_of_memory(command: Command) -> Any:
+            if isinstance(command, EmergencyStop):
                 raise MemoryError
-            return call(do, **arguments)
+            return call(command)
 
         monkeypatch.setattr(teleop.session.control, "call", short_of_memory)
         with pytest.raises(MemoryError):
@@ -234,8 +235,8 @@ class TestOneAtATime:
         )
         assert sorted(raised) == [
             f"mode plan: {AFTER}",
+            "refused before a reset: emergency stop",
             f"reset: {AFTER}",
-            "switch_mode: refused before a reset: emergency stop",
         ]
         assert is_stopped(run)
         assert run.session.mode == "teleop"
@@ -260,10 +261,10 @@ class TestEpisodes:
         session = runtime.session
         real = session.control.call
 
-        def call(do: str, **arguments: Any) -> Any:
-            if do == "reset_episode" and not session.stops:
-                real("estop")  # after the check of the host
-            return real(do, **arguments)
+        def call(command: Command) -> Any:
+            if isinstance(command, ResetEpisode) and not session.stops:
+                real(EmergencyStop())  # after the check of the host
+            return real(command)
 
         monkeypatch.setattr(session.control, "call", call)
         steps(runtime, 60)  # the first ends

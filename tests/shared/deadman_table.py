@@ -32,6 +32,7 @@ from takeovers import CONFIG, JOINTS
 from ibrobot_core.api import Context, Header, Twist, TwistStamped, Vector3
 from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.config import load_config
+from ibrobot_core.control.commands import EmergencyStop, RaiseFault
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
@@ -610,7 +611,7 @@ def thaw(trial: Trial) -> None:
 
 def stop(trial: Trial) -> None:
     """An emergency stop, and a reset."""
-    trial.runtime.session.control.call("estop")
+    trial.runtime.session.control.call(EmergencyStop())
     trial.hold(50)
     trial.reset()
     trial.hold(250)
@@ -618,7 +619,7 @@ def stop(trial: Trial) -> None:
 
 def fault(trial: Trial) -> None:
     """A fault of another part, and a reset."""
-    trial.runtime.session.control.call("fault", fault="a joint does not answer")
+    trial.runtime.session.control.call(RaiseFault(fault="a joint does not answer"))
     trial.hold(50)
     trial.reset()
     trial.hold(250)

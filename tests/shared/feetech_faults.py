@@ -41,6 +41,7 @@ from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, from_document
 from ibrobot_core.control.build import build_core
+from ibrobot_core.control.commands import ClearFaults, RaiseFault
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Context, JointReading, Teleop
 from ibrobot_core.interfaces.run_state import PlanRecord
@@ -305,7 +306,7 @@ class Bench:
             command = self.device.read(self._reading())
         except TeleopError as error:
             self._lost = True
-            self.core.handle({"do": "fault", "id": 0, "fault": str(error)})
+            self.core.handle(RaiseFault(str(error)))
             return
         if command.positions:
             plan = np.array([[command.positions[joint] for joint in JOINTS]])
@@ -321,7 +322,7 @@ class Bench:
         except TeleopError:
             self.tally.resets["refused by the leader"] += 1
             return False
-        if error := self.core.handle({"do": "reset", "id": 0}).get("error"):
+        if error := self.core.handle(ClearFaults()).get("error"):
             self.tally.resets["refused by control"] += 1
             self.said.lines.append(str(error))
             return False

@@ -18,7 +18,18 @@ import numpy as np
 import pytest
 from ibrobot_testing.fakes import FakeTeleop
 
-from ibrobot_core.api import NS_PER_S, IbrobotError, JointReading, TeleopCommand, TeleopDescriptor, ns
+from ibrobot_core.api import (
+    NS_PER_S,
+    FollowTrajectory,
+    Header,
+    IbrobotError,
+    JointReading,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    TeleopCommand,
+    TeleopDescriptor,
+    ns,
+)
 from ibrobot_core.app import HOLD_S, ComponentFailed, ControlState, Registry
 from ibrobot_core.interfaces.run_state import PlanRecord
 
@@ -130,9 +141,9 @@ class Story:
             self.consent, self.settles, Lever.allowed_ns = mode == "policy", SETTLES_TICKS, -NS_PER_S
 
     def goal(self, stops: int) -> None:
-        points = [{"time_from_start_ns": 600_000_000, "positions": [self.draw.uniform(-0.8, 0.8)]}]
-        goal = {"trajectory": {"joint_names": ["pan"], "points": points}}
-        self.run.session.control.call("goal", executor="arm_trajectory", goal_id="1", goal=goal, stops=stops)
+        point = JointTrajectoryPoint(600_000_000, np.array([self.draw.uniform(-0.8, 0.8)]))
+        goal = FollowTrajectory(JointTrajectory(Header(0, ""), ("pan",), (point,)))
+        self.run.session.send_goal("arm_trajectory", "1", goal, stops)
         assert not self.latched
         self.consent = True
 

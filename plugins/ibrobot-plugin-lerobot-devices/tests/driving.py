@@ -34,6 +34,7 @@ from ibrobot_core.api import (
 from ibrobot_core.app import ComponentFailed, begin_operation, operate
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
+from ibrobot_core.control.commands import ClearFaults, EmergencyStop
 from ibrobot_core.interfaces.run_state import PlanRecord
 from ibrobot_core.plugins import Entry, discover
 
@@ -353,13 +354,13 @@ class Drive:
 
     def stop(self) -> None:
         """The emergency stop."""
-        self.core.handle({"do": "estop", "id": 1})
+        self.core.handle(EmergencyStop())
         self.fault_ns = self.fault_ns or self.world.clock.now_ns()
 
     def reset(self, attempts: int = 8) -> bool:
         """Reset as a person does, who tries again; whether the fault is cleared."""
         for _ in range(attempts):
-            if "error" not in self.core.handle({"do": "reset", "id": 1}):
+            if "error" not in self.core.handle(ClearFaults()):
                 self.fault_ns = None
                 begin_operation(self.teleop, self._reading())
                 return True

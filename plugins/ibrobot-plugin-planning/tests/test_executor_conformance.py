@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import override
 
+import attrs
+import numpy as np
 from ibrobot_planning.executors.gripper import GripperExecutor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.executors.trajectory import TrajectoryExecutor
 from ibrobot_testing import ExecutorSuite
 from ibrobot_testing.contexts import GRIPPER, control_context
+
+from ibrobot_core.api import FollowTrajectory, Header, JointTrajectory, JointTrajectoryPoint, MoveJoint
 
 
 class TestTrajectory(ExecutorSuite):
@@ -18,15 +23,14 @@ class TestTrajectory(ExecutorSuite):
 
     @override
     def goal(self, ctx, position):
-        at_rest = [0.0] * len(position)
-        point = {"time_from_start_ns": 2_000_000_000, "positions": position.tolist(), "velocities": at_rest}
-        return {"trajectory": {"joint_names": list(ctx.joints), "points": [point]}}
+        point = JointTrajectoryPoint(2_000_000_000, position, np.zeros(len(position)))
+        return FollowTrajectory(JointTrajectory(Header(), ctx.joints, (point,)))
 
     @override
     def wrong_goals(self, ctx):
         right = self.goal(ctx, self.poses(ctx)[1])
-        names = {"joint_names": list(ctx.joints[1:]), "points": right["trajectory"]["points"]}
-        return [{}, {"trajectory": names}, {**right, "path_tolerance": -3}]
+        other = attrs.evolve(right.trajectory, joint_names=ctx.joints[1:])
+        return [MoveJoint(0.0), FollowTrajectory(other), attrs.evolve(right, path_tolerance=-3.0)]
 
 
 class TestGripper(ExecutorSuite):
@@ -40,8 +44,8 @@ class TestGripper(ExecutorSuite):
 
     @override
     def goal(self, ctx, position):
-        return {"position": float(position[0])}
+        return MoveJoint(float(position[0]))
 
     @override
     def wrong_goals(self, ctx):
-        return [{}, {"position": 99.0}, {"position": "open"}]
+        return [FollowTrajectory(JointTrajectory(Header(), ctx.joints, ())), MoveJoint(99.0), MoveJoint(math.nan)]

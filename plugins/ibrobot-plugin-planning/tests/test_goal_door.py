@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from ibrobot_core.api import Header, IbrobotError, JointTrajectory, JointTrajectoryPoint, PlanningError, ns
+from ibrobot_core.api import (
+    FollowTrajectory,
+    Header,
+    IbrobotError,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    PlanningError,
+    SlowDown,
+    ns,
+)
 
 from .conftest import Make
 from .table_arm import ARM
@@ -17,8 +25,8 @@ from .test_motion import robot_yaml
 WALL_BOX = {"shape": "box", "size": [0.3, 0.02, 0.3], "position": [0.2, 0, 0.15]}
 
 
-def to(*positions: float, at: float = 2.0, names: tuple[str, ...] = ARM) -> dict[str, Any]:
-    return {"trajectory": JointTrajectory(Header(), names, (JointTrajectoryPoint(ns(at), np.array(positions)),))}
+def to(*positions: float, at: float = 2.0, names: tuple[str, ...] = ARM) -> FollowTrajectory:
+    return FollowTrajectory(JointTrajectory(Header(), names, (JointTrajectoryPoint(ns(at), np.array(positions)),)))
 
 
 def test_without_a_model_goals_are_limited_and_the_run_says_so_once(start: Make, caplog: pytest.LogCaptureFixture):
@@ -68,7 +76,7 @@ def test_arm_that_moves_without_a_goal_is_waited_for(start: Make, tmp_path: Path
     runtime.session.send_goal("arm", "one", to(0.5, 0.0, 0.0, 0.0, 0.0))
     for _ in range(50):
         runtime.step()
-    runtime.session.send_goal("arm", "stop", {"stop": True})
+    runtime.session.send_goal("arm", "stop", SlowDown())
     runtime.step()
     with pytest.raises(PlanningError, match="the joints still move"):
         runtime.session.send_goal("arm", "two", to(0.2, 0.0, 0.0, 0.0, 0.0))

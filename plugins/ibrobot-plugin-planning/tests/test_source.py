@@ -99,7 +99,7 @@ def test_goal_that_cannot_be_reached_is_counted_and_the_next_one_tried(
 def test_emergency_stop_fails_the_goal_under_way(start: Make):
     runtime = start(mode="plan", goals=("up",))
     seconds(runtime, 0.1)
-    runtime.session.control.call("estop")
+    runtime.session.emergency_stop()
     to_the_end(runtime)
     assert runtime.summary()["goals_failed"] == 1
 
@@ -107,7 +107,7 @@ def test_emergency_stop_fails_the_goal_under_way(start: Make):
 def test_goals_requested_before_an_emergency_stop_do_not_begin_after_the_reset(start: Make):
     runtime = start(mode="plan", goals=("up", "pan=-0.3"))
     seconds(runtime, 0.1)
-    runtime.session.control.call("estop")
+    runtime.session.emergency_stop()
     clock: Any = runtime.session.clock
     control: Any = runtime.session.control
     for _ in range(30):  # it brakes, and the source has no time to notice
@@ -124,7 +124,7 @@ def test_goals_requested_before_an_emergency_stop_do_not_begin_after_the_reset(s
 
 def test_goal_sent_while_the_robot_is_stopped_is_refused(start: Make):
     runtime = start(mode="plan")
-    runtime.session.control.call("estop")
+    runtime.session.emergency_stop()
     seconds(runtime, 0.1)
     with pytest.raises(PlanningError, match="refused before a reset: emergency stop"):
         runtime.session.bus.call(GO_TO, "up")

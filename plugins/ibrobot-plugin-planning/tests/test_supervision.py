@@ -87,10 +87,10 @@ def test_refused_blend_is_reported_and_the_motion_begins_after_a_stop(
     commands = step(runtime, 25)
     call = runtime.session.control.call
 
-    def refused(what: str, **asked: Any) -> Any:
-        if refuse in asked.get("goal_id", "") and "takes_over" in asked["goal"]:
+    def refused(command: Any) -> Any:
+        if type(command).__name__ == "SendGoal" and refuse in command.goal_id and command.goal.takes_over:
             raise HardwareError("too fast")
-        return call(what, **asked)
+        return call(command)
 
     monkeypatch.setattr(runtime.session.control, "call", refused)
     assert finish(runtime, runtime.session.bus.call(GO_TO, "pan=1.6,lift=0.4"), commands).success
@@ -216,7 +216,7 @@ def test_lost_joint_is_reported_as_the_cause(run):
     runtime = run()
     number = runtime.session.bus.call(GO_TO, "left")
     step(runtime, 25)
-    runtime.session.control.call("fault", fault="joint elbow does not answer")
+    runtime.session.raise_fault("joint elbow does not answer")
     result = finish(runtime, number)
     assert (result.outcome, result.code) == ("EXECUTION_FAILED", PlanCode.CONTROL_FAILED)
     assert result.message == "joint elbow does not answer"

@@ -196,7 +196,7 @@ def test_fault_ends_all_alternatives(run):
     runtime = run()
     number = runtime.session.bus.call(RUN, steps("alternatives: [[{wait: {seconds: 5}}], [{move: {pose: left}}]]"))
     runtime.step()
-    runtime.session.control.call("fault", fault="the cable is loose")
+    runtime.session.raise_fault("the cable is loose")
     assert finish(runtime, number).message == "step 1 (alternatives): the robot stopped: the cable is loose"
 
 
@@ -319,7 +319,7 @@ def test_fault_fails_the_step(run):
     runtime = run()
     number = runtime.session.bus.call(RUN, steps("wait: {seconds: 5}"))
     runtime.step()
-    runtime.session.control.call("fault", fault="the cable is loose")
+    runtime.session.raise_fault("the cable is loose")
     result = finish(runtime, number)
     assert result.message == "step 1 (wait): the robot stopped: the cable is loose"
 

@@ -93,7 +93,7 @@ class Robot:
         if cause == "STOP":
             session.emergency_stop()
         else:
-            session.control.call("fault", fault=cause)
+            session.raise_fault(cause)
         wait_for(lambda: session.faults and session.stopped_by)
         return before_ns
 

@@ -18,12 +18,15 @@ import numpy as np
 
 from ibrobot_core.api import (
     NS_PER_S,
+    ExecutorGoal,
+    FollowTrajectory,
     GoalRejected,
     Header,
     IbrobotError,
     JointReading,
     JointTrajectory,
     JointTrajectoryPoint,
+    MoveJoint,
     PlanningError,
     seconds,
 )
@@ -280,7 +283,7 @@ class Actions:
     def _index(self, executor: str) -> Any:
         return self._session.config.robot.indices(self._executors[executor].joints)
 
-    def _read(self, executor: ExecutorConfig, goal: Mapping[str, Any]) -> dict[str, Any]:
+    def _read(self, executor: ExecutorConfig, goal: Mapping[str, Any]) -> ExecutorGoal:
         """The goal in the executor's form.
 
         Raises:
@@ -290,16 +293,16 @@ class Actions:
             return self._trajectory(executor, goal)
         command = goal["command"]
         if self._gripper_action == GRIPPER_ACTIONS[0]:
-            return {"position": command["position"], "max_effort": command["max_effort"]}
+            return MoveJoint(command["position"], command["max_effort"])
         if list(command["name"]) not in ([], list(executor.joints)):
             raise _Invalid(f"names must be {', '.join(executor.joints)}, got {', '.join(command['name'])}")
         if len(command["position"]) != 1 or len(command["effort"]) > 1:
             raise _Invalid(f"needs one position, and at most one effort, got {command['position']}")
         if command["velocity"]:
             raise _Invalid("a velocity cannot be given: the executor's option velocity is used")
-        return {"position": command["position"][0], "max_effort": (command["effort"] or [0.0])[0]}
+        return MoveJoint(command["position"][0], (command["effort"] or [0.0])[0])
 
-    def _trajectory(self, executor: ExecutorConfig, fields: Mapping[str, Any]) -> dict[str, Any]:
+    def _trajectory(self, executor: ExecutorConfig, fields: Mapping[str, Any]) -> FollowTrajectory:
         trajectory = fields["trajectory"]
         if fields["multi_dof_trajectory"]["joint_names"]:
             raise _Invalid("multi_dof_trajectory: joints with several degrees of freedom are not supported")
@@ -311,11 +314,8 @@ class Actions:
             )
         points = tuple(JointTrajectoryPoint(**point) for point in trajectory["points"])
         message = JointTrajectory(Header(**trajectory["header"]), tuple(trajectory["joint_names"]), points)
-        goal: dict[str, Any] = {"trajectory": self._begun(message)}
-        for key in ("path_tolerance", "goal_tolerance"):
-            goal[key] = _tolerances(key, fields[key])
-        goal["goal_time"] = seconds(fields["goal_time_tolerance_ns"])
-        return goal
+        path, goal = (_tolerances(key, fields[key]) for key in ("path_tolerance", "goal_tolerance"))
+        return FollowTrajectory(self._begun(message), path, goal, seconds(fields["goal_time_tolerance_ns"]))
 
     def _begun(self, message: JointTrajectory) -> JointTrajectory:
         """A trajectory that begins now, of one that begins at its stamp; 0 stands for now, as does a moment ago.

@@ -179,8 +179,8 @@ class RecordingControl:
     def __init__(self) -> None:
         self.calls: list[str] = []
 
-    def call(self, do: str, **arguments: Any) -> dict[str, Any]:
-        self.calls.append(do)
+    def call(self, command: Any) -> dict[str, Any]:
+        self.calls.append(type(command).__name__)
         return {}
 
 
@@ -211,7 +211,7 @@ def test_a_stop_that_fails_stops_the_robot_and_ends_the_run(session: Session, er
     assert session.finished.wait(PATIENCE_S)
     assert session.failure is not None
     assert session.failure[0] == "services"
-    assert session.control.calls == ["estop"]  # type: ignore[attr-defined]
+    assert session.control.calls == ["EmergencyStop"]  # type: ignore[attr-defined]
     workers.end()
 
 

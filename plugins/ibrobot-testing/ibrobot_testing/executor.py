@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar, override
+import math
+from typing import ClassVar, override
 
 import attrs
 import numpy as np
@@ -12,10 +12,15 @@ import pytest
 from ibrobot_core.api import (
     Context,
     Executor,
+    ExecutorGoal,
+    FollowTrajectory,
     GoalRejected,
     GoalState,
     GoalStatus,
+    Header,
     JointReading,
+    JointTrajectory,
+    MoveJoint,
     Plan,
     Vector,
     ns,
@@ -39,13 +44,13 @@ class ExecutorSuite(Suite[Executor]):
     def context(self) -> Context:
         return control_context(joints=ARM)
 
-    def goal(self, ctx: Context, position: Vector) -> Mapping[str, Any] | None:
+    def goal(self, ctx: Context, position: Vector) -> ExecutorGoal | None:
         """A goal that ends at `position` [rad], shape (J,); None for executors that do not accept goals."""
         return None
 
-    def wrong_goals(self, ctx: Context) -> list[Mapping[str, Any]]:
+    def wrong_goals(self, ctx: Context) -> list[ExecutorGoal]:
         """Goals that must be refused."""
-        return [{}, {"nonsense": 1}]
+        return [MoveJoint(math.nan), FollowTrajectory(JointTrajectory(Header(), ("nonsense",), ()))]
 
     def poses(self, ctx: Context) -> list[Vector]:
         """Positions [rad], each shape (J,): nonzero and within limits."""
@@ -61,7 +66,7 @@ class ExecutorSuite(Suite[Executor]):
         executor.activate(measure(ctx, start))
         return executor, ctx, start
 
-    def _goal(self, ctx: Context, position: Vector) -> Mapping[str, Any]:
+    def _goal(self, ctx: Context, position: Vector) -> ExecutorGoal:
         goal = self.goal(ctx, position)
         if goal is None:
             pytest.skip("takes no goals")

@@ -9,7 +9,20 @@ import pytest
 from ibrobot_testing import ExecutorSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeExecutor, FakeTrajectoryExecutor
 
-from ibrobot_core.api import GoalRejected, GoalState, GoalStatus
+from ibrobot_core.api import (
+    FollowTrajectory,
+    GoalRejected,
+    GoalState,
+    GoalStatus,
+    Header,
+    JointTrajectory,
+    JointTrajectoryPoint,
+)
+
+
+def trajectory(joints, position):
+    point = JointTrajectoryPoint(2_000_000_000, position)
+    return FollowTrajectory(JointTrajectory(Header(), joints, (point,)))
 
 
 class TestExecutor(ExecutorSuite):
@@ -19,11 +32,11 @@ class TestExecutor(ExecutorSuite):
 
     @override
     def goal(self, ctx, position):
-        return {"position": position.tolist()}
+        return trajectory(ctx.joints, position)
 
     @override
     def wrong_goals(self, ctx):
-        return [{}, {"position": [0.0]}, {"position": [float("nan")] * len(ctx.joints)}]
+        return [trajectory(ctx.joints, [0.0]), trajectory(ctx.joints, [float("nan")] * len(ctx.joints))]
 
 
 class TestTrajectoryExecutor(ExecutorSuite):
@@ -33,8 +46,7 @@ class TestTrajectoryExecutor(ExecutorSuite):
 
     @override
     def goal(self, ctx, position):
-        point = {"time_from_start_ns": 2_000_000_000, "positions": position.tolist()}
-        return {"trajectory": {"joint_names": list(ctx.joints), "points": [point]}}
+        return trajectory(ctx.joints, position)
 
 
 class OtherJoints(FakeExecutor):

@@ -13,6 +13,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import (
+    FollowTrajectory,
     JointTrajectory,
     MissingDependency,
     NotSupported,
@@ -172,7 +173,7 @@ def _planned(
         planner.close()
         if result is None:
             raise PlanningError(f"goal {aim.text!r} moves no joint of the arm: {', '.join(joints)}")
-        trajectory = next(each for each in goals.values() if isinstance(each, JointTrajectory))
+        trajectory = next(each.trajectory for each in goals.values() if isinstance(each, FollowTrajectory))
         sampled = _sampled(trajectory, robot, start)
         clearance = _clearance(session, joints, start, sampled)
     limits = robot.max_velocity[robot.indices(joints)]

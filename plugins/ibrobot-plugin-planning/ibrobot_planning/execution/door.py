@@ -13,11 +13,14 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import (
+    ExecutorGoal,
+    FollowTrajectory,
     GoalRejected,
     HardwareError,
     IbrobotError,
     JointTrajectory,
     PlanningError,
+    SlowDown,
     Vector,
     ns,
     seconds,
@@ -43,7 +46,7 @@ _GLANCE_S = 0.1
 _REST_S = 1.0
 """Longest wait for joints that come to rest, e.g. after a cancel [s]."""
 
-type Send = Callable[[Mapping[str, Any]], None]
+type Send = Callable[[ExecutorGoal], None]
 
 
 @attrs.define(eq=False)
@@ -160,29 +163,29 @@ class GoalDoor(SessionWorker):
         if self._is_checked():
             self._paths.note(trajectory, self._paths.snapshot(self._margins()))
 
-    def take(self, executor: str, goal_id: str, goal: Mapping[str, Any], send: Send) -> None:
+    def take(self, executor: str, goal_id: str, goal: ExecutorGoal, send: Send) -> None:
         """Let a goal pass. See `Session.goal_door`.
 
         Raises:
             PlanningError: if it fails a check.
             IbrobotError: if control refuses it.
         """
-        if "trajectory" not in goal or executor not in self._executors:
-            if "stop" in goal:
+        if not isinstance(goal, FollowTrajectory) or executor not in self._executors:
+            if isinstance(goal, SlowDown):
                 self._tracks.pop(executor, None)  # it slows down: who sends this watches it
             send(goal)
             return
         if executor not in self.session.config.control_modes[self.session.mode].executors:
             raise GoalRejected(f"executor {executor!r} is not active in mode {self.session.mode}")
         with self._door:
-            if "takes_over" in goal or any(known is goal["trajectory"] for known in self._complete):
-                self._check_free(goal["trajectory"])
+            if goal.takes_over is not None or any(known is goal.trajectory for known in self._complete):
+                self._check_free(goal.trajectory)
                 self._send(executor, goal_id, goal, send)
             else:
                 self._complete_and_send(executor, goal_id, goal, send)
 
-    def _complete_and_send(self, executor: str, goal_id: str, goal: Mapping[str, Any], send: Send) -> None:
-        trajectory: JointTrajectory = goal["trajectory"]
+    def _complete_and_send(self, executor: str, goal_id: str, goal: FollowTrajectory, send: Send) -> None:
+        trajectory = goal.trajectory
         check_size(trajectory)
         unknown = [name for name in trajectory.joint_names if name not in self._robot.joint_names]
         if unknown or not trajectory.joint_names:
@@ -192,7 +195,7 @@ class GoalDoor(SessionWorker):
             whole = completed(trajectory, start, self._robot, self._period_ns)
             self._check_free(whole)
             try:
-                self._send(executor, goal_id, {**goal, "trajectory": whole, **takes_over}, send)
+                self._send(executor, goal_id, attrs.evolve(goal, trajectory=whole, **takes_over), send)
             except HardwareError as error:
                 if not takes_over:
                     raise
@@ -218,7 +221,7 @@ class GoalDoor(SessionWorker):
         begin_s = min(round(passed_s + ahead_s, 3), motion.duration)
         columns = [track.trajectory.joint_names.index(name) for name in joints]
         position, velocity, acceleration = motion.at(begin_s)[:, columns]
-        takes_over = {"takes_over": {"goal": track.goal_id, "time_ns": ns(begin_s)}}
+        takes_over = {"takes_over": track.goal_id, "at_ns": ns(begin_s)}
         if begin_s == motion.duration:
             return Start(position), takes_over
         return Start(position, velocity, acceleration), takes_over
@@ -263,8 +266,8 @@ class GoalDoor(SessionWorker):
         if self._is_checked() and (touched := self._paths.blocked(trajectory, self._others(), self._margins())):
             raise PlanningError(f"the trajectory is not free: {touched}", PlanCode.INVALID_MOTION_PLAN)
 
-    def _send(self, executor: str, goal_id: str, goal: Mapping[str, Any], send: Send) -> None:
-        before, track = self._tracks.get(executor), _Track(goal_id, goal["trajectory"])
+    def _send(self, executor: str, goal_id: str, goal: FollowTrajectory, send: Send) -> None:
+        before, track = self._tracks.get(executor), _Track(goal_id, goal.trajectory)
         self._tracks[executor] = track
         try:
             send(goal)
@@ -290,7 +293,7 @@ class GoalDoor(SessionWorker):
         self.session.log.warning("%s stops before an obstacle: %s", name, touched)
         track.trajectory = None
         try:
-            self.session.send_goal(name, f"{track.goal_id} before {touched}", {"stop": True})
+            self.session.send_goal(name, f"{track.goal_id} before {touched}", SlowDown())
         except HardwareError:  # an executor of another plugin may not know how to slow down
             self.session.cancel_goals(name)
 

@@ -11,11 +11,14 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import (
+    ExecutorGoal,
+    FollowTrajectory,
     HardwareError,
     Header,
     JointTrajectory,
     JointTrajectoryPoint,
     PlanningError,
+    SlowDown,
     Vector,
     ns,
     seconds,
@@ -30,9 +33,6 @@ _LATENCY_S = 0.04
 """How far ahead a trajectory takes over from the running one, so that its goal arrives in time."""
 _LEAD_S = 0.15
 """How long a replaced motion goes on before it brakes, so that quick replans do not slow the arm."""
-
-type ExecutorGoal = JointTrajectory | float
-"""A trajectory, or a position [rad]."""
 
 
 def commanded(session: RunView) -> Vector:
@@ -128,7 +128,7 @@ class Execution:
             for name in sorted(self._tracks):
                 goal_id = f"{number}:stop:{name}"
                 try:
-                    session.send_goal(name, goal_id, {"stop": True})
+                    session.send_goal(name, goal_id, SlowDown())
                 except HardwareError as error:
                     session.log.warning("%s does not slow down, and is cancelled: %s", name, error)
                     session.cancel_goals()
@@ -152,9 +152,9 @@ class Execution:
             rest = commanded(self._session).copy()
             try:
                 for name, (begin_ns, way) in braked.items():
-                    takes_over = {"goal": self._tracks[name].goal_id, "time_ns": begin_ns}
                     self._door.free(way)  # along the path under way
-                    self._send(name, f"{number}:brake:{name}", way, takes_over)
+                    goal = FollowTrajectory(way, takes_over=self._tracks[name].goal_id, at_ns=begin_ns)
+                    self._send(name, f"{number}:brake:{name}", goal)
                     rest[self._session.config.robot.indices(way.joint_names)] = way.points[-1].positions
             except (HardwareError, PlanningError) as error:
                 self._session.log.warning("the arm stops before its next motion: braking was refused: %s", error)
@@ -166,7 +166,8 @@ class Execution:
         """Add the next motion to the braking one."""
         with self._lock:
             self._ahead = {
-                name: _Next(goal, None if isinstance(goal, float) else motion_of(goal)) for name, goal in goals.items()
+                name: _Next(goal, motion_of(goal.trajectory) if isinstance(goal, FollowTrajectory) else None)
+                for name, goal in goals.items()
             }
         self.step()
 
@@ -175,10 +176,10 @@ class Execution:
         with self._lock:
             for name, following in list(self._ahead.items()):
                 track, goal = self._tracks.get(name), following.goal
-                if isinstance(goal, float) or track is None or track.trajectory is None:
+                if not isinstance(goal, FollowTrajectory) or track is None or track.trajectory is None:
                     sent = self._begin(name, following)
                 else:
-                    sent = self._blended(name, track, track.trajectory, following, goal)
+                    sent = self._blended(name, track, track.trajectory, following, goal.trajectory)
                 if sent:
                     self._ahead.pop(name, None)
 
@@ -228,15 +229,12 @@ class Execution:
                     return touched
         return ""
 
-    def _send(self, name: str, goal_id: str, goal: ExecutorGoal, takes_over: Mapping[str, Any] | None = None) -> None:
-        message: dict[str, Any] = {"position": goal} if isinstance(goal, float) else {"trajectory": goal}
-        if takes_over is not None:
-            message["takes_over"] = takes_over
-        if not isinstance(goal, float):
-            self._door.complete(goal)
-        track = _Track(goal_id, None if isinstance(goal, float) else goal)
-        self._session.send_goal(name, goal_id, message, self._stops)
-        self._tracks[name] = track
+    def _send(self, name: str, goal_id: str, goal: ExecutorGoal) -> None:
+        trajectory = goal.trajectory if isinstance(goal, FollowTrajectory) else None
+        if trajectory is not None:
+            self._door.complete(trajectory)
+        self._session.send_goal(name, goal_id, goal, self._stops)
+        self._tracks[name] = _Track(goal_id, trajectory)
 
     def _begin(self, name: str, following: _Next) -> bool:
         """Send a goal to an executor at rest; True, as it needs no retry."""
@@ -245,10 +243,10 @@ class Execution:
         self._send(name, f"{self._number}:{name}", following.goal)
         return True
 
-    def _take_over(self, name: str, following: _Next, way: JointTrajectory, takes_over: Mapping[str, Any]) -> bool:
+    def _take_over(self, name: str, following: _Next, goal: FollowTrajectory) -> bool:
         """Let a trajectory take over from the running one; False if the executor refuses it, e.g. as too late."""
         try:
-            self._send(name, f"{self._number}:{name}", way, takes_over)
+            self._send(name, f"{self._number}:{name}", goal)
         except (HardwareError, PlanningError) as error:
             following.refused = str(error)
             return False
@@ -297,5 +295,6 @@ class Execution:
             if not self._planner.blocked(overlap, others):
                 blend = trajectory_of(way, running.joint_names, goal.header.stamp_ns)
                 self._door.free(blend)
-                return self._take_over(name, following, blend, {"goal": track.goal_id, "time_ns": ns(begin_s)})
+                goal_there = FollowTrajectory(blend, takes_over=track.goal_id, at_ns=ns(begin_s))
+                return self._take_over(name, following, goal_there)
         return False

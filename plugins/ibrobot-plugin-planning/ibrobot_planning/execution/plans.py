@@ -10,9 +10,18 @@ import attrs
 import numpy as np
 from ibrobot_kinematics import robot_model
 
-from ibrobot_core.api import IbrobotError, JointTrajectory, PlanningError, Vector, ns
+from ibrobot_core.api import (
+    ExecutorGoal,
+    FollowTrajectory,
+    IbrobotError,
+    JointTrajectory,
+    MoveJoint,
+    PlanningError,
+    Vector,
+    ns,
+)
 from ibrobot_core.app import ControlMode, PlanCode, Plugins, RobotConfig, RunView
-from ibrobot_planning.execution.motions import ExecutorGoal, commanded
+from ibrobot_planning.execution.motions import commanded
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import GoalOptions
 from ibrobot_planning.goals.joints import without_names
@@ -157,7 +166,7 @@ class GoalPlans:
         planned = None
         for name, goal in wanted.items():
             if isinstance(goal, float):
-                goals[name] = goal
+                goals[name] = MoveJoint(goal)
                 continue
             others = dict(zip(robot.joint_names, start.tolist(), strict=True))
             if isinstance(goal, JointTrajectory):
@@ -168,7 +177,7 @@ class GoalPlans:
                 first, scalings = start[robot.indices(joints)], (target.velocity_scaling, target.acceleration_scaling)
                 planned = self.planned(PlanRequest(joints, first, goal, *scalings, others))
                 trajectory = planned.trajectory
-            goals[name] = self._checked(trajectory, start, others)
+            goals[name] = FollowTrajectory(self._checked(trajectory, start, others))
         return goals, planned
 
     def _checked(self, trajectory: JointTrajectory, start: Vector, others: Mapping[str, float]) -> JointTrajectory:

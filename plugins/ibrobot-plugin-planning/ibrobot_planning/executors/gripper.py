@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections import deque
 from collections.abc import Mapping
 from typing import Any, override
@@ -14,11 +13,14 @@ import numpy as np
 from ibrobot_core.api import (
     Context,
     Executor,
+    ExecutorGoal,
     GoalRejected,
     GoalState,
     GoalStatus,
     JointReading,
+    MoveJoint,
     NotSupported,
+    SlowDown,
     Vector,
     ns,
     seconds,
@@ -48,7 +50,7 @@ class GripperExecutor(Executor):
     Reached: the measured position is within `goal_tolerance` of the goal. Stalled: the measured speed has been below
     `stall_velocity` for `stall_time`; something is in the way. With `allow_stalling` that is a success (grasped) and
     the setpoint goes on to the goal, so that the gripper keeps squeezing; without it, the goal is aborted and the
-    measured position held, as by `cancel`. The goal `{"stop": True}` slows down and holds. With `max_effort` the
+    measured position held, as by `cancel`. The goal `SlowDown` slows down and holds. With `max_effort` the
     setpoint stays while the measured effort is at or above it, also after the goal has ended.
     """
 
@@ -89,26 +91,23 @@ class GripperExecutor(Executor):
         self._setpoint = self._target = math.nan
 
     @override
-    def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
+    def set_goal(self, goal_id: str, goal: ExecutorGoal, measured: JointReading) -> None:
         """Begin to open or close.
-
-        Args:
-            goal_id: names it in `pop_status`.
-            goal: `position` [rad]; optionally `max_effort` [Nm], 0 for no limit. Or `{"stop": True}`.
-            measured: the joint now, shape (1,).
 
         Raises:
             GoalRejected: e.g. a position outside the joint's limits; the old goal goes on.
         """
         if math.isnan(self._setpoint):
             raise GoalRejected("the executor is not active")
-        if goal == {"stop": True}:
+        if isinstance(goal, SlowDown):
             self._begin(_Running(goal_id, stops=True), self._setpoint + self._braking_distance())
             return
-        unknown = [key for key in goal if key not in {"position", "max_effort"}]
-        if unknown:
-            raise GoalRejected(f"the goal has an unknown key {unknown[0]!r}; known: position, max_effort")
-        position, max_effort = _number(goal, "position", None), _number(goal, "max_effort", 0.0)
+        if not isinstance(goal, MoveJoint):
+            raise GoalRejected(f"expected a position, got {goal}")
+        position, max_effort = goal.position, goal.max_effort
+        for name, value in (("position", position), ("max_effort", max_effort)):
+            if not math.isfinite(value):
+                raise GoalRejected(f"{name} must be a finite number, got {value!r}")
         if not self._lower <= position <= self._upper:
             raise GoalRejected(
                 f"position {position:.6g} rad is outside the limits of {self.joints[0]}, "
@@ -194,10 +193,3 @@ class GripperExecutor(Executor):
         if self._running is not None:
             self._statuses.append(GoalStatus(self._running.goal_id, state, message, result or {}))
             self._running = None
-
-
-def _number(goal: Mapping[str, Any], key: str, default: float | None) -> float:
-    value = goal.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
-        raise GoalRejected(f"{key} must be a finite number, got {value!r}")
-    return float(value)

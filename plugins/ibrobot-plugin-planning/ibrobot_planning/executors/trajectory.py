@@ -10,15 +10,26 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import Context, Executor, GoalRejected, GoalState, GoalStatus, JointReading, Vector, seconds
+from ibrobot_core.api import (
+    Context,
+    Executor,
+    ExecutorGoal,
+    FollowTrajectory,
+    GoalRejected,
+    GoalState,
+    GoalStatus,
+    JointReading,
+    SlowDown,
+    Vector,
+    seconds,
+)
 from ibrobot_core.app import Spline
 from ibrobot_planning.executors.options import TrajectoryOptions
 from ibrobot_planning.executors.trajectory_goal import (
-    Takeover,
-    TrajectoryGoal,
+    CheckedTrajectory,
     check_plausible,
     check_positions,
-    parse_goal,
+    check_trajectory,
 )
 
 LAG_S = 0.1
@@ -47,7 +58,7 @@ class _Stop:
 @attrs.frozen(eq=False)
 class _Running:
     goal_id: str
-    goal: TrajectoryGoal
+    goal: CheckedTrajectory
     begin_ns: int
     spline: Spline
     stop: _Stop | None = None
@@ -63,7 +74,7 @@ class TrajectoryExecutor(Executor):
     late at the goal, aborts it. Aborting and cancelling hold the measured position.
 
     A trajectory with `takes_over` begins at a given time of the running one, with its setpoint, velocity and
-    acceleration at that time. The goal `{"stop": True}` slows down along the trajectory under way, within the
+    acceleration at that time. The goal `SlowDown` slows down along the trajectory under way, within the
     acceleration limits, and holds where it comes to rest.
 
     Trajectories advance by one control period per tick: missed ticks delay them, and skip nothing.
@@ -96,17 +107,8 @@ class TrajectoryExecutor(Executor):
         self._held = None
 
     @override
-    def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
+    def set_goal(self, goal_id: str, goal: ExecutorGoal, measured: JointReading) -> None:
         """Begin a trajectory.
-
-        Args:
-            goal_id: names it in `pop_status`.
-            goal: `trajectory`: `joint_names` and `points`, each of `time_from_start_ns`, `positions` and, in all
-                points or in none, `velocities`, `accelerations`; optionally `path_tolerance` and `goal_tolerance`
-                [rad], a number or one by joint name, and `goal_time` [s]: 0 means the options' value, -1 none;
-                and `takes_over`: `goal`, the running one, and `time_ns`, the time of its trajectory at which this one
-                begins. Or `{"stop": True}`.
-            measured: the joints now.
 
         Raises:
             GoalRejected: e.g. times that do not increase, a velocity at the end, or a time to take over that has
@@ -114,27 +116,29 @@ class TrajectoryExecutor(Executor):
         """
         if self._held is None:
             raise GoalRejected("the executor is not active")
-        if "stop" in goal:
-            self._begin_stop(goal_id, goal)
+        if isinstance(goal, SlowDown):
+            self._begin_stop(goal_id)
             return
-        parsed = parse_goal(goal, self.joints, self._options)
-        check_plausible(parsed, self.joints, self._velocity, self._acceleration)
-        begin_ns = self._now_ns if parsed.takes_over is None else self._takeover_ns(parsed.takes_over)
-        following = _Running(goal_id, parsed, begin_ns, self._spline(parsed, begin_ns))
+        if not isinstance(goal, FollowTrajectory):
+            raise GoalRejected(f"expected a trajectory, got {goal}")
+        checked = check_trajectory(goal, self.joints, self._options)
+        check_plausible(checked, self.joints, self._velocity, self._acceleration)
+        begin_ns = self._now_ns if goal.takes_over is None else self._takeover_ns(goal.takes_over, goal.at_ns)
+        following = _Running(goal_id, checked, begin_ns, self._spline(checked, begin_ns))
         if self._next is not None:
             self._statuses.append(GoalStatus(self._next.goal_id, GoalState.CANCELED, f"replaced by goal {goal_id}"))
         self._next = following
-        if parsed.takes_over is None:
+        if goal.takes_over is None:
             self._begin_next()
 
-    def _takeover_ns(self, takeover: Takeover) -> int:
+    def _takeover_ns(self, name: str, at_ns: int) -> int:
         running = self._running
-        if running is None or running.goal_id != takeover.goal or running.stop is not None:
-            raise GoalRejected(f"goal {takeover.goal} does not run, so no trajectory can take over from it")
-        begin_ns = running.begin_ns + takeover.time_ns
+        if running is None or running.goal_id != name or running.stop is not None:
+            raise GoalRejected(f"goal {name} does not run, so no trajectory can take over from it")
+        begin_ns = running.begin_ns + at_ns
         if not self._now_ns <= begin_ns <= running.spline.end_ns:
             raise GoalRejected(
-                f"takes_over is at {takeover.time_ns} ns of goal {takeover.goal}, which is at "
+                f"the trajectory takes over at {at_ns} ns of goal {name}, which is at "
                 f"{self._now_ns - running.begin_ns} ns and ends at {running.spline.end_ns - running.begin_ns} ns"
             )
         return begin_ns
@@ -148,9 +152,7 @@ class TrajectoryExecutor(Executor):
         begin_ns = self._stamp_ns - (self._now_ns - following.begin_ns)
         self._statuses.append(GoalStatus(following.goal_id, GoalState.EXECUTING, "", {"begin_ns": begin_ns}))
 
-    def _begin_stop(self, goal_id: str, goal: Mapping[str, Any]) -> None:
-        if goal != {"stop": True}:
-            raise GoalRejected(f"a goal that stops is {{'stop': True}}, got {dict(goal)!r}")
+    def _begin_stop(self, goal_id: str) -> None:
         running = self._running
         self._end(GoalState.CANCELED, f"stopped by goal {goal_id}")
         self._statuses.append(GoalStatus(goal_id, GoalState.EXECUTING))
@@ -240,7 +242,7 @@ class TrajectoryExecutor(Executor):
         left = _STOP_SHARE * self._acceleration + np.sign(velocity) * acceleration * rate**2
         return float((-left[moving] / np.abs(velocity[moving])).max())
 
-    def _spline(self, goal: TrajectoryGoal, begin_ns: int) -> Spline:
+    def _spline(self, goal: CheckedTrajectory, begin_ns: int) -> Spline:
         """A spline through the goal's points, from the setpoint at `begin_ns` [ns]."""
         position, velocity, acceleration = self._sample(begin_ns)
         times_ns, positions = goal.times_ns, goal.positions

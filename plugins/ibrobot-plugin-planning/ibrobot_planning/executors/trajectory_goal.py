@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import GoalRejected, Vector, ns
+from ibrobot_core.api import FollowTrajectory, GoalRejected, JointTrajectoryPoint, Vector, ns
 from ibrobot_planning.executors.options import TrajectoryOptions
 
 _LONGEST_S = 86_400.0
@@ -26,19 +24,9 @@ _SHARES = np.linspace(0.0, 1.0, 65)
 """Where pieces of a spline that may leave the limits are sampled."""
 
 
-@attrs.frozen
-class Takeover:
-    """When a trajectory takes over from the running one."""
-
-    goal: str
-    """Name of the running goal."""
-    time_ns: int
-    """Time along its trajectory [ns]."""
-
-
 @attrs.frozen(eq=False)
-class TrajectoryGoal:
-    """A goal in the executor's joint order: N points of J joints."""
+class CheckedTrajectory:
+    """A trajectory in the executor's joint order: N points of J joints."""
 
     times_ns: NDArray[np.int64]
     """[ns] from the start, strictly increasing, shape (N,)."""
@@ -54,29 +42,27 @@ class TrajectoryGoal:
     """[rad], shape (J,); 0: not checked."""
     goal_time_ns: int
     """[ns]; 0: no limit."""
-    takes_over: Takeover | None = None
 
 
-def parse_goal(goal: Mapping[str, Any], joints: Sequence[str], options: TrajectoryOptions) -> TrajectoryGoal:
+def check_trajectory(goal: FollowTrajectory, joints: Sequence[str], options: TrajectoryOptions) -> CheckedTrajectory:
     """Check a goal for the executor's `joints`.
 
     Raises:
         GoalRejected: for the first fault.
     """
-    _keys(goal, ("trajectory",), ("path_tolerance", "goal_tolerance", "goal_time", "takes_over"), "the goal")
-    trajectory = goal["trajectory"]
-    _keys(trajectory, ("joint_names", "points"), (), "the trajectory")
-    order = _order(trajectory["joint_names"], joints)
-    points = trajectory["points"]
-    if not isinstance(points, list | tuple) or not points:
+    order = _order(goal.trajectory.joint_names, joints)
+    points = goal.trajectory.points
+    if not points:
         raise GoalRejected("the trajectory has no points; it needs at least one")
-    for index, point in enumerate(points):
-        _keys(point, ("time_from_start_ns", "positions"), ("velocities", "accelerations"), f"point {index}")
     times_ns = _times(points)
-    positions = _field(points, "positions", order)
-    velocities, accelerations = _field(points, "velocities", order), _field(points, "accelerations", order)
+    positions, velocities, accelerations, efforts = (
+        _field([getattr(point, name) for point in points], name, order)
+        for name in ("positions", "velocities", "accelerations", "effort")
+    )
     if positions is None:
         raise GoalRejected("the points have no positions; every point needs them")
+    if efforts is not None:
+        raise GoalRejected("the points have efforts; only positions, velocities and accelerations are followed")
     if accelerations is not None and velocities is None:
         raise GoalRejected("the points have accelerations but no velocities; give both, or positions alone")
     if velocities is not None and velocities[-1].any():
@@ -84,19 +70,18 @@ def parse_goal(goal: Mapping[str, Any], joints: Sequence[str], options: Trajecto
         raise GoalRejected(
             f"the last point has {joints[joint]} at {velocities[-1, joint]:.6g} rad/s; it must be at rest"
         )
-    return TrajectoryGoal(
+    return CheckedTrajectory(
         times_ns,
         positions,
         velocities,
         accelerations,
-        path_tolerance=_tolerance(goal, "path_tolerance", options.path_tolerance, joints),
-        goal_tolerance=_tolerance(goal, "goal_tolerance", options.goal_tolerance, joints),
-        goal_time_ns=ns(_setting(goal.get("goal_time", 0), options.goal_time, "goal_time", _LONGEST_S)),
-        takes_over=_takeover(goal["takes_over"]) if "takes_over" in goal else None,
+        path_tolerance=_tolerance(goal.path_tolerance, "path_tolerance", options.path_tolerance, joints),
+        goal_tolerance=_tolerance(goal.goal_tolerance, "goal_tolerance", options.goal_tolerance, joints),
+        goal_time_ns=ns(_setting(goal.goal_time, options.goal_time, "goal_time", _LONGEST_S)),
     )
 
 
-def check_plausible(goal: TrajectoryGoal, joints: Sequence[str], velocity: Vector, acceleration: Vector) -> None:
+def check_plausible(goal: CheckedTrajectory, joints: Sequence[str], velocity: Vector, acceleration: Vector) -> None:
     """Refuse velocities and accelerations of points that are far beyond the limits of the joints, each shape (J,).
 
     Raises:
@@ -178,54 +163,30 @@ def _check_inside(
     )
 
 
-def _takeover(value: Any) -> Takeover:
-    _keys(value, ("goal", "time_ns"), (), "takes_over")
-    if not isinstance(value["goal"], str):
-        raise GoalRejected(f"takes_over has goal {value['goal']!r}; it must be the name of the running goal")
-    return Takeover(value["goal"], _time_ns(value["time_ns"], "takes_over"))
-
-
-def _keys(value: Any, required: Sequence[str], optional: Sequence[str], what: str) -> None:
-    if not isinstance(value, Mapping):
-        raise GoalRejected(f"{what} must be a mapping with {', '.join(required)}, got {value!r}")
-    for key in required:
-        if key not in value:
-            raise GoalRejected(f"{what} has no {key}")
-    for key in value:
-        if key not in required and key not in optional:
-            raise GoalRejected(f"{what} has an unknown key {key!r}; known: {', '.join((*required, *optional))}")
-
-
-def _order(names: Any, joints: Sequence[str]) -> list[int]:
+def _order(names: Sequence[str], joints: Sequence[str]) -> list[int]:
     """Index in `names` of each of `joints`."""
-    if not isinstance(names, list | tuple) or sorted(map(str, names)) != sorted(joints):
-        raise GoalRejected(f"joint_names must be, in any order, {', '.join(joints)}; got {names!r}")
+    if sorted(names) != sorted(joints):
+        raise GoalRejected(f"joint_names must be, in any order, {', '.join(joints)}; got {', '.join(names) or 'none'}")
     return [names.index(joint) for joint in joints]
 
 
-def _times(points: Sequence[Mapping[str, Any]]) -> NDArray[np.int64]:
+def _times(points: Sequence[JointTrajectoryPoint]) -> NDArray[np.int64]:
     previous = -1
     for index, point in enumerate(points):
-        time_ns = _time_ns(point["time_from_start_ns"], f"point {index}", "time_from_start_ns")
+        time_ns = point.time_from_start_ns
+        if not 0 <= time_ns < 2**62:
+            raise GoalRejected(f"point {index} has time_from_start_ns {time_ns}; it must be from 0 on")
         if time_ns <= previous:
             raise GoalRejected(f"point {index} is at {time_ns} ns, not after the point before it at {previous} ns")
         previous = time_ns
     if previous == 0:
         raise GoalRejected("the last point is at time 0, which leaves no time to reach it")
-    return np.array([point["time_from_start_ns"] for point in points], dtype=np.int64)
+    return np.array([point.time_from_start_ns for point in points], dtype=np.int64)
 
 
-def _time_ns(value: Any, what: str, key: str = "time_ns") -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**62:
-        raise GoalRejected(f"{what} has {key} {value!r}; it must be an integer from 0 on")
-    return value
-
-
-def _field(points: Sequence[Mapping[str, Any]], name: str, order: Sequence[int]) -> Vector | None:
-    """Field `name` of all points in the executor's order, shape (N, J); None if no point has it."""
-    rows = [point.get(name, ()) for point in points]
-    # In ROS, an empty list means that the field is missing.
-    present = [not (isinstance(row, list | tuple) and not row) for row in rows]
+def _field(rows: Sequence[Vector], name: str, order: Sequence[int]) -> Vector | None:
+    """A field of all points in the executor's order, shape (N, J); None if no point has it."""
+    present = [row.size > 0 for row in rows]  # in ROS, an empty list means that the field is missing
     if not any(present):
         return None
     if not all(present):
@@ -233,17 +194,17 @@ def _field(points: Sequence[Mapping[str, Any]], name: str, order: Sequence[int])
             f"point {present.index(False)} has no {name} but point {present.index(True)} has; all or none must"
         )
     for index, row in enumerate(rows):
-        if not isinstance(row, list | tuple) or len(row) != len(order):
-            raise GoalRejected(f"point {index} has {name} {row!r}; it must be a list of {len(order)} numbers")
-        for value in row:
-            if not _is_finite(value):
-                raise GoalRejected(f"point {index} has {value!r} among its {name}; each must be a finite number")
-    return np.array(rows, dtype=np.float64)[:, order]
+        if row.shape != (len(order),):
+            raise GoalRejected(f"point {index} has {name} {row.tolist()}; it must be a list of {len(order)} numbers")
+    values = np.stack(rows)
+    if not np.isfinite(values).all():
+        index, joint = np.argwhere(~np.isfinite(values))[0]
+        raise GoalRejected(f"point {index} has {values[index, joint]} among its {name}; each must be a finite number")
+    return values[:, order]
 
 
-def _tolerance(goal: Mapping[str, Any], name: str, default: float, joints: Sequence[str]) -> Vector:
+def _tolerance(value: float | Mapping[str, float], name: str, default: float, joints: Sequence[str]) -> Vector:
     """Tolerance of each joint [rad], shape (J,); 0: not checked."""
-    value = goal.get(name, 0)
     by_joint = value if isinstance(value, Mapping) else dict.fromkeys(joints, value)
     for joint in by_joint:
         if joint not in joints:
@@ -251,14 +212,10 @@ def _tolerance(goal: Mapping[str, Any], name: str, default: float, joints: Seque
     return np.array([_setting(by_joint.get(joint, 0), default, name, _WIDEST_RAD) for joint in joints])
 
 
-def _setting(value: Any, default: float, name: str, highest: float) -> float:
+def _setting(value: float, default: float, name: str, highest: float) -> float:
     """A setting; 0 means the default, -1 none (returned as 0)."""
-    if not _is_finite(value) or (value < 0 and value != -1):
+    if not math.isfinite(value) or (value < 0 and value != -1):
         raise GoalRejected(f"{name} is {value!r}; it must be above 0, or 0 for the default, or -1 for none")
     if value > highest:
         raise GoalRejected(f"{name} is {value!r}; it must be at most {highest:g}")
-    return default if value == 0 else max(float(value), 0.0)
-
-
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return default if value == 0 else max(value, 0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, override
+from typing import override
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from ibrobot_core.api import (
     Context,
     EpisodeSetup,
     Executor,
+    ExecutorGoal,
+    FollowTrajectory,
     GoalRejected,
     GoalState,
     GoalStatus,
@@ -177,7 +179,7 @@ class _HoldingExecutor(Executor):
 
 
 class FakeExecutor(_HoldingExecutor):
-    """Accepts plans, read at their nearest point, and goals `{"position": …}`, approached at constant speed.
+    """Accepts plans, read at their nearest point, and the end of a trajectory, approached at constant speed.
 
     A plan is stale a second after its last point.
     """
@@ -229,11 +231,8 @@ class FakeExecutor(_HoldingExecutor):
         self._plan, self._is_stale = plan, False
 
     @override
-    def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
-        position = np.asarray(goal.get("position", ()), np.float64)
-        if position.shape != self._setpoint.shape or not np.isfinite(position).all():
-            raise GoalRejected(f"position must be {len(self.joints)} finite numbers, got {goal!r}")
-        self._goal = position
+    def set_goal(self, goal_id: str, goal: ExecutorGoal, measured: JointReading) -> None:
+        self._goal = _positions(goal, self.joints)[-1]
         self._begin_goal(goal_id)
 
     @override
@@ -241,21 +240,29 @@ class FakeExecutor(_HoldingExecutor):
         return {"refused_plans": self._refused}
 
 
+def _positions(goal: ExecutorGoal, joints: tuple[str, ...]) -> Vector:
+    """The positions of a trajectory's points in the order of the joints [rad], shape (N, J)."""
+    try:
+        assert isinstance(goal, FollowTrajectory)
+        order = [goal.trajectory.joint_names.index(joint) for joint in joints]
+        positions = np.stack([point.positions[order] for point in goal.trajectory.points])
+        assert np.isfinite(positions).all()
+    except (AssertionError, IndexError, ValueError) as error:
+        raise GoalRejected(f"not a trajectory of {', '.join(joints)}: {goal!r}") from error
+    return positions
+
+
 class FakeTrajectoryExecutor(_HoldingExecutor):
-    """Accepts goals made by `trajectory_goal`, and interpolates their positions linearly.
+    """Accepts trajectories, and interpolates their positions linearly.
 
     A goal succeeds once the joints are within 0.02 rad of its end.
     """
 
     @override
-    def set_goal(self, goal_id: str, goal: Mapping[str, Any], measured: JointReading) -> None:
-        try:
-            names, points = goal["trajectory"]["joint_names"], goal["trajectory"]["points"]
-            order = [names.index(joint) for joint in self.joints]
-            positions = np.array([[point["positions"][i] for i in order] for point in points], np.float64)
-            times_ns = np.array([point["time_from_start_ns"] for point in points], np.float64)
-        except (KeyError, ValueError, TypeError) as error:
-            raise GoalRejected(f"not a trajectory of {', '.join(self.joints)}: {goal!r}") from error
+    def set_goal(self, goal_id: str, goal: ExecutorGoal, measured: JointReading) -> None:
+        positions = _positions(goal, self.joints)
+        assert isinstance(goal, FollowTrajectory)
+        times_ns = np.array([point.time_from_start_ns for point in goal.trajectory.points], np.float64)
         self._end_goal(GoalState.CANCELED)
         self._times_ns: Vector = measured.stamp_ns + np.concatenate(([0.0], times_ns))
         self._positions: Vector = np.vstack((self._setpoint, positions))
