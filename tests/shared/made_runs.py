@@ -114,6 +114,16 @@ class Run:
     outcome: str = "success"
     prompt: str = "pick up the cube"
     amplitude: float = 1.0
+    stall: tuple[float, float] = (0.0, 0.0)
+    """When a person who demonstrates stops, and for how long [s]."""
+    shake: float = 0.0
+    """How far the hand of a person who demonstrates trembles [rad]."""
+    cut: tuple[int, float] = (0, np.inf)
+    """A joint, and the position beyond which its leader does not go [rad]."""
+    shut: bool = False
+    """Whether the gripper does not act."""
+    blind: tuple[float, float] = (0.0, 0.0)
+    """From when to when no picture comes [s]."""
     acts: bool = True
     """Whether a model acts; otherwise a person demonstrates."""
 
@@ -268,15 +278,25 @@ class _Maker:
         if operated:
             return HOME + 0.3 * np.sin(t_s)
         if not self.run.acts:
-            return intended(self.run, np.array([t_s]), self._phase)[0]
+            return self._demonstrated(t_s)
         i = int(t_s * HZ) - self._begin
         if not 0 <= i < len(self._plan):
             return self._command
         return self._plan[i] + (t_s * HZ % 1) * (self._plan[min(i + 1, len(self._plan) - 1)] - self._plan[i])
 
+    def _demonstrated(self, t_s: float) -> np.ndarray[Any, Any]:
+        run, (begin, lasts) = self.run, self.run.stall
+        at = t_s if t_s < begin or not lasts else max(begin, t_s - lasts)
+        wanted = intended(run, np.array([at]), self._phase)[0]
+        wanted += run.shake * self._rng.normal(0, 1, len(JOINTS)) if run.shake else 0.0
+        wanted[run.cut[0]] = min(wanted[run.cut[0]], run.cut[1])
+        if run.shut:
+            wanted[3] = HOME[3] + 0.9
+        return wanted
+
     def _look(self, tick: int, t_s: float) -> Iterator[tuple[str, Message]]:
         run, every = self.run, CONTROL_HZ / self.run.camera_hz
-        if tick and int(tick / every) == int((tick - 1) / every):
+        if (tick and int(tick / every) == int((tick - 1) / every)) or run.blind[0] <= t_s < run.blind[1]:
             return
         for camera in run.cameras:
             true = self._state.copy()

@@ -1,6 +1,6 @@
-"""The plugin's hooks: the command `ibrobot explain`.
+"""The plugin's hooks: `ibrobot explain`, `datasets check` and `datasets card`.
 
-Causes are classes; those of other packages are entry points of the group `ibrobot_causes`, see `cause`.
+Causes are classes, see `cause`; other packages add theirs by the hook `ibrobot_causes`, which this plugin defines.
 """
 
 from __future__ import annotations
@@ -8,12 +8,22 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from ibrobot_core.api import Late, hookimpl
-from ibrobot_core.app import Command
-from ibrobot_diagnose.options import EVENTS
+from ibrobot_core.app import Command, Kind
+from ibrobot_diagnose.cause import KIND, CauseDescriptor
+from ibrobot_diagnose.options import CHECK_EVENTS, EVENTS
+
+
+@hookimpl
+def ibrobot_kinds() -> Iterable[Kind]:
+    """Causes."""
+    yield Kind(KIND, "ibrobot_causes", CauseDescriptor)
 
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """`ibrobot explain`."""
+    """`ibrobot explain`, `ibrobot datasets check` and `ibrobot datasets card`."""
     summary = "Say why a recorded run of a policy failed."
-    yield Command("explain", Late("ibrobot_diagnose.commands:Explain"), summary, EVENTS)
+    yield Command("datasets card", Late("ibrobot_diagnose.commands.card:MakeCard"))
+    check = Late("ibrobot_diagnose.commands.check:CheckDataset")
+    yield Command("datasets check", check, "Check each episode of a dataset.", CHECK_EVENTS)
+    yield Command("explain", Late("ibrobot_diagnose.commands.explain:Explain"), summary, EVENTS)

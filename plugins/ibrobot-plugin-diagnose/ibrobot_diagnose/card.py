@@ -15,8 +15,8 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import DatasetError, replace_file
-from ibrobot_diagnose.course import begins_to_move, delay_of
+from ibrobot_core.api import Contract, DatasetError, replace_file
+from ibrobot_diagnose.course import delay_of
 from ibrobot_diagnose.pictures import SMALL, Grey, background, descriptors, grey, nearest, png, read_png, shift_of
 from ibrobot_diagnose.window import Camera, Floats, Window
 
@@ -24,6 +24,8 @@ FILE = "reference.json"
 """Name of the card in the folder of a checkpoint or a dataset."""
 SCHEMA, VERSION = "ibrobot card", 1
 LEVELS = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
+WAY = 16
+"""Positions of the way of an episode."""
 _OF_EPISODE, _IN_ALL, _POSES = 24, 480, 200
 """Most thumbnails of an episode and of a camera, and most start and end poses."""
 _LARGEST = 64 << 20
@@ -87,10 +89,12 @@ class Card:
     starts: Floats
     """Positions at the beginning of episodes [rad], shape (N, J)."""
     ends: Floats
+    ways: Floats
+    """The ways of episodes, each `WAY` positions of all joints one after the other [rad], shape (N, WAY * J)."""
     following: tuple[float | None, ...]
     """What is left of the error of each joint without its delay [rad rms]; None if unknown."""
     series: Mapping[str, tuple[float, ...]]
-    """seconds, idle_start_s, moving_speed [rad/s] -> values over the episodes at `LEVELS`."""
+    """Names of `series_of` -> values over the episodes at `LEVELS`."""
     ages_ms: Mapping[str, float]
     """Stream -> median age of its samples on receipt [ms]; empty for data without stamps of their own."""
     cameras: Mapping[str, CameraCard] = attrs.field(factory=dict)
@@ -122,7 +126,7 @@ class Card:
             "joints": list(self.joints), "contract": self.contract, "episodes": self.episodes, "frames": self.frames,
             "prompts": dict(self.prompts), "state": _rounded(self.state), "action": _rounded(self.action),
             "speed": _rounded(self.speed), "lead": _rounded(self.lead),
-            "starts": _rounded(self.starts), "ends": _rounded(self.ends),
+            "starts": _rounded(self.starts), "ends": _rounded(self.ends), "ways": _rounded(self.ways),
             "following": list(self.following), "series": {name: list(each) for name, each in self.series.items()},
             "ages_ms": dict(self.ages_ms), "norm_mode": self.norm_mode, "trained": self.trained,
             "statistics": self.statistics,
@@ -153,6 +157,7 @@ class Card:
         joints = tuple(str(each) for each in facts["joints"])
         tables = {name: _table(facts[name], len(LEVELS), len(joints), name) for name in _QUANTILES}
         poses = {name: _table(facts[name], None, len(joints), name) for name in ("starts", "ends")}
+        poses["ways"] = _table(facts["ways"], None, WAY * len(joints), "ways")
         following = tuple(None if each is None else _finite(each, "following") for each in facts["following"])
         if len(following) != len(joints):
             raise ValueError("following has not a number for each joint")
@@ -278,6 +283,57 @@ def repeated_of(window: Window, camera: Camera) -> tuple[float, float | None]:
     return best
 
 
+def way_of(window: Window) -> Floats:
+    """The way of an episode: positions at times evenly over it, one after the other, shape (WAY * J,)."""
+    known = window.states[np.isfinite(window.states).all(axis=1)]
+    result: Floats = known[np.linspace(0, len(known) - 1, WAY).round().astype(int)].ravel()
+    return result
+
+
+def rests_of(window: Window) -> tuple[float, float, float, float]:
+    """Time without motion at the beginning, at the end, and longest in between [s], and when that begins [s]."""
+    values = window.commands if "commands" in window.streams else window.states
+    values = values[np.isfinite(values).all(axis=1)]
+    rate = window.contract.rate_hz
+    if len(values) < 3:
+        return 0.0, 0.0, 0.0, 0.0
+    back = max(1, round(0.2 * rate))
+    moved = np.abs(values[back:] - values[:-back]).max(axis=1) > 0.01
+    if not moved.any():
+        return window.seconds, window.seconds, 0.0, 0.0
+    first, last = int(moved.argmax()), len(moved) - 1 - int(moved[::-1].argmax())
+    longest = run = begin = 0
+    for i in range(first, last + 1):
+        run = 0 if moved[i] else run + 1
+        if run > longest:
+            longest, begin = run, i - run + 1
+    return first / rate, (len(moved) - 1 - last) / rate, longest / rate, begin / rate
+
+
+def jerk_of(window: Window) -> float:
+    """Deviation of the second differences of the positions while the arm moves, in relation to its speed [1/s]."""
+    states = window.states[np.isfinite(window.states).all(axis=1)]
+    if len(states) < 5:
+        return 0.0
+    speed = np.diff(states, axis=0)
+    moving = np.abs(speed[1:]).sum(axis=1) > 0.002
+    if moving.sum() < 5:
+        return 0.0
+    change = np.diff(speed, axis=0)[moving]
+    return float(np.sqrt((change**2).mean()) / np.sqrt((speed[1:][moving] ** 2).mean())) * window.contract.rate_hz
+
+
+def series_of(window: Window) -> dict[str, float]:
+    """Numbers of an episode, of which a card has the quantiles."""
+    start, end, stall, _ = rests_of(window)
+    states = window.states[np.isfinite(window.states).all(axis=1)]
+    return {
+        "seconds": window.seconds, "idle_start_s": start, "idle_end_s": end, "stall_s": stall,
+        "moving_speed": moving_speed(window), "jerk": jerk_of(window),
+        "path": float(np.abs(np.diff(states, axis=0)).sum()) if len(states) > 1 else 0.0,
+    }  # fmt: skip
+
+
 def moving_speed(window: Window) -> float:
     """Mean speed of the commands, or of the arm without commands, over the joints while it moves [rad/s]."""
     values = window.commands if "commands" in window.streams else window.states
@@ -293,14 +349,14 @@ def background_of(camera: Camera) -> tuple[Grey, Grey] | None:
 
 
 class Maker:
-    """Makes a card of episodes, one after the other, so that they need not fit into memory."""
+    """Makes a card of episodes, one after the other, so that they need not fit into memory. Can be pickled."""
 
     def __init__(self) -> None:
-        self._first: Window | None = None
-        self._tables: dict[str, list[Floats]] = {name: [] for name in (*_QUANTILES, "starts", "ends")}
+        self._contract: Contract | None = None
+        self._tables: dict[str, list[Floats]] = {name: [] for name in (*_QUANTILES, "starts", "ends", "ways")}
         self._prompts: Counter[str] = Counter()
         self._rests: list[Floats] = []
-        self._series: dict[str, list[float]] = {"seconds": [], "idle_start_s": [], "moving_speed": []}
+        self._series: dict[str, list[float]] = {}
         self._ages: dict[str, list[float]] = {}
         self._cameras: dict[str, _CameraMaker] = {}
 
@@ -310,11 +366,10 @@ class Maker:
         Raises:
             DatasetError: if it has other joints than the first one, or none.
         """
-        self._first = first = self._first or window
-        if window.joints != first.joints or not window.joints:
-            raise DatasetError(
-                f"{window.name}: its joints are {', '.join(window.joints)}, not {', '.join(first.joints)}"
-            )
+        self._contract = contract = self._contract or window.contract
+        if window.joints != contract.action_joints or not window.joints:
+            has, wanted = (", ".join(each) or "none" for each in (window.joints, contract.action_joints))
+            raise DatasetError(f"{window.name}: its joints are {has}, those of the first episode {wanted}")
         known = np.isfinite(window.states).all(axis=1)
         if not known.any():
             return
@@ -327,22 +382,44 @@ class Maker:
             self._tables["lead"].append(lead[np.isfinite(lead).all(axis=1)])
             self._tables["action"].append(commands)
             self._rests.append(delay_of(window)[1])
-            self._series["idle_start_s"].append(begins_to_move(window))
         self._tables["starts"].append(states[:1])
         self._tables["ends"].append(states[-1:])
+        self._tables["ways"].append(way_of(window)[None])
         self._prompts[window.prompt] += 1
-        self._series["seconds"].append(window.seconds)
-        self._series["moving_speed"].append(moving_speed(window))
+        for name, value in series_of(window).items():
+            self._series.setdefault(name, []).append(value)
         if not window.sampled and len(window.state.times_ns):
             age = float(np.median(window.state.times_ns - window.state.stamps_ns)) / 1e6
             self._ages.setdefault("joint positions", []).append(age)
         for key, camera in window.cameras.items():
             if camera.pictures:
-                self._cameras.setdefault(key, _CameraMaker(camera)).add(window, camera)
+                self._cameras.setdefault(key, _CameraMaker(camera.topic, camera.size)).add(window, camera)
                 if not window.sampled:
                     ages = np.array(camera.times_ns) - np.array(camera.stamps_ns)
                     name = f"pictures of {camera.name}"
                     self._ages.setdefault(name, []).append(float(np.median(ages)) / 1e6)
+
+    def join(self, other: Maker) -> None:
+        """Add the episodes of another maker.
+
+        Raises:
+            DatasetError: if they have other joints.
+        """
+        if other._contract is None:
+            return
+        self._contract = self._contract or other._contract
+        if self._contract.action_joints != other._contract.action_joints:
+            has, wanted = (", ".join(each.action_joints) for each in (other._contract, self._contract))
+            raise DatasetError(f"episodes have different joints: {has}, and {wanted}")
+        for name, tables in other._tables.items():
+            self._tables[name] += tables
+        self._prompts += other._prompts
+        self._rests += other._rests
+        for own, theirs in ((self._series, other._series), (self._ages, other._ages)):
+            for name, values in theirs.items():
+                own.setdefault(name, []).extend(values)
+        for key, camera in other._cameras.items():
+            self._cameras.setdefault(key, _CameraMaker(camera.topic, camera.size)).join(camera)
 
     def card(self, **more: Any) -> Card:
         """The card.
@@ -350,20 +427,22 @@ class Maker:
         Raises:
             DatasetError: without an episode.
         """
-        first, tables = self._first, self._tables
-        if first is None or not tables["state"]:
+        contract, tables = self._contract, self._tables
+        if contract is None or not tables["state"]:
             raise DatasetError("there is no episode with joint positions to make a card of")
+        joints = contract.action_joints
         joined = {name: np.concatenate(each) for name, each in tables.items() if each}
-        joined.setdefault("action", joined["state"])
+        joined = {"action": joined["state"], "lead": np.zeros((1, len(joints))), **joined}
         quantiles: dict[str, Any] = {name: np.quantile(joined[name], LEVELS, axis=0) for name in _QUANTILES}
-        poses: dict[str, Any] = {name: joined[name][_thinned(len(joined[name]), _POSES)] for name in ("starts", "ends")}
+        chosen = _thinned(len(joined["starts"]), _POSES)
+        poses: dict[str, Any] = {name: joined[name][chosen] for name in ("starts", "ends", "ways")}
         series = {n: tuple(np.quantile(each or [0.0], LEVELS).tolist()) for n, each in self._series.items()}
-        following: list[float | None] = [None] * len(first.joints)
-        for j in range(len(first.joints)):
+        following: list[float | None] = [None] * len(joints)
+        for j in range(len(joints)):
             known = [float(rests[j]) for rests in self._rests if np.isfinite(rests[j])]
             following[j] = float(np.quantile(known, 0.95)) if known else None
         return Card(
-            first.contract.rate_hz, first.joints, first.contract.canonical(), len(self._series["seconds"]),
+            contract.rate_hz, joints, contract.canonical(), len(joined["starts"]),
             len(joined["state"]), dict(self._prompts), **quantiles, **poses, following=tuple(following), series=series,
             ages_ms={name: float(np.median(each)) for name, each in self._ages.items()},
             cameras={key: each.card() for key, each in self._cameras.items()}, **more,
@@ -375,19 +454,18 @@ def _thinned(count: int, most: int) -> NDArray[np.intp]:
 
 
 class _CameraMaker:
-    def __init__(self, camera: Camera) -> None:
-        self._topic, self._size = camera.topic, camera.size
+    def __init__(self, topic: str, size: tuple[int, int]) -> None:
+        self.topic, self.size = topic, size
         self._numbers: dict[str, list[NDArray[np.float64]]] = {name: [] for name in _NUMBERS}
         self._thumbnails: list[NDArray[np.uint8]] = []
         self._places: list[tuple[str, float]] = []
-        self._owners: list[int] = []
         self._poses: list[Floats] = []
         self._kept: list[list[NDArray[np.uint8]]] = []
         self._repeated: list[float] = []
 
     def add(self, window: Window, camera: Camera) -> None:
         for name, values in numbers_of(camera).items():
-            self._numbers[name].append(values)
+            self._numbers[name].append(values[_thinned(len(values), 4 * _OF_EPISODE)])
         chosen = _thinned(len(camera.pictures), _OF_EPISODE)
         poses = window.state.at(np.array(camera.times_ns, np.int64)[chosen])
         if np.isfinite(poses).any():
@@ -396,15 +474,23 @@ class _CameraMaker:
         for i in chosen.tolist():
             self._thumbnails.append(camera.pictures[i].small)
             self._places.append((window.name, round(window.since(camera.times_ns[i]), 3)))
-            self._owners.append(len(self._kept))
         kept = list(camera.kept.values())
         self._kept.append([kept[i] for i in _thinned(len(kept), 8)])
         self._repeated.append(repeated_of(window, camera)[0])
 
+    def join(self, other: _CameraMaker) -> None:
+        for name, values in other._numbers.items():
+            self._numbers[name] += values
+        self._thumbnails += other._thumbnails
+        self._places += other._places
+        self._poses += other._poses
+        self._kept += other._kept
+        self._repeated += other._repeated
+
     def card(self) -> CameraCard:
         chosen = _thinned(len(self._thumbnails), _IN_ALL)
         thumbnails = np.stack([self._thumbnails[i] for i in chosen])
-        owners = np.array([self._owners[i] for i in chosen])
+        owners = np.array([self._places[i][0] for i in chosen])
         vectors, far = descriptors(thumbnails), []
         for owner in np.unique(owners).tolist():
             others = vectors[owners != owner]
@@ -412,20 +498,19 @@ class _CameraMaker:
                 far.append(nearest(vectors[owners == owner], others)[0])
         usual = float(np.quantile(np.concatenate(far), 0.99)) if far else 0.5
         shape = self._kept[0][0].shape
-        kept = [[each for each in of if each.shape == shape] for of in self._kept]
-        chosen_episodes = [kept[i] for i in _thinned(len(kept), 12) if kept[i]]
-        middle, moving = background([each for of in chosen_episodes for each in of])
+        kept = [of for each in self._kept if (of := [picture for picture in each if picture.shape == shape])]
+        some = [kept[i] for i in _thinned(len(kept), 12)]
+        middle, moving = background([each for of in some for each in of])
         shifts = [0.0]
-        for of in chosen_episodes:
-            if len(of) >= 3 and len(chosen_episodes) > 1:
+        for of in some[:6]:
+            if len(of) >= 3 and len(some) > 1:
                 shift = shift_of(middle, background(of)[0], still(moving))
                 shifts += [shift.pixels] if shift is not None and shift.after > 0.3 else []
         return CameraCard(
-            self._topic, self._size,
+            self.topic, self.size,
             {n: tuple(np.quantile(np.concatenate(each), LEVELS).tolist()) for n, each in self._numbers.items()},
             thumbnails, tuple(self._places[i] for i in chosen), np.concatenate(self._poses)[chosen], usual,
-            _coloured(middle), _coloured(moving),
-            float(np.quantile(shifts, 0.9)), max(self._repeated),
+            _coloured(middle), _coloured(moving), float(np.quantile(shifts, 0.9)), max(self._repeated),
         )  # fmt: skip
 
 

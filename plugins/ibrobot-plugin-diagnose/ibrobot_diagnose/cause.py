@@ -5,22 +5,22 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache
-from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import IbrobotError
+from ibrobot_core.api import Descriptor, IbrobotError
+from ibrobot_core.app import installed_plugins
 
 if TYPE_CHECKING:
+    from ibrobot_diagnose.ask_again import Examined
     from ibrobot_diagnose.card import Card
     from ibrobot_diagnose.window import Window
 
-GROUP = "ibrobot_causes"
-"""Group of entry points, each a cause's class: `CLASS = "package.module:Class"`."""
+KIND = "cause"
+"""The kind of plugin, with the hook `ibrobot_causes`."""
 ACCUSED = 0.5
 """Likelihood from which a cause is named."""
 
@@ -59,8 +59,8 @@ class Reference:
 
     card: Card | None = None
     """The card of the model's data, or of the other episodes of a dataset."""
-    model: Any = None
-    """The model, to ask it again; see `ask_again.Model`."""
+    model: Examined | None = None
+    """What the model answers when it is asked again."""
 
     @property
     def streams(self) -> frozenset[str]:
@@ -94,6 +94,13 @@ class Cause(ABC):
     @abstractmethod
     def test(self, window: Window, reference: Reference) -> Evidence | None:
         """Evidence for this cause; None if nothing points to it."""
+
+
+@attrs.frozen
+class CauseDescriptor(Descriptor[Cause]):
+    """A cause of another package."""
+
+    make: Callable[[], Cause] = attrs.field(kw_only=True)  # type: ignore[assignment]
 
 
 @attrs.frozen(eq=False)
@@ -130,7 +137,7 @@ _LACKS = {
     "state": "no joint positions were recorded", "commands": "no commands were recorded",
     "answers": "no answers of a model were recorded", "chunks": "no answer of the model was used",
     "pictures": "no pictures were recorded", "outcome": "nobody judged the outcome",
-    "demonstration": "a model acted, nobody demonstrated", "card": "there is no card of the model's data: --data",
+    "card": "there is no card of the model's data: --data",
     "card pictures": "there is no card of the model's pictures: --data",
     "training card": "there is no card from a training", "model": "the model was not asked: --model",
 }  # fmt: skip
@@ -158,24 +165,18 @@ def own_causes() -> tuple[Cause, ...]:
     return causes.all_causes()
 
 
-@cache
 def installed_causes() -> tuple[Cause, ...]:
     """The causes of this package and of others.
 
     Raises:
-        IbrobotError: if one of another package cannot be loaded, or has the name of another cause.
+        IbrobotError: if one has the name of another.
     """
     known = {each.name: each for each in own_causes()}
-    for point in sorted(entry_points(group=GROUP), key=lambda each: each.name):
-        where = f"entry point {point.name!r} of {point.dist.name if point.dist else 'a package'} ({GROUP})"
-        try:
-            cause = point.load()()
-        except Exception as error:
-            raise IbrobotError(f"{where}: {point.value} cannot be loaded: {type(error).__name__}: {error}") from error
-        if not isinstance(cause, Cause):
-            raise IbrobotError(f"{where}: {point.value} is no subclass of ibrobot_diagnose.cause.Cause")
+    for descriptor in installed_plugins().of_kind(KIND):
+        assert isinstance(descriptor, CauseDescriptor)
+        cause = descriptor.make()
         if cause.name in known:
-            raise IbrobotError(f"{where}: there is a cause {cause.name!r} already; choose another name")
+            raise IbrobotError(f"there is a cause {cause.name!r} already; the plugin must give its own another name")
         known[cause.name] = cause
     return tuple(known.values())
 
@@ -196,6 +197,8 @@ def diagnose(
     findings: list[Finding] = []
     healthy, untested = [], []
     for cause in installed_causes() if causes is None else causes:
+        if "demonstration" in cause.needs and "demonstration" not in there:
+            continue
         if lacking := sorted(cause.needs - there):
             untested.append((cause.name, _LACKS.get(lacking[0], lacking[0])))
             continue

@@ -28,6 +28,10 @@ class ExplainOptions:
         None, names="dataset", label="Data",
         help="the data that the model was trained on: a dataset, its episodes, or a folder or file with their card",
     )  # fmt: skip
+    model: str | None = option(
+        None, label="Model", names="policy",
+        help="ask the model again: its checkpoint's folder, or its name in the recorded YAML; `.`: the one that acted",
+    )  # fmt: skip
     ticks: bool = option(False, label=None, help="with --json, add what happened at each tick")
     jobs: int | None = option(
         None, ge=1, label="Episodes at once", more=True, help="episodes in parallel; by default one for each CPU core"
@@ -63,3 +67,45 @@ class Report(Event):
 
 
 EVENTS = (Progress, Report)
+
+
+@attrs.frozen(kw_only=True)
+class CheckOptions:
+    """Which dataset is checked."""
+
+    dataset: Path = option(
+        typed="DATASET", names="dataset", label="Dataset", help="a LeRobot dataset, or a folder of recorded episodes"
+    )
+    least: float = option(
+        0.5, ge=0.05, le=1, label="Likelihood", more=True, help="likelihood from which an episode is listed"
+    )
+    jobs: int | None = option(
+        None, ge=1, label="Episodes at once", more=True, help="episodes in parallel; by default one for each CPU core"
+    )
+    on: str = on_option()
+
+
+@attrs.frozen(kw_only=True)
+class CheckProgress(Event):
+    """An episode was read, or checked."""
+
+    done: int = option(help="episodes read and checked")
+    of: int = option(help="number of both")
+
+    @override
+    def shown(self) -> Shown:
+        return Shown(f"{self.done} of {self.of} steps", self.done / max(1, self.of))
+
+
+@attrs.frozen(kw_only=True)
+class CheckReport(Event):
+    """The result."""
+
+    lines: tuple[str, ...] = option(help="the listed episodes with their reasons, worst first")
+
+    @override
+    def shown(self) -> Shown:
+        return Shown("; ".join(self.lines[:3]), 1.0)
+
+
+CHECK_EVENTS = (CheckProgress, CheckReport)

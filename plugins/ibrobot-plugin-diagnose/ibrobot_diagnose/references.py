@@ -81,10 +81,8 @@ def read_episode(path: Path) -> Window:
 def _is_own(dataset: Path) -> bool:
     """Whether `ibrobot convert` has made a dataset, so that it describes itself."""
     try:
-        return "ibrobot" in json.dumps(json.loads((dataset / _INFO).read_text(encoding="utf-8"))) or any(
-            dataset.glob("meta/ibrobot*")
-        )
-    except (OSError, ValueError):
+        return "conversion" in json.loads((dataset / "meta" / "ibrobot.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError):
         return False
 
 

@@ -53,12 +53,38 @@ class Explanation:
         diagnosis, window = self.diagnosis, self.window
         return {
             "episode": window.name, "outcome": window.outcome, "seconds": round(window.seconds, 3), "first": self.first,
-            "causes": [_finding(each) for each in diagnosis.findings],
+            "causes": [finding_facts(each) for each in diagnosis.findings],
             "healthy": [{"name": name, "text": title} for name, title in diagnosis.healthy],
             "untested": [{"name": name, "why": why} for name, why in diagnosis.untested],
-            "between": between(window, self.course),
+            "between": between(window, self.course), **self._model_facts(),
             **({"ticks": self.course.table()} if ticks and self.course is not None else {}),
         }  # fmt: skip
+
+    def _model_facts(self) -> dict[str, Any]:
+        model = self.reference.model
+        if model is None:
+            return {}
+        return {
+            "model": {
+                "asked": len(model.again), "equal": sum(each.equal for each in model.again), "whose": model.whose,
+                "identity": model.identity,
+                "effects": [
+                    {"what": each.what, "change": each.change, "rad": {k: _plain(v) for k, v in each.per_joint.items()}}
+                    for each in model.effects
+                ],
+            }
+        }  # fmt: skip
+
+    def _model_lines(self) -> list[str]:
+        model = self.reference.model
+        if model is None:
+            return []
+        equal = sum(each.equal for each in model.again)
+        counts = f"{equal} of {len(model.again)} answers are equal, bit for bit"
+        lines = [f"The model asked again ({model.identity or 'here'}): {counts}."]
+        lines += [f"   The first difference: {model.whose}."] if model.whose else []
+        shown = "; ".join(f"{each.what} {each.change} {each.largest:.3f} rad" for each in model.effects[:12])
+        return [*lines, f"How far its answers move: {shown}."] if shown else lines
 
     def lines(self) -> list[str]:
         """The explanation for a terminal."""
@@ -71,7 +97,7 @@ class Explanation:
             lines += [f"   likelihood {100 * evidence.likelihood:.0f} %{since} ({each.name})"]
             lines += [f"   {detail}" for detail in evidence.details]
             lines += [f"   What to do: {each.cause.remedy}"]
-        lines += ["", *between_lines(self.window, self.course)]
+        lines += ["", *between_lines(self.window, self.course), *self._model_lines()]
         if diagnosis.healthy:
             lines += [f"Tested and healthy: {'; '.join(title for _, title in diagnosis.healthy)}."]
         reasons = Counter(why for _, why in diagnosis.untested)
@@ -82,7 +108,8 @@ class Explanation:
         return lines
 
 
-def _finding(each: Finding) -> dict[str, Any]:
+def finding_facts(each: Finding) -> dict[str, Any]:
+    """A finding as a JSON object."""
     evidence = each.evidence
     return {
         "name": each.name, "text": evidence.text, "number": _plain(evidence.number), "unit": evidence.unit,
@@ -141,7 +168,6 @@ def between_lines(window: Window, course: Course | None) -> list[str]:
         lines.append(
             f"Mean difference from the newest answer to the arm: {parts}. Held without a plan "
             f"{100 * facts['share_held']:.1f} % of the time, operated {100 * facts['share_operated']:.1f} %, at a "
-            "limit "
-            f"{100 * facts['share_at_limit']:.1f} %."
+            f"limit {100 * facts['share_at_limit']:.1f} %."
         )
     return lines

@@ -6,9 +6,11 @@ from collections import Counter
 
 import pytest
 from ibrobot_diagnose.card import make_card
-from ibrobot_diagnose.cause import Reference, diagnose, installed_causes
+from ibrobot_diagnose.cause import KIND, Cause, CauseDescriptor, Evidence, Reference, diagnose, installed_causes
 from made_runs import Run, window_of
 from planted_faults import JOINTS, PICTURES, STRENGTHS, TIMES
+
+from ibrobot_core.api import IbrobotError
 
 SEEDS = range(9000, 9003)
 """Seeds on which no threshold was chosen."""
@@ -62,3 +64,38 @@ def test_each_cause_says_what_to_do():
         assert cause.remedy.endswith("."), cause.name
         assert cause.title[0].islower(), cause.name
         assert cause.explains <= {each.name for each in installed_causes()} | {"camera_ignored"}, cause.name
+
+
+def test_gripper_that_holds_something_is_no_fault():
+    held = window_of(Run(seed=9300, cameras=(), gain={3: 0.6}))
+    assert diagnose(held, Reference()).first == ""
+
+
+def test_gripper_that_never_moves_is_one():
+    shut = window_of(Run(seed=9301, cameras=(), slack={3: 5.0}))
+    first = diagnose(shut, Reference()).findings[0]
+    assert (first.name, "gripper" in first.evidence.text) == ("arm_not_following", True)
+
+
+def test_of_two_causes_the_one_that_explains_the_other_comes_first():
+    slow = diagnose(window_of(Run(seed=9302, cameras=(), latency_s=0.8)), Reference())
+    assert [each.name for each in slow.findings][:2] == ["answers_slow", "plan_dry"]
+    assert slow.findings[0].evidence.likelihood < slow.findings[1].evidence.likelihood
+
+
+class Squeaks(Cause):
+    """A cause of another package."""
+
+    name, title, remedy = "squeaks", "no joint squeaks", "Oil it."
+
+    def test(self, window, reference):
+        return Evidence("A joint squeaks.", 1.0, "joints", 0.5, 0.9)
+
+
+def test_other_packages_add_causes(monkeypatch):
+    offered = CauseDescriptor(type="squeaks", make=Squeaks, summary="a joint squeaks")
+    monkeypatch.setattr("ibrobot_core.plugins.Registry.of_kind", lambda self, kind: [offered] * (kind == KIND))
+    assert diagnose(window_of(Run(cameras=())), Reference()).first == "squeaks"
+    monkeypatch.setattr(Squeaks, "name", "plan_dry")
+    with pytest.raises(IbrobotError, match="there is a cause 'plan_dry' already"):
+        installed_causes()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 
 import pytest
+import trainer
 from command_line import run_here
 from made_runs import Made, Run, metadata
 
@@ -75,3 +78,69 @@ def test_unreadable_episode_is_named_and_the_others_are_explained(folder, tmp_pa
     done = run_here("explain", bad)
     assert done.returncode == 1
     assert str(bad) in done.stderr
+
+
+@pytest.mark.usefixtures("fork_server")
+def test_check_lists_the_worst_episode_first(folder):
+    record(folder / "demos" / "episodes" / "episode_000009", Run(seed=9, acts=False, seconds=9, idle_s=4.0))
+    done = run_here("datasets", "check", folder / "demos", "--json", "--jobs", 1)
+    assert done.returncode == 0, done.stderr
+    checked = json.loads(done.stdout)
+    assert checked["episodes"] == 4
+    assert checked["listed"][0]["episode"].endswith("episode_000009")
+    assert checked["listed"][0]["causes"][0]["name"] == "idle_start"
+    assert "idle_start" in checked["counts"]
+
+
+def test_card_of_a_dataset_is_made_and_used(folder, tmp_path):
+    card = tmp_path / "reference.json"
+    assert run_here("datasets", "card", folder / "demos", "--out", card).returncode == 0
+    (explained,) = json.loads(run_here("explain", folder / "runs:1", "--data", card, "--json").stdout)
+    assert explained["causes"][0]["name"] == "picture_dark"
+
+
+@pytest.mark.parametrize("text", ["{", '{"schema": "ibrobot card", "version": 2}', '{"schema": "another"}'])
+def test_bad_card_is_named(folder, tmp_path, text):
+    card = tmp_path / "reference.json"
+    card.write_text(text)
+    done = run_here("explain", folder / "runs:1", "--data", card)
+    assert done.returncode == 2
+    assert str(card) in done.stderr
+
+
+@pytest.fixture(scope="module")
+def dataset(folder, tmp_path_factory):
+    """A LeRobot dataset of the demonstrations."""
+    out = tmp_path_factory.mktemp("datasets") / "demos"
+    done = run_here("convert", folder / "demos", "--out", out, "--jobs", 1, "--codec", "h264")
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+@pytest.mark.usefixtures("fork_server")
+@pytest.mark.parametrize("described", [True, False], ids=["of ibrobot", "of others"])
+def test_lerobot_dataset_is_checked_and_is_data_for_explain(folder, dataset, described, tmp_path):
+    root = tmp_path / "demos"
+    shutil.copytree(dataset, root)
+    if not described:
+        (root / "meta" / "ibrobot.json").unlink()
+    checked = json.loads(run_here("datasets", "check", root, "--json", "--jobs", 1).stdout)
+    assert (checked["episodes"], checked["unreadable"]) == (len(list(folder.glob("demos/*/*"))), [])
+    (explained,) = json.loads(run_here("explain", folder / "runs:1", "--data", root, "--json").stdout)
+    assert explained["causes"][0]["name"] == "picture_dark"
+
+
+@pytest.mark.usefixtures("fork_server")
+def test_training_writes_the_card_beside_its_checkpoint(folder, dataset, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr("ibrobot_lerobot.trainer.find_trainer", lambda: str(trainer.install(tmp_path)))
+    weights = tmp_path / "torch/hub/checkpoints/resnet18-stand_in.pth"
+    weights.parent.mkdir(parents=True)
+    weights.touch()
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    done = run_here("train", dataset, "--out", tmp_path / "out", "--steps", 10)
+    assert done.returncode == 0, done.stderr
+    card = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/reference.json").read_text())
+    assert card["trained"] == {"policy": "small_act", "step": 10, "steps": 10, "batch_size": 32, "dataset": "demos"}
+    (explained,) = json.loads(run_here("explain", folder / "runs:1", "--data", tmp_path / "out", "--json").stdout)
+    assert {"picture_dark", "checkpoint_early"} <= {each["name"] for each in explained["causes"]}

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from ibrobot_provenance.ownership import owned
 
-from ibrobot_core.api import DatasetError
-from ibrobot_core.app import echo
+from ibrobot_core.api import DatasetError, IbrobotError
+from ibrobot_core.app import echo, installed_plugins
 from ibrobot_lerobot.layout import existing_dataset
 from ibrobot_lerobot.pretrained import check_policy
 from ibrobot_lerobot.training import AUTO, SMALL, TrainOptions, find_trainer
@@ -38,6 +38,8 @@ _REPORTS = 200
 """Reports of progress in a training."""
 _END_S = 10.0
 INTERRUPTED = 130
+CARD, CARD_FILE = "datasets card", "reference.json"
+"""The command that makes a card of a dataset, and its file beside a checkpoint."""
 _WHEN_CONTINUING = ("--policy.device", "--steps", "--save_freq", "--log_freq", "--output_dir")
 """Arguments of a command that continues a training; LeRobot takes the others from the checkpoint."""
 _WATCH = "import os, signal, sys; sys.stdin.read(); os.killpg(0, signal.SIGKILL)"
@@ -86,7 +88,25 @@ def run_training(options: TrainOptions, follow: Follow | None) -> tuple[int, Tra
         if follow is None:
             echo(f"$ {shlex.join(command)}", err=True)
         code = _run(command, _environment(policy, download=options.download), begun, steps, follow)
-        return code, newest_checkpoint(out)
+        newest = newest_checkpoint(out)
+        if newest is not None and newest.step > begun:
+            _write_card(options, newest)
+        return code, newest
+
+
+def _write_card(options: TrainOptions, newest: TrainingCheckpoint) -> None:
+    """Write the card of the data beside the checkpoint, if a plugin offers the command for it."""
+    command = installed_plugins().commands.get(CARD)
+    if command is None:
+        return
+    facts = {
+        "policy": options.policy, "step": newest.step, "steps": options.steps, "batch_size": options.batch_size,
+        "dataset": options.dataset.resolve().name,
+    }  # fmt: skip
+    try:
+        command.options(dataset=options.dataset, out=newest.policy / CARD_FILE, trained=json.dumps(facts))()
+    except (IbrobotError, SystemExit) as error:  # the training itself is done
+        echo(f"no card of the data was written beside the checkpoint: {error}", err=True)
 
 
 def _environment(policy: str, *, download: bool) -> dict[str, str]:

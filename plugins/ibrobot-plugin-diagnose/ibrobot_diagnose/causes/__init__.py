@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from ibrobot_diagnose.cause import Cause
-from ibrobot_diagnose.causes import data, joints, limits, motion, pictures, timing
+from ibrobot_diagnose.causes import data, episodes, joints, limits, model, motion, pictures, timing
 
-_FAMILIES = (timing, limits, motion, pictures, joints, data)
+_FAMILIES = (timing, limits, motion, pictures, joints, data, episodes, model)
 
 
 def all_causes() -> tuple[Cause, ...]:

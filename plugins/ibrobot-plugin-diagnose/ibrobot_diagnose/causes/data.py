@@ -79,8 +79,7 @@ class UnseenStates(Cause):
     needs = frozenset({"state", "card"})
     remedy = (
         "See what led the arm there, at the time that is given. If nothing else is wrong, record episodes that begin "
-        "there "
-        "and end well: `ibrobot record` with corrections."
+        "there and end well: `ibrobot record` with corrections."
     )
 
     @override

@@ -67,8 +67,7 @@ class OtherUnits(Cause):
     explains = _CONSEQUENCES | {"joint_order", "joint_zero", "gripper_scaled", "gripper_reversed"}
     remedy = (
         "Deliver the joints in radians, as every driver here does (LeRobot's deliver degrees or -100 to 100), and give "
-        "the "
-        "model the unit of its training: `models: {…: {norm_mode: …}}`."
+        "the model the unit of its training: `models: {…: {norm_mode: …}}`."
     )
 
     @override
@@ -196,8 +195,7 @@ class JointZero(Cause):
         others = np.delete(sure, j)
         text = (
             f"The zero of {window.joints[j]} is shifted by {middle[j]:+.2f} rad ({np.degrees(middle[j]):+.0f}°): at "
-            "pictures "
-            "that look the same, the data has other positions of this joint."
+            "pictures that look the same, the data has other positions of this joint."
         )
         details = tuple(
             f"{joint}: {off:+.3f} rad, scattered by {width:.3f}"
@@ -268,8 +266,7 @@ class GripperReversed(Cause):
         ratio = (plain + 0.08) / (other + 0.08) if plain > 0.35 else 0.5
         text = (
             f"The gripper is reversed: it begins at {own[0, 0]:.2f} rad where the data begins at {start:.2f}, and the "
-            "mirror "
-            f"image of its way is {ratio:.1f} times as close to the data."
+            f"mirror image of its way is {ratio:.1f} times as close to the data."
         )
         return Evidence(text, ratio, "times", 2.0, likelihood(ratio, 2.0, 3.5))
 

@@ -25,6 +25,11 @@ class ArmNotFollowing(Cause):
     @override
     def test(self, window: Window, reference: Reference) -> Evidence | None:
         delays, rests = delay_of(window)
+        ranges = np.nanmax(window.states, axis=0) - np.nanmin(window.states, axis=0)
+        asked = np.nanmax(window.commands, axis=0) - np.nanmin(window.commands, axis=0)
+        for gripper in (i for i, joint in enumerate(window.joints) if "grip" in joint or "jaw" in joint):
+            if ranges[gripper] > 0.1 * asked[gripper]:  # it holds something
+                rests[gripper] = np.nan
         if not np.isfinite(rests).any():
             return None
         usual = np.full(len(rests), 0.07)

@@ -103,8 +103,7 @@ class CamerasExchanged(Cause):
     })  # fmt: skip
     remedy = (
         "Exchange the devices of these cameras in the robot YAML (`peripherals: …`); `ibrobot camera preview` shows "
-        "which "
-        "is which. A path below /dev/v4l/by-path stays with the USB port."
+        "which is which. A path below /dev/v4l/by-path stays with the USB port."
     )
 
     @override
@@ -138,8 +137,7 @@ class CameraMoved(PictureCause):
     unit, threshold, certain = "pixels", 1.0, 2.0
     remedy = (
         "Put the camera back: the two pictures of the report show where it was. `ibrobot preflight` shows it live. If "
-        "it "
-        "must stay there, record some episodes from its new place and train again."
+        "it must stay there, record some episodes from its new place and train again."
     )
 
     @override
@@ -153,8 +151,7 @@ class CameraMoved(PictureCause):
             turned = f", turned by {np.degrees(abs(shift.angle)):.1f}°" if abs(shift.angle) > 0.01 else ""
             text = (
                 f"The camera {name} has moved: its picture is shifted by {shift.pixels:.0f} of 640 pixels{turned}; up "
-                "to "
-                f"{usual:.0f} are usual."
+                f"to {usual:.0f} are usual."
             )
             return shift.pixels / usual, text
         if shift.after < 0.3 and shift.before < 0.3:
@@ -331,8 +328,7 @@ class Bgr(PictureCause):
         ratio = pair.distance() / max(pair.distance(lambda small: small[..., ::-1]), 1e-3)
         text = (
             f"Red and blue of {pair.camera.name} are exchanged: with them back, the pictures are {ratio:.1f} times as "
-            "close "
-            "to those of the data."
+            "close to those of the data."
         )
         return ratio, text
 
@@ -359,8 +355,7 @@ class PictureFlipped(PictureCause):
         ratio = own / max(distance, 1e-3)
         text = (
             f"The picture of {pair.camera.name} is {how}: turned back, it is {ratio:.1f} times as close to those of "
-            "the "
-            "data."
+            "the data."
         )
         return ratio, text
 
@@ -381,8 +376,7 @@ class UnseenPictures(PictureCause):
         ratio = pair.distance() / max(pair.card.usual_distance, 0.05)
         text = (
             f"The pictures of {pair.camera.name} look like none of the data: {ratio:.1f} times as far from the nearest "
-            "as "
-            "those are from each other."
+            "as those are from each other."
         )
         return ratio, text
 

@@ -84,8 +84,7 @@ class AnswersSlow(Cause):
         late = sum(each.answer.outcome == "late" for each in used)
         text = (
             f"The model needed {latency:.0f} ms for an answer, {100 * share:.0f} % of the {chunk_ms:.0f} ms that a "
-            "chunk "
-            "lasts: that part of each answer is past when it comes."
+            "chunk lasts: that part of each answer is past when it comes."
         )
         details = [f"slowest answer: {latencies.max():.0f} ms"]
         if late:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import attrs
 from ibrobot_provenance.jobs import Job, open_pool
 
-from ibrobot_core.api import RecorderError
+from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import Emit, Unsuccessful, echo, wrong_input
 from ibrobot_diagnose.options import ExplainOptions, Progress, Report
 from ibrobot_diagnose.references import card_of, find_episodes, read_episode
@@ -67,7 +67,7 @@ def _explained(
     if len(episodes) == 1 and not options.on:
         try:
             yield episodes[0], explain_episode((episodes[0], options, card)), ""
-        except RecorderError as error:
+        except IbrobotError as error:
             yield episodes[0], {}, str(error)
         return
     work = [Job(explain_episode, (episode, options, card)) for episode in episodes]
@@ -83,13 +83,18 @@ def explain_episode(
     """Explain an episode; its facts and lines.
 
     Raises:
-        RecorderError: if it cannot be read.
+        IbrobotError: if it cannot be read, or the model cannot be asked.
     """
     from ibrobot_diagnose.cause import Reference, diagnose
     from ibrobot_diagnose.report import Explanation
 
     episode, options, card = order
     window = read_episode(episode)
-    reference = Reference(card)
+    examined = None
+    if options.model is not None:
+        from ibrobot_diagnose.ask_again import examine, model_of
+
+        examined = examine(model_of(window, episode, "" if options.model == "." else options.model))
+    reference = Reference(card, examined)
     explanation = Explanation.of(window, reference, diagnose(window, reference, tested=lambda name: progress(1)))
     return {**explanation.facts(ticks=options.ticks), "lines": explanation.lines()}

@@ -1,0 +1,255 @@
+"""Causes in demonstrations: idle time, stalls, jerk, saturation, black pictures, gaps, odd lengths and ways."""
+
+from __future__ import annotations
+
+from typing import ClassVar, override
+
+import numpy as np
+
+from ibrobot_diagnose.card import jerk_of, rests_of, series_of, way_of
+from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
+from ibrobot_diagnose.window import Window
+
+_SHOWN = frozenset({"demonstration", "state"})
+
+
+class _Still(Cause):
+    """Nothing moves for a time."""
+
+    needs = _SHOWN | {"card"}
+    series: ClassVar[str]
+    least_s: ClassVar[float] = 1.0
+    where: ClassVar[str]
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        assert reference.card is not None
+        start, end, stall, begin = rests_of(window)
+        seconds = {"idle_start_s": start, "idle_end_s": end, "stall_s": stall}[self.series]
+        usual = max(self.least_s, 1.3 * reference.card.quantile(self.series, 0.75) + 0.3)
+        text = f"Nothing moves for {seconds:.1f} s {self.where}; up to {usual:.1f} s are usual in the other episodes."
+        since = {"idle_start_s": 0.0, "idle_end_s": window.seconds - end, "stall_s": begin}[self.series]
+        return Evidence(text, seconds, "s", usual, likelihood(seconds, usual, 2.0 * usual), since)
+
+
+class IdleStart(_Still):
+    """The episode begins with time in which nothing moves."""
+
+    name, title, series, where = (
+        "idle_start",
+        "the arm moves soon after the beginning",
+        "idle_start_s",
+        "at the beginning",
+    )
+    remedy = "Cut it: `ibrobot episodes trim EPISODE --start TIME`; a policy learns to wait from it."
+
+
+class IdleEnd(_Still):
+    """The episode ends with time in which nothing moves."""
+
+    name, title, series, where = "idle_end", "the episode ends soon after the motion", "idle_end_s", "at the end"
+    remedy = "Cut it: `ibrobot episodes trim EPISODE --end TIME`."
+
+
+class Stall(_Still):
+    """The arm stands in the middle."""
+
+    name, title, series, where = "stall", "the arm goes on moving", "stall_s", "in the middle"
+    least_s = 1.2
+    explains = frozenset({"odd_length"})
+    remedy = "Drop the episode, or keep the part before or after: `ibrobot episodes trim`."
+
+
+class Jerk(Cause):
+    """The motion is jerky."""
+
+    name, title = "jerk", "the motion is as smooth as in the other episodes"
+    needs = _SHOWN | {"card"}
+    explains = frozenset({"other_speed", "odd_path"})
+    remedy = "Drop the episode; look for a leader that sticks, a device with gaps, or a control rate that is too low."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        assert reference.card is not None
+        jerk, usual = jerk_of(window), 1.3 * reference.card.quantile("jerk", 0.95)
+        text = (
+            f"The motion is jerky: its speed changes by {jerk:.1f} times itself per second; up to {usual:.1f} are "
+            "usual."
+        )
+        return Evidence(text, jerk, "1/s", usual, likelihood(jerk / max(usual, 1e-6), 1.0, 1.6)) if usual > 0 else None
+
+
+class Saturated(Cause):
+    """A joint stands at the end of its range."""
+
+    name, title = "saturated", "no joint stands at the end of its range"
+    needs = _SHOWN
+    remedy = "Calibrate the whole range of the joint, on the leader, too; drop the episode if the motion is cut off."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        values = window.commands if "commands" in window.streams else window.states
+        values = values[np.isfinite(values).all(axis=1)]
+        if len(values) < 10:
+            return None
+        moving = np.abs(np.diff(values, axis=0)).max(axis=1, initial=0.0) > 0.002
+        span = np.ptp(values, axis=0)
+        shares = np.zeros(len(window.joints))
+        for extreme in (values.min(axis=0), values.max(axis=0)):
+            cut = np.abs(values[1:] - extreme) < 1e-4
+            shares = np.maximum(shares, (cut & moving[:, None]).sum(axis=0) / max(1, int(moving.sum())))
+        shares[span < 0.1] = 0.0
+        # A gripper that is shut stands at its end, too.
+        shares = np.array(
+            [0.0 if "grip" in joint else share for joint, share in zip(window.joints, shares, strict=True)]
+        )
+        j = int(np.argmax(shares))
+        text = (
+            f"{window.joints[j]} stands at the end of its range for {100 * shares[j]:.0f} % of the motion: it is cut "
+            "off."
+        )
+        return Evidence(text, 100 * float(shares[j]), "%", 12.0, likelihood(float(shares[j]), 0.12, 0.3))
+
+
+class PictureBlack(Cause):
+    """Pictures are black."""
+
+    name, title = "picture_black", "no picture is black"
+    needs = frozenset({"pictures"})
+    explains = frozenset({
+        "picture_dark", "picture_frozen", "picture_blurred", "picture_covered", "unseen_pictures", "white_balance",
+    })  # fmt: skip
+    remedy = "Drop the episode, and look at the camera's cable, its cover, and the light."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        shares = {
+            camera.name: float(np.mean([each.brightness < 6 and each.contrast < 4 for each in camera.pictures]))
+            for camera in window.cameras.values()
+            if camera.pictures
+        }
+        name = max(shares, key=lambda each: shares[each])
+        text = f"{100 * shares[name]:.0f} % of the pictures of {name} are black."
+        return Evidence(text, 100 * shares[name], "%", 2.0, likelihood(shares[name], 0.02, 0.1))
+
+
+class PictureGaps(Cause):
+    """Pictures come late, or with gaps."""
+
+    name, title = "picture_gaps", "pictures come in their rate"
+    needs = frozenset({"pictures"})
+    remedy = "Drop the episode if it moves meanwhile; see which camera or disk is too slow: `ibrobot episodes verify`."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        worst = (0.0, "", 0.0, 0)
+        for camera in window.cameras.values():
+            if window.sampled or len(camera.times_ns) < 10:
+                continue
+            gaps = np.diff(camera.times_ns) / 1e9
+            i = int(np.argmax(gaps))
+            ratio = float(gaps[i] / max(np.median(gaps), 1e-3))
+            worst = max(worst, (ratio, camera.name, float(gaps[i]), camera.times_ns[i]))
+        ratio, name, gap, begin = worst
+        if not name:
+            return None
+        text = f"The pictures of {name} pause for {gap:.2f} s, {ratio:.0f} times their usual distance."
+        return Evidence(text, ratio, "times", 6.0, likelihood(ratio, 6.0, 15.0), window.since(begin))
+
+
+class GripperIdle(Cause):
+    """The gripper never acts."""
+
+    name, title = "gripper_idle", "the gripper acts"
+    needs = _SHOWN | {"card"}
+    remedy = "Drop the episode if the task needs the gripper; look at its motor, and at the leader's handle."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        grippers = [j for j, joint in enumerate(window.joints) if "grip" in joint or "jaw" in joint]
+        known = window.states[np.isfinite(window.states).all(axis=1)]
+        usual = card.row(card.state, 0.95) - card.row(card.state, 0.05)
+        grippers = [j for j in grippers if usual[j] > 0.15]
+        if not grippers or not len(known):
+            return None
+        shares = [float(np.ptp(known[:, j]) / usual[j]) for j in grippers]
+        j, share = grippers[int(np.argmin(shares))], min(shares)
+        text = f"{window.joints[j]} moves by {100 * share:.0f} % of what is usual: it never acts."
+        return Evidence(text, 100 * share, "%", 20.0, likelihood(share, 0.2, 0.06))
+
+
+class _Odd(Cause):
+    """A number of the episode lies far from those of the others."""
+
+    needs = _SHOWN | {"card"}
+    series: ClassVar[str]
+    words: ClassVar[tuple[str, str]]
+    unit: ClassVar[str]
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        assert reference.card is not None
+        value = series_of(window)[self.series]
+        low, middle, high = (reference.card.quantile(self.series, level) for level in (0.05, 0.5, 0.95))
+        if middle <= 0 or low <= 0:
+            return None
+        factor = max(value / high, low / max(value, 1e-6))
+        long, short = self.words
+        text = f"The {long if value > high else short}: {value:.3g} {self.unit}; {low:.3g} to {high:.3g} are usual."
+        return Evidence(text, factor, "times", 1.6, likelihood(factor, 1.6, 2.5))
+
+
+class OddLength(_Odd):
+    """The episode is far longer or shorter than the others."""
+
+    name, title, series, unit = "odd_length", "the episode is as long as the others", "seconds", "s"
+    words = ("episode is too long", "episode is too short")
+    remedy = "Look at it: drop what was begun or ended in the wrong moment."
+
+
+class OddPath(_Odd):
+    """The arm goes a far longer or shorter way than in the others."""
+
+    name, title, series, unit = "odd_path", "the arm goes as far as in the others", "path", "rad"
+    words = ("way of the arm is too long", "way of the arm is too short")
+    remedy = "Look at it: something went wrong, or another task was done."
+
+
+class Duplicate(Cause):
+    """The episode is that of another number."""
+
+    name, title = "duplicate", "no other episode is nearly the same"
+    needs = _SHOWN | {"card"}
+    remedy = "Drop one of the two: copies make the others count less, and a test on one of them means nothing."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        card = reference.card
+        assert card is not None
+        if not np.isfinite(window.states).all(axis=1).any() or not len(card.ways):
+            return None
+        distance = float(np.abs(card.ways - way_of(window)[None]).max(axis=1).min())
+        text = f"Another episode takes the same way, to {distance:.4f} rad: it is a copy, or nearly."
+        return Evidence(text, distance, "rad", 0.004, likelihood(distance, 0.004, 0.001))
+
+
+class NotJudged(Cause):
+    """Nobody judged the episode."""
+
+    name, title = "not_judged", "the episode is judged"
+    needs = frozenset({"demonstration"})
+    remedy = "Look at it and judge it: `ibrobot episodes mark EPISODE success`."
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        if window.sampled or window.outcome != "unknown":
+            return None
+        return Evidence("Nobody judged this episode.", 1.0, "episodes", 0.5, 0.51)
+
+
+CAUSES: tuple[type[Cause], ...] = (
+    IdleStart, IdleEnd, Stall, Jerk, Saturated, PictureBlack, PictureGaps, GripperIdle, OddLength, OddPath, Duplicate,
+    NotJudged,
+)  # fmt: skip

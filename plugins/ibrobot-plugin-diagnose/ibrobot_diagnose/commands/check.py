@@ -1,0 +1,132 @@
+"""`ibrobot datasets check`: each episode of a dataset, compared with the others."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import attrs
+from ibrobot_provenance.jobs import Job, open_pool
+
+from ibrobot_core.api import DatasetError
+from ibrobot_core.app import Emit, Unsuccessful, echo, wrong_input
+from ibrobot_diagnose.card import Card, Maker
+from ibrobot_diagnose.cause import Reference, diagnose
+from ibrobot_diagnose.options import CheckOptions, CheckProgress, CheckReport
+from ibrobot_diagnose.references import find_episodes, read_episode
+from ibrobot_diagnose.report import finding_facts
+
+_PARTS = 5
+"""The episodes of a part are compared with the ones of the other parts."""
+
+
+@attrs.frozen(kw_only=True)
+class CheckDataset(CheckOptions):
+    """Check each episode of a DATASET, and list the ones to look at, worst first.
+
+    Each episode is compared with the others: idle beginnings and ends, stalls, jerk, cut-off joints, pictures that are
+    black, frozen, dark or blurred, a camera that moved, commands that the arm does not follow, a gripper that never
+    acts, odd lengths and ways, starts and tasks that no other has, copies, and episodes that nobody judged. The same
+    causes explain runs, see `ibrobot explain`.
+    """
+
+    @wrong_input()
+    def __call__(self, emit: Emit) -> dict[str, Any] | None:
+        episodes = find_episodes([self.dataset])
+        if len(episodes) < 2:
+            raise DatasetError(f"{self.dataset}: has {len(episodes)} episodes; at least 2 are needed to compare them")
+        checked = _checked(self, episodes, emit)
+        if emit is not None:
+            emit(CheckReport(lines=tuple(_lines(checked))))
+            return None
+        if checked["unreadable"]:
+            for each in checked["unreadable"]:
+                echo(f"unreadable: {each}", err=True)
+            raise Unsuccessful(checked)
+        return checked
+
+    def show(self, checked: dict[str, Any]) -> None:
+        """Print the listed episodes."""
+        for line in _lines(checked):
+            echo(line)
+
+
+def _checked(options: CheckOptions, episodes: Sequence[Path], emit: Emit) -> dict[str, Any]:
+    """Check the episodes; the facts of those with findings, worst first."""
+    done, unreadable = 0, []
+
+    def tell() -> None:
+        nonlocal done
+        done += 1
+        if emit is not None:
+            emit(CheckProgress(done=done, of=2 * len(episodes)))
+
+    def run(jobs: Sequence[Job[Any]]) -> Iterator[tuple[Path, Any]]:
+        with closing(open_pool(options.on, options.jobs)) as pool, closing(pool.run(jobs)) as finished:
+            for each in finished:
+                tell()
+                if each.error is not None:
+                    unreadable.append(str(each.error))
+                else:
+                    yield each.job.argument[0], each.result()
+
+    makers = dict(run([Job(summarise, (episode,)) for episode in episodes]))
+    readable = [episode for episode in episodes if episode in makers]
+    parts = min(_PARTS, len(readable))
+    cards = [_card([makers[each] for i, each in enumerate(readable) if i % parts != part]) for part in range(parts)]
+    jobs = [Job(check_episode, (each, cards[i % parts])) for i, each in enumerate(readable)]
+    results = {episode: causes for episode, causes in run(jobs)}
+    listed = []
+    for episode in readable:
+        causes = [each for each in results.get(episode, ()) if each["likelihood"] >= options.least]
+        if causes:
+            listed.append({"episode": str(episode), "causes": causes})
+    listed.sort(key=lambda each: (-each["causes"][0]["likelihood"], -len(each["causes"]), each["episode"]))
+    counts = Counter(cause["name"] for each in listed for cause in each["causes"])
+    return {
+        "dataset": str(options.dataset), "episodes": len(episodes), "listed": listed,
+        "counts": dict(counts.most_common()), "unreadable": unreadable,
+    }  # fmt: skip
+
+
+def _card(makers: Sequence[Maker]) -> Card:
+    joined = Maker()
+    for each in makers:
+        joined.join(each)
+    return joined.card()
+
+
+def summarise(order: tuple[Path], progress: Callable[[int], None] = lambda more: None) -> Maker:
+    """What the card needs of an episode.
+
+    Raises:
+        RecorderError: if it cannot be read.
+    """
+    maker = Maker()
+    maker.add(read_episode(order[0]))
+    return maker
+
+
+def check_episode(
+    order: tuple[Path, Card], progress: Callable[[int], None] = lambda more: None
+) -> list[dict[str, Any]]:
+    """The facts of an episode's findings, most probable first."""
+    episode, card = order
+    diagnosis = diagnose(read_episode(episode), Reference(card))
+    return [finding_facts(each) for each in diagnosis.findings]
+
+
+def _lines(checked: dict[str, Any]) -> list[str]:
+    listed = checked["listed"]
+    if not listed:
+        return [f"All {checked['episodes']} episodes are like one another: nothing was found."]
+    lines = []
+    for each in listed:
+        first, *others = each["causes"]
+        more = f" Also: {', '.join(other['name'] for other in others)}." if others else ""
+        lines.append(f"{each['episode']}: {first['text']}{more}")
+    names = ", ".join(f"{name} {count}" for name, count in checked["counts"].items())
+    return [*lines, f"{len(listed)} of {checked['episodes']} episodes to look at: {names}"]

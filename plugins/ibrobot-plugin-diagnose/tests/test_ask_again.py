@@ -1,0 +1,38 @@
+"""A model asked again answers as it did, bit for bit; where it does not, the report says whose the difference is."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from command_line import run_here
+
+pytestmark = pytest.mark.integration  # a simulation, its policy and a recorder
+
+
+@pytest.fixture(scope="module")
+def episode(tmp_path_factory):
+    """A simulated run of a scripted policy."""
+    root = tmp_path_factory.mktemp("runs")
+    done = run_here(
+        "launch", "so101_blind", "--sim", "--headless", "--lockstep", "--episodes", 1, "--seed", 5,
+        "--set", f"recording.root={root}", "--set", "recording.type=mcap",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return next(root.glob("*/episodes/episode_000001"))
+
+
+def test_answers_are_equal_bit_for_bit(episode):
+    (explained,) = json.loads(run_here("explain", episode, "--model", ".", "--json").stdout)
+    model = explained["model"]
+    assert model["asked"] >= 5
+    assert (model["equal"], model["whose"]) == (model["asked"], "")
+    assert {each["what"] for each in model["effects"]} == {"state", "environment_state"}
+    assert explained["causes"] == []
+
+
+def test_unknown_model_is_named(episode):
+    done = run_here("explain", episode, "--model", "another")
+    assert done.returncode == 1
+    assert "no model 'another'" in done.stderr
+    assert "scripted_pick" in done.stderr
