@@ -63,6 +63,8 @@ class SceneObject:
     """The `Signal` that has its pose during a run; empty for an object that stands still."""
     first: int = 0
     """Index of the pose in that signal: position [m] (3), quaternion wxyz (4)."""
+    color: tuple[float, ...] = ()
+    """Red, green, blue and opacity, 0 to 1; empty if it has none."""
 
 
 class Torque(Enum):

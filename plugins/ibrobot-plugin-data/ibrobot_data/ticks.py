@@ -288,7 +288,7 @@ class Ticks:
                     leading.append((frame.stamp_ns, missing))
                     continue
                 self._begin_late(leading, frame.stamp_ns)
-            self.gaps.update(missing - before)
+            self.gaps.update(sorted(missing - before))  # equal episodes give equal bytes
             before = missing
             if missing and not self._take(missing, frame.stamp_ns):
                 continue

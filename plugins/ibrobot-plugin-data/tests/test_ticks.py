@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from ibrobot_data.config_metadata import load_contract
-from ibrobot_data.ticks import frames
+from ibrobot_data.ticks import Ticks, frames
 
-from ibrobot_core.api import Contract, ContractError, Header, JointState
-from ibrobot_core.app import FrameAssembler
+from ibrobot_core.api import (
+    Contract,
+    ContractError,
+    Feature,
+    Header,
+    JointState,
+    ObservationPart,
+    Recorded,
+    TopicSummary,
+)
+from ibrobot_core.app import Align, FrameAssembler
 
 CONTRACT = """\
 contract:
@@ -38,3 +49,24 @@ def test_messages_must_be_in_the_order_of_receipt(contract: Contract) -> None:
 def test_ticks_may_be_endless(contract: Contract) -> None:
     endless = frames(FrameAssembler(contract), [message(0)], itertools.count(0, contract.step_ns))
     assert [len(frame.values) for frame in itertools.islice(endless, 3)] == [1, 1, 1]
+
+
+def test_observations_that_go_missing_together_are_counted_in_one_order() -> None:
+    """In that of sets, equal episodes would give different bytes."""
+    names = [f"o{i}" for i in range(8)]
+    kind, feature = JointState.ros_type, Feature("float32", (1,), ("pan.pos",))
+    parts = [
+        ObservationPart(name, f"/{name}", kind, ("position.pan",), None, Align("asof", tol_ms=10.0), feature)
+        for name in names
+    ]
+    times = [ms * 1_000_000 for ms in (*range(0, 300, 5), *range(600, 900, 5))]
+    messages = [
+        Recorded(f"/{name}", JointState(Header(t), ("pan",), np.zeros(1)), t, t) for t in times for name in names
+    ]
+    summary = SimpleNamespace(
+        topics={f"/{name}": TopicSummary(kind, len(times)) for name in names}, start_ns=0, end_ns=times[-1]
+    )
+    reader: Any = SimpleNamespace(summary=lambda: summary, messages=lambda topics=None: iter(messages))
+    ticks = Ticks(reader, Contract(30.0, tuple(parts), ()), "skip")
+    assert sum(1 for _ in ticks) > 10
+    assert list(ticks.gaps.items()) == [(name, 1) for name in names]

@@ -37,12 +37,14 @@ def scene_objects(options: MujocoOptions, robot: Robot) -> tuple[SceneObject, ..
 def _object(model: mujoco.MjModel, physics: mujoco.MjData, geom: int, topic: str, first: int) -> SceneObject:
     pose = Pose(Vector3(*physics.geom_xpos[geom].tolist()), orientation(physics.geom_xmat[geom].reshape(3, 3)))
     name, size = model.geom(geom).name, model.geom_size[geom].tolist()
+    material = int(model.geom_matid[geom])
+    color = tuple((model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]).tolist())
     match int(model.geom_type[geom]):
         case mujoco.mjtGeom.mjGEOM_PLANE:
-            return SceneObject(name, "plane", (), pose, topic, first)
+            return SceneObject(name, "plane", (), pose, topic, first, color)
         case mujoco.mjtGeom.mjGEOM_SPHERE:
-            return SceneObject(name, "sphere", (size[0],), pose, topic, first)
+            return SceneObject(name, "sphere", (size[0],), pose, topic, first, color)
         case mujoco.mjtGeom.mjGEOM_CYLINDER:
-            return SceneObject(name, "cylinder", (size[0], 2 * size[1]), pose, topic, first)
+            return SceneObject(name, "cylinder", (size[0], 2 * size[1]), pose, topic, first, color)
         case _:
-            return SceneObject(name, "box", tuple(2 * each for each in size), pose, topic, first)
+            return SceneObject(name, "box", tuple(2 * each for each in size), pose, topic, first, color)

@@ -86,6 +86,8 @@ def test_signals_have_the_poses_of_objects_that_move():
     assert read("ball")[2] < 0.27, "it falls"
     np.testing.assert_allclose(read("can"), pose_of(found["can"]), atol=1e-3)
     hardware.disconnect()
+    assert all(len(thing.color) == 4 for thing in found.values()), "as a camera sees them"
+    assert len({thing.color for thing in found.values()}) > 1
 
 
 def test_cube_begins_clear_of_objects():

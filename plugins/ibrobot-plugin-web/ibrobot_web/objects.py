@@ -65,7 +65,7 @@ def place_of(thing: SceneObject) -> dict[str, Any]:
     at, turn = thing.pose.position, thing.pose.orientation
     return {
         "name": thing.name, "type": thing.shape, "size": _half(thing.shape, thing.size), "pos": [at.x, at.y, at.z],
-        "quat": [turn.w, turn.x, turn.y, turn.z],
+        "quat": [turn.w, turn.x, turn.y, turn.z], "color": [round(float(each), 3) for each in thing.color],
     }  # fmt: skip
 
 

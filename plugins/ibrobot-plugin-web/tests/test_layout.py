@@ -144,6 +144,8 @@ async def look() -> None:
         assert await page.evaluate(OUT_OF_SIGHT, [*IN_SIGHT, "#toggles button"]) == [], (
             "more joints scroll on their own"
         )
+        await look_at_one_arm(page, run)
+        await look_at_keys(page, run)
         await page.locator("#mode summary").click()
         assert await page.get_by_role("button", name="drive by keys keyboard needs a terminal").is_disabled()
         await page.get_by_role("button", name="run the policy pick").click()
@@ -156,6 +158,35 @@ async def look() -> None:
             "but for the unit"
         )
         await browser.close()
+
+
+async def look_at_one_arm(page: Any, run: Run) -> None:
+    """Of two arms, the page shows the joints of the chosen one, with names that leave out the arm's."""
+    two = status(("left_", "right_"))
+    joints = [joint["name"] for joint in two["robot"]["joints"]]
+    arms = {"page_left": joints[:6], "page_right": joints[6:]}
+    two["robot"]["modes"][0]["jogs"] = arms
+    two["robot"]["groups"] = {"left": joints[:6], "right": joints[6:]}
+    run.show({**two, "jogs": list(arms)})
+    await until(page, "document.querySelectorAll('.joint').length === 6")
+    names = page.locator(".joint .name")
+    assert await names.all_inner_texts() == [name.removeprefix("left_") for name in joints[:6]]
+    await page.get_by_role("button", name="right", exact=True).first.click()
+    await until(page, "document.querySelector('.joint .name').title.startsWith('right_')")
+    assert await names.all_inner_texts() == [name.removeprefix("right_") for name in joints[6:]]
+    run.show(status())
+    await until(page, "!document.querySelector('.joint .name').title.startsWith('right_')")
+
+
+async def look_at_keys(page: Any, run: Run) -> None:
+    """`?` lists the keys that do something now."""
+    for recording, keys in ((False, ["B", "R"]), (True, ["S", "F", "D", "R"])):
+        run.show(status(episode={**EPISODE, "recording": recording}))
+        await until(page, f"Boolean(document.querySelector('[data-key={keys[0].lower()}]'))")
+        await page.keyboard.press("?")
+        shown = await page.locator("#dialog kbd").all_inner_texts()
+        assert shown == ["Esc", *keys, "1", "2", "3", "?"]
+        await page.get_by_role("button", name="Close").click()
 
 
 def test_pictures_and_controls_are_visible_without_scrolling() -> None:

@@ -154,7 +154,7 @@ def test_objects_around_the_robot_are_shown_where_they_are() -> None:
     session = make_session()
     session.bus.serve(stand_in("/world/shapes"), lambda request: things)
     (crate,) = SceneObjects(session).json()
-    shape = {"type": "box", "size": [0.1, 0.2, 0.3], "pos": [1, 2, 3], "quat": [1, 0, 0, 0]}
+    shape = {"type": "box", "size": [0.1, 0.2, 0.3], "pos": [1, 2, 3], "quat": [1, 0, 0, 0], "color": []}
     assert crate == {"name": "crate", **shape}
 
 
@@ -163,7 +163,7 @@ def test_objects_of_a_simulated_scene_are_where_the_simulation_has_them() -> Non
     things = (
         SceneObject("table", "plane", (), here),
         SceneObject("bin", "box", (0.2, 0.4, 0.6), here),
-        SceneObject("cube", "box", (0.2, 0.2, 0.2), here, "/simulation/scene", 2),
+        SceneObject("cube", "box", (0.2, 0.2, 0.2), here, "/simulation/scene", 2, (0.8, 0.1, 0.1234567, 1.0)),
     )
     session = make_session()
     make: Any = None
@@ -175,5 +175,6 @@ def test_objects_of_a_simulated_scene_are_where_the_simulation_has_them() -> Non
     session.bus.publish("/simulation/scene", Float64MultiArray(np.array([9.0, 9.0, 0.5, 0.6, 0.7, 0.0, 1.0, 0.0, 0.0])))
     bin_, cube = objects.json()
     assert (bin_["pos"], bin_["size"]) == ([1, 2, 3], [0.1, 0.2, 0.3])
+    assert (bin_["color"], cube["color"]) == ([], [0.8, 0.1, 0.123, 1.0])
     assert (cube["pos"], cube["quat"]) == ([0.5, 0.6, 0.7], [0.0, 1.0, 0.0, 0.0])
     objects.close()

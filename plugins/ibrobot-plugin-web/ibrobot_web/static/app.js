@@ -1,6 +1,6 @@
 // The page of a run: header, faults, pictures, recording, driving, and panels that fold away.
 
-import { h, refresh, say, switchTheme, toast } from "./dom.js";
+import { h, refresh, row, say, switchTheme, table, toast } from "./dom.js";
 import { Deadman } from "./hold.js";
 import { Drive, StopLine, Stream } from "./link.js";
 import { View3D } from "./view3d.js";
@@ -115,11 +115,23 @@ $("operate").addEventListener("click", () => {
   else page.command("operate", { take_over: true });
 });
 $("theme").addEventListener("click", switchTheme);
+// Which keys do something now.
+function showKeys() {
+  const keys = [...page.role === "watch" ? [] : [["Esc", "emergency stop"]], ...record.keys, ...pictures.keys, ["?", "this list"]];
+  const dialog = $("dialog");
+  dialog.replaceChildren(h("h2", { id: "dialog-title" }, "Keys that are active now"),
+    table(null, keys.map(([key, does]) => row([h("th", { scope: "row" }, h("kbd", {}, key)), does]))),
+    page.status?.help ? h("pre", {}, page.status.help) : "",
+    h("form", { method: "dialog", class: "row" }, h("button", { autofocus: true }, "Close")));
+  dialog.showModal();
+}
+$("keys").addEventListener("click", showKeys);
 // Keys of recording and of pictures, unless something is typed or asked.
 window.addEventListener("keydown", (event) => {
   if (event.repeat || event.ctrlKey || event.altKey || event.metaKey || event.defaultPrevented) return;
   if (event.target.closest?.("input:not([type=range]):not([type=checkbox]), select, textarea, dialog")) return;
-  if (record.press(event.key.toLowerCase()) || pictures.press(event.key)) event.preventDefault();
+  if (event.key === "?") showKeys();
+  else if (record.press(event.key.toLowerCase()) || pictures.press(event.key)) event.preventDefault();
 });
 
 let missed = 0, missedAt = -Infinity; // the loop's late ticks, and when the last one came

@@ -30,10 +30,14 @@ export function refresh(element, description, make) {
   element.replaceChildren(...[make()].flat().map(words));
 }
 
-// A table: the names of its columns, and its rows.
+// A table: the names of its columns, and its rows. On a phone each row is a card, whose values have these names.
 export function table(columns, rows, caption = null) {
-  return h("table", {}, caption && h("caption", {}, caption),
-    columns && h("thead", {}, h("tr", {}, columns.map((name) => h("th", { scope: "col" }, name)))), h("tbody", {}, rows));
+  const heads = columns?.map((name) => h("th", { scope: "col" }, name));
+  const body = h("tbody", {}, rows);
+  if (heads) {
+    for (const { cells } of body.rows) [...cells].forEach((cell, i) => { if (i && heads[i]) cell.dataset.of = heads[i].textContent; });
+  }
+  return h("table", {}, caption && h("caption", {}, caption), heads && h("thead", {}, h("tr", {}, heads)), body);
 }
 
 // A row of a table: texts, elements, or cells; the first one names the row.

@@ -27,21 +27,24 @@ export class Joints {
   }
 
   update({ robot }) {
-    refresh(this.list, robot.joints, () => {
-      this.rows = robot.joints.map((joint) => this.row(joint));
+    const { jogs, mode, device } = this.page;
+    const own = jogs.length > 1 ? mode.jogs[device] : null; // those of the chosen arm
+    const shared = own ? prefix(own) : "";
+    refresh(this.list, [robot.joints, own], () => {
+      this.rows = robot.joints.map((joint, index) => ({ joint, index })).filter(({ joint }) => !own || own.includes(joint.name))
+        .map(({ joint, index }) => this.row(joint, index, joint.name.slice(shared.length)));
       return this.rows.map((row) => row.element);
     });
-    const { jogs, mode } = this.page;
     for (const row of this.rows) {
       row.device = jogs.find((device) => mode.jogs[device].includes(row.joint.name));
       for (const control of [row.slider, row.less, row.more]) control.disabled = !row.device;
     }
   }
 
-  row(joint) {
+  row(joint, index, name) {
     const { deadman } = this.page;
     const step = (joint.upper - joint.lower) / 1000;
-    const row = { joint };
+    const row = { joint, index };
     row.slider = h("input", {
       type: "range", min: joint.lower, max: joint.upper, step, "aria-label": `${joint.name}, target`,
     });
@@ -58,14 +61,15 @@ export class Joints {
     row.value = h("output", {});
     row.bar = h("div", { class: "value" });
     row.command = h("div", { class: "command" });
-    row.element = h("div", { class: "joint" }, h("span", { class: "name" }, joint.name), row.value,
+    row.element = h("div", { class: "joint" }, h("span", { class: "name", title: joint.name }, name), row.value,
       h("div", { class: "bar", "aria-hidden": "true" }, row.bar, row.command),
       h("div", { class: "jog" }, row.less, h("div", { class: "track" }, row.slider), row.more));
     return row;
   }
 
   state({ position, command }) {
-    this.rows.forEach((row, i) => {
+    this.rows.forEach((row) => {
+      const i = row.index;
       const { lower, upper, name } = row.joint;
       const share = (value) => `${100 * Math.min(1, Math.max(0, (value - lower) / (upper - lower)))}%`;
       say(row.value, this.page.view.slides.includes(name) ? `${signed(position[i] * 1000, 0)} mm`
@@ -77,6 +81,16 @@ export class Joints {
       if (document.activeElement !== row.slider || !this.page.deadman.held) row.slider.value = position[i];
     });
   }
+}
+
+// What the names of an arm's joints begin with, up to a separator, e.g. `left_`.
+function prefix(names) {
+  const first = names[0] ?? "";
+  for (let end = first.length - 1; end > 0; end--) {
+    const begin = first.slice(0, end);
+    if (/[_/.-]$/.test(begin) && names.length > 1 && names.every((name) => name.startsWith(begin))) return begin;
+  }
+  return "";
 }
 
 // A number with a typographic minus, and none before zero.

@@ -19,6 +19,8 @@ export class Pictures {
   // The names of all pictures, in their order.
   get names() { return [...this.section.querySelectorAll(":scope > .picture")].map(({ dataset }) => dataset.name); }
 
+  get keys() { const { names } = this; return names.length > 1 ? names.map((name, i) => [String(i + 1), `Show ${name} large`]) : []; }
+
   arrange() {
     const pictures = [...this.section.querySelectorAll(":scope > .picture")];
     const chosen = pictures.find(({ dataset }) => dataset.name === this.chosen) ?? pictures[0];

@@ -70,6 +70,11 @@ export class Record {
     return [form, ...again("Redo the last"), this.cues.choice];
   }
 
+  // The keys that press a button now, and its text.
+  get keys() {
+    return [...this.section.querySelectorAll("button[data-key]:not(:disabled)")].map((button) => [button.dataset.key.toUpperCase(), button.firstChild.textContent]);
+  }
+
   // Presses the button with this key; false if there is none.
   press(key) {
     const button = this.section.querySelector(`button[data-key="${CSS.escape(key)}"]:not(:disabled)`);

@@ -134,10 +134,10 @@ function plan({ plan: message, positions, kept: keeps = false }) {
 }
 
 function objects({ objects: found }) {
-  extras = found.map(({ type, size: sizes, pos, quat }) => {
+  extras = found.map(({ type, size: sizes, pos, quat, color }) => {
     const kind = `${type} ${sizes}`;
     if (!shapes.has(kind)) shapes.set(kind, screen.mesh(primitive(type, sizes)));
-    return { shape: shapes.get(kind), matrix: placed(pos, quat), color: OBJECT, lit: true };
+    return { shape: shapes.get(kind), matrix: placed(pos, quat), color: color?.length ? color : OBJECT, lit: true };
   });
   dirty = true;
 }

@@ -2,12 +2,19 @@
 
 import { h, refresh, when } from "../dom.js";
 
+const FIRST_S = 1e9; // runs in lockstep have a clock of their own, which begins in 1970
 const RUNS = ["run", "record"];
+// Titles of a robot's runs: the name of its file, without the ending.
+const RUN_OF = (robot) => { const name = robot.split("/").at(-1).replace(/\.ya?ml$/, ""); return [name, `${name} in simulation`]; };
 
 export class Overview {
-  constructor(ui) {
+  // `choose` is called with the robot of the card that was clicked.
+  constructor(ui, choose) {
     this.ui = ui;
-    this.element = h("section", { class: "tiles", "aria-label": "Overview" });
+    this.choose = choose;
+    this.tiles = h("section", { class: "tiles", "aria-label": "Overview" });
+    this.robots = h("section", { class: "tiles", "aria-label": "Your robots" });
+    this.element = h("div", { class: "overview" }, this.tiles, this.robots);
   }
 
   // Counts again; what was asked while it counts is asked once more.
@@ -27,22 +34,33 @@ export class Overview {
 
   show(found) {
     const runs = [...this.ui.jobs.values()].filter(({ kind, state, facts }) => RUNS.includes(kind) && state === "running" && facts.url);
-    refresh(this.element, [found, runs.map(({ number, facts }) => [number, facts.url])], () => [
+    refresh(this.tiles, [found, runs.map(({ number, facts }) => [number, facts.url])], () => [
       tile("Set up", this.setUp(found, runs)), tile("Record", record(found)), tile("Learn", learn(found)), tile("Evaluate", evaluate(found))]);
+    const last = (robot) => [...this.ui.jobs.values()].filter(({ kind, title }) => kind === "run" && RUN_OF(robot).includes(title)).at(-1);
+    refresh(this.robots, found.robots.map(({ robot, summary }) => [robot, summary, last(robot)?.state, last(robot)?.facts.url]), () =>
+      found.robots.map(({ robot, summary }) => tile(robot, this.robot(robot, summary, last(robot)), "h3")));
+  }
+
+  robot(robot, summary, run) {
+    const running = run?.state === "running";
+    const state = running ? "It runs." : run?.state === "failed" ? "Its last run failed." : run ? "Its last run has ended." : "It does not run.";
+    return [summary, h("p", { class: running ? "good" : run?.state === "failed" ? "bad" : "note" }, state), h("div", { class: "row" },
+      running && run.facts.url ? h("a", { class: "button primary", href: this.ui.runAddress(run.facts.url), target: "_blank" }, "Open its page")
+        : h("button", { onclick: () => this.choose(robot), "aria-label": `Choose ${robot}` }, "Choose"))].filter(Boolean);
   }
 
   setUp({ robots }, runs) {
     const running = runs.map(({ title, facts }) => h("a", { class: "button primary", href: this.ui.runAddress(facts.url), target: "_blank" }, `Open ${title}`));
-    const own = robots.length ? [`Your robots: ${robots.map(({ robot }) => robot).join(", ")}.`] : ["No robot of your own yet: launch a shipped one in simulation, or copy it for your arm."];
+    const own = robots.length ? [`${count(robots.length, "robot")} of your own.`] : ["No robot of your own yet: launch a shipped one in simulation, or copy it for your arm."];
     return [...own, ...(running.length ? running : [robots.length ? link("devices", "Check its devices") : link("robots", "Choose a robot below")])];
   }
 }
 
 function record({ episodes, unjudged, newest }) {
   if (!episodes) return ["No episode yet.", link("record", "Record some")];
-  const last = newest[0];
   return [`${count(episodes, "episode")}, ${unjudged} not judged.`,
-    `The newest: ${[last.task && `“${last.task}”`, last.outcome, last.began_s && when(last.began_s)].filter(Boolean).join(", ")}.`,
+    h("ul", { class: "list", "aria-label": "The newest" }, newest.map(({ path, task, outcome, began_s: began }) => h("li", {},
+      h("a", { href: `#episodes/${encodeURIComponent(path)}` }, task ? `“${task}”` : path.split("/").at(-1)), ", ", h("span", {}, outcome), began > FIRST_S ? `, ${when(began)}` : null))),
     unjudged ? link("episodes", `Judge ${count(unjudged, "episode")}`) : link("record", "Record more")];
 }
 
@@ -60,6 +78,6 @@ function evaluate({ policies, reports }) {
 const link = (view, text) => h("a", { class: "button", href: `#${view}` }, text);
 const count = (number, one, several = `${one}s`) => `${number} ${number === 1 ? one : several}`;
 
-function tile(title, content) {
-  return h("div", { class: "card" }, h("h2", {}, title), ...content.map((each) => (typeof each === "string" ? h("p", {}, each) : each)));
+function tile(title, content, heading = "h2") {
+  return h("div", { class: "card" }, h(heading, {}, title), ...content.map((each) => (typeof each === "string" ? h("p", {}, each) : each)));
 }

@@ -13,7 +13,11 @@ export class View {
     this.runs = new JobList(ui, "No run yet. A run opens a page of its own, which shows and drives the robot.", ...RUNS);
     this.chooser = new Chooser(ui, () => this.enable());
     this.copy = new Copy(ui, this.chooser);
-    this.overview = new Overview(ui);
+    this.overview = new Overview(ui, (robot) => {
+      this.chooser.choose({ robot, mode: "" });
+      this.chooser.fields.scrollIntoView({ block: "center" });
+      this.chooser.robot.focus();
+    });
   }
 
   mount(element) {
@@ -50,6 +54,6 @@ export class View {
 
   job(job) {
     this.runs.update(job);
-    if (job.state !== "running") this.overview.load();
+    this.overview.load();
   }
 }
