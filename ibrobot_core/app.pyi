@@ -93,6 +93,7 @@ from ibrobot_core.deadman import HOLD_S as HOLD_S
 from ibrobot_core.control.spline import Spline as Spline
 
 # Planning
+from ibrobot_core.interfaces.guard import Guard as Guard
 from ibrobot_core.errors import PlanCode as PlanCode
 
 # Topics and services

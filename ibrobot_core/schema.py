@@ -115,6 +115,13 @@ class PlannerConfig(ComponentConfig):
 
 
 @attrs.frozen
+class GuardConfig(ComponentConfig):
+    """The guard, which stops commands that would lead to a collision."""
+
+    plugin_kind = "guard"
+
+
+@attrs.frozen
 class ViewerConfig(ComponentConfig):
     """A display of the robot."""
 
@@ -419,6 +426,7 @@ class ControlConfig:
     )
     following_error: Following = option(factory=Following, help="detection of joints that do not follow setpoints")
     load_shedding: Shedding = option(factory=Shedding, help="relief of joints that stay hot or overloaded")
+    guard: GuardConfig | None = option(None, help="what stops commands of every origin before a collision")
 
 
 @documented

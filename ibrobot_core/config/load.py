@@ -25,7 +25,7 @@ from ibrobot_core.errors import ConfigError, PluginNotInstalled, Problem
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import Registry, installed_plugins
 from ibrobot_core.robot import Robot
-from ibrobot_core.schema import ContractConfig, PeripheralConfig, RobotConfig
+from ibrobot_core.schema import ContractConfig, ControlConfig, PeripheralConfig, RobotConfig
 
 DEFAULT_CONFIG = "so101"
 
@@ -175,6 +175,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         },
         "teleoperation": _components(sections.teleoperation),
         "contract": contract,
+        "control": attrs.evolve(sections.plain.get("control") or ControlConfig(), guard=_component(sections.guard)),
         "recording": _component(sections.recording),
         "transport": _component(sections.transport),
         "viewer": _component(sections.viewer),

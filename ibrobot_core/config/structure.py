@@ -57,6 +57,7 @@ class ParsedSections:
     recording: ParsedComponent[schema.RecordingConfig] | None = None
     transport: ParsedComponent[schema.TransportConfig] | None = None
     viewer: ParsedComponent[schema.ViewerConfig] | None = None
+    guard: ParsedComponent[schema.GuardConfig] | None = None
     plugin_sections: dict[str, ParsedComponent[ComponentConfig]] = attrs.field(factory=dict)
     """The sections of plugins."""
     missing: list[Missing] = attrs.field(factory=list)
@@ -68,7 +69,7 @@ class ParsedSections:
         """The components that a run opens when it starts."""
         yield from () if self.simulated else self.hardware.values()
         yield from self.peripherals.values()
-        yield from (part for part in (self.simulation, self.recording, self.transport, self.viewer) if part is not None)
+        yield from (part for part in (self.simulation, self.recording, self.transport, self.viewer, self.guard) if part)
         yield from self.plugin_sections.values()
 
     def all(self) -> Iterator[ParsedComponent[Any]]:
@@ -139,6 +140,7 @@ class SectionParser:
                 sections.inference |= {name: inference} if inference is not None else {}
         sections.transport = self._component(("transport",), schema.TransportConfig)
         sections.viewer = self._component(("viewer",), schema.ViewerConfig)
+        sections.guard = self._component(("control", "guard"), schema.GuardConfig)
         sections.recording = self._component(("recording",), schema.RecordingConfig)
         return sections
 

@@ -36,4 +36,6 @@ def build_core(config: RobotConfig, registry: Registry, clock: Clock, seed: int)
     else:
         problem = "neither hardware nor simulation is there: nothing to control"
         raise ConfigError([Problem(str(config.source), 0, "hardware", problem)])
-    return ControlCore(config, HardwareGroup(config.robot, hardware, config.control.state_timeout), executors, clock)
+    guard = config.control.guard and make("guard", config.control.guard, "guard", config.robot.joint_names)
+    group = HardwareGroup(config.robot, hardware, config.control.state_timeout)
+    return ControlCore(config, group, executors, clock, guard)

@@ -89,9 +89,16 @@ class BeginStartup:
     """Begin the motion to the startup pose, if there is one."""
 
 
+@attrs.frozen
+class ChangeWorld:
+    """Tell the guard, if there is one, of a change of the world."""
+
+    change: Mapping[str, Any]
+
+
 Command = (
     SwitchMode | ResetEpisode | EmergencyStop | RaiseFault | ClearFaults | SendGoal | CancelGoals | GetCounters | Halt
-    | BeginStartup
+    | BeginStartup | ChangeWorld
 )  # fmt: skip
 _CLASSES = {kind.__name__: kind for kind in get_args(Command)}
 _RESETTABLE = (Phase.RUNNING, Phase.FAULTED, Phase.SHEDDING, Phase.SHED)

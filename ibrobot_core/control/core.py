@@ -23,7 +23,7 @@ from ibrobot_core.control.readings import Readings
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.control.timing import Pace
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
-from ibrobot_core.interfaces import EpisodeSetup, Executor, JointReading, Signal, Torque
+from ibrobot_core.interfaces import EpisodeSetup, Executor, Guard, JointReading, Signal, Torque
 from ibrobot_core.interfaces.executor import ExecutorGoal
 from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 from ibrobot_core.robot import Vector
@@ -49,6 +49,7 @@ class ControlCore:
         hardware: all hardware of the robot; connected by `start`.
         executors: name -> executor.
         clock: the source of stamps.
+        guard: what keeps commands from leading to a collision.
 
     Attributes:
         phase: what the loop does; `TRANSITIONS` has what leads to another one.
@@ -57,15 +58,17 @@ class ControlCore:
     """
 
     def __init__(
-        self, config: RobotConfig, hardware: HardwareGroup, executors: Mapping[str, Executor], clock: Clock
-    ) -> None:
+        self, config: RobotConfig, hardware: HardwareGroup, executors: Mapping[str, Executor], clock: Clock,
+        guard: Guard | None = None,
+    ) -> None:  # fmt: skip
         self._log = logging.getLogger("ibrobot.control")
         self._config = config
         self._robot = config.robot
         self._hardware = hardware
         self._clock = clock
         self.period_ns = ns(1.0 / config.control.rate_hz)
-        self._safety = SafetyLayer(config.robot, self.period_ns)
+        self._safety = SafetyLayer(config.robot, self.period_ns, guard)
+        self._overruled = ""
         self._pose = PoseMotion(self._safety, clock)
         self._readings = Readings(hardware, config.robot, clock, self.period_ns, ns(config.control.state_timeout))
         self._counts = {"write_errors": 0, "signal_errors": 0, "old_plans": 0, "following_errors": 0}
@@ -94,6 +97,7 @@ class ControlCore:
             commands.GetCounters: self.counters,
             commands.Halt: self._halt,
             commands.BeginStartup: self.begin_startup,
+            commands.ChangeWorld: lambda change: None if guard is None else guard.world(change),
         }
         """What executes a command, with its fields as arguments."""
         self.take_stops: Callable[[], None] = lambda: None
@@ -103,7 +107,7 @@ class ControlCore:
         self.generation = 0
         self.fault = ""
         self.events: deque[Mapping[str, Any]] = deque()
-        """Events for the host, of kinds `goal` and `fault`."""
+        """Events for the host, of kinds `goal`, `fault` and `guard`."""
         self._executors = ActiveExecutors(config.robot, executors, self.events.append, lambda: self._safety.rest)
         self.state: ControlState | None = None
         """Readings and commands of the last tick; None before the first."""
@@ -191,6 +195,9 @@ class ControlCore:
         self._check_health()
         measured = self._readings.newest
         command = self._safety.apply(self._desired(), measured.position)
+        if (overruled := self._safety.overruled) != self._overruled:
+            self._overruled = overruled
+            self.events.append({"event": "guard", "overruled": overruled})
         self._write(command)
         self._hardware.advance(periods * self.period_ns)
         self._tick += 1

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.errors import HardwareError
+from ibrobot_core.interfaces.guard import Guard
 from ibrobot_core.robot import Robot, Vector
 from ibrobot_core.units import seconds
 
-KINDS = ("estop", "nonfinite", "unmeasured", "first_command", "position", "lead", "velocity", "acceleration")
+KINDS = ("estop", "nonfinite", "unmeasured", "first_command", "position", "lead", "guard", "velocity", "acceleration")
 """Reasons for changing a desired setpoint. A joint counts once per tick, under the first reason that applies."""
 
 
@@ -37,9 +38,10 @@ class SafetyLayer:
     Args:
         robot: joints and their limits; J is their number.
         period_ns: the control period [ns]; call `apply` once per period.
+        guard: what may choose, for each joint, a command between that of the limits and braking.
     """
 
-    def __init__(self, robot: Robot, period_ns: int) -> None:
+    def __init__(self, robot: Robot, period_ns: int, guard: Guard | None = None) -> None:
         if period_ns <= 0:
             raise ValueError(f"period_ns must be above 0, got {period_ns}")
         self._names = robot.joint_names
@@ -71,6 +73,9 @@ class SafetyLayer:
         self._events = {"outside": 0, "wrong_length": 0, "missing": 0}
         self._estopped = False
         self._active = False
+        self._guard = guard
+        self.overruled = ""
+        """As of the guard, in the last tick."""
 
     def activate(self, measured: Vector) -> None:
         """Start at rest from the measured positions [rad], shape (J,). Call it again when torque returns.
@@ -114,18 +119,21 @@ class SafetyLayer:
         seen = self._nothing if seen is None else seen
         known = np.isfinite(seen)
         lower, upper = self._bounds(seen, known)
+        self.overruled = ""
         if wanted is None:
             self._events["missing" if desired is None else "wrong_length"] += 1
             command = self._next(self._nothing, np.zeros(len(self._names), dtype=bool), lower, upper)
         else:
             follow = np.zeros_like(known) if self._estopped else np.isfinite(wanted) & known
             before = self._position
-            command = self._next(wanted, follow, lower, upper)
+            before_step = self._step
+            command = limited = self._next(wanted, follow, lower, upper)
+            if self._guard is not None and not self._estopped:
+                command = self._guarded(self._guard, before, before_step, limited, seen, lower[0], upper[0])
             differs = command != wanted
             if differs.any():
-                self._count(
-                    differs, wanted, known, before, np.where(wanted > before, upper[1] - before, before - lower[1])
-                )
+                room = np.where(wanted > before, upper[1] - before, before - lower[1])
+                self._count(differs, wanted, known, before, room, command != limited)
             self._fresh &= ~follow
         return command.copy()
 
@@ -179,7 +187,8 @@ class SafetyLayer:
 
     def counters(self) -> Mapping[str, int]:
         """Counts since construction: joint-ticks for each of `KINDS`, `outside` joints, refused and missing vectors."""
-        return dict(zip(KINDS, self._counts.sum(axis=1).tolist(), strict=True)) | self._events
+        of_guard = {} if self._guard is None else {f"guard_{k}": n for k, n in self._guard.counts.items()}
+        return dict(zip(KINDS, self._counts.sum(axis=1).tolist(), strict=True)) | self._events | of_guard
 
     @property
     def interventions(self) -> Mapping[str, int]:
@@ -243,9 +252,26 @@ class SafetyLayer:
         self._target_step = target_step
         return command
 
+    def _guarded(
+        self, guard: Guard, before: Vector, step: Vector, limited: Vector, seen: Vector, low: Vector, high: Vector
+    ) -> Vector:
+        """The command of the guard [rad], shape (J,): between that of the limits and braking, whatever it returns."""
+        accepted = _vector(guard.accept(before, step / self._period_s, limited, seen), len(before))
+        self.overruled = guard.overruled
+        if accepted is None or not np.array_equal(accepted, limited):
+            brakes = before + _limited(np.zeros_like(step), step - self._change, step + self._change)
+            usable = brakes if accepted is None else np.where(np.isfinite(accepted), accepted, brakes)
+            self._position = _limited(
+                _limited(usable, np.minimum(brakes, limited), np.maximum(brakes, limited)), low, high
+            )
+            self._step = self._step + (self._position - limited)
+            self._target = np.where(self._position == limited, self._target, np.nan)
+        return self._position
+
     def _count(
-        self, differs: NDArray[np.bool_], wanted: Vector, known: NDArray[np.bool_], before: Vector, room: Vector
-    ) -> None:
+        self, differs: NDArray[np.bool_], wanted: Vector, known: NDArray[np.bool_], before: Vector, room: Vector,
+        guarded: NDArray[np.bool_],
+    ) -> None:  # fmt: skip
         """Count the joints marked in `differs`, each under the first of `KINDS` that applies.
 
         Args:
@@ -254,6 +280,7 @@ class SafetyLayer:
             known: whether each joint is measured, shape (J,).
             before: the last commands, shape (J,).
             room: the way to the last setpoint that the lead allows in the direction of `wanted` [rad], shape (J,).
+            guarded: which the guard has changed, shape (J,).
         """
         lower, upper = np.minimum(self._lower, before), np.maximum(self._upper, before)
         step = _limited(wanted, lower, upper) - before
@@ -261,7 +288,7 @@ class SafetyLayer:
         leads = (np.abs(wanted - before) > room) & (room < self._braking)
         reasons = np.array([
             differs & self._estopped, ~np.isfinite(wanted), ~known, self._fresh, (wanted < lower) | (wanted > upper),
-            leads, np.abs(step) > self._max_step + self._half_slack, differs,
+            leads, guarded, np.abs(step) > self._max_step + self._half_slack, differs,
         ])  # fmt: skip
         joints = np.flatnonzero(differs)
         self._counts[reasons.argmax(axis=0)[joints], joints] += 1

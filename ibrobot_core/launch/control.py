@@ -17,7 +17,7 @@ from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import ComponentFailed, HardwareError
 from ibrobot_core.interfaces.run_state import ControlState
 from ibrobot_core.launch.session import Session
-from ibrobot_core.messages import JOINT_STATES, Float64MultiArray, Header, JointState
+from ibrobot_core.messages import JOINT_STATES, Float64MultiArray, Header, JointState, String
 from ibrobot_core.pulses import PULSE_S
 from ibrobot_core.schema import ControlMode, RobotConfig
 
@@ -33,7 +33,8 @@ class ControlComponent(Component):
         where = "in this process, in lockstep" if session.request.lockstep else "in a process of its own"
         simulation = config.simulation if config.simulated else None
         types = [simulation.type] if simulation else [each.type for each in config.hardware.values()]
-        super().__init__(CONTROL, f"{', '.join(types)} at {config.control.rate_hz:g} Hz, {where}", needs)
+        guard = f", guarded by {config.control.guard.type}" if config.control.guard is not None else ""
+        super().__init__(CONTROL, f"{', '.join(types)} at {config.control.rate_hz:g} Hz, {where}{guard}", needs)
         self._session = session
         self._joints = config.robot.joint_names
         self._checked_s = self._ending_s = 0.0
@@ -125,6 +126,8 @@ class ControlComponent(Component):
         if event["event"] == "goal":
             for call in (session.command_source.take_goal, *session.on_goal):
                 call(event)
+        elif event["event"] == "guard":
+            session.bus.publish("/guard", String(event["overruled"]), latched=True)
         elif event["event"] == "fault":
             fault = str(event["fault"])
             session.add_fault(fault, int(event["generation"]))

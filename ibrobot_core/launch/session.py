@@ -235,6 +235,14 @@ class Session:
 
         send(goal) if self.goal_door is None else self.goal_door(executor, goal_id, goal, send)
 
+    def change_world(self, change: Mapping[str, Any]) -> None:
+        """Tell the guard of the control process of a change of the world, in the words of its plugin.
+
+        Raises:
+            IbrobotError: if the guard refuses it, or control has died.
+        """
+        self.control.call(commands.ChangeWorld(change))
+
     def cancel_goals(self, executor: str = "") -> None:
         """Cancel the goal of an executor, or all goals if it is empty; the executors then hold.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any, get_args
 
 import attrs
@@ -33,6 +34,7 @@ VALUES: dict[Any, st.SearchStrategy[Any]] = {
     int: st.integers(),
     int | None: st.none() | st.integers(),
     bool: st.booleans(),
+    Mapping[str, Any]: st.dictionaries(st.text(), JSON, max_size=3),
     ExecutorGoal: st.one_of(
         st.builds(
             FollowTrajectory,
@@ -57,6 +59,7 @@ OTHERS: dict[Any, st.SearchStrategy[Any]] = {
     int: JSON.filter(lambda value: type(value) is not int),
     int | None: JSON.filter(lambda value: value is not None and type(value) is not int),
     bool: JSON.filter(lambda value: not isinstance(value, bool)),
+    Mapping[str, Any]: JSON.filter(lambda value: not isinstance(value, dict)),
     ExecutorGoal: JSON.filter(lambda value: not isinstance(value, dict)),
 }
 """Type of a field -> JSON that it does not take."""

@@ -23,6 +23,7 @@ ALLOWED = {
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.interfaces.run_state"): DRIVE,
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.plugins"): DRIVE,
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.control.safety"): LOOP,
+    ("ibrobot-plugin-planning/tests/test_guard.py", "ibrobot_core.control.safety"): "what calls the guard",
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.dispatch.smoother"): LOOP,
     (
         "ibrobot-plugin-data/tests/test_interleavings.py",

@@ -14,7 +14,7 @@ import ibrobot_core
 from ibrobot_core.api import MODEL_ANSWERS, Contract, EpisodeStart, ModelAnswer, RecorderError, String
 from ibrobot_core.app import InUse, RecordedRun, RecordingConfig, RobotConfig, calibrations
 from ibrobot_data.episode_dataset import EpisodeDataset
-from ibrobot_data.options import COMMANDER
+from ibrobot_data.options import GUARD, LABELS
 
 _PREFIX = "episode_"
 
@@ -82,8 +82,12 @@ def episode_start(
     if session.factors:
         metadata["factors"] = json.dumps(dict(session.factors))
     metadata["uuid"] = str(uuid5(NAMESPACE_OID, json.dumps(metadata)) if session.request.lockstep else uuid4())
+    guarded = GUARD if config.control.guard is not None else ""
     if recording.topics == "contract":
-        kept = {**contract.topics, **({COMMANDER: String.ros_type} if COMMANDER in topics else {})}
+        kept = {
+            **contract.topics,
+            **{topic: String.ros_type for topic in LABELS if topic in topics or topic == guarded},
+        }
         kept = {**model_topics(config, policy), **kept}
     else:
         kept = {topic: type_ for topic, type_ in topics.items() if is_kept(topic, recording, contract)}
@@ -93,7 +97,7 @@ def episode_start(
 def is_kept(topic: str, recording: RecordingConfig, contract: Contract) -> bool:
     """Whether the `recording` section selects `topic`."""
     if recording.topics == "contract":
-        return topic in contract.topics or topic == COMMANDER
+        return topic in contract.topics or topic in LABELS
     return recording.topics == "all" or topic in recording.topics
 
 

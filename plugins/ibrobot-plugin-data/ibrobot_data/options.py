@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 COMMANDER = "/commander"
 """Topic (std_msgs/msg/String) with who commands the robot at each state of control, in modes with `intervene`."""
+GUARD = "/guard"
+LABELS = (COMMANDER, GUARD)
+"""Topics beside those of the contract that say of each tick who commanded, and what the guard of control kept apart."""
 POLICY, OPERATOR, HANDOVER = "policy", "operator", "handover"
 """The words on `COMMANDER`; in a handover nobody commands, and the arm holds."""
 PLANNER = "planner"

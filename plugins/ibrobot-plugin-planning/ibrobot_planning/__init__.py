@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from ibrobot_core.api import ExecutorDescriptor, Late, OptionFault, did_you_mean, hookimpl
 from ibrobot_core.app import Command, Kind, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
+from ibrobot_planning.guard.descriptor import GuardDescriptor
+from ibrobot_planning.guard.options import ClearanceGuardOptions
 from ibrobot_planning.planner import PlannerDescriptor
 from ibrobot_planning.planners.options import GoalCheckOptions, JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
@@ -15,13 +17,14 @@ from ibrobot_planning.world.options import WorldOptions
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
-    from ibrobot_core.app import Component, RunView
+    from ibrobot_core.app import Component, RobotConfig, RunView
 
 
 @hookimpl
 def ibrobot_kinds() -> Iterable[Kind]:
-    """Planners."""
+    """Planners and guards."""
     yield Kind("planner", "ibrobot_planners", PlannerDescriptor)
+    yield Kind("guard", "ibrobot_guards", GuardDescriptor)
 
 
 @hookimpl
@@ -47,6 +50,29 @@ def ibrobot_planners() -> Iterable[PlannerDescriptor]:
 def _needs_model(options: RrtConnectOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
     if robot.description.mjcf is None:
         yield OptionFault((), "planning around obstacles needs robot.description.mjcf: set it", "mjcf")
+
+
+@hookimpl
+def ibrobot_guards() -> Iterable[GuardDescriptor]:
+    """The guard `clearance`."""
+    yield GuardDescriptor(
+        type="clearance",
+        options=ClearanceGuardOptions,
+        make=Late("ibrobot_planning.guard.clearance_guard:ClearanceGuard"),
+        check=find_engines,
+        check_options=_check_guard,
+        summary="keeps commands of every origin clear of the arm itself and of the world",
+    )
+
+
+def _feeds_guard(config: RobotConfig) -> bool:
+    guard = config.control.guard
+    return guard is not None and guard.type == "clearance" and "world" in config.plugin_sections
+
+
+def _check_guard(options: ClearanceGuardOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    if robot.description.mjcf is None:
+        yield OptionFault((), "the guard needs robot.description.mjcf: set it, or leave control.guard out", "mjcf")
 
 
 @hookimpl
@@ -140,7 +166,7 @@ def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -
 
 @hookimpl
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
-    """The sections `world`, `goals` and `tasks`."""
+    """The sections `world`, `goals` and `tasks`, and what tells the guard of the world."""
     yield SectionDescriptor(
         type="world",
         options=WorldOptions,
@@ -157,6 +183,12 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         ),
         without_section=lambda config: any(each.goals == "trajectory" for each in config.executors.values()),
         summary="checks trajectories of all clients against limits, the arm and the world before control gets them",
+    )
+    yield SectionDescriptor(
+        type="guard_feed",
+        make=lambda options, session: Late("ibrobot_planning.guard.feed:GuardFeed")(session),
+        without_section=_feeds_guard,
+        summary="tells the guard of changes of the world; runs by itself with `control.guard` and `world`",
     )
     yield SectionDescriptor(
         type="tasks",

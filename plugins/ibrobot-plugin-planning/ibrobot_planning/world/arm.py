@@ -14,7 +14,7 @@ from typing import Any
 import attrs
 import numpy as np
 from ibrobot_kinematics.errors import KinematicsError
-from ibrobot_kinematics.mjcf import placement, read_mjcf
+from ibrobot_kinematics.mjcf import Mjcf, placement, read_mjcf, several_arms
 
 from ibrobot_core.api import PlanningError, Robot, Vector
 from ibrobot_core.app import PlanCode
@@ -152,12 +152,12 @@ def robot_arm(robot: Robot) -> Arm:
             f"robot {robot.name!r} has no robot.description.mjcf; planning around obstacles needs a MuJoCo model",
             PlanCode.COLLISION_CHECKING_UNAVAILABLE,
         )
-    arm = read_arm(robot.description.mjcf, robot.joint_names)
+    arm = read_arm(robot.description.mjcf, robot.joint_names, tuple(robot.description.arms.items()))
     return attrs.evolve(arm, lower=robot.lower, upper=robot.upper)
 
 
 @lru_cache(maxsize=4)
-def read_arm(path: Path, joints: tuple[str, ...]) -> Arm:
+def read_arm(path: Path, joints: tuple[str, ...], arms: tuple[tuple[str, tuple[float, ...]], ...] = ()) -> Arm:
     """An arm from an MJCF.
 
     Links without collision geometry, such as the base of the SO-101, get the convex hulls of their visible meshes.
@@ -165,6 +165,7 @@ def read_arm(path: Path, joints: tuple[str, ...]) -> Arm:
     Args:
         path: the MJCF.
         joints: the joints that may move, in the order of vectors. Others stay at their reference position.
+        arms: of several equal arms, prefix of its names and place of its base, as in `robot.description.arms`.
 
     Raises:
         PlanningError: if the file cannot be read, lacks a joint, or one is neither a hinge nor a slide.
@@ -172,7 +173,7 @@ def read_arm(path: Path, joints: tuple[str, ...]) -> Arm:
     import pinocchio
 
     try:
-        mjcf = read_mjcf(path)
+        mjcf = Mjcf(path, several_arms(path, dict(arms))) if arms else read_mjcf(path)
         source = mjcf.solid
         tree = mjcf.tree(source, joints)
     except KinematicsError as error:

@@ -46,8 +46,18 @@ def checked_arm(robot: Robot, log: logging.Logger) -> Arm:
 
 
 def _made(robot: Robot, log: logging.Logger) -> Arm:
+    return with_hulls(may_touch_arm(robot, log))
+
+
+def may_touch_arm(robot: Robot, log: logging.Logger) -> Arm:
+    """The collision model of a robot with the pairs of links that may touch, without hulls.
+
+    Raises:
+        PlanningError: as `robot_arm`.
+        KinematicsError: for a URDF or SRDF that cannot be read.
+    """
     arm = robot_arm(robot)
-    arm = with_hulls(attrs.evolve(arm, unchecked=unchecked_pairs(arm)))
+    arm = attrs.evolve(arm, unchecked=unchecked_pairs(arm))
     if robot.description.urdf is None:
         return arm
     urdf = read_urdf(robot.description.urdf)

@@ -1,0 +1,227 @@
+"""The guard `clearance`: each command comes with a motion that stops the arm, and whose whole way is clear."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, override
+
+import attrs
+import numpy as np
+import pinocchio
+from ibrobot_kinematics.poses import matrix
+
+from ibrobot_core.api import Context, PlanningError, Pose, Vector, Vector3, seconds
+from ibrobot_core.app import Guard
+from ibrobot_planning.guard.changes import WorldChange
+from ibrobot_planning.guard.options import ClearanceGuardOptions
+from ibrobot_planning.guard.pairs import Indices, Pairs
+from ibrobot_planning.world.arm import Arm, Pair, sorted_pair
+from ibrobot_planning.world.checked_arm import may_touch_arm
+from ibrobot_planning.world.objects import FLOOR, Plane, World, WorldObject
+
+_HISTORY_S = 0.5
+"""How long a joint may lag behind its commands and still be on their path [s]."""
+_DECAY_S = 1.0
+"""Time in which the greatest distance from the path is forgotten by a factor of e [s]."""
+_HALVINGS = 3
+"""How finely the share of a motion that leads nearer is chosen."""
+_MOST_LOOKS = 40
+"""Most configurations that are looked at in a tick, which bounds its time."""
+_ROUNDS = 3
+"""How often a motion that slides is changed because of further pairs."""
+_SWEEPS = 8
+"""How often a motion is projected in turn on what each of several pairs permits."""
+
+
+class ClearanceGuard(Guard):
+    """Accepts a command if the arm stays clear on the way to it and while it brakes from it at its limits.
+
+    Otherwise it takes the part of the motion that leads no pair nearer that is too near, as much of the rest as is
+    clear, or else brakes. Braking was checked with the command of the tick before.
+
+    Args:
+        options: options in the YAML.
+        context: robot, period and log.
+    """
+
+    def __init__(self, options: ClearanceGuardOptions, context: Context) -> None:
+        self._options, self._log = options, context.log
+        self._arm: Arm = may_touch_arm(context.robot, context.log)
+        period_s = seconds(context.period_ns)
+        self._period_s = period_s
+        self._change: Vector = context.robot.max_acceleration * period_s**2
+        self._follows = ~np.asarray(context.robot.grips)
+        floor = options.floor
+        self._fixed = {} if floor is None else {FLOOR: WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor)))}
+        self._pressed = {
+            sorted_pair(name, other): options.press for name, others in options.may_touch.items() for other in others
+        }
+        self._world = World()
+        self._changes: deque[WorldChange] = deque()
+        self._pairs = self._made()
+        self._stale = self._label = ""
+        self._pair: tuple[str, ...] = ()
+        """What the last setpoint was about to touch."""
+        size = len(self._arm.joint_names)
+        self._past: Vector = np.full((max(2, round(_HISTORY_S / period_s)), size), np.nan)
+        """The last commands [rad], shape (H, J)."""
+        self._newest = -1
+        self._away: Vector = np.zeros(size)
+        """Largest distance of each joint from the path of its commands, fading [rad], shape (J,)."""
+        self._fade = float(np.exp(-period_s / _DECAY_S))
+        self._reach = self._pairs.levers.max(axis=0, initial=0.0)
+        self._counts = {"ticks": 0, "slid": 0, "braked": 0, "stale": 0, "world_changes": 0, "refused_changes": 0}
+
+    @override
+    def world(self, change: Mapping[str, Any]) -> None:
+        self._changes.append(WorldChange.read(change))
+
+    @property
+    def counts(self) -> Mapping[str, int]:  # type: ignore[override]
+        """Ticks with a changed setpoint (`ticks`), those in which the arm slid or braked, and what the world did."""
+        return self._counts | {"distances": self._pairs.measured, "pairs": len(self._pairs.names)}
+
+    @override
+    def accept(self, position: Vector, velocity: Vector, setpoint: Vector, measured: Vector) -> Vector:
+        while self._changes:
+            self._apply(self._changes.popleft())
+        self._note(position, measured)
+        self._pairs.left = _MOST_LOOKS
+        step = velocity * self._period_s
+        brakes: Vector = position + np.sign(step) * np.maximum(np.abs(step) - self._change, 0.0)
+        return self._accepted(position, brakes, setpoint)
+
+    def _accepted(self, position: Vector, brakes: Vector, setpoint: Vector) -> Vector:
+        before, self.overruled = self._pair, ""
+        self._pair = ()
+        if self._stale and self._options.when_stale == "hold" and not np.array_equal(setpoint, brakes):
+            self._counts["stale"] += 1
+            self.overruled = json.dumps({"first": "world", "second": self._stale, "distance": None})
+            return brakes
+        extra = self._pairs.levers @ self._away
+        blocking = self._blocking(position, setpoint, extra)
+        if not len(blocking):
+            return setpoint
+        self._counts["ticks"] += 1
+        nearest = int(blocking[self._pairs.distances(position, blocking).argmin()])
+        self._pair = self._pairs.names[nearest]
+        if self._pair != before:
+            distance = round(float(self._pairs.distances(position, np.array([nearest]))[0]), 4)
+            self._label = json.dumps({"first": self._pair[0], "second": self._pair[1], "distance": distance})
+        self.overruled = self._label
+        lowest, highest = np.minimum(brakes, setpoint), np.maximum(brakes, setpoint)
+        for _ in range(_ROUNDS):
+            slides = self._along(position, setpoint, lowest, highest, blocking)
+            further = self._blocking(position, slides, extra)
+            if not len(further):
+                self._counts["slid"] += 1
+                return self._most(position, slides, setpoint, extra)
+            if np.isin(further, blocking).all():
+                break
+            blocking = np.union1d(blocking, further)
+        self._counts["braked"] += 1
+        return self._most(position, brakes, slides, extra)
+
+    def _most(self, position: Vector, clear: Vector, wanted: Vector, extra: Vector) -> Vector:
+        """The last clear command on the way from one that is clear to one that is wanted, halving the way."""
+        best, low, high = clear, 0.0, 1.0
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            command = clear + middle * (wanted - clear)
+            if len(self._blocking(position, command, extra)):
+                high = middle
+            else:
+                best, low = command, middle
+        return best
+
+    def _blocking(self, position: Vector, command: Vector, extra: Vector) -> Indices:
+        """Pairs that come too near on the way to a command and while braking from it; none if it is clear."""
+        pairs, path = self._pairs, self._path(position, command)
+        suspect = pairs.unproved(position, path[-1], extra)
+        if len(suspect):
+            pairs.distances((position + path[-1]) / 2, suspect)
+            suspect = suspect[pairs.unproved(position, path[-1], extra, suspect)]
+        if not len(suspect):
+            return suspect
+        required = pairs.required(position, suspect, extra)
+        return pairs.first_blocked(path, suspect, required)
+
+    def _path(self, position: Vector, command: Vector) -> Vector:
+        """The way to a command and to rest, at each tick [rad], shape (N, J)."""
+        step = command - position
+        ticks = max(1, int(np.ceil(np.abs(step) / self._change).max()))
+        steps = np.abs(step) - self._change * np.arange(ticks)[:, None]
+        moved = np.cumsum(np.copysign(np.maximum(steps, 0.0), step), axis=0)
+        return np.concatenate([position[None], position + moved])
+
+    def _along(self, position: Vector, setpoint: Vector, lowest: Vector, highest: Vector, blocking: Indices) -> Vector:
+        """The command nearest to `setpoint`, within bounds, that leads no blocking pair nearer, if there is one."""
+        self._pairs.distances(position, blocking)
+        gradients = self._pairs.gradients(blocking)
+        step = setpoint - position
+        for _ in range(_SWEEPS):
+            before = step
+            for gradient in gradients:
+                rate = float(gradient @ step)
+                if rate < 0:
+                    step = step - gradient * (rate / float(gradient @ gradient))
+            step = np.minimum(np.maximum(step, lowest - position), highest - position)
+            if np.array_equal(step, before):
+                break
+        return position + step
+
+    def _note(self, position: Vector, measured: Vector) -> None:
+        """Take in the last command and where the joints are."""
+        if self._newest < 0:
+            self._past[:] = position
+        self._newest = (self._newest + 1) % len(self._past)
+        self._past[self._newest] = position
+        self._away *= self._fade
+        known = np.isfinite(measured)
+        if not known.all():
+            measured = np.where(known, measured, position)
+        gaps = np.abs(self._past - measured)
+        nearest = gaps[int((gaps @ self._reach).argmin())]
+        self._away = np.maximum(self._away, np.where(self._follows, nearest, 0.0))
+
+    def _apply(self, change: WorldChange) -> None:
+        """Bring the world up to date; one that no arm can have changes nothing."""
+        self._counts["world_changes"] += 1
+        self._stale = change.stale
+        world = change.apply(self._world)
+        if world is self._world:
+            return
+        moved = change.only_moved(self._world)
+        try:
+            if moved is None:
+                self._world, before = world, self._world
+                try:
+                    made = self._made()
+                except BaseException:
+                    self._world = before
+                    raise
+                made.keep_limits(self._pairs)
+                made.measured = self._pairs.measured
+                self._pairs = made
+            else:
+                self._world = world
+                for name in moved:
+                    self._pairs.move(self._whole(world), name, pinocchio.SE3(matrix(world.objects[name].pose)))
+        except PlanningError as error:
+            self._counts["refused_changes"] += 1
+            self._log.warning("the guard keeps the world that it had: %s", error)
+
+    def _whole(self, world: World) -> World:
+        """A world with the table, and with what the options permit."""
+        free, objects = self._options.free, {**self._fixed, **world.objects}
+        for name in free.keys() & objects.keys():
+            objects[name] = attrs.evolve(objects[name], may_touch=objects[name].may_touch.union(free[name]))
+        return World(objects)
+
+    def _made(self) -> Pairs:
+        options = self._options
+        world = self._whole(self._world)
+        pressed: Mapping[Pair, float] = self._pressed
+        return Pairs(self._arm, world, margin=options.margin, self_margin=options.self_margin, pressed=pressed)

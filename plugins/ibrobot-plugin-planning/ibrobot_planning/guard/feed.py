@@ -1,0 +1,37 @@
+"""Tells the guard in the control process what the world of the run has become."""
+
+from __future__ import annotations
+
+from typing import override
+
+from ibrobot_core.app import CONTROL, RunView, SessionWorker
+from ibrobot_planning.guard.changes import WorldChange
+from ibrobot_planning.world.objects import World, observed_world
+
+
+class GuardFeed(SessionWorker):
+    """Compares the world with what the guard knows at each state of control, and sends what has changed."""
+
+    urgent = True
+
+    def __init__(self, session: RunView) -> None:
+        super().__init__(session, "guard", "tells the guard of changes of the world", (CONTROL, "world"))
+        self._sent, self._stale = World(), ""
+
+    @override
+    def setup(self) -> None:
+        self._states = self.session.watch_states()
+        self._update()
+
+    @override
+    def work(self, timeout_s: float) -> None:
+        if self._states.get(timeout_s) is not None:
+            self._update()
+
+    def _update(self) -> None:
+        observed = observed_world(self.session.bus)
+        stale = "" if observed.is_awaited else observed.refusal
+        if observed.world == self._sent and stale == self._stale:
+            return
+        self.session.change_world(WorldChange.between(self._sent, observed.world, stale).message())
+        self._sent, self._stale = observed.world, stale

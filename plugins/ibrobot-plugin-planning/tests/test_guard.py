@@ -1,0 +1,385 @@
+"""The guard `clearance`: commands of every kind keep the arm clear, as MuJoCo's own collision detection sees it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import attrs
+import mujoco
+import numpy as np
+import pytest
+from ibrobot_planning.guard.changes import WorldChange
+from ibrobot_planning.guard.clearance_guard import ClearanceGuard
+from ibrobot_planning.guard.feed import GuardFeed
+from ibrobot_planning.guard.options import ClearanceGuardOptions
+from ibrobot_planning.world.objects import (
+    OBSERVED,
+    Box,
+    Mesh,
+    ObservedWorld,
+    Plane,
+    Sphere,
+    Voxels,
+    World,
+    WorldObject,
+)
+
+from ibrobot_core.api import Context, HardwareError, Pose, Robot, SteppedClock, Vector, Vector3
+from ibrobot_core.app import Bus
+from ibrobot_core.control.safety import SafetyLayer
+
+from .table_arm import JOINTS, MJCF, box, make_robot
+
+PERIOD_NS = 10_000_000
+FLOOR = '<geom name="floor" type="plane" size="1 1 .1"/>'
+POSTS = {"post": box(0.16, 0.0, 0.1, 0.03, 0.03, 0.2), "wall": box(-0.2, 0.0, 0.2, 0.02, 0.6, 0.4)}
+MARGIN_M = 0.003
+
+
+class Loop:
+    """The safety layer with the guard, in ticks; the joints follow exactly unless `measured` is given."""
+
+    def __init__(self, folder: Path, at: Vector | None = None, *, guarded: bool = True, **options: Any) -> None:
+        self.robot: Robot = make_robot(folder)
+        context = Context("guard", SteppedClock(7), logging.getLogger("test"), self.robot, self.robot.joint_names)
+        self.guard = ClearanceGuard(
+            ClearanceGuardOptions(**{"margin": MARGIN_M, "self_margin": MARGIN_M, **options}), context
+        )
+        self.safety = SafetyLayer(self.robot, PERIOD_NS, self.guard if guarded else None)
+        self.position = np.zeros(len(JOINTS)) if at is None else at
+        self.safety.activate(self.position)
+
+    def world(self, objects: dict[str, WorldObject], *removed: str, stale: str = "") -> None:
+        self.guard.world(WorldChange(objects, removed, stale).message())
+
+    def tick(self, wanted: Vector, measured: Vector | None = None) -> Vector:
+        self.position = self.safety.apply(wanted, self.position if measured is None else measured)
+        return self.position
+
+    def go(self, wanted: Vector, ticks: int = 120) -> Vector:
+        for _ in range(ticks):
+            self.tick(wanted)
+        return self.position
+
+
+class Seen:
+    """MuJoCo's own view of the arm among objects, with the distance that it sees at each configuration."""
+
+    def __init__(self, objects: dict[str, WorldObject], floor: bool = False) -> None:
+        geoms = FLOOR if floor else ""
+        for name, thing in objects.items():
+            p = thing.pose.position
+            assert isinstance(thing.shape, Box)
+            half = " ".join(str(length / 2) for length in thing.shape.size)
+            geoms += f'<geom name="{name}" type="box" size="{half}" pos="{p.x} {p.y} {p.z}"/>'
+        spec = mujoco.MjSpec.from_string(MJCF.format(objects=geoms))
+        for geom in spec.geoms:
+            geom.margin = 0.05  # contacts are listed from this distance on
+        spec.body("base").first_geom().contype = 1  # as planning sees it: its visible shape
+        spec.add_exclude(bodyname1="base", bodyname2="turret")  # a joint connects them
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self.joints = [int(self.model.joint(name).qposadr[0]) for name in JOINTS]
+
+    def distance(self, q: Vector) -> float:
+        self.data.qpos[self.joints] = q
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_collision(self.model, self.data)
+        return float(self.data.contact.dist.min()) if self.data.ncon else 0.05
+
+    def along(self, a: Vector, b: Vector, parts: int = 4) -> float:
+        """The least distance on the straight way between two commands."""
+        return min(self.distance(a + share * (b - a)) for share in np.linspace(1 / parts, 1, parts))
+
+
+def random_targets(robot: Robot, rng: np.random.Generator) -> Iterator[Vector]:
+    while True:
+        target = rng.uniform(robot.lower, robot.upper)
+        yield from itertools.repeat(target, int(rng.integers(1, 60)))
+
+
+def bang_bang(robot: Robot, rng: np.random.Generator) -> Iterator[Vector]:
+    while True:
+        target = np.where(rng.random(len(robot.joints)) < 0.5, robot.lower, robot.upper)
+        yield from itertools.repeat(target, int(rng.integers(1, 80)))
+
+
+def walk(robot: Robot, rng: np.random.Generator) -> Iterator[Vector]:
+    at = np.zeros(len(robot.joints))
+    while True:
+        at = np.clip(at + rng.normal(scale=0.05, size=len(at)), robot.lower, robot.upper)
+        yield at
+
+
+def down(robot: Robot, rng: np.random.Generator) -> Iterator[Vector]:
+    """Folded towards the table, its own base and the post, by turns."""
+    poses = [(0, 1.8, 1.2, 1.2, 0, 0), (0, 1.8, -1.5, 0, 1, 1), (0, 1.4, 2.2, 1.8, -1, 0), (0.1, 1.2, 0.6, 0.3, 0, 1.2)]
+    while True:
+        target = np.array(poses[rng.integers(len(poses))], dtype=float) + rng.normal(scale=0.1, size=6)
+        yield from itertools.repeat(target, int(rng.integers(20, 90)))
+
+
+def switching(robot: Robot, rng: np.random.Generator) -> Iterator[Vector]:
+    """One commander after the other, each from where it is."""
+    commanders = [each(robot, rng) for each in (random_targets, bang_bang, walk, down)]
+    while True:
+        yield from itertools.islice(commanders[rng.integers(len(commanders))], int(rng.integers(1, 30)))
+
+
+COMMANDERS = (random_targets, bang_bang, walk, down, switching)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("commander", COMMANDERS)
+def test_no_command_touches_anything(tmp_path, commander, seed: int) -> None:
+    loop = Loop(tmp_path, floor=0.0, may_touch={"floor": ("base", "turret")})
+    loop.world(POSTS)
+    seen, rng = Seen(POSTS, floor=True), np.random.default_rng(seed)
+    nearest, before = 1.0, loop.position
+    for wanted in itertools.islice(commander(loop.robot, rng), 500):
+        loop.tick(wanted)
+        nearest = min(nearest, seen.along(before, loop.position))
+        before = loop.position
+    assert nearest > MARGIN_M - 0.001
+    assert commander is walk or loop.guard.counts["ticks"] > 0
+
+
+def test_without_the_guard_the_same_commands_touch(tmp_path) -> None:
+    loop = Loop(tmp_path, guarded=False)
+    seen, nearest, before = Seen(POSTS, floor=True), 1.0, loop.position
+    for wanted in itertools.islice(down(loop.robot, np.random.default_rng(0)), 300):
+        loop.tick(wanted)
+        nearest = min(nearest, seen.along(before, loop.position))
+        before = loop.position
+    assert nearest < -0.01
+
+
+def test_a_harmless_command_passes_bit_by_bit(tmp_path) -> None:
+    guarded, alone = Loop(tmp_path), Loop(tmp_path, guarded=False)
+    for wanted in itertools.islice(walk(guarded.robot, np.random.default_rng(1)), 150):
+        assert guarded.tick(wanted * 0.3).tobytes() == alone.tick(wanted * 0.3).tobytes()
+    assert guarded.guard.overruled == ""
+
+
+LEFT, ACROSS = np.array([1.0, 1.2, 0.6, 0.3, 0.0, 0.0]), np.array([-1.0, 1.2, 0.6, 0.3, 0.0, 0.0])
+WALL = {"wall": box(0.35, 0.0, 0.15, 0.4, 0.02, 0.3)}
+
+
+def test_joints_that_lead_no_nearer_go_on(tmp_path) -> None:
+    loop = Loop(tmp_path, LEFT)
+    loop.world(WALL)
+    wanted = ACROSS.copy()
+    wanted[4] = 1.0
+    at = loop.go(wanted)
+    assert "wall" in json.loads(loop.guard.overruled).values()
+    assert 0.0 < at[0] < LEFT[0] - 0.3, "it has come near the wall, and stopped there"
+    assert at[4] == pytest.approx(1.0), "the roll does not lead nearer"
+    assert loop.go(LEFT) == pytest.approx(LEFT), "the way back is free"
+    assert loop.guard.overruled == ""
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_from_near_anything_the_way_out_is_free(tmp_path, seed: int) -> None:
+    """Wherever a command has led, the way that it came is free, and so is the pose above."""
+    loop = Loop(tmp_path, floor=0.0, may_touch={"floor": ("base", "turret")})
+    loop.world(POSTS)
+    rng = np.random.default_rng(seed)
+    start = np.array([rng.uniform(-0.4, 0.4), 0.3, 0.3, 0.2, 0.0, 0.3])
+    loop.go(start)
+    before = loop.position
+    way = [loop.tick(wanted) for wanted in itertools.islice(down(loop.robot, rng), 120)]
+    loop.go(loop.position, 20)
+    for at in reversed(way):
+        loop.tick(at)
+    assert np.abs(loop.go(before, 200) - before).max() < 0.05
+
+
+def test_from_a_start_in_contact_only_the_way_out_is_free(tmp_path) -> None:
+    start = np.array([0.05, 1.2, 0.6, 0.3, 0.0, 0.0])
+    loop = Loop(tmp_path, start)
+    loop.world(WALL)
+    seen = Seen(WALL)
+    depth = seen.distance(start)
+    assert depth < 0
+    loop.go(ACROSS)
+    assert seen.distance(loop.position) > depth - 0.001, "not further in"
+    assert loop.go(LEFT) == pytest.approx(LEFT)
+    loop.go(ACROSS)
+    assert seen.distance(loop.position) > MARGIN_M - 0.001, "and not back in"
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_an_object_that_appears_is_stopped_in_front_of(tmp_path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    loop, seen = Loop(tmp_path, LEFT), Seen(WALL)
+    for _ in range(int(rng.integers(1, 30))):
+        loop.tick(ACROSS)
+    room = seen.distance(loop.safety.rest)
+    loop.world(WALL)
+    nearest, before = 1.0, loop.position
+    for _ in range(100):
+        nearest, before = min(nearest, seen.along(before, loop.tick(ACROSS))), loop.position
+    assert nearest > min(room, MARGIN_M) - 0.001, "never nearer than braking at once would have led"
+    assert "wall" in json.loads(loop.guard.overruled).values()
+
+
+def test_what_may_be_touched_is_pressed_so_deep_and_no_deeper(tmp_path) -> None:
+    touching = {"floor": ("base", "turret", "hand", "finger")}
+    seen = Seen({}, floor=True)
+    for press in (0.005, 0.02):
+        loop = Loop(tmp_path, floor=0.0, may_touch=touching, press=press)
+        loop.go(np.array([0.0, 1.4, 1.2, 0.5, 0.0, 0.0]))
+        assert -press - 0.001 < seen.distance(loop.position) < -press + 0.002
+
+
+def test_permissions_of_the_world_count(tmp_path) -> None:
+    loop = Loop(tmp_path, LEFT)
+    links = ("upper", "lower", "wrist", "hand", "finger")
+    loop.world({"wall": attrs.evolve(WALL["wall"], may_touch=links)})
+    assert loop.go(ACROSS) == pytest.approx(ACROSS)
+
+
+def test_a_carried_object_is_part_of_the_arm(tmp_path) -> None:
+    stick = WorldObject(Box((0.02, 0.2, 0.02)), Pose(Vector3(0.0, 0.0, 0.08)), "hand", ("hand", "finger"))
+    at = {}
+    for name, carried in (("none", {}), ("stick", {"stick": stick})):
+        loop = Loop(tmp_path, LEFT)
+        loop.world(WALL | carried)
+        at[name] = loop.go(np.array([1.0, 1.2, 0.6, -1.5, 0.0, 0.0]), 50) * 0 + loop.go(ACROSS)
+    assert at["stick"][0] > at["none"][0]
+
+
+def test_a_stale_world_holds_or_not_as_stated(tmp_path) -> None:
+    for rule in ("hold", "keep"):
+        loop = Loop(tmp_path, when_stale=rule)
+        wanted = np.array([1.0, 0.3, 0.0, 0.0, 0.0, 0.0])
+        loop.go(wanted, 10)
+        loop.world({}, stale="cloud 'top' is 2.0 s old")
+        at = loop.go(wanted, 100)
+        assert (np.abs(at - wanted).max() < 1e-6) == (rule == "keep")
+        loop.world({})
+        assert loop.go(wanted) == pytest.approx(wanted)
+
+
+def test_joints_that_stray_from_their_path_widen_the_margin(tmp_path) -> None:
+    """A lag behind the path does not; a constant offset of the measured position does."""
+    at = {}
+    for name, offset in (("none", 0.0), ("offset", 0.05)):
+        loop = Loop(tmp_path, LEFT)
+        loop.world(WALL)
+        for _ in range(120):
+            loop.tick(ACROSS, loop.position - np.array([offset, 0, 0, 0, 0, 0]))
+        at[name] = loop.position[0]
+    assert at["offset"] > at["none"] + 0.02
+
+
+def make_change(kind: str) -> WorldObject:
+    shape = {
+        "box": Box((0.1, 0.2, 0.3)),
+        "sphere": Sphere(0.1),
+        "plane": Plane(),
+        "mesh": Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.5]]), np.array([[0, 1, 2]])),
+        "voxels": Voxels(0.02, np.array([[0, 0, 0], [4, -3, 2]])),
+    }[kind]
+    return WorldObject(shape, Pose(Vector3(0.1, 0.2, 0.3)), None, ("a", "b"))
+
+
+@pytest.mark.parametrize("kind", ["box", "sphere", "plane", "mesh", "voxels"])
+def test_a_change_of_the_world_survives_the_way_to_control(kind: str) -> None:
+    thing = make_change(kind)
+    sent = WorldChange({"it": thing}, ("gone",), "too old")
+    read = WorldChange.read(json.loads(json.dumps(sent.message())))
+    assert (read.removed, read.stale) == (sent.removed, sent.stale)
+    assert json.dumps(read.message()) == json.dumps(sent.message())
+
+
+def written(shape: Any, at: float = 0.0, turn: tuple[int, ...] = (0, 0, 0, 1)) -> dict[str, Any]:
+    return {"changed": {"it": {"shape": shape, "pose": [at, 0, 0, *turn], "link": None, "may_touch": []}}}
+
+
+WRONG = [
+    {"changed": {"it": None}},
+    {"changed": []},
+    {"removed": 3},
+    written(["box", [0.1, 0.1, 0.1]], turn=()),
+    written(["box", [0.1, 0.1, 0.1]], turn=(0, 0, 0, 0)),
+    written(["box", [float("nan"), 1, 1]]),
+    written(["box", [1, 1, 1]], float("inf")),
+    written(["ball", 1]),
+    written(["voxels", 0.1, "!!"]),
+    written(["sphere", -1.0]),
+    written(["mesh", "", "", False]),
+]
+
+
+@pytest.mark.parametrize("message", WRONG, ids=range(len(WRONG)))
+def test_a_malformed_change_is_refused_and_changes_nothing(tmp_path, message) -> None:
+    loop = Loop(tmp_path, LEFT)
+    loop.world(WALL)
+    with pytest.raises(HardwareError, match="change of the world"):
+        loop.guard.world(message)
+    assert loop.go(ACROSS)[0] > 0
+
+
+def test_a_world_that_the_arm_cannot_have_leaves_the_one_before(tmp_path, caplog) -> None:
+    """An object with the name of a link, or on a link that is not there."""
+    loop = Loop(tmp_path, LEFT)
+    loop.world(WALL)
+    for name, link in (("hand", None), ("stick", "nowhere")):
+        loop.world({name: attrs.evolve(box(0, 0, 1, 0.1, 0.1, 0.1), link=link)})
+        assert loop.go(ACROSS)[0] > 0
+        loop.go(LEFT)
+    assert loop.guard.counts["refused_changes"] == 2
+    assert "the guard keeps the world that it had" in caplog.text
+
+
+def test_an_object_that_moves_is_where_it_is_and_not_where_it_was(tmp_path) -> None:
+    loop = Loop(tmp_path, LEFT)
+    loop.world(WALL)
+    loop.go(ACROSS, 20)
+    loop.world({"wall": box(0.35, -0.6, 0.15, 0.4, 0.02, 0.3)})
+    assert loop.go(ACROSS) == pytest.approx(ACROSS)
+    loop.world({}, "wall")
+    assert loop.go(LEFT) == pytest.approx(LEFT)
+    assert loop.guard.counts["ticks"] == 0 or loop.guard.overruled == ""
+
+
+class TestFeed:
+    """What tells the guard of the world: each change once, and in its words."""
+
+    def make(self, observed: list[ObservedWorld]) -> tuple[GuardFeed, list[WorldChange]]:
+        bus, sent = Bus(SteppedClock(7)), []
+        bus.serve(OBSERVED, lambda _: observed[-1])
+        session = SimpleNamespace(bus=bus, change_world=lambda change: sent.append(WorldChange.read(change)))
+        feed = GuardFeed(session)
+        return feed, sent
+
+    def test_each_change_is_sent_once(self) -> None:
+        worlds = [ObservedWorld(World(WALL))]
+        feed, sent = self.make(worlds)
+        steps = [
+            (World(WALL), ""), (World(WALL), ""), (World(WALL | POSTS), ""), (World(POSTS), "too old"),
+            (World({"wall": POSTS["wall"]}), ""),
+        ]  # fmt: skip
+        known = World()
+        for world, stale in steps:
+            before = len(sent)
+            worlds.append(ObservedWorld(world, refusal=stale))
+            feed._update()
+            assert len(sent) <= before + 1
+            if len(sent) > before:
+                known = sent[-1].apply(known)
+                assert sent[-1].stale == stale
+            assert known.objects == world.objects
+        assert len(sent) == len(steps) - 1
+
+    def test_a_world_that_is_still_awaited_is_not_stale(self) -> None:
+        feed, sent = self.make([ObservedWorld(World(WALL), refusal="nothing has come", is_awaited=True)])
+        feed._update()
+        assert [each.stale for each in sent] == [""]

@@ -1,0 +1,107 @@
+"""A guard chooses between the command of the limits and braking; whatever it returns, the limits hold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ibrobot_core.api import Joint, Robot
+from ibrobot_core.control.safety import SafetyLayer
+from ibrobot_core.interfaces import Guard
+
+PERIOD_S = 0.01
+ROBOT = Robot(
+    name="two",
+    joints=tuple(Joint(name, -1.0, 1.5, max_velocity=3.0, max_acceleration=40.0) for name in "ab"),
+    groups={"arm": ("a", "b")},
+)
+
+
+class Says(Guard):
+    """A guard that returns what a function makes of the setpoint."""
+
+    def __init__(self, say: Callable[[np.ndarray], Any]) -> None:
+        self.say = say
+        self.seen: list[tuple[np.ndarray, ...]] = []
+        self.overruled = '{"first": "x", "second": "y", "distance": 0.01}'
+
+    def accept(self, position, velocity, setpoint, measured):
+        self.seen.append((position, velocity, setpoint, measured))
+        return self.say(setpoint)
+
+    def world(self, change) -> None:
+        raise NotImplementedError
+
+
+ANYTHING = st.one_of(
+    st.lists(st.floats(), min_size=2, max_size=2).map(np.array), st.none(), st.just(np.zeros(3)), st.just("no"),
+    st.lists(st.floats(-3, 3), min_size=2, max_size=2).map(np.array),
+)  # fmt: skip
+
+
+@given(st.lists(st.tuples(ANYTHING, st.lists(st.floats(-3, 3), min_size=2, max_size=2)), min_size=1, max_size=30))
+def test_limits_hold_whatever_a_guard_returns(ticks) -> None:
+    answers = iter([answer for answer, _ in ticks])
+    layer = SafetyLayer(ROBOT, 10_000_000, Says(lambda setpoint: next(answers)))
+    at, step = np.zeros(2), np.zeros(2)
+    layer.activate(at)
+    for _, wanted in ticks:
+        command = layer.apply(np.array(wanted), at)
+        assert np.isfinite(command).all()
+        assert ((command >= -1.0) & (command <= 1.5)).all()
+        assert (np.abs(command - at) <= 3.0 * PERIOD_S + 1e-9).all()
+        assert (np.abs((command - at) - step) <= 40.0 * PERIOD_S**2 + 1e-9).all()
+        at, step = command, command - at
+    for _ in range(12):
+        at = layer.apply(None, at)
+    assert layer.at_rest
+    assert ((at >= -1.0) & (at <= 1.5)).all()
+
+
+def test_a_guard_that_refuses_brakes_the_joints_and_counts() -> None:
+    guard = Says(lambda setpoint: setpoint)
+    layer = SafetyLayer(ROBOT, 10_000_000, guard)
+    layer.activate(np.zeros(2))
+    wanted = np.array([1.0, 0.0])
+    for _ in range(20):
+        at = layer.apply(wanted, layer.current)
+    guard.say = lambda setpoint: np.full(2, math.nan)
+    rest = layer.rest
+    for _ in range(20):
+        at = layer.apply(wanted, at)
+    assert at == pytest.approx(rest, abs=1e-9)
+    assert layer.overruled == guard.overruled
+    assert layer.counters()["guard"] == 20
+    assert layer.interventions["a"] >= 20
+
+
+def test_a_guard_sees_the_command_that_the_limits_permit() -> None:
+    guard = Says(lambda setpoint: setpoint)
+    layer, alone = SafetyLayer(ROBOT, 10_000_000, guard), SafetyLayer(ROBOT, 10_000_000)
+    for each in (layer, alone):
+        each.activate(np.zeros(2))
+    at = np.zeros(2)
+    for wanted in np.random.default_rng(0).uniform(-2, 2, (50, 2)):
+        measured = at + 0.001
+        before, speed = layer.current, layer.velocity
+        at = layer.apply(wanted, measured)
+        assert at.tobytes() == alone.apply(wanted, measured).tobytes()
+        for seen, given_ in zip(guard.seen[-1], (before, speed, at, measured), strict=True):
+            assert seen == pytest.approx(given_)
+
+
+@pytest.mark.parametrize("brake", [lambda layer: layer.apply(None, layer.current), lambda layer: layer.estop()])
+def test_braking_asks_no_guard(brake) -> None:
+    guard = Says(lambda setpoint: setpoint)
+    layer = SafetyLayer(ROBOT, 10_000_000, guard)
+    layer.activate(np.zeros(2))
+    brake(layer)
+    layer.apply(None, np.zeros(2))
+    assert guard.seen == []
+    assert layer.overruled == ""
