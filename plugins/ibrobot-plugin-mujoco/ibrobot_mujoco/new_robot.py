@@ -20,7 +20,9 @@ from ibrobot_mujoco.mjcf_model import complete_model
 from ibrobot_mujoco.urdf_model import DrivenJoint, RobotModel, make_model
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
-_LIMITS_OF_ARM = "Write those of its datasheet, or begin with a tenth."
+_SHARE = 0.1
+"""Share of the model's velocities and accelerations that a new robot YAML allows."""
+_LOW = "max_velocity and max_acceleration are LOW, a tenth of the model's, and max_acceleration is a guess"
 
 
 @attrs.frozen(kw_only=True)
@@ -96,8 +98,7 @@ class NewRobot:
         for doubt in model.doubts:
             echo(f"check: {doubt}")
         echo(f"try it: ibrobot launch {self.out} --sim --mode web --web")
-        fastest = max(joint.max_acceleration for joint in model.joints)
-        echo(f"BEFORE A REAL ARM MOVES: its limits, e.g. max_acceleration {fastest:.3g}, are guesses. {_LIMITS_OF_ARM}")
+        echo(f"{_LOW}. Before you raise them for a real arm, read its datasheet.")
 
 
 @contextmanager
@@ -151,9 +152,10 @@ def _limits(lower: float, upper: float) -> tuple[str, str]:
 def _joint(joint: DrivenJoint, *, grips: bool) -> str:
     """A joint; `grips` marks a gripper's joint whose group is not named gripper."""
     lower, upper = _limits(joint.lower, joint.upper)
+    velocity, acceleration = _SHARE * joint.max_velocity, _SHARE * joint.max_acceleration
     return (
-        f"{{name: {_word(joint.name)}, lower: {lower}, upper: {upper}, max_velocity: {joint.max_velocity:.6g}, "
-        f"max_acceleration: {joint.max_acceleration:.6g}{', grips: true' if grips and joint.gripper else ''}}}"
+        f"{{name: {_word(joint.name)}, lower: {lower}, upper: {upper}, max_velocity: {velocity:.6g}, "
+        f"max_acceleration: {acceleration:.6g}{', grips: true' if grips and joint.gripper else ''}}}"
     )
 
 
@@ -245,7 +247,8 @@ def robot_yaml(model: RobotModel, source: Path, folder: str) -> str:
 # What that file does not say is a guess:
 {notes}
 # A real arm needs a section `hardware` with a plugin for it.
-# BEFORE A REAL ARM MOVES: max_velocity and max_acceleration are for the simulation. {_LIMITS_OF_ARM}
+# {_LOW}.
+# Before you raise them for a real arm, read its datasheet.
 robot:
   name: {_word(model.name)}
   joints:                                 # order here = order in every vector

@@ -52,7 +52,9 @@ def test_arm_holds_each_pose_that_it_is_sent_to(name: str, tmp_path: Path) -> No
     groups = robot.groups
     assert (len(groups["arm"]), len(groups.get("gripper", ()))) == ARMS[name]
     assert "note: Each drive is a position servo" in done.stdout
-    assert "BEFORE A REAL ARM MOVES: its limits, e.g. max_acceleration" in done.stdout.splitlines()[-1]
+    assert done.stdout.splitlines()[-1].startswith("max_velocity and max_acceleration are LOW, a tenth of the model's")
+    assert max(robot.max_velocity) <= 0.6
+    assert max(robot.max_acceleration) <= 8.0
     assert "# - Each drive is a position servo" in (tmp_path / "arm.yaml").read_text()
     model = mujoco.MjModel.from_xml_path(str(robot.description.mjcf))
     data = mujoco.MjData(model)

@@ -362,6 +362,8 @@ export default {
   "Keys that are active now": "现在有效的按键",
   "emergency stop": "急停",
   "this list": "此列表",
+  "plan": "规划",
+  "jog from the page of the viewer web, while a button is held": "从网页查看器点动：按住按钮时移动",
   "Show {} large": "放大显示 {}",
   "Play": "播放",
   "Pause": "暂停",
