@@ -67,6 +67,8 @@ def ibrobot_commands() -> Iterable[Command]:
     yield Command("camera list", Late("ibrobot_camera.commands.list_cameras:ListCameras"))
     yield Command("camera preview", Late("ibrobot_camera.commands.preview:Preview"))
     yield Command("camera snapshot", Late("ibrobot_camera.commands.snapshot:Snapshot"))
+    yield Command("camera board", Late("ibrobot_camera.commands.calibrate:MakeBoard"))
+    yield Command("camera calibrate", Late("ibrobot_camera.commands.calibrate:CalibrateCamera"))
 
 
 @hookimpl
@@ -79,6 +81,13 @@ def ibrobot_guides() -> Iterable[GuideDescriptor]:
         summary,
         Late("ibrobot_camera.guides:show_cameras"),
         Late("ibrobot_camera.guides:camera_questions"),
+    )
+    yield GuideDescriptor(
+        "lens",
+        "Calibrate a camera",
+        "Measure the lens of a camera with a printed board; `ibrobot camera board` makes the page to print.",
+        Late("ibrobot_camera.commands.calibrate:guided"),
+        Late("ibrobot_camera.commands.calibrate:questions"),
     )
 
 

@@ -429,6 +429,10 @@ export default {
   // Words of forms and guides, which their owners declare.
   "The SO-101": "SO-101",
   "Calibrate an arm": "校准手臂",
+  "Calibrate a camera": "标定相机",
+  "Measure the lens of a camera with a printed board; `ibrobot camera board` makes the page to print.": "用打印的标定板测量相机镜头；`ibrobot camera board` 生成要打印的页面。",
+  "File to write": "要写入的文件",
+  "Side of a square of the printed board [mm]": "打印的标定板上方格的边长 [mm]",
   "Check an arm": "检查手臂",
   "Find an arm's port": "查找手臂的端口",
   "Serial ports": "串口",

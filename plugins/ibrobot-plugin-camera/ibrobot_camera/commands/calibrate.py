@@ -1,0 +1,181 @@
+"""`ibrobot camera board` and `ibrobot camera calibrate`: the intrinsics of a camera."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import attrs
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_camera.intrinsics.board import PAPERS, Board
+from ibrobot_camera.intrinsics.solve import FEWEST_VIEWS, Intrinsics, solve
+from ibrobot_camera.intrinsics.views import View, Views, find
+from ibrobot_core.api import SensorError, option
+from ibrobot_core.app import Guide, Question, RequestError, echo, wrong_input
+
+VIEWS = 20
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
+_HINT_S = 2.0
+"""Least time between two hints [s]."""
+_BOARD = Path("board.pdf")
+
+type Read = Callable[[float], NDArray[np.uint8] | None]
+"""Waits for a picture up to a time [s]; grey or BGR."""
+
+
+@attrs.frozen(kw_only=True)
+class MakeBoard(Board):
+    """Make a page with a board for `ibrobot camera calibrate`.
+
+    Print it at 100 %, without fitting it to the page, and glue it onto something flat and stiff. Then measure a row of
+    squares, and give the side of one to `--square` if it differs.
+    """
+
+    output: Path = option(_BOARD, typed="-o FILE", help="a .pdf or .png file")
+    paper: str = option("a4", choices=tuple(PAPERS), help="size of the paper")
+
+    def __call__(self) -> None:
+        with wrong_input():
+            self.save(self.output, self.paper)
+        echo(f"{self.output}: {self.columns}x{self.rows} squares of {self.square:g} mm on {self.paper}")
+        echo("print it at 100 %, measure a row of squares, and glue it onto something flat and stiff")
+
+
+@attrs.frozen(kw_only=True)
+class CalibrateCamera(Board):
+    """Measure the lens of a camera with a printed board; see `ibrobot camera board`.
+
+    SOURCE is a device, a robot YAML with one `opencv` camera or with --camera, or a folder of pictures. Of a camera,
+    pictures are taken by themselves while you show the board: hold it still for a moment in each place. The focus must
+    not change afterwards, so switch autofocus off before.
+
+    The result is a file for the option `info` of the camera. It is not written if the views cannot tell the lens.
+    """
+
+    source: str = option(typed="SOURCE", help="a device, a robot YAML, or a folder of pictures")
+    camera: str = option("", help="the camera of the robot YAML, if it has several")
+    output: Path | None = option(
+        None, typed="-o FILE", help="the file to write, by default NAME.yaml; it is replaced if it exists"
+    )
+    views: int = option(VIEWS, ge=FEWEST_VIEWS, le=200, help="number of views to take")
+    seconds: float = option(300.0, gt=0, unit="s", help="time after which the views that were taken must suffice")
+
+    def __call__(self) -> Intrinsics:
+        with wrong_input():
+            if Path(self.source).is_dir():
+                name, views = Path(self.source).name, self._of_folder(Path(self.source))
+            else:
+                with camera(self.source, self.camera) as (name, read):
+                    views = self._live(read)
+            result = solve(views)
+            output = self.output or Path(f"{name}.yaml")
+            result.save(output, name)
+            echo(f"{output}: {result.size[0]}x{result.size[1]}; put it into the robot YAML: info: {output}")
+        return result
+
+    def show(self, result: Intrinsics) -> None:
+        """Print the result."""
+        for line in result.lines():
+            echo(line)
+
+    def _of_folder(self, folder: Path) -> list[View]:
+        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _PICTURES)
+        if not paths:
+            raise SensorError(f"{folder}: has no pictures ({', '.join(_PICTURES)})")
+        views = []
+        for path in paths:
+            picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            if picture is None:
+                raise SensorError(f"{path}: is not a picture that can be read")
+            if (view := find(np.asarray(picture, np.uint8), self, path.name)) is not None:
+                views.append(view)
+            else:
+                echo(f"{path.name}: too little of the board is seen", err=True)
+        return views
+
+    def _live(self, read: Read) -> list[View]:
+        views, hint, told_s, end_s = Views(), "", 0.0, time.monotonic() + self.seconds
+        while (now_s := time.monotonic()) < end_s and (missing := views.missing(self.views)):
+            if missing != hint and now_s > told_s + _HINT_S:
+                hint, told_s = missing, now_s
+                echo(f"{len(views.views)} of {self.views} views; {hint}")
+            picture = read(min(1.0, end_s - now_s))
+            if picture is not None and views.add_live(find(picture, self, f"view {len(views.views) + 1}")):
+                echo("\a", nl=False)
+        return views.views
+
+
+@contextmanager
+def camera(source: str, name: str = "") -> Iterator[tuple[str, Read]]:
+    """Open one camera; yields its name and a function that reads pictures.
+
+    Raises:
+        SensorError: if it does not open, or the robot YAML has several cameras and `name` is none of them.
+    """
+    from ibrobot_camera.commands.sources import decoded, opened, pixels
+
+    with opened(source) as cameras:
+        known = ", ".join(cameras)
+        if name and name not in cameras:
+            raise RequestError(f"--camera: {source} has no opencv camera {name!r}; it has: {known}")
+        if not name and len(cameras) > 1:
+            raise RequestError(f"{source} has several cameras ({known}): name one with --camera")
+        name = name or next(iter(cameras))
+
+        def read(timeout_s: float) -> NDArray[np.uint8] | None:
+            message = cameras[name].read(timeout_s)
+            return None if message is None else np.asarray(pixels(decoded(message)), np.uint8)
+
+        yield name, read
+
+
+def questions() -> tuple[Question, ...]:
+    """Of the guide for pages."""
+    from ibrobot_camera import v4l2
+
+    names = tuple(each.stable_id or each.path for each in v4l2.cameras())
+    return (
+        Question("camera", "Camera", names[0] if names else "", names, open=True),
+        Question("file", "File to write", "camera.yaml"),
+        Question("square", "Side of a square of the printed board [mm]", "25"),
+    )
+
+
+def guided(answers: Mapping[str, str | bool], guide: Guide) -> None:
+    """Calibrate a camera from a page.
+
+    Raises:
+        SensorError: if the camera does not open, or its views cannot tell the lens.
+    """
+    try:
+        board = Board(square=float(answers["square"]))
+    except ValueError as error:
+        raise SensorError(f"side of a square: {error}") from None
+    views, picture, last = Views(), np.zeros((1, 1), np.uint8), [""]
+    with camera(str(answers["camera"])) as (name, read):
+
+        def rows() -> list[list[str]]:
+            nonlocal picture
+            if (taken := read(0.02)) is not None:
+                picture = taken
+                views.add_live(find(taken, board, f"view {len(views.views) + 1}"))
+            last[0] = views.missing(VIEWS) or "enough: go on"
+            return [[str(len(views.views)), last[0]]]
+
+        guide.wait("Show the board as the table says, still for a moment each.", columns=(">views", "next"), rows=rows)
+    for view in views.views:
+        for x, y in view.corners.tolist():
+            cv2.circle(picture, (round(x), round(y)), 2, (0, 0, 255), -1)
+    encoded, jpeg = cv2.imencode(".jpg", picture)
+    if encoded and views.views:
+        guide.picture("corners of all views", jpeg.tobytes())
+    result, path = solve(views.views), Path(str(answers["file"]))
+    result.save(path, name)
+    for line in result.lines():
+        guide.say(line)
+    guide.say(f"{path} is written; put it into the robot YAML: info: {path}")
